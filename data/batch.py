@@ -1,0 +1,118 @@
+"""A batch: one run of one machine on a regular time grid, with what was found wrong in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from data.errors import InputError, closest
+
+Role = Literal["temperature", "error", "driver", "ambient", "position"]
+ROLES: tuple[str, ...] = ("temperature", "error", "driver", "ambient", "position")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What one column of a batch means.
+
+    `unit` is the canonical unit in the lake (degC, um, rpm, mm/min, mm, …); `resolution` the
+    smallest step the instrument shows, in that unit; `low` and `high` the plausible range.
+    """
+
+    name: str
+    role: Role
+    unit: str
+    resolution: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing found in the recordings: which check, where, when, in words with numbers.
+
+    `start_s`/`end_s` are times from the batch's start, both included; None means the batch's end
+    on that side. `channel` None means every channel. `masks` says that the stretch is kept out
+    of training; `overruled` gives the user's reason when the machine file lifts that.
+    """
+
+    check: str
+    channel: str | None
+    words: str
+    start_s: float | None = None
+    end_s: float | None = None
+    masks: bool = True
+    overruled: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        return dict(self.__dict__)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One run. `table` has `time_s` (regular, from 0) and one float64 column per channel.
+
+    `table` holds what was recorded, NaN where nothing was; `masked()` blanks what the findings
+    put under a mask. Rows are never cut for a finding, so the lake keeps everything.
+    """
+
+    machine: str
+    batch_id: str
+    table: pd.DataFrame
+    channels: Mapping[str, Channel]
+    start: pd.Timestamp | None = None
+    simulated: bool = False
+    source: str = ""
+    digest: str = ""  # sha256 of the stored content: what a model was trained on
+    version: int = 1
+    repairs: Mapping[str, int] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+    labels: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def n_rows(self) -> int:
+        return len(self.table)
+
+    @cached_property
+    def time_s(self) -> NDArray[np.float64]:
+        """Time from the batch's start, s, shape (n,)."""
+        return self.table["time_s"].to_numpy(float)
+
+    @cached_property
+    def step_s(self) -> float:
+        """The grid's step, s."""
+        return float(self.time_s[1] - self.time_s[0]) if self.n_rows > 1 else 0.0
+
+    def names(self, *roles: str) -> tuple[str, ...]:
+        """Channel names of the given roles, in the machine file's order."""
+        return tuple(n for n, c in self.channels.items() if c.role in roles)
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """As recorded, in the canonical unit, shape (n,); NaN where nothing was recorded."""
+        if name not in self.table.columns or name == "time_s":
+            raise InputError(
+                f"batch {self.batch_id} of {self.machine}: no channel {name!r}; {closest(name, self.channels)}"
+            )
+        return self.table[name].to_numpy(float)
+
+    def masked(self, name: str) -> NDArray[np.float64]:
+        """As recorded, NaN inside every stretch that a finding masks, shape (n,)."""
+        values = self.values(name)
+        hits = [f for f in self.findings if f.masks and not f.overruled and f.channel in (name, None)]
+        if not hits:
+            return values
+        values = values.copy()
+        for f in hits:
+            lo = -np.inf if f.start_s is None else f.start_s
+            hi = np.inf if f.end_s is None else f.end_s
+            values[(self.time_s >= lo - 1e-6) & (self.time_s <= hi + 1e-6)] = np.nan
+        return values
+
+    def with_findings(self, findings: tuple[Finding, ...]) -> Batch:
+        return replace(self, findings=findings)

@@ -1,0 +1,22 @@
+"""The two ways a command can end badly, each told in one line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(Exception):
+    """What the user gave cannot be used: what, where, got, expected, what to do. Exit code 2."""
+
+
+class WorkError(Exception):
+    """The input was fine but the work failed. Exit code 1."""
+
+
+def closest(got: str, allowed: Iterable[str]) -> str:
+    """'did you mean …' for an unknown name, with the allowed ones: ``did you mean 'ridge'? Allowed: bp, ridge``."""
+    names = sorted(allowed)
+    near = difflib.get_close_matches(got, names, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"{hint}Allowed: {', '.join(names)}"

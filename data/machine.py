@@ -1,0 +1,179 @@
+"""The machine file: one YAML file says what a machine's recordings mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from data.batch import Channel, Role
+from data.errors import InputError, closest
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TimeColumn(_Part):
+    """Which column is time. `unit` is s, min, h, or timestamp (then `format` may name a strptime pattern)."""
+
+    column: str | int = "time_s"  # a header, or a 0-based position where the file has none
+    unit: Literal["s", "min", "h", "timestamp"] = "s"
+    format: str | None = None
+
+
+class Stage(_Part):
+    """One stage of a schedule row: how long (column name, h) and the driver columns that hold during it."""
+
+    hours: str
+    drivers: dict[str, str]  # driver channel -> column of the schedule file
+
+
+class Schedule(_Part):
+    """Drivers that stand in a table beside the recordings: one row a batch, up to several stages."""
+
+    file: str
+    batch_column: str
+    stages: list[Stage]
+    labels: dict[str, str] = {}  # batch label -> column
+
+
+class Split(_Part):
+    """Cut one long recording into batches where `driver` rises from 0; the stop that follows belongs to the batch."""
+
+    driver: str
+    min_run_s: Annotated[float, Field(gt=0)] = 600.0
+
+
+class Recording(_Part):
+    """How a recording file becomes batches."""
+
+    files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
+    header: bool = True
+    time: TimeColumn = TimeColumn()
+    step_s: Annotated[float, Field(gt=0)] = 60.0
+    max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
+    start_from_name: str | None = None  # strptime pattern over the file's stem, e.g. "%Y%m%d"
+    split: Split | None = None
+    schedule: Schedule | None = None
+
+
+class ChannelPart(_Part):
+    """One channel: role, canonical unit, where it stands in the file, resolution and plausible range in that unit.
+
+    `column` defaults to the channel's name; `unit_in_file` to `unit`. A driver that only the schedule gives has
+    `column: null` and `source: schedule`.
+    """
+
+    role: Role
+    unit: str
+    column: str | int | None = None
+    unit_in_file: str | None = None
+    source: Literal["file", "schedule"] = "file"
+    resolution: Annotated[float, Field(gt=0)] | None = None
+    range: tuple[float, float] | None = None
+    guessed: list[str] = []  # keys that `describe` guessed and nobody has confirmed
+
+    @model_validator(mode="after")
+    def _range_rises(self) -> ChannelPart:
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise ValueError(f"range {list(self.range)}: the first must be below the second")
+        return self
+
+
+class Overrule(_Part):
+    """The user's word against a check: findings that match lose their mask; `mask: true` adds a mask instead."""
+
+    batch: str = "*"
+    channel: str = "*"
+    check: str = "*"
+    mask: bool = False
+    start_s: float | None = None
+    end_s: float | None = None
+    reason: str
+
+
+class Machine(_Part):
+    """A whole machine file."""
+
+    machine: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]
+    description: str = ""
+    simulated: bool = False
+    recording: Recording = Recording()
+    channels: dict[str, ChannelPart]
+    ignore: list[str] = []  # columns known and not wanted
+    overrule: list[Overrule] = []
+    twin: dict[str, Any] | None = None  # read by the twin
+
+    def channel(self, name: str) -> Channel:
+        c = self.channels[name]
+        low, high = c.range if c.range else (None, None)
+        return Channel(name, c.role, c.unit, c.resolution, low, high)
+
+    def batch_channels(self) -> dict[str, Channel]:
+        """Name -> Channel for every channel, in the file's order."""
+        return {name: self.channel(name) for name in self.channels}
+
+    def names(self, *roles: str) -> tuple[str, ...]:
+        return tuple(n for n, c in self.channels.items() if c.role in roles)
+
+
+def load_machine(path: Path | str) -> Machine:
+    """Read and check a machine file.
+
+    Raises:
+        InputError: file missing, not YAML, a misspelt key (with the closest), a wrong value; one line each.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"machine file {path}: cannot be read ({error}); give the path of a .yml file") from None
+    return parse_machine(text, str(path))
+
+
+def parse_machine(text: str, where: str) -> Machine:
+    """The same from text; `where` names the origin in error lines."""
+    try:
+        raw = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        at = f" line {mark.line + 1}" if mark else ""
+        raise InputError(f"machine file {where}{at}: not valid YAML ({getattr(error, 'problem', error)})") from None
+    if not isinstance(raw, dict):
+        raise InputError(
+            f"machine file {where}: expected a mapping with the keys machine and channels, got {type(raw).__name__}"
+        )
+    try:
+        return Machine.model_validate(raw)
+    except ValidationError as error:
+        raise InputError(f"machine file {where}: {_one_line(error)}") from None
+
+
+def _one_line(error: ValidationError) -> str:
+    """The first problem in words; how many more follow."""
+    problems = error.errors()
+    first = problems[0]
+    where = ".".join(str(p) for p in first["loc"])
+    if first["type"] == "extra_forbidden":
+        text = f"unknown key {where!r}; {closest(str(first['loc'][-1]), _allowed_keys(first['loc'][:-1]))}"
+    elif first["type"] == "missing":
+        text = f"key {where!r} is missing"
+    else:
+        text = f"key {where!r}: got {first['input']!r}; {first['msg']}"
+    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+    return text + more
+
+
+def _allowed_keys(loc: Sequence[Any]) -> list[str]:
+    """Keys of the model that an error's location points into."""
+    part: Any = Machine
+    for step in loc:
+        if isinstance(part, type) and issubclass(part, BaseModel):
+            part = part.model_fields[str(step)].annotation if str(step) in part.model_fields else part
+        args = [a for a in getattr(part, "__args__", ()) if isinstance(a, type) and issubclass(a, BaseModel)]
+        part = args[0] if args else part
+    return sorted(part.model_fields) if isinstance(part, type) and issubclass(part, BaseModel) else []

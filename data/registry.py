@@ -1,0 +1,36 @@
+"""A registry: one line per member, imported only when it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+from data.errors import InputError, closest
+
+
+class Registry(Mapping[str, Any]):
+    """Maps a key to a class given as ``"module:Class"``; the module loads at the first look-up.
+
+    A lazy look-up keeps `thermodrift --help` from importing torch. Iteration gives keys in the
+    order of the registry file.
+
+    Raises:
+        InputError: an unknown key, with the closest and the allowed ones.
+    """
+
+    def __init__(self, kind: str, members: Mapping[str, str]) -> None:
+        self.kind = kind
+        self._members = dict(members)
+
+    def __getitem__(self, key: str) -> Any:
+        if key not in self._members:
+            raise InputError(f"unknown {self.kind} {key!r}: {closest(key, self._members)}")
+        module, name = self._members[key].split(":")
+        return getattr(import_module(module), name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._members)
+
+    def __len__(self) -> int:
+        return len(self._members)

@@ -1,0 +1,128 @@
+"""Batches stacked into arrays once, so that every selector, family and fold works on the same rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from features.rises import feature, zeroed_error_um
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Per-batch sums over the usable rows: all that a linear family needs to know.
+
+    count (K,), sum_x (K, p), sum_y (K,), xx (K, p, p), xy (K, p), yy (K,). Inputs and target are
+    first shifted by `shift_x`, `shift_y` (fixed, only for conditioning: results do not depend on it).
+    """
+
+    count: Array
+    sum_x: Array
+    sum_y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+    shift_x: Array
+    shift_y: float
+
+    def subset(self, columns: Sequence[int]) -> Moments:
+        c = np.asarray(columns, int)
+        return Moments(self.count, self.sum_x[:, c], self.sum_y, self.xx[:, c[:, None], c[None, :]],
+                       self.xy[:, c], self.yy, self.shift_x[c], self.shift_y)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Design:
+    """Rows of K batches: x (n, p) inputs, y_um (n,) target, time_s (n,), offsets (K+1,).
+
+    Rows of batch k are offsets[k]:offsets[k+1]; they are consecutive on the regular grid and never
+    cross a border. y_um is NaN where there is no usable target, x where there is no usable input;
+    `usable` marks rows fit for training. Short holes in x are the readers' and checks' business.
+    """
+
+    inputs: tuple[str, ...]
+    target: str
+    batch_ids: tuple[str, ...]
+    x: Array
+    y_um: Array
+    time_s: Array
+    offsets: NDArray[np.int64]
+    step_s: float = 0.0
+    _columns: tuple[int, ...] | None = field(default=None, repr=False)
+    _parent: Design | None = field(default=None, repr=False)
+
+    @classmethod
+    def build(cls, batches: Sequence[Batch], inputs: Sequence[str], target: str | None) -> Design:
+        """Stack the named inputs (feature names, see features.rises) and the zeroed target of the batches."""
+        sizes = [b.n_rows for b in batches]
+        offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        n, p = int(offsets[-1]), len(inputs)
+        x = np.empty((n, p))
+        y = np.full(n, np.nan)
+        time_s = np.empty(n)
+        for k, b in enumerate(batches):
+            rows = slice(offsets[k], offsets[k + 1])
+            time_s[rows] = b.time_s
+            for j, name in enumerate(inputs):
+                x[rows, j] = feature(b, name)
+            if target is not None:
+                y[rows] = zeroed_error_um(b, target)
+        return cls(tuple(inputs), target or "", tuple(b.batch_id for b in batches), x, y, time_s, offsets,
+                   batches[0].step_s if batches else 0.0)  # fmt: skip
+
+    @property
+    def n_batches(self) -> int:
+        return len(self.batch_ids)
+
+    def rows(self, k: int) -> slice:
+        """The rows of batch k."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    @cached_property
+    def group(self) -> NDArray[np.int64]:
+        """Batch index of every row, (n,)."""
+        return np.repeat(np.arange(self.n_batches), np.diff(self.offsets))
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """Rows with a finite target and finite inputs, (n,)."""
+        return np.isfinite(self.y_um) & np.isfinite(self.x).all(axis=1)
+
+    def stacked(self, train: Sequence[int]) -> tuple[Array, Array, NDArray[np.int64]]:
+        """x, y_um and batch index of the usable rows of the given batches."""
+        keep = self.usable & np.isin(self.group, np.asarray(train, int))
+        return self.x[keep], self.y_um[keep], self.group[keep]
+
+    def subset(self, inputs: Sequence[str]) -> Design:
+        """The same rows with fewer inputs; usable rows are those of the subset."""
+        columns = tuple(self.inputs.index(i) for i in inputs)
+        return Design(tuple(inputs), self.target, self.batch_ids, self.x[:, columns], self.y_um, self.time_s,
+                      self.offsets, self.step_s, columns, self)  # fmt: skip
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Cross-products per batch; a subset takes its parent's where both use the same rows."""
+        if self._parent is not None and self._columns is not None:
+            if np.array_equal(self._parent.usable, self.usable):
+                return self._parent.moments.subset(self._columns)
+        ok = self.usable
+        shift_x = self.x[ok].mean(axis=0) if ok.any() else np.zeros(len(self.inputs))
+        shift_y = float(self.y_um[ok].mean()) if ok.any() else 0.0
+        k, p = self.n_batches, len(self.inputs)
+        count, sum_x, sum_y = np.zeros(k), np.zeros((k, p)), np.zeros(k)
+        xx, xy, yy = np.zeros((k, p, p)), np.zeros((k, p)), np.zeros(k)
+        for i in range(k):
+            rows = self.rows(i)
+            keep = ok[rows]
+            x = self.x[rows][keep] - shift_x
+            y = self.y_um[rows][keep] - shift_y
+            count[i], sum_x[i], sum_y[i] = len(y), x.sum(axis=0), y.sum()
+            xx[i], xy[i], yy[i] = x.T @ x, x.T @ y, y @ y
+        return Moments(count, sum_x, sum_y, xx, xy, yy, shift_x, shift_y)

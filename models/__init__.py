@@ -1,0 +1,20 @@
+"""The model families, one line each."""
+
+from data.registry import Registry
+
+FAMILIES = Registry(
+    "family",
+    {
+        "zero": "models.zero:Zero",
+        "mean_curve": "models.mean_curve:MeanCurve",
+        "thermal_exponential": "models.thermal_exponential:ThermalExponential",
+        "mlr": "models.mlr:MLR",
+        "ridge": "models.ridge:Ridge",
+        "pcr": "models.pcr:PCR",
+        "pcr_lbo": "models.pcr:PCRByLeaveBatchOut",
+        "pls": "models.pls:PLS",
+        "bp": "models.bp:BP",
+        "lssvm": "models.lssvm:LSSVM",
+        "gm1n": "models.gm1n:GM1N",
+    },
+)

@@ -1,0 +1,118 @@
+"""What every model family is.
+
+To add one: a class below `Family` in a file of its own and a line in `models/__init__.py`. It needs
+`fit_design` and `predict_design`; `fit_folds` only where many folds can be fitted at once.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from features.design import Design
+
+Array = NDArray[np.float64]
+Plain = dict[str, Any]  # str, int, float, list of those, or numpy array
+
+
+class Family(ABC):
+    """A model of one error channel. Options are constructor arguments; what is learned is in `fitted`.
+
+    `fitted` is plain data (numbers, strings, lists, arrays), so a model is stored as JSON and arrays.
+    """
+
+    key: ClassVar[str]
+    words: ClassVar[str]
+    source: ClassVar[str]
+    uses_inputs: ClassVar[bool] = True  # False for baselines: every selector and n_tsp gives the same model
+    closed_form: ClassVar[bool] = True  # False: iterative, so the grid takes a stated few n_tsp
+    rowwise: ClassVar[bool] = True  # a prediction at a row needs that row alone (sklearn's checks apply)
+    rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
+
+    def __init__(self) -> None:
+        self.inputs: tuple[str, ...] = ()
+        self.target: str = ""
+        self.fitted: Plain = {}
+
+    @abstractmethod
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        """A new, fitted copy from the usable rows of the batches `train` of the design.
+
+        Raises:
+            InputError: too few usable rows, with the batches and what is needed.
+        """
+
+    @abstractmethod
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Free-running error_um (n_k,) of each batch, from the design's inputs (never its target).
+
+        NaN where an input is missing, unless the family can bridge it.
+        """
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """One fitted copy per fold (a fold is the training batches' indices), equal to `fit_design` fold by fold."""
+        return [self.fit_design(design, fold) for fold in folds]
+
+    def fit(self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str) -> Self:
+        """A new, fitted copy from whole batches."""
+        design = Design.build(train_batches, inputs, target)
+        return self.fit_design(design, range(design.n_batches))
+
+    def predict(self, batch: Batch) -> Array:
+        """Error_um (n,) of a batch from its inputs alone, zero at its start as the training targets were."""
+        return self.predict_design(Design.build([batch], self.inputs, None), [0])[0]
+
+    def n_parameters(self) -> int:
+        """How many numbers were learned."""
+        return int(sum(np.size(v) for v in self.fitted.values() if not isinstance(v, str)))
+
+    def options(self) -> Plain:
+        """The constructor's arguments of this object."""
+        hidden = {"inputs", "target", "fitted"}
+        return {k: v for k, v in vars(self).items() if k not in hidden and not k.startswith("_")}
+
+    def as_plain(self) -> Plain:
+        """Everything needed to predict elsewhere; `family_from_plain` reads it back."""
+        return {"family": self.key, "options": self.options(), "inputs": list(self.inputs), "target": self.target,
+                "fitted": dict(self.fitted)}  # fmt: skip
+
+    def _learned(self, design: Design, fitted: Plain) -> Self:
+        """A copy of this object with inputs, target and learned numbers set."""
+        other = copy.copy(self)
+        other.inputs, other.target, other.fitted = design.inputs, design.target, fitted
+        return other
+
+
+def family_from_plain(plain: Plain) -> Family:
+    """The inverse of `Family.as_plain`.
+
+    Raises:
+        InputError: unknown family key.
+    """
+    from models import FAMILIES
+
+    family: Family = FAMILIES[plain["family"]](**plain["options"])
+    family.inputs, family.target = tuple(plain["inputs"]), plain["target"]
+    family.fitted = dict(plain["fitted"])
+    return family
+
+
+def inner_groups(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Groups for choices inside a training set: its batches; for fewer than 3 batches contiguous quarters of each.
+
+    A single batch has no batch to leave out, yet train-on-one must choose its penalty too.
+    """
+    ids, compact = np.unique(group, return_inverse=True)
+    if len(ids) >= 3:
+        return compact.astype(np.int64)
+    out = np.empty(len(group), np.int64)
+    for k in range(len(ids)):
+        rows = np.flatnonzero(compact == k)
+        out[rows] = 4 * k + (np.arange(len(rows)) * 4) // max(1, len(rows))
+    return out
