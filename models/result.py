@@ -1,0 +1,64 @@
+"""What the grid hands on: one tidy table of scores, one row per cell, and the left-out predictions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+CELL_KEYS = ["protocol", "selector", "family", "n_tsp"]
+SCORES = ["S_um", "max_abs_um", "bias_um", "p95_abs_um", "rmse_um", "compensation_effect", "eta", "grey_degree"]
+
+
+@dataclass(frozen=True)
+class GridResult:
+    """Everything one training found out about one error channel of one machine.
+
+    - `batches`: batch_id, start, digest, version, source, simulated, n_rows, speed_rpm, start_ambient_degC, season.
+    - `scores`: one row per protocol, selector, family, n_tsp, fold and tested batch_id with the columns `SCORES`
+      (µm, or a ratio), fit_S_um (the fold's training batches) and n_rows. For train-on-one a row is a fold
+      (fold = the training batch), batch_id "*", S_um the mean and S_std_um the std over the other batches.
+    - `cells`: one row per protocol, selector, family, n_tsp: S_mean_um, S_std_um, the means of the other scores
+      (max_abs_um: the largest), fit_S_um, n_batches, n_parameters, rank (smaller is simpler), tsp_stability
+      (mean Jaccard similarity of the chosen sets over folds, 1 = always the same), inputs (the set chosen from all
+      batches, joined by "|"), n_inputs, simulated.
+    - `subsets`: protocol, selector, n_tsp, fold, inputs ("|"-joined): which points every fold chose.
+    - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um and one float32 column per
+      "selector|family|n_tsp" with the left-out prediction in µm.
+    - `findings`: batch_id, check, channel, start_s, end_s, words, masks, overruled.
+    - `excluded`: channel, reason: channels that no cell may use.
+    """
+
+    machine: str
+    target: str
+    simulated: bool
+    batches: pd.DataFrame
+    scores: pd.DataFrame
+    cells: pd.DataFrame
+    subsets: pd.DataFrame
+    predictions: pd.DataFrame
+    findings: pd.DataFrame
+    excluded: pd.DataFrame
+
+    def save(self, folder: Path) -> None:
+        """One Parquet file per table and `result.json`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        meta: dict[str, Any] = {"schema": "thermodrift.grid/1"}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, pd.DataFrame):
+                value.to_parquet(folder / f"{f.name}.parquet", index=False, compression="zstd")
+            else:
+                meta[f.name] = value
+        (folder / "result.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: Path) -> GridResult:
+        """The inverse of `save`."""
+        meta = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        meta.pop("schema")
+        tables = {p.stem: pd.read_parquet(p) for p in folder.glob("*.parquet")}
+        return cls(**meta, **{f.name: tables[f.name] for f in fields(cls) if f.name in tables})
