@@ -59,6 +59,11 @@ class Family(ABC):
         """One fitted copy per fold (a fold is the training batches' indices), equal to `fit_design` fold by fold."""
         return [self.fit_design(design, fold) for fold in folds]
 
+    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+        """Predictions (n, F) of F fitted copies on every row of the design, equal to `predict_design` one by one."""
+        everything = range(design.n_batches)
+        return np.column_stack([np.concatenate(f.predict_design(design, everything)) for f in fitted])
+
     def fit(self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str) -> Self:
         """A new, fitted copy from whole batches."""
         design = Design.build(train_batches, inputs, target)

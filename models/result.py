@@ -58,7 +58,7 @@ class GridResult:
     @classmethod
     def load(cls, folder: Path) -> GridResult:
         """The inverse of `save`."""
-        meta = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        meta.pop("schema")
-        tables = {p.stem: pd.read_parquet(p) for p in folder.glob("*.parquet")}
-        return cls(**meta, **{f.name: tables[f.name] for f in fields(cls) if f.name in tables})
+        meta: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        values = {f.name: meta[f.name] if f.name in meta else pd.read_parquet(folder / f"{f.name}.parquet")
+                  for f in fields(cls)}  # fmt: skip
+        return cls(**values)

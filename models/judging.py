@@ -1,0 +1,137 @@
+"""Judging one family under one protocol: every distinct set of inputs and fold, each fitted and scored once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from features.design import Design
+from models.base import Family
+from models.metrics import batch_scores
+from models.protocols import Fold
+from models.result import SCORES
+
+Array = NDArray[np.float64]
+Inputs = tuple[str, ...]
+_COLUMNS_AT_ONCE_BYTES = 128 * 2**20
+
+
+@dataclass
+class Judged:
+    """Every distinct (inputs, fold) of one family under one protocol, with its scores on every tested batch."""
+
+    column: dict[tuple[Inputs, int], int]
+    tested: dict[str, Array]  # score -> (columns, K), NaN where a batch is not tested
+    fit_S_um: Array  # (columns,)
+    kept: dict[int, Array]  # column -> prediction on the fold's tested rows
+    n_parameters: int
+    failures: list[str]
+
+    @classmethod
+    def run(
+        cls, design: Design, family: Family, folds: Sequence[Fold], needed: Sequence[tuple[Design, list[int]]]
+    ) -> Judged:
+        """Fit and judge. `needed`: each distinct subset of the design's inputs with the folds it is wanted for."""
+        total = sum(len(which) for _, which in needed)
+        tested = {name: np.full((total, design.n_batches), np.nan) for name in [*SCORES, "n_rows"]}
+        out = cls({}, tested, np.full(total, np.nan), {}, 0, [])
+        pending: list[tuple[Inputs, int, Array]] = []
+        budget = max(1, _COLUMNS_AT_ONCE_BYTES // (8 * max(1, len(design.y_um))))
+        for sub, which in needed:
+            try:
+                fitted = family.fit_folds(sub, [folds[i].train for i in which])
+                predicted = family.predict_folds(sub, fitted)
+            except InputError as error:
+                out.failures.append(f"{len(sub.inputs)} points: {error}")
+                continue
+            out.n_parameters = max(out.n_parameters, fitted[0].n_parameters())
+            pending += [(sub.inputs, i, predicted[:, c]) for c, i in enumerate(which)]
+            if len(pending) >= budget:
+                out._judge(design, folds, pending)
+                pending = []
+        out._judge(design, folds, pending)
+        return out
+
+    def _judge(self, design: Design, folds: Sequence[Fold], pending: list[tuple[Inputs, int, Array]]) -> None:
+        if not pending:
+            return
+        first = len(self.column)
+        predicted = np.column_stack([p for _, _, p in pending])
+        fold_of = np.array([i for _, i, _ in pending])
+        in_test = np.zeros((len(folds), design.n_batches), bool)
+        in_train = np.zeros_like(in_test)
+        for i, fold in enumerate(folds):
+            in_test[i, list(fold.test)] = True
+            in_train[i, list(fold.train)] = True
+            if len(fold.test) == 1:
+                rows = design.rows(fold.test[0])
+                self.kept |= {first + int(c): predicted[rows, c] for c in np.flatnonzero(fold_of == i)}
+        S_all = np.full((len(pending), design.n_batches), np.nan)
+        for k in range(design.n_batches):
+            rows = design.rows(k)
+            y, p = design.y_um[rows], predicted[rows]
+            e = y[:, None] - p
+            ok = np.isfinite(e)
+            n = ok.sum(axis=0)
+            e = np.where(ok, e, 0.0)
+            sse = np.einsum("ij,ij->j", e, e)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                S_all[:, k] = np.where(n > 1, np.sqrt(sse / (n - 1)), np.nan)
+            columns = np.flatnonzero(in_test[fold_of, k])
+            if len(columns):
+                for name, values in batch_scores(y, p[:, columns]).items():
+                    self.tested[name][first + columns, k] = values
+        self.fit_S_um[first : first + len(pending)] = _masked_mean(S_all, in_train[fold_of])
+        for offset, (inputs, i, _) in enumerate(pending):
+            self.column[inputs, i] = first + offset
+
+    def left_out(self, design: Design, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Every batch's prediction by the fold that left it out, on all rows of the design, µm."""
+        out = np.full(len(design.y_um), np.nan, np.float32)
+        for fold, column in zip(folds, columns, strict=True):
+            out[design.rows(fold.test[0])] = self.kept[int(column)]
+        return out
+
+
+def _masked_mean(values: Array, where: NDArray[np.bool_]) -> Array:
+    ok = where & np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.where(ok, values, 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
+
+
+def score_rows(
+    batch_ids: Sequence[str], folds: Sequence[Fold], judged: Judged, columns: NDArray[np.int64], protocol: str
+) -> pd.DataFrame:
+    """A row per fold and tested batch; for train-on-one a row per fold, summed up over the batches it tests."""
+    if protocol == "train-on-one":
+        data: dict[str, Any] = {"fold": [f.name for f in folds], "batch_id": "*"}
+        with np.errstate(all="ignore"):
+            for name in SCORES:
+                reduce = np.nanmax if name == "max_abs_um" else np.nanmean
+                data[name] = reduce(judged.tested[name][columns], axis=1)
+            data["S_std_um"] = np.nanstd(judged.tested["S_um"][columns], axis=1, ddof=1)
+            data["n_rows"] = np.nansum(judged.tested["n_rows"][columns], axis=1)
+        return pd.DataFrame({**data, "fit_S_um": judged.fit_S_um[columns]})
+    fold_index = np.concatenate([np.full(len(f.test), i) for i, f in enumerate(folds)])
+    batch_index = np.concatenate([f.test for f in folds])
+    picked = columns[fold_index]
+    data = {"fold": [folds[i].name for i in fold_index], "batch_id": [batch_ids[k] for k in batch_index]}
+    data |= {name: judged.tested[name][picked, batch_index] for name in [*SCORES, "n_rows"]}
+    return pd.DataFrame({**data, "fit_S_um": judged.fit_S_um[picked]})
+
+
+def summary(table: pd.DataFrame, protocol: str) -> dict[str, float]:
+    """Accuracy S_mean and robustness S_std over tested batches, and the other scores."""
+    s = table["S_um"].to_numpy()
+    spread = table["S_std_um"].mean() if protocol == "train-on-one" else (s.std(ddof=1) if len(s) > 1 else np.nan)
+    out = {"S_mean_um": float(s.mean()), "S_std_um": float(spread), "fit_S_um": float(table["fit_S_um"].mean())}
+    for name in SCORES[1:]:
+        values = table[name]
+        out[name] = float(values.max() if name == "max_abs_um" else values.mean())
+    return out | {"n_batches": len(table)}

@@ -1,0 +1,80 @@
+"""How a prediction is judged, for many models at once.
+
+All on one batch's usable rows, recorded y and prediction p (µm), e = y − p:
+S = sqrt(Σ e² / (n − 1)), the residual standard deviation of the year-round PCR study; max |e|; bias = mean e;
+95 % quantile of |e|; RMSE; compensation effect 1 − range(e)/range(y); prediction accuracy
+eta = 1 − mean|e|/mean|y| (coupled-lathe study); grey synthetic relational degree of y and p (Liu 1991).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from features.grey import synthetic_degree
+from models.result import SCORES
+
+Array = NDArray[np.float64]
+
+
+def batch_scores(y_um: Array, predicted_um: Array) -> dict[str, Array]:
+    """Scores of C models on one batch.
+
+    Args:
+        y_um: recorded error (n,), NaN where masked.
+        predicted_um: predictions (n, C), NaN where a model has none.
+
+    Returns:
+        one array (C,) per name in `SCORES`, and `n_rows` (C,): the rows both are finite in. NaN below 2 rows.
+    """
+    columns = predicted_um.shape[1]
+    out = {name: np.full(columns, np.nan) for name in [*SCORES, "n_rows"]}
+    finite = np.isfinite(y_um)[:, None] & np.isfinite(predicted_um)
+    counts = finite.sum(axis=0)
+    # Columns that share their usable rows are judged together; nearly always all of them do.
+    full = counts == int(np.isfinite(y_um).sum())
+    groups = [(np.flatnonzero(full), np.isfinite(y_um))] if full.any() else []
+    groups += [(np.array([c]), finite[:, c]) for c in np.flatnonzero(~full)]
+    for which, rows in groups:
+        n = int(rows.sum())
+        out["n_rows"][which] = n
+        if n < 2:
+            continue
+        y, p = y_um[rows], predicted_um[rows][:, which]
+        for name, values in _scores(y, p).items():
+            out[name][which] = values
+    return out
+
+
+def _scores(y: Array, p: Array) -> dict[str, Array]:
+    e = y[:, None] - p
+    absolute = np.abs(e)
+    sse = np.einsum("ij,ij->j", e, e)
+    n = len(y)
+    mean_y, range_y = np.abs(y).mean(), np.ptp(y)
+    mean_abs = absolute.mean(axis=0)
+    return {
+        "S_um": np.sqrt(sse / (n - 1)),
+        "rmse_um": np.sqrt(sse / n),
+        "max_abs_um": absolute.max(axis=0),
+        "bias_um": e.mean(axis=0),
+        "p95_abs_um": _quantile95(absolute),
+        "compensation_effect": 1.0 - np.ptp(e, axis=0) / range_y if range_y > 0 else np.full(p.shape[1], np.nan),
+        "eta": 1.0 - mean_abs / mean_y if mean_y > 0 else np.full(p.shape[1], np.nan),
+        "grey_degree": synthetic_degree(y, p),
+    }
+
+
+def _quantile95(values: Array) -> Array:
+    """Linear 95 % quantile over rows; a partition instead of a sort."""
+    position = 0.95 * (len(values) - 1)
+    low = int(position)
+    high = min(low + 1, len(values) - 1)
+    part = np.partition(values, (low, high), axis=0)
+    return part[low] + (position - low) * (part[high] - part[low])
+
+
+def residual_std_um(error_um: Array) -> float:
+    """S of one residual series (n,), NaN left out; NaN below 2 rows."""
+    e = error_um[np.isfinite(error_um)]
+    return float(np.sqrt(e @ e / (len(e) - 1))) if len(e) > 1 else float("nan")
