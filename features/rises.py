@@ -5,9 +5,10 @@ An input is named by its channel and, behind an @, what is made of it; the plain
 | name | what | unit |
 |---|---|---|
 | `front` | rise T(t) − T(0) of a temperature, or a driver as recorded | K, or the driver's unit |
-| `front@rate` | slope of the rise over the last 10 min | K/h |
-| `front@ambient` | T(t) − T_ambient(t), less its value at the start | K |
-| `front@lag30min` | rise (or driver) behind a first-order lag of the stated time constant | K |
+| `front@rate` | slope of the rise over the last 10 min (since the first usable sample where that is nearer) | K/h |
+| `front@ambient` | T(t) − T_ambient(t), less its first usable value | K |
+| `front@lag30min` | rise behind a first-order lag of the stated time constant | K |
+| `speed@lag30min` | driver behind such a lag, at rest (0) when the batch starts | the driver's unit |
 | `room@start` | value at the batch's first usable sample, held | degC |
 """
 
@@ -18,12 +19,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, closest
 
 Array = NDArray[np.float64]
 _RATE_WINDOW_S = 600.0
+_THERMAL = ("temperature", "ambient")
 _LAG = re.compile(r"^lag(\d+(?:\.\d+)?)(s|min|h)$")
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -34,31 +37,38 @@ def feature(batch: Batch, name: str) -> Array:
     Raises:
         InputError: unknown channel or unknown kind of feature.
     """
-    channel, _, kind = name.partition("@")
+    channel, kind = _parts(name)
     values = batch.masked(channel)
+    thermal = batch.channels[channel].role in _THERMAL
     if kind == "start":
         return np.full(batch.n_rows, _first(values))
-    base = values - _first(values) if batch.channels[channel].role in ("temperature", "ambient") else values
-    if kind == "":
-        return base
+    if kind == "ambient":
+        values = values - batch.masked(_ambient(batch, name))
+        return values - _first(values)
+    base = values - _first(values) if thermal else values
     if kind == "rate":
         return _rate_per_h(base, batch.step_s)
-    if kind == "ambient":
-        ambient = batch.names("ambient")
-        if not ambient:
-            raise InputError(f"feature {name!r}: machine {batch.machine} has no channel with role ambient")
-        room = batch.masked(ambient[0])
-        return base - (room - _first(room))
     if match := _LAG.match(kind):
-        return first_order_lag(base, float(match[1]) * _SECONDS[match[2]], batch.step_s)
-    raise InputError(f"feature {name!r}: unknown kind {kind!r}; allowed: rate, ambient, start, lag<number><s|min|h>")
+        tau_s = float(match[1]) * _SECONDS[match[2]]
+        return first_order_lag(base, tau_s, batch.step_s, start=None if thermal else 0.0)
+    return base
 
 
 def feature_unit(batch: Batch, name: str) -> str:
-    """Unit of a feature: K, K/h, degC, or the driver's own."""
-    channel, _, kind = name.partition("@")
+    """Unit of a feature: K, K/h, degC, or the driver's own.
+
+    Raises:
+        InputError: unknown channel or unknown kind of feature.
+    """
+    channel, kind = _parts(name)
+    if channel not in batch.channels:
+        raise InputError(
+            f"batch {batch.batch_id} of {batch.machine}: no channel {channel!r}; {closest(channel, batch.channels)}"
+        )
     spec = batch.channels[channel]
-    if spec.role not in ("temperature", "ambient"):
+    if kind == "ambient":
+        _ambient(batch, name)
+    if spec.role not in _THERMAL:
         return f"{spec.unit}/h" if kind == "rate" else spec.unit
     return {"rate": "K/h", "start": spec.unit}.get(kind, "K")
 
@@ -69,17 +79,19 @@ def zeroed_error_um(batch: Batch, target: str) -> Array:
     return values - _first(values)
 
 
-def first_order_lag(values: Array, tau_s: float, step_s: float) -> Array:
-    """Response of τ dv/dt + v = u, exact for u held over a step, started in equilibrium at u(0); shape (n,).
+def first_order_lag(values: Array, tau_s: float, step_s: float, start: float | None = None) -> Array:
+    """Response of τ dv/dt + v = u, exact for u held over the step before its sample; shape (n,).
 
-    A hole is bridged by holding the last input and stays NaN in the result.
+    The first value is the state: `start`, or u(0), which is equilibrium. A hole is bridged by holding the last
+    input and stays NaN in the result. A time constant of 0 gives the input itself.
     """
+    if tau_s == 0 or len(values) == 0:
+        return values.copy()
     held = hold_last(values)
-    keep = float(np.exp(-step_s / tau_s)) if tau_s > 0 else 0.0
+    keep = float(np.exp(-step_s / tau_s))
     out = np.empty_like(held)
-    state = held[0] if len(held) else 0.0
-    for i, u in enumerate(held):
-        out[i] = state = keep * state + (1.0 - keep) * u if i else u
+    out[0] = held[0] if start is None else start
+    out[1:], _ = lfilter([1.0 - keep], [1.0, -keep], held[1:], zi=[keep * out[0]])
     out[~np.isfinite(values)] = np.nan
     return out
 
@@ -106,8 +118,34 @@ def _first(values: Array) -> float:
 
 
 def _rate_per_h(values: Array, step_s: float) -> Array:
-    back = max(1, round(_RATE_WINDOW_S / step_s)) if step_s > 0 else 1
-    earlier = np.concatenate([np.full(min(back, len(values)), values[0] if len(values) else 0.0), values[:-back]])
-    elapsed = np.minimum(np.arange(len(values)), back) * step_s
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(elapsed > 0, (values - earlier[: len(values)]) / elapsed * 3600.0, 0.0)
+    """Slope to the sample 10 min before, or to the first usable one where that is nearer; 0 there."""
+    ok = np.isfinite(values)
+    if step_s <= 0 or not ok.any():
+        return np.where(ok, 0.0, np.nan)
+    row = np.arange(len(values))
+    earlier = np.maximum(row - max(1, round(_RATE_WINDOW_S / step_s)), int(np.argmax(ok)))
+    elapsed_h = np.maximum(row - earlier, 1) * step_s / 3600.0
+    return (values - values[np.minimum(earlier, row)]) / elapsed_h
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """Channel and kind of a feature name; the kind is checked."""
+    channel, at, kind = name.partition("@")
+    if at and kind not in ("rate", "ambient", "start") and not _LAG.match(kind):
+        raise InputError(
+            f"feature {name!r}: unknown kind {kind!r}; allowed: rate, ambient, start, lag<number><s|min|h>"
+        )
+    return channel, kind
+
+
+def _ambient(batch: Batch, name: str) -> str:
+    """The channel that ambient-relative features are taken against: the first ambient one."""
+    channel = name.partition("@")[0]
+    ambient = batch.names("ambient")
+    if not ambient:
+        raise InputError(f"feature {name!r}: machine {batch.machine} has no channel with role ambient")
+    if channel in batch.channels and batch.channels[channel].role not in _THERMAL:
+        raise InputError(
+            f"feature {name!r}: channel {channel!r} is a {batch.channels[channel].role}; expected a temperature"
+        )
+    return ambient[0]

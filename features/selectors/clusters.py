@@ -1,0 +1,71 @@
+"""Fuzzy clusters of sensors: transitive closure of the similarity |corr|, cut into every number of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from features.design import Design
+from features.selectors.statistics import DIGITS, Statistics, in_order, ranking
+
+Array = NDArray[np.float64]
+
+
+def transitive_closure(similarity: Array) -> Array:
+    """Smallest max–min transitive relation above a symmetric similarity (p, p) with ones on its diagonal.
+
+    The fixed point of R ← R∘R, (R∘R)_ij = max_k min(r_ik, r_kj), reached in one pass over k
+    (L. A. Zadeh 1971, Similarity relations and fuzzy orderings, Inf. Sci. 3; S. Warshall 1962, J. ACM 9).
+    """
+    closure = similarity.copy()
+    for k in range(len(closure)):
+        np.maximum(closure, np.minimum(closure[:, k, None], closure[k]), out=closure)
+    return closure
+
+
+def partitions(closure: Array) -> NDArray[np.int64]:
+    """Class of every member for every number of classes, (p, p): row n−1 holds n classes, named by their first member.
+
+    Lowering λ from 1 merges classes; where several merge at one λ, no cut gives the numbers between. Then
+    they merge one after the other in the order of their first members, as single linkage does, so every n exists.
+    """
+    p = len(closure)
+    classes = np.empty((p, p), np.int64)
+    current = np.arange(p)
+    classes[p - 1] = current
+    i, j = np.triu_indices(p, 1)
+    order = np.argsort(-np.round(closure[i, j], DIGITS), kind="stable")
+    n = p
+    for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if n == 1:
+            break
+        first, second = sorted((int(current[a]), int(current[b])))
+        if first != second:
+            current[current == second] = first
+            n -= 1
+            classes[n - 1] = current
+    return classes
+
+
+def best_of_clusters(
+    design: Design, statistics: Statistics, score: Array, n_tsps: Sequence[int]
+) -> dict[int, tuple[str, ...]]:
+    """From each of n clusters the input of the largest score (p,), for every n asked.
+
+    Constant inputs have no similarity; they join, in the design's order, only when n exceeds the number of the others.
+    """
+    order = ranking(score, statistics.varying)
+    varying = np.flatnonzero(statistics.varying)
+    constant = np.flatnonzero(~statistics.varying)
+    classes = partitions(transitive_closure(np.abs(statistics.between[np.ix_(varying, varying)])))
+    place = np.searchsorted(varying, order[: len(varying)])  # members of `classes`, best first
+    chosen = {}
+    for n in n_tsps:
+        if n <= len(varying):
+            _, best = np.unique(classes[n - 1, place], return_index=True)
+            chosen[n] = in_order(design, order[best])
+        else:
+            chosen[n] = in_order(design, np.concatenate([varying, constant[: n - len(varying)]]))
+    return chosen

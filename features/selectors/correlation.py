@@ -1,0 +1,28 @@
+"""Inputs of the largest correlation with the error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from features.design import Design
+from features.selectors.base import Selector
+from features.selectors.statistics import check_n_tsps, in_order, ranking, training_statistics
+
+
+class Correlation(Selector):
+    """The n inputs of largest |corr| with the target, over the stacked rows of the training batches.
+
+    Neighbours of one hot spot all rank high, so the chosen points are often near twins.
+    """
+
+    key = "correlation"
+    words = "largest |correlation| with the error"
+    source = "K. Pearson (1895), Proc. R. Soc. 58, 240–242"
+
+    def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
+        check_n_tsps(design, n_tsps, self.key)
+        statistics = training_statistics(design, train, self.key)
+        order = ranking(np.abs(statistics.with_target), statistics.varying)
+        return {n: in_order(design, order[:n]) for n in n_tsps}

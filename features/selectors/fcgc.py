@@ -1,0 +1,33 @@
+"""Fuzzy clustering + grey correlation: one input from every cluster, by its grey relational degree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from features.design import Design
+from features.grey import relational_degree
+from features.selectors.base import Selector
+from features.selectors.clusters import best_of_clusters
+from features.selectors.statistics import check_n_tsps, training_statistics
+
+
+class FuzzyClusterGreyCorrelation(Selector):
+    """n clusters by the transitive closure of |corr|, from each the input of largest grey relational degree.
+
+    The closure equals single linkage, so it chains: two groups joined by one sensor between them fall into
+    one cluster while a single odd sensor takes a cluster of its own.
+    """
+
+    key = "fcgc"
+    words = "fuzzy clusters, from each the largest grey relational degree with the error"
+    source = "fuzzy clustering + grey correlation (FCGC) of the year-round studies; J. L. Deng (1989) for the degree"
+
+    def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
+        check_n_tsps(design, n_tsps, self.key)
+        statistics = training_statistics(design, train, self.key)
+        x, y_um, _ = design.stacked(train)
+        degree = np.zeros(len(design.inputs))
+        degree[statistics.varying] = relational_degree(x[:, statistics.varying], y_um)
+        return best_of_clusters(design, statistics, degree, n_tsps)

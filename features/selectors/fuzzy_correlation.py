@@ -1,0 +1,28 @@
+"""Fuzzy clustering + correlation: one input from every cluster, by its correlation with the error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from features.design import Design
+from features.selectors.base import Selector
+from features.selectors.clusters import best_of_clusters
+from features.selectors.statistics import check_n_tsps, training_statistics
+
+
+class FuzzyCorrelation(Selector):
+    """n clusters by the transitive closure of |corr|, from each the input of largest |corr| with the target.
+
+    Chosen anew for every error channel; chains as every single linkage does.
+    """
+
+    key = "fuzzy_correlation"
+    words = "fuzzy clusters, from each the largest |correlation| with the error"
+    source = "coupled-lathe study: fuzzy clustering and correlation analysis; L. A. Zadeh (1971) for the closure"
+
+    def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
+        check_n_tsps(design, n_tsps, self.key)
+        statistics = training_statistics(design, train, self.key)
+        return best_of_clusters(design, statistics, np.abs(statistics.with_target), n_tsps)
