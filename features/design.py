@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
-from features.rises import feature, zeroed_error_um
+from features.rises import feature, feature_unit, zeroed_error_um
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,8 @@ class Design:
     Rows of batch k are offsets[k]:offsets[k+1]; they are consecutive on the regular grid and never
     cross a border. y_um is NaN where there is no usable target, x where there is no usable input;
     `usable` marks rows fit for training. Short holes in x are the readers' and checks' business.
+    `drivers` (n, d) are the first batch's driver channels as recorded (NaN where a batch lacks one), for the
+    families that follow the load; empty where the design was made by hand. Units are in the same order as names.
     """
 
     inputs: tuple[str, ...]
@@ -57,6 +59,10 @@ class Design:
     step_s: float = 0.0
     _columns: tuple[int, ...] | None = field(default=None, repr=False)
     _parent: Design | None = field(default=None, repr=False)
+    drivers: Array = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    driver_names: tuple[str, ...] = ()
+    driver_units: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
 
     @classmethod
     def build(cls, batches: Sequence[Batch], inputs: Sequence[str], target: str | None) -> Design:
@@ -67,15 +73,22 @@ class Design:
         x = np.empty((n, p))
         y = np.full(n, np.nan)
         time_s = np.empty(n)
+        driver_names = batches[0].names("driver") if batches else ()
+        drivers = np.full((n, len(driver_names)), np.nan)
         for k, b in enumerate(batches):
             rows = slice(offsets[k], offsets[k + 1])
             time_s[rows] = b.time_s
             for j, name in enumerate(inputs):
                 x[rows, j] = feature(b, name)
+            for j, name in enumerate(driver_names):
+                if name in b.channels:
+                    drivers[rows, j] = b.masked(name)
             if target is not None:
                 y[rows] = zeroed_error_um(b, target)
         return cls(tuple(inputs), target or "", tuple(b.batch_id for b in batches), x, y, time_s, offsets,
-                   batches[0].step_s if batches else 0.0)  # fmt: skip
+                   batches[0].step_s if batches else 0.0, drivers=drivers, driver_names=driver_names,
+                   driver_units=tuple(batches[0].channels[d].unit for d in driver_names),
+                   input_units=tuple(feature_unit(batches[0], i) for i in inputs) if batches else ())  # fmt: skip
 
     @property
     def n_batches(self) -> int:
@@ -104,25 +117,44 @@ class Design:
         """The same rows with fewer inputs; usable rows are those of the subset."""
         columns = tuple(self.inputs.index(i) for i in inputs)
         return Design(tuple(inputs), self.target, self.batch_ids, self.x[:, columns], self.y_um, self.time_s,
-                      self.offsets, self.step_s, columns, self)  # fmt: skip
+                      self.offsets, self.step_s, columns, self, self.drivers, self.driver_names, self.driver_units,
+                      tuple(self.input_units[c] for c in columns if c < len(self.input_units)))  # fmt: skip
 
     @cached_property
     def moments(self) -> Moments:
         """Cross-products per batch; a subset takes its parent's where both use the same rows."""
+        parent = self._parent
+        if parent is not None and self._columns is not None and np.array_equal(parent.usable, self.usable):
+            return parent.moments.subset(self._columns)
+        return self._sums(self.group[self.usable], self.n_batches)
+
+    @cached_property
+    def quarters(self) -> Moments:
+        """The same per contiguous quarter of every batch's usable rows: quarter q of batch k at 4 k + q, (4 K, …).
+
+        The blocks of `models.base.inner_groups` for trainings of one or two batches.
+        """
         if self._parent is not None and self._columns is not None:
             if np.array_equal(self._parent.usable, self.usable):
-                return self._parent.moments.subset(self._columns)
+                return self._parent.quarters.subset(self._columns)
+        batch = self.group[self.usable]
+        count = np.bincount(batch, minlength=self.n_batches)
+        within = np.arange(len(batch)) - (np.cumsum(count) - count)[batch]
+        return self._sums(4 * batch + within * 4 // np.maximum(count, 1)[batch], 4 * self.n_batches)
+
+    def _sums(self, block: NDArray[np.int64], n_blocks: int) -> Moments:
+        """Moments per block; `block` numbers the usable rows, rising."""
         ok = self.usable
-        shift_x = self.x[ok].mean(axis=0) if ok.any() else np.zeros(len(self.inputs))
-        shift_y = float(self.y_um[ok].mean()) if ok.any() else 0.0
-        k, p = self.n_batches, len(self.inputs)
+        usable_x, usable_y = self.x[ok], self.y_um[ok]
+        shift_x = usable_x.mean(axis=0) if len(block) else np.zeros(len(self.inputs))
+        shift_y = float(usable_y.mean()) if len(block) else 0.0
+        usable_x, usable_y = usable_x - shift_x, usable_y - shift_y
+        k, p = n_blocks, len(self.inputs)
         count, sum_x, sum_y = np.zeros(k), np.zeros((k, p)), np.zeros(k)
         xx, xy, yy = np.zeros((k, p, p)), np.zeros((k, p)), np.zeros(k)
+        border = np.searchsorted(block, np.arange(k + 1))
         for i in range(k):
-            rows = self.rows(i)
-            keep = ok[rows]
-            x = self.x[rows][keep] - shift_x
-            y = self.y_um[rows][keep] - shift_y
+            x, y = usable_x[border[i] : border[i + 1]], usable_y[border[i] : border[i + 1]]
             count[i], sum_x[i], sum_y[i] = len(y), x.sum(axis=0), y.sum()
             xx[i], xy[i], yy[i] = x.T @ x, x.T @ y, y @ y
         return Moments(count, sum_x, sum_y, xx, xy, yy, shift_x, shift_y)
