@@ -1,0 +1,37 @@
+# `make run` and `make test` do all the set-up; nothing else needs to be known.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: run test lint bench clean lock
+
+run: $(READY)  ## the main job on the built-in sample year
+	$(BIN)/thermodrift simulate --sample-year --out var/sample_year
+	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year
+
+test: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(READY)
+	$(BIN)/python benchmarks/grid.py
+	$(BIN)/python benchmarks/ingest.py
+
+clean:
+	rm -rf .venv var .mypy_cache .ruff_cache .hypothesis *.egg-info
+
+lock: $(READY)  ## renew the lock file from requirements-dev.in
+	$(BIN)/pip install --quiet --upgrade -r requirements-dev.in
+	(echo "# Every direct and indirect version, from requirements-dev.in; \`make lock\` renews it."; \
+	 $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f) > requirements.lock
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v == (3, 11) else f"thermodrift needs Python 3.11, got {v[0]}.{v[1]}; call make PYTHON=/path/to/python3.11")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
