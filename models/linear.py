@@ -1,0 +1,295 @@
+"""Linear families from per-batch sums: every fold, and every inner fold, is a pooling of the same few moments.
+
+Rows are read once, for the moments. A fold's covariance is a sum over its batches, so 30 folds cost 30 small
+matrices, and a choice by leave-batch-out inside them 435 more (leaving out i and k is one fit, whichever is outer).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from features.design import Design, Moments
+from models.base import Array, Family
+
+Mask = NDArray[np.bool_]
+EPS = float(np.finfo(float).eps)
+FLAT = 1e-12  # an input that moves less than this part of its own size does not move
+DIGITS_LEFT = 1e8  # beyond this condition of the covariance a fit goes back to the rows
+_CONDITION_SEEN = 1e10  # beyond this the condition itself is taken from the rows
+_MIN_ROWS = 4
+_AT_ONCE = 4_000_000  # numbers in a stack of covariances
+_KELVIN = ("K", "degC")
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Centred sums of S sets of rows: count (S,), mean_x (S, p), mean_y (S,), xx (S, p, p), xy (S, p).
+
+    xx and xy are of the inputs divided by `scale` (S, p), which is 1 where all inputs are in K. `loss` (S,) says
+    how much the sums about the common origin exceed the centred ones: the digits that centring cost.
+    """
+
+    count: Array
+    mean_x: Array
+    mean_y: Array
+    xx: Array
+    xy: Array
+    scale: Array
+    loss: Array
+
+    def correlation(self) -> tuple[Array, Array]:
+        """xx of the inputs over their own spread (S, p, p), and that spread (S, p); a flat input stands alone."""
+        spread = np.sqrt(np.einsum("sjj->sj", self.xx))
+        flat = spread == 0
+        spread = np.where(flat, 1.0, spread)
+        out = self.xx / (spread[:, :, None] * spread[:, None, :])
+        np.einsum("sjj->sj", out)[flat] = 1.0
+        return out, spread
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Sums over B blocks of rows, each about its own mean, so that pooling them cancels nothing."""
+
+    count: Array
+    mean_x: Array
+    mean_y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+    raw: Array  # (B, p) sums of squares about the moments' origin
+    origin: Array  # (p,)
+
+    @classmethod
+    def of(cls, m: Moments) -> Blocks:
+        n = np.maximum(m.count, 1.0)
+        mean_x, mean_y = m.sum_x / n[:, None], m.sum_y / n
+        xx = m.xx - m.sum_x[:, :, None] * mean_x[:, None, :]
+        xy = m.xy - m.sum_x * mean_y[:, None]
+        raw = np.einsum("bjj->bj", m.xx)
+        moves = np.einsum("bjj->bj", xx) > FLAT * raw
+        xx *= moves[:, :, None] & moves[:, None, :]
+        yy = np.maximum(m.yy - m.sum_y * mean_y, 0.0)
+        return cls(m.count, mean_x, mean_y, xx, xy * moves, yy, raw, m.shift_x)
+
+    def pool(self, masks: Mask, scaled: bool) -> Pool:
+        """Sets of blocks, masks (S, B), each as one training set; `scaled` divides inputs by their std there."""
+        sets, p = len(masks), self.mean_x.shape[1]
+        take = masks.astype(float)
+        weight = take * self.count
+        count = weight.sum(axis=1)
+        n = np.maximum(count, 1.0)
+        mean_x, mean_y = weight @ self.mean_x / n[:, None], weight @ self.mean_y / n
+        root = np.sqrt(weight)
+        between = root[:, :, None] * (self.mean_x - mean_x[:, None, :])
+        between_y = root * (self.mean_y - mean_y[:, None])
+        across = between.transpose(0, 2, 1)
+        xx = (take @ self.xx.reshape(len(self.xx), -1)).reshape(sets, p, p) + across @ between
+        xy = take @ self.xy + (across @ between_y[:, :, None])[:, :, 0]
+        raw = take @ self.raw
+        square = np.einsum("sjj->sj", xx)
+        moves = square > n[:, None] * (FLAT * (np.abs(self.origin) + np.sqrt(raw / n[:, None]))) ** 2
+        if not moves.all():
+            xx *= moves[:, :, None] & moves[:, None, :]
+            xy *= moves
+        safe = np.where(moves, square, 1.0)
+        loss = np.where(moves, raw / safe, 1.0).max(axis=1, initial=1.0)
+        scale = np.sqrt(np.where(moves, square, n[:, None]) / n[:, None]) if scaled else np.ones((sets, p))
+        if scaled:
+            xx, xy = xx / (scale[:, :, None] * scale[:, None, :]), xy / scale
+        return Pool(count, mean_x, mean_y, xx, xy, scale, loss)
+
+    def left_out_S_um(self, block: NDArray[np.int64], pool: Pool, which: NDArray[np.int64], coef: Array) -> Array:
+        """S (V, G) in µm of left-out blocks (V,) under the models coef (S, p, G) fitted on pool[which]."""
+        beta = coef[which]
+        square = np.einsum("vjg,vjg->vg", beta, self.xx[block] @ beta)
+        cross = (self.xy[block][:, None, :] @ beta)[:, 0]
+        away = (self.mean_x[block] - pool.mean_x[which])[:, None, :] @ beta
+        bias = (self.mean_y[block] - pool.mean_y[which])[:, None] - away[:, 0]
+        n = self.count[block][:, None]
+        sse = self.yy[block][:, None] - 2.0 * cross + square + n * bias**2
+        return np.sqrt(np.maximum(sse, 0.0) / np.maximum(n - 1.0, 1.0))
+
+
+def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> NDArray[np.int64]:
+    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,).
+
+    `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
+    training sets are fitted once.
+    """
+    outer, left = np.nonzero(masks)
+    inner = masks[outer]
+    inner[np.arange(len(left)), left] = False
+    packed = np.packbits(inner, axis=1)
+    key = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[1])))[:, 0]
+    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    step = max(1, _AT_ONCE // blocks.mean_x.shape[1] ** 2)
+    S_um: Array | None = None
+    for start in range(0, len(first), step):
+        pool = blocks.pool(inner[first[start : start + step]], scaled)
+        rows = np.flatnonzero((which >= start) & (which < start + step))
+        part = blocks.left_out_S_um(left[rows], pool, which[rows] - start, path(pool))
+        S_um = np.empty((len(left), part.shape[1])) if S_um is None else S_um
+        S_um[rows] = part
+    assert S_um is not None
+    border = np.searchsorted(outer, np.arange(len(masks)))
+    total = np.add.reduceat(S_um, border, axis=0)
+    return np.asarray(np.argmin(total, axis=1))
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a linear family fits: the design, its folds as masks (F, K), their pooled moments."""
+
+    design: Design
+    masks: Mask
+    blocks: Blocks
+    pool: Pool
+    scaled: bool
+
+    @cached_property
+    def _factors(self) -> list[tuple[Array, Array, float]]:
+        """Per batch the triangle of its centred rows [x, y], their mean, their number."""
+        out = []
+        for k in range(self.design.n_batches):
+            rows = self.design.rows(k)
+            ok = self.design.usable[rows]
+            table = np.column_stack([self.design.x[rows][ok], self.design.y_um[rows][ok]])
+            mean = table.mean(axis=0) if len(table) else np.zeros(table.shape[1])
+            triangle: Array = np.asarray(np.linalg.qr(table - mean, mode="r"))
+            out.append((triangle, mean, float(len(table))))
+        return out
+
+    def centred_rows(self, f: int) -> tuple[Array, Array]:
+        """Fold f's centred rows up to a rotation, x (m, p) over `scale` and y_um (m,): fitted unsquared."""
+        parts = [self._factors[k] for k in np.flatnonzero(self.masks[f])]
+        count = np.array([n for _, _, n in parts])
+        means = np.array([mean for _, mean, _ in parts])
+        between = np.sqrt(count)[:, None] * (means - count @ means / count.sum())
+        table = np.vstack([*(r for r, _, _ in parts), between])
+        flat = np.einsum("jj->j", self.pool.xx[f]) == 0
+        table[:, :-1][:, flat] = 0.0
+        return table[:, :-1] / self.pool.scale[f], table[:, -1]
+
+    def condition(self) -> Array:
+        """Condition number (F,) of the inputs that move, each over its own spread (Belsley 1980); at most 1/eps."""
+        correlation, _ = self.pool.correlation()
+        values = np.linalg.eigvalsh(correlation)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = np.sqrt(values[:, -1] / values[:, 0])
+        for f in np.flatnonzero(~(values[:, 0] * _CONDITION_SEEN > values[:, -1] * self.pool.loss)):
+            x, _ = self.centred_rows(int(f))
+            size = np.linalg.norm(x, axis=0)
+            singular = np.linalg.svd(x[:, size > 0] / size[size > 0], compute_uv=False)
+            short = len(singular) < np.count_nonzero(size)
+            out[f] = 1 / EPS if short or singular[-1] <= EPS * singular[0] else singular[0] / singular[-1]
+        return out
+
+
+class Linear(Family):
+    """error_um = x · coef_um_per_K + intercept_um.
+
+    `fitted`: coef_um_per_K (p,) (µm per K, or per the input's own unit), intercept_um, condition, n_rows and what the
+    family adds. Families that are not indifferent to scale take the inputs as they are where all are in K or degC
+    (or the design knows no units), and divided by their training std where another unit is among them.
+    """
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """One fitted copy per fold, all at once from the design's moments.
+
+        Raises:
+            InputError: no inputs, or fewer than 4 usable rows in a fold.
+        """
+        if not folds:
+            return []
+        moments = design.moments
+        masks = np.zeros((len(folds), design.n_batches), bool)
+        for f, fold in enumerate(folds):
+            masks[f, list(fold)] = True
+            _check_rows(self.key, design, fold, int(moments.count[masks[f]].sum()))
+        masks &= moments.count > 0
+        scaled = any(unit not in _KELVIN for unit in design.input_units)
+        blocks = Blocks.of(moments)
+        task = Task(design, masks, blocks, blocks.pool(masks, scaled), scaled)
+        coef, learned = self._solve(task)
+        pool = task.pool
+        intercept = pool.mean_y + moments.shift_y - np.einsum("fj,fj->f", pool.mean_x + moments.shift_x, coef)
+        learned = {"intercept_um": intercept, "condition": task.condition(), "n_rows": pool.count.astype(int)} | learned
+        columns = {name: values.tolist() for name, values in learned.items()}
+        return [
+            self._learned(design, {"coef_um_per_K": coef[f], **{name: values[f] for name, values in columns.items()}})
+            for f in range(len(folds))
+        ]
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """NaN at a row where any input is missing."""
+        coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
+        return [design.x[design.rows(k)] @ coef + intercept for k in batches]
+
+    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+        coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
+        out: Array = design.x @ coef + np.array([f.fitted["intercept_um"] for f in fitted])
+        return out
+
+    def n_parameters(self) -> int:
+        """Coefficients and intercept."""
+        return len(self.inputs) + 1 if self.fitted else 0
+
+    @abstractmethod
+    def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
+        """Coefficients (F, p) per unit of the inputs, and more to remember, each (F,)."""
+
+
+class Tuned(Linear):
+    """A linear family with one setting, chosen in every fold by leave-batch-out inside the fold's training batches.
+
+    The score is the mean S over the batches left out; for fewer than 3 batches contiguous quarters of them stand in
+    for batches (`models.base.inner_groups`).
+    """
+
+    def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
+        chosen = np.zeros(len(task.masks), np.int64)
+        many = task.masks.sum(axis=1) >= 3
+        if many.any():
+            chosen[many] = leave_block_out(task.blocks, task.masks[many], task.scaled, self._path)
+        if not many.all():
+            quarters = Blocks.of(task.design.quarters)
+            masks = np.repeat(task.masks[~many], 4, axis=1) & (quarters.count > 0)
+            chosen[~many] = leave_block_out(quarters, masks, task.scaled, self._path)
+        return self._refit(task, chosen)
+
+    def _refit(self, task: Task, chosen: NDArray[np.int64]) -> tuple[Array, dict[str, NDArray[Any]]]:
+        coef = np.take_along_axis(self._path(task.pool), chosen[:, None, None], axis=2)[:, :, 0]
+        return coef, self._setting(task.pool, chosen)
+
+    @abstractmethod
+    def _path(self, pool: Pool) -> Array:
+        """Coefficients (S, p, G) per unit of the inputs for every setting, from the simplest or strongest on."""
+
+    @abstractmethod
+    def _setting(self, pool: Pool, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """The chosen setting in words of the family, each (S,)."""
+
+
+def _check_rows(key: str, design: Design, fold: Sequence[int], n_rows: int) -> None:
+    names = [design.batch_ids[k] for k in fold]
+    where = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    if not design.inputs:
+        raise InputError(f"{key}: no inputs given for {design.target or 'the error'}; name at least one channel")
+    if n_rows < _MIN_ROWS:
+        raise InputError(
+            f"{key}: batches {where or '(none)'} have {n_rows} usable rows (target {design.target!r} and all "
+            f"{len(design.inputs)} inputs recorded and not masked), expected at least {_MIN_ROWS}; add batches, "
+            "or drop the inputs that are missing"
+        )

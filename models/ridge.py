@@ -1,0 +1,56 @@
+"""Ridge regression, its penalty chosen by leave-batch-out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from models.base import Array
+from models.linear import Pool, Tuned
+
+
+class Ridge(Tuned):
+    """Least squares with the penalty alpha · |coef|², intercept free.
+
+    The penalty is k times the mean variance of the inputs: alpha = k · trace(XᵀX)/p over the centred training
+    rows, k from a logarithmic grid of `n_penalties` between `least` and `most`. `fitted` adds k and alpha (the
+    summed penalty, scikit-learn's alpha). Of equal scores the largest k wins.
+    """
+
+    key = "ridge"
+    words = "ridge regression, penalty by leave-batch-out inside the training batches"
+    source = "Hoerl and Kennard (1970), eq. 2.1"
+    rank = 12
+
+    def __init__(self, least: float = 1e-6, most: float = 1e2, n_penalties: int = 25) -> None:
+        super().__init__()
+        if not 0 < least <= most or n_penalties < 1:
+            raise InputError(
+                f"ridge: least {least}, most {most}, n_penalties {n_penalties}; expected 0 < least <= most and at "
+                "least one penalty"
+            )
+        self.least, self.most, self.n_penalties = least, most, n_penalties
+
+    def _grid(self) -> Array:
+        return np.geomspace(self.most, self.least, self.n_penalties)
+
+    def _path(self, pool: Pool) -> Array:
+        values, vectors = np.linalg.eigh(pool.xx)
+        scores = np.einsum("sji,sj->si", vectors, pool.xy)
+        alpha = _mean_square(pool)[:, None, None] * self._grid()
+        weights = scores[:, :, None] / (np.maximum(values, 0.0)[:, :, None] + alpha)
+        out: Array = (vectors @ weights) / pool.scale[:, :, None]
+        return out
+
+    def _setting(self, pool: Pool, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        k = self._grid()[chosen]
+        return {"k": k, "alpha": k * _mean_square(pool)}
+
+
+def _mean_square(pool: Pool) -> Array:
+    """trace(XᵀX)/p (S,); 1 where no input moves."""
+    mean = np.einsum("sjj->s", pool.xx) / pool.xx.shape[1]
+    return np.where(mean > 0, mean, 1.0)
