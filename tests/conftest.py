@@ -1,0 +1,49 @@
+"""A small machine with a known law, for tests that need several batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Channel
+
+
+def make_toy_batches(
+    k: int = 6, n: int = 60, noise_um: float = 0.5, seed: int = 0, sensors: int = 5, step_s: float = 300.0
+) -> list[Batch]:
+    """K batches: sensors follow the load and the room with different time constants; z = 3·a − 2·b + noise, x = b."""
+    rng = np.random.default_rng(seed)
+    names = [f"t{i}" for i in range(sensors)]
+    channels = {name: Channel(name, "temperature", "degC", 0.1, -20.0, 100.0) for name in names}
+    channels["room"] = Channel("room", "ambient", "degC", 0.1, -20.0, 60.0)
+    channels["spindle_rpm"] = Channel("spindle_rpm", "driver", "rpm", 1.0, 0.0, 8000.0)
+    channels["z"] = Channel("z", "error", "um", 1.0, -500.0, 500.0)
+    channels["x"] = Channel("x", "error", "um", 1.0, -500.0, 500.0)
+    time_s = np.arange(n) * step_s
+    batches = []
+    for i in range(k):
+        rpm = [2000.0, 4000.0, 6000.0][i % 3]
+        ambient = 5.0 + 25.0 * i / max(1, k - 1)
+        room = ambient + rng.uniform(-1, 4) * time_s / time_s[-1]
+        table = {"time_s": time_s, "room": room, "spindle_rpm": np.full(n, rpm)}
+        for j, name in enumerate(names):
+            tau_s = 1200.0 * (1 + j)
+            rise = (6.0 - j) * rpm / 2000 * (1 - np.exp(-time_s / tau_s)) + 0.3 * j * (room - ambient)
+            table[name] = ambient + rise + 0.02 * rng.standard_normal(n)
+        a, b = table["t0"] - table["t0"][0], table[f"t{sensors - 1}"] - table[f"t{sensors - 1}"][0]
+        table["z"] = 3.0 * a - 2.0 * b + noise_um * rng.standard_normal(n)
+        table["x"] = b + noise_um * rng.standard_normal(n)
+        frame = pd.DataFrame({c: table[c] for c in ["time_s", *channels]})
+        start = pd.Timestamp("2025-01-10 08:00") + pd.Timedelta(days=30 * i)
+        batches.append(
+            Batch("toy", f"b{i:02d}", frame, channels, start=start, source=f"b{i:02d}.csv", digest=f"{i:064x}")
+        )
+    return batches
+
+
+@pytest.fixture
+def toy_batches() -> Callable[..., list[Batch]]:
+    return make_toy_batches
