@@ -1,0 +1,187 @@
+"""Kills at every step and two writers at once: the lake shows the old or the new state, never a third."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Channel
+from data.lake import Lake
+from data.lakefile import content_digest
+
+CALLS = ("replace", "link", "unlink", "fsync", "open", "chmod", "mkdir")
+
+
+def make(batch_id: str, seed: int, start: str = "2026-03-01") -> Batch:
+    values = np.random.default_rng(seed).normal(20.0, 1.0, 5)
+    table = pd.DataFrame({"time_s": np.arange(5) * 60.0, "T1": values})
+    return Batch("vmc", batch_id, table, {"T1": Channel("T1", "temperature", "degC")}, pd.Timestamp(start))
+
+
+OLD, NEW = make("a", 1, "2025-12-31"), make("a", 2, "2026-01-01")
+NEWCOMER = make("b", 3)
+
+
+def scenario(root: Path) -> None:
+    """A batch changes content and year, another comes along, a file goes to quarantine."""
+    lake = Lake(root)
+    lake.put_many([NEW, NEWCOMER])
+    lake.quarantine(root.parent / "junk.csv", "vmc", "junk")
+
+
+def die_at(n: int) -> None:
+    """Kill this process at the n-th change to a folder: odd n before the system call, even n right after it."""
+    count = 0
+
+    def dying(call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*args: Any, **kwargs: Any) -> Any:
+            nonlocal count
+            count += 1
+            if count == n:
+                os.kill(os.getpid(), signal.SIGKILL)
+            result = call(*args, **kwargs)
+            count += 1
+            if count == n:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return result
+
+        return wrapped
+
+    for name in CALLS:
+        setattr(os, name, dying(getattr(os, name)))
+
+
+def crash_everywhere(base: Path) -> None:
+    """Run in a process of its own: one forked child per point of death, until a child lives to the end."""
+    for n in range(1, 500):
+        root = base / f"{n:03d}"
+        Lake(root).put(OLD)
+        child = os.fork()
+        if child == 0:
+            die_at(n)
+            scenario(root)
+            os._exit(0)
+        if os.waitpid(child, 0)[1] == 0:
+            return
+
+
+def store_forever(root: Path, ready: int) -> None:
+    lake = Lake(root)
+    for seed in range(100_000):
+        lake.put_many([make("a", seed), make("b", seed + 1, f"20{10 + seed % 80}-01-01")])
+        if seed == 0:
+            os.write(ready, b"x")
+
+
+def kill_at_random(base: Path) -> None:
+    delays_s = np.random.default_rng(0).uniform(0.0, 0.04, 25)
+    for delay_s in delays_s:
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            store_forever(base / "lake", writer)
+        os.read(reader, 1)
+        time.sleep(delay_s)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
+def check(root: Path) -> dict[str, list[Batch]]:
+    """Everything the manifest lists loads, is what its digest says, and plain readers see one file a batch."""
+    lake = Lake(root)
+    found = {}
+    for batch_id in lake.batch_ids("vmc"):
+        versions = lake.versions("vmc", batch_id)
+        found[batch_id] = [lake.load("vmc", batch_id, v.version) for v in versions]
+        assert [v.version for v in versions] == list(range(1, len(versions) + 1))
+        assert [v.digest for v in versions] == [content_digest(b) for b in found[batch_id]]
+        assert [v.current for v in versions] == [False] * (len(versions) - 1) + [True]
+        current = list(root.glob(f"machine=vmc/year=*/{batch_id}.parquet"))
+        assert len(current) <= 1
+        if current:
+            shown = pd.read_parquet(current[0])["T1"].to_numpy()
+            assert any(np.array_equal(shown, b.values("T1")) for b in found[batch_id][-2:])
+    for entry in lake.quarantined("vmc"):
+        assert entry.copy is not None and entry.copy.read_text() == "junk"
+    return found
+
+
+def shown_by_plain_readers(root: Path) -> dict[str, list[float]]:
+    frame = pd.read_parquet(root)
+    assert len(frame) == 5 * frame["batch"].nunique()
+    return {str(name): part["T1"].tolist() for name, part in frame.groupby("batch")}
+
+
+def run(function: str, base: Path) -> subprocess.Popen[bytes]:
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_lake_crash as t; "
+    return subprocess.Popen([sys.executable, "-c", code + f"t.{function}"])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> None:
+    (tmp_path / "junk.csv").write_text("junk")
+    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))", tmp_path).wait(60) == 0
+    roots = sorted(p for p in tmp_path.iterdir() if p.is_dir())
+    assert len(roots) > 60
+    seen = set()
+    for root in roots:
+        found = check(root)
+        new = "b" in found
+        assert [b.values("T1").tolist() for b in found["a"]] == [
+            b.values("T1").tolist() for b in ([OLD, NEW] if new else [OLD])
+        ]
+        seen.add((new, len(Lake(root).quarantined("vmc"))))
+        Lake(root).put(make("c", 9))  # any next write heals
+        wanted = {"a": NEW if new else OLD, "c": make("c", 9)} | ({"b": NEWCOMER} if new else {})
+        assert shown_by_plain_readers(root) == {n: b.values("T1").tolist() for n, b in wanted.items()}
+        assert list((root / "_tmp").iterdir()) == []
+        scenario(root)  # and the killed work can be done again
+        assert len(check(root)["a"]) == 2 and len(Lake(root).quarantined("vmc")) == 1
+        assert len(shown_by_plain_readers(root)) == 3
+    assert seen == {(False, 0), (True, 0), (True, 1)}
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_kills_at_random_moments_on_one_lake(tmp_path: Path) -> None:
+    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))", tmp_path).wait(60) == 0
+    found = check(tmp_path / "lake")
+    assert len(found["a"]) > 25
+    for name, seeds in (("a", 0), ("b", 1)):
+        for batch in found[name]:  # every version is a whole batch that somebody put
+            assert any(np.array_equal(batch.values("T1"), make(name, s + seeds).values("T1")) for s in range(400))
+    Lake(tmp_path / "lake").put(make("c", 0))
+    assert shown_by_plain_readers(tmp_path / "lake")["a"] == found["a"][-1].values("T1").tolist()
+
+
+def store_range(root: Path, who: str, go: Path) -> None:
+    lake = Lake(root)
+    while not go.exists():
+        time.sleep(0.002)
+    for i in range(30):
+        lake.put(make(f"{who}{i}", i))
+        lake.put(make("shared", 1000 * (who == "x") + i))
+        lake.quarantine(Path(__file__), "vmc", f"{who}{i}")
+
+
+def test_two_writers_at_once_lose_nothing(tmp_path: Path) -> None:
+    root, go = tmp_path / "lake", tmp_path / "go"
+    call = "store_range(t.Path({!r}), {!r}, t.Path({!r}))"
+    writers = [run(call.format(str(root), who, str(go)), tmp_path) for who in ("x", "y")]
+    go.touch()
+    assert [w.wait(60) for w in writers] == [0, 0]
+    lake = Lake(root)
+    assert lake.batch_ids("vmc") == sorted([f"{w}{i}" for w in "xy" for i in range(30)] + ["shared"])
+    put = {content_digest(make("shared", 1000 * k + i)) for k in (0, 1) for i in range(30)}
+    digests = [v.digest for v in lake.versions("vmc", "shared")]
+    assert set(digests) == put and len(digests) == 60
+    assert {e.reason for e in lake.quarantined("vmc")} == {f"{w}{i}" for w in "xy" for i in range(30)}
+    assert len(lake.load_all("vmc")) == 61
+    assert len(pd.read_parquet(root)) == 61 * 5
