@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
+from data.errors import InputError, closest
 from features.rises import feature, feature_unit, zeroed_error_um
 
 Array = NDArray[np.float64]
@@ -66,7 +67,18 @@ class Design:
 
     @classmethod
     def build(cls, batches: Sequence[Batch], inputs: Sequence[str], target: str | None) -> Design:
-        """Stack the named inputs (feature names, see features.rises) and the zeroed target of the batches."""
+        """Stack the named inputs (feature names, see features.rises) and the zeroed target of the batches.
+
+        Raises:
+            InputError: an unknown channel or kind of feature, or batches on different time steps.
+        """
+        steps = sorted((b.step_s, b.batch_id) for b in batches if b.n_rows > 1)
+        if steps and steps[-1][0] - steps[0][0] > 1e-6:
+            (one, first), (other, second) = steps[0], steps[-1]
+            raise InputError(
+                f"batches {first} and {second}: time steps of {one:g} s and {other:g} s; expected one step for all, "
+                "ingest them with the same step_s"
+            )
         sizes = [b.n_rows for b in batches]
         offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         n, p = int(offsets[-1]), len(inputs)
@@ -86,7 +98,7 @@ class Design:
             if target is not None:
                 y[rows] = zeroed_error_um(b, target)
         return cls(tuple(inputs), target or "", tuple(b.batch_id for b in batches), x, y, time_s, offsets,
-                   batches[0].step_s if batches else 0.0, drivers=drivers, driver_names=driver_names,
+                   steps[0][0] if steps else 0.0, drivers=drivers, driver_names=driver_names,
                    driver_units=tuple(batches[0].channels[d].unit for d in driver_names),
                    input_units=tuple(feature_unit(batches[0], i) for i in inputs) if batches else ())  # fmt: skip
 
@@ -105,19 +117,57 @@ class Design:
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
-        """Rows with a finite target and finite inputs, (n,)."""
-        return np.isfinite(self.y_um) & np.isfinite(self.x).all(axis=1)
+        """Rows with a finite target and finite inputs, (n,), read-only."""
+        if self._parent is not None and self._columns is not None:
+            return self._parent._usable_with(self._columns)
+        return self._usable_with(range(len(self.inputs)))
+
+    @cached_property
+    def _finite(self) -> NDArray[np.bool_]:
+        return np.isfinite(self.x)
+
+    @cached_property
+    def _holed(self) -> list[bool]:
+        """Inputs that are missing in some row with a target: only these tell the rows of two subsets apart."""
+        missing = np.count_nonzero(~self._finite[np.isfinite(self.y_um)], axis=0)
+        return [bool(m) for m in missing]
+
+    @cached_property
+    def _masks(self) -> dict[tuple[int, ...], NDArray[np.bool_]]:
+        return {}
+
+    def _usable_with(self, columns: Iterable[int]) -> NDArray[np.bool_]:
+        key = tuple(sorted({c for c in columns if self._holed[c]}))
+        if key not in self._masks:
+            mask = np.isfinite(self.y_um) & self._finite[:, list(key)].all(axis=1)
+            mask.setflags(write=False)
+            self._masks[key] = mask
+        return self._masks[key]
 
     def stacked(self, train: Sequence[int]) -> tuple[Array, Array, NDArray[np.int64]]:
         """x, y_um and batch index of the usable rows of the given batches."""
-        keep = self.usable & np.isin(self.group, np.asarray(train, int))
+        trained = np.zeros(self.n_batches, bool)
+        trained[np.asarray(train, int)] = True
+        keep = self.usable & trained[self.group]
         return self.x[keep], self.y_um[keep], self.group[keep]
 
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        return {name: c for c, name in enumerate(self.inputs)}
+
     def subset(self, inputs: Sequence[str]) -> Design:
-        """The same rows with fewer inputs; usable rows are those of the subset."""
-        columns = tuple(self.inputs.index(i) for i in inputs)
-        return Design(tuple(inputs), self.target, self.batch_ids, self.x[:, columns], self.y_um, self.time_s,
-                      self.offsets, self.step_s, columns, self, self.drivers, self.driver_names, self.driver_units,
+        """The same rows with fewer inputs; usable rows are those of the subset.
+
+        Raises:
+            InputError: an input that the design does not have.
+        """
+        unknown = [i for i in inputs if i not in self._place]
+        if unknown:
+            raise InputError(f"subset of a design: no input {unknown[0]!r}; {closest(unknown[0], self.inputs)}")
+        columns = tuple(self._place[i] for i in inputs)
+        x = self.x.take(np.array(columns, int), axis=1)
+        return Design(tuple(inputs), self.target, self.batch_ids, x, self.y_um, self.time_s, self.offsets,
+                      self.step_s, columns, self, self.drivers, self.driver_names, self.driver_units,
                       tuple(self.input_units[c] for c in columns if c < len(self.input_units)))  # fmt: skip
 
     @cached_property
@@ -134,9 +184,9 @@ class Design:
 
         The blocks of `models.base.inner_groups` for trainings of one or two batches.
         """
-        if self._parent is not None and self._columns is not None:
-            if np.array_equal(self._parent.usable, self.usable):
-                return self._parent.quarters.subset(self._columns)
+        parent = self._parent
+        if parent is not None and self._columns is not None and np.array_equal(parent.usable, self.usable):
+            return parent.quarters.subset(self._columns)
         batch = self.group[self.usable]
         count = np.bincount(batch, minlength=self.n_batches)
         within = np.arange(len(batch)) - (np.cumsum(count) - count)[batch]

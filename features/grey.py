@@ -103,7 +103,8 @@ def synthetic_degree(a: Array, b: Array, theta: float = 0.5, shift: float = STAR
 
 def _area(x: Array) -> Array:
     """s along the first axis; (n, p) gives (p,), (n,) a scalar array."""
-    return np.asarray(x.sum(axis=0) - len(x) * x[0] - 0.5 * (x[-1] - x[0]))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(x.sum(axis=0) - len(x) * x[0] - 0.5 * (x[-1] - x[0]))
 
 
 def _from_areas(s: Array, s0: float) -> Array:

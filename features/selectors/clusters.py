@@ -32,9 +32,8 @@ def partitions(closure: Array) -> NDArray[np.int64]:
     they merge one after the other in the order of their first members, as single linkage does, so every n exists.
     """
     p = len(closure)
-    classes = np.empty((p, p), np.int64)
     current = np.arange(p)
-    classes[p - 1] = current
+    classes = np.tile(current, (p, 1))
     i, j = np.triu_indices(p, 1)
     order = np.argsort(-np.round(closure[i, j], DIGITS), kind="stable")
     n = p
