@@ -224,6 +224,7 @@ class Linear(Family):
         task = Task(design, masks, blocks, blocks.pool(masks, scaled), scaled)
         coef, learned = self._solve(task)
         pool = task.pool
+        coef = np.where(np.einsum("fjj->fj", pool.xx) > 0, coef, 0.0)
         intercept = pool.mean_y + moments.shift_y - np.einsum("fj,fj->f", pool.mean_x + moments.shift_x, coef)
         learned = {"intercept_um": intercept, "condition": task.condition(), "n_rows": pool.count.astype(int)} | learned
         columns = {name: values.tolist() for name, values in learned.items()}

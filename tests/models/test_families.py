@@ -1,0 +1,167 @@
+"""What every family promises, run over the registry: a new member is tested without touching this file."""
+
+import json
+from importlib.util import find_spec
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Channel
+from data.errors import InputError
+from features.design import Design
+from models import FAMILIES
+from models.base import Family, family_from_plain
+
+INPUTS = ("front", "column", "bed")
+N = 72
+
+
+def make_batch(k: int) -> Batch:
+    """A six-hour run whose error follows its sensors and its load, with noise."""
+    rng = np.random.default_rng(k)
+    time_s = np.arange(N) * 300.0
+    load, ambient = rng.uniform(0.5, 1.2), rng.uniform(5, 30)
+    fast, slow = load * 18 * (1 - np.exp(-time_s / 2400)), load * 9 * (1 - np.exp(-time_s / 9000))
+    drift = rng.normal(0, 2) * time_s / time_s[-1]
+    table = pd.DataFrame({
+        "time_s": time_s,
+        "front": ambient + 0.9 * fast + 0.2 * slow + drift,
+        "column": ambient + 0.2 * fast + 0.8 * slow + drift,
+        "bed": ambient + 0.3 * slow + drift,
+        "spindle": np.where(time_s > 0, 4000.0 * load, 0.0),
+        "z": 12.0 + 1.8 * fast + 2.4 * slow + 1.5 * drift + rng.normal(0, 0.3, N),
+    })  # fmt: skip
+    table[list(INPUTS)] = (table[list(INPUTS)] + rng.normal(0, 0.03, (N, 3))).round(1)
+    channels = {name: Channel(name, "temperature", "degC", 0.1, -20, 120) for name in INPUTS}
+    channels |= {"spindle": Channel("spindle", "driver", "rpm"), "z": Channel("z", "error", "um", 0.1)}
+    return Batch("vmc", f"K{k + 1}", table, channels)
+
+
+BATCHES = [make_batch(k) for k in range(5)]
+MODULES = {key: FAMILIES._members[key].split(":")[0] for key in FAMILIES}
+_FITTED: dict[str, Family] = {}
+
+
+@pytest.fixture(params=list(FAMILIES))
+def key(request) -> str:
+    if find_spec(MODULES[request.param]) is None:
+        pytest.skip(f"{MODULES[request.param]} is not there yet")
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    return Design.build(BATCHES, INPUTS, "z")
+
+
+@pytest.fixture
+def fitted(key, design) -> Family:
+    if key not in _FITTED:
+        _FITTED[key] = FAMILIES[key]().fit_design(design, [0, 1, 2, 3])
+    return _FITTED[key]
+
+
+def test_says_what_it_is(key):
+    cls = FAMILIES[key]
+    assert cls.key == key and issubclass(cls, Family)
+    assert cls.words and cls.source and isinstance(cls.rank, int)
+
+
+def test_fit_gives_a_new_copy_that_predicts_every_row(key, design, fitted):
+    empty = FAMILIES[key]()
+    assert empty.fitted == {} and empty.inputs == ()
+    assert empty.fit_design(design, [0, 1, 2, 3]) is not empty and empty.fitted == {}
+    assert (fitted.inputs, fitted.target) == (INPUTS, "z")
+    first, second = fitted.predict_design(design, [4, 1])
+    assert first.shape == second.shape == (N,) and first.dtype == np.float64
+    assert np.isfinite(first).all() and np.isfinite(second).all()
+    assert fitted.n_parameters() >= (0 if key == "zero" else 1)
+
+
+def test_fit_and_predict_on_whole_batches_are_the_same_model(key, fitted):
+    model = FAMILIES[key]().fit(BATCHES[:4], INPUTS, "z")
+    got = fitted.predict(BATCHES[4])
+    np.testing.assert_allclose(model.predict(BATCHES[4]), got, rtol=0, atol=1e-6 * max(1.0, np.abs(got).max()))
+
+
+def test_beats_no_model_on_a_batch_it_never_saw(key, design, fitted):
+    error_um = design.y_um[design.rows(4)]
+    left = fitted.predict_design(design, [4])[0] - error_um
+    if key != "zero":
+        assert np.std(left) < 0.6 * np.std(error_um)
+
+
+def test_is_the_same_every_time(key, design, fitted):
+    again = FAMILIES[key]().fit_design(design, [0, 1, 2, 3])
+    np.testing.assert_array_equal(again.predict_design(design, [4])[0], fitted.predict_design(design, [4])[0])
+
+
+def test_nothing_crosses_a_border_between_batches(key, design, fitted):
+    alone = fitted.predict_design(Design.build([BATCHES[4]], INPUTS, "z"), [0])[0]
+    for neighbours in ([4, 0], [0, 4]):
+        both = Design.build([BATCHES[k] for k in neighbours], INPUTS, "z")
+        np.testing.assert_allclose(fitted.predict_design(both, [neighbours.index(4)])[0], alone, rtol=0, atol=1e-9)
+
+
+def test_a_prediction_never_sees_the_recorded_error(key, design, fitted):
+    blind = Design.build(BATCHES, INPUTS, None)
+    np.testing.assert_array_equal(fitted.predict_design(blind, [4])[0], fitted.predict_design(design, [4])[0])
+
+
+def test_starts_near_zero_as_its_training_did(key, design, fitted):
+    for k in range(5):
+        y_um = design.y_um[design.rows(k)]
+        assert abs(fitted.predict_design(design, [k])[0][0]) < 0.15 * np.ptp(y_um)
+
+
+def test_folds_at_once_are_the_folds_one_by_one(key, design, fitted):
+    folds = [[0, 1, 2, 3], [2]]
+    together = FAMILIES[key]().fit_folds(design, folds)
+    one_by_one = [fitted, FAMILIES[key]().fit_design(design, [2])]
+    for a, b in zip(together, one_by_one, strict=True):
+        want = b.predict_design(design, [4])[0]
+        got = a.predict_design(design, [4])[0]
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * max(1.0, np.abs(want).max()))
+    columns = fitted.predict_folds(design, together)
+    np.testing.assert_allclose(columns[design.rows(4), 0], together[0].predict_design(design, [4])[0], atol=1e-6)
+
+
+def test_one_batch_is_enough(key, design):
+    model = FAMILIES[key]().fit_design(design, [1])
+    error_um = design.y_um[design.rows(1)]
+    own = model.predict_design(design, [1])[0]
+    assert np.isfinite(own).all()
+    if key != "zero":
+        assert np.std(own - error_um) < 0.3 * np.std(error_um)
+
+
+def test_left_out_batches_do_not_touch_the_fit(key, design, fitted):
+    other = Design.build([*BATCHES[:4], make_batch(99)], INPUTS, "z")
+    model = FAMILIES[key]().fit_design(other, [0, 1, 2, 3])
+    got, want = model.predict_design(other, [0])[0], fitted.predict_design(design, [0])[0]
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * max(1.0, np.abs(want).max()))
+
+
+def test_stored_as_json_and_arrays_it_predicts_the_same(key, design, fitted):
+    def encode(value: object) -> object:
+        assert isinstance(value, np.ndarray) and value.dtype != object, f"not plain data: {type(value)}"
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+
+    def decode(part: dict) -> object:
+        return np.array(part["array"], part["dtype"]) if set(part) == {"array", "dtype"} else part
+
+    text = json.dumps(fitted.as_plain(), default=encode, allow_nan=False)
+    back = family_from_plain(json.loads(text, object_hook=decode))
+    assert type(back) is type(fitted) and back.options() == fitted.options()
+    np.testing.assert_array_equal(back.predict_design(design, [4])[0], fitted.predict_design(design, [4])[0])
+
+
+def test_no_usable_row_is_told_in_one_line(key):
+    if key == "zero":
+        pytest.skip("learns nothing")
+    table = BATCHES[0].table.assign(z=np.nan)
+    dead = Batch("vmc", "K9", table, BATCHES[0].channels)
+    with pytest.raises(InputError) as error:
+        FAMILIES[key]().fit([dead], INPUTS, "z")
+    assert "\n" not in str(error.value) and "K9" in str(error.value) and key.split("_")[0] in str(error.value)

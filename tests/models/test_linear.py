@@ -1,0 +1,340 @@
+"""Linear families from moments, held against direct fits on the rows by numpy and scikit-learn."""
+
+import json
+
+import numpy as np
+import pytest
+from sklearn.cross_decomposition import PLSRegression
+from sklearn.linear_model import LinearRegression
+from sklearn.linear_model import Ridge as SkRidge
+from sklearn.model_selection import LeaveOneGroupOut
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from data.errors import InputError
+from features.design import Design
+from models.base import family_from_plain, inner_groups
+from models.linear import Linear
+from models.mlr import MLR
+from models.pcr import PCR, PCRByLeaveBatchOut
+from models.pls import PLS
+from models.ridge import Ridge
+
+LINEAR = [MLR, Ridge, PCR, PCRByLeaveBatchOut, PLS]
+K, N, P = 8, 60, 6
+FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[k] for k in range(K)] + [[0, 3], [1, 2, 5]]
+
+
+def make_design(seed=0, quantum_K=0.1, x=None, y_um=None, units=()) -> Design:
+    """Collinear rises of a warming machine: four modes, rounded like the instruments', VIF 10³–10⁴."""
+    rng = np.random.default_rng(seed)
+    time_s = np.tile(np.arange(N) * 300.0, K)
+    tau_s = np.array([0.5, 1.5, 4.0, 10.0]) * 3600
+    gains, weights = rng.uniform(0.3, 1, (4, P)), np.array([1.5, 2.0, -1.0, 3.0])
+    parts, errors = [], []
+    for _ in range(K):
+        load = rng.uniform(6, 20) * (1 - np.exp(-np.arange(N)[:, None] * 300.0 / tau_s)) * [1, 0.6, 0.4, 0.3]
+        room = rng.normal(0, 3) * (1 - np.exp(-np.arange(N) * 300.0 / 8e3))
+        rises = load @ gains + room[:, None] * rng.uniform(0.9, 1, P)
+        parts.append(np.round(rises / quantum_K) * quantum_K)
+        errors.append(np.round(load @ weights + 2 * room + rng.normal(0, 1, N)))
+        errors[-1] -= errors[-1][0]
+    x = np.vstack(parts) if x is None else x
+    return Design(tuple(f"T{j}" for j in range(x.shape[1])), "z_um", tuple(f"K{k + 1}" for k in range(K)), x,
+                  np.concatenate(errors) if y_um is None else y_um, time_s, np.arange(K + 1, dtype=np.int64) * N,
+                  300.0, input_units=units)  # fmt: skip
+
+
+def predicted(model, design) -> np.ndarray:
+    return np.concatenate(model.predict_design(design, range(design.n_batches)))
+
+
+def near(got, want, rtol=1e-8) -> None:
+    np.testing.assert_allclose(got, want, rtol=0, atol=rtol * np.abs(want).max())
+
+
+def least_squares(design, fold) -> np.ndarray:
+    X, y, _ = design.stacked(fold)
+    return np.linalg.lstsq(X - X.mean(0), y - y.mean(), rcond=None)[0]
+
+
+def direct(design, fold) -> np.ndarray:
+    X, y, _ = design.stacked(fold)
+    return (design.x - X.mean(0)) @ least_squares(design, fold) + y.mean()
+
+
+def brute_choice(design, fold, makers) -> int:
+    """The estimator of least mean S by leaving out each inner group in a plain loop."""
+    X, y, batch = design.stacked(fold)
+    groups = inner_groups(batch)
+    S_um = np.zeros(len(makers))
+    for train, test in LeaveOneGroupOut().split(X, y, groups):
+        for m, make in enumerate(makers):
+            e = y[test] - np.ravel(make(X[train], y[train]).predict(X[test]))
+            S_um[m] += np.sqrt(e @ e / (len(test) - 1))
+    return int(np.argmin(S_um))
+
+
+def test_the_test_bed_is_as_collinear_as_real_head_sensors():
+    vif = np.diag(np.linalg.inv(np.corrcoef(make_design().x.T)))
+    assert 1e3 < vif.max() < 1e5
+
+
+def test_mlr_is_least_squares_on_the_rows_in_every_fold():
+    design = make_design()
+    for fold, model in zip(FOLDS, MLR().fit_folds(design, FOLDS), strict=True):
+        near(predicted(model, design), direct(design, fold))
+        X, _, _ = design.stacked(fold)
+        Z = (X - X.mean(0)) / X.std(0)
+        assert model.fitted["condition"] == pytest.approx(np.linalg.cond(Z), rel=1e-6)
+        assert model.fitted["n_rows"] == len(fold) * N
+
+
+@pytest.mark.parametrize("case", ["twin", "nearly a twin", "constant", "far from the mean"])
+def test_mlr_on_deficient_inputs_is_the_minimum_norm_solution(case):
+    x = make_design().x.copy()
+    if case == "twin":
+        x[:, 3] = x[:, 2]
+    elif case == "nearly a twin":
+        x[:, 3] = x[:, 2] + 1e-6 * np.random.default_rng(3).normal(size=len(x))
+    elif case == "constant":
+        x[:, 3] = 21.7
+    else:
+        x = x + 1e5 * np.arange(1, P + 1)
+    design = make_design(x=x)
+    for fold, model in zip(FOLDS, MLR().fit_folds(design, FOLDS), strict=True):
+        near(predicted(model, design), direct(design, fold), rtol=1e-7)
+        near(model.fitted["coef_um_per_K"], least_squares(design, fold), rtol=1e-4 if case == "nearly a twin" else 1e-6)
+        if case != "far from the mean":
+            assert np.isfinite(model.fitted["condition"])
+        if "twin" in case:
+            assert model.fitted["condition"] > 1e5
+    if case == "constant":
+        assert model.fitted["coef_um_per_K"][3] == 0 and model.fitted["condition"] < 1e4
+
+
+def test_more_inputs_than_rows_still_fits():
+    rng = np.random.default_rng(5)
+    design = make_design(x=rng.normal(size=(K * N, 2 * N)))
+    y = design.stacked([4])[1]
+    near(predicted(MLR().fit_design(design, [4]), design)[4 * N : 5 * N], y)
+    for cls in (Ridge, PCR, PCRByLeaveBatchOut, PLS):
+        assert np.isfinite(predicted(cls().fit_design(design, [4]), design)).all()
+
+
+def test_pcr_with_all_components_is_least_squares():
+    design = make_design()
+    for fold, model in zip(FOLDS, PCR(contribution=1.0).fit_folds(design, FOLDS), strict=True):
+        near(predicted(model, design), direct(design, fold))
+        assert model.fitted["n_components"] == P
+
+
+def test_pcr_with_all_components_of_deficient_inputs_is_the_minimum_norm_solution():
+    x = make_design().x.copy()
+    x[:, 3] = x[:, 2]
+    design = make_design(x=x)
+    for fold, model in zip(FOLDS, PCR(contribution=1.0).fit_folds(design, FOLDS), strict=True):
+        near(model.fitted["coef_um_per_K"], least_squares(design, fold))
+        assert model.fitted["n_components"] == P - 1
+
+
+def test_pcr_by_hand():
+    # Two uncorrelated inputs of variance 8 and 2: contributions 0.8 and 0.2; y = 3 x1 + 5 x2 + 7.
+    x = np.array([[4, 2], [4, -2], [-4, 2], [-4, -2]]) * np.sqrt([0.5, 0.5]) + [10.0, 20.0]
+    design = Design(("a", "b"), "z_um", ("K1",), x, x @ [3.0, 5.0] + 7, np.arange(4.0), np.array([0, 4]), 1.0)
+    one, two = PCR(0.79).fit_design(design, [0]).fitted, PCR(0.81).fit_design(design, [0]).fitted
+    np.testing.assert_allclose(one["coef_um_per_K"], [3, 0], atol=1e-12)
+    assert one["intercept_um"] == pytest.approx(5 * 20 + 7)  # the dropped input rests at its mean
+    assert (one["n_components"], one["contribution"]) == (1, pytest.approx(0.8))
+    np.testing.assert_allclose(two["coef_um_per_K"], [3, 5], atol=1e-12)
+    assert (two["n_components"], two["intercept_um"]) == (2, pytest.approx(7))
+
+
+def test_pcr_keeps_the_components_of_the_raw_covariance_to_95_percent():
+    design = make_design(seed=1)
+    for fold, model in zip(FOLDS, PCR(0.999).fit_folds(design, FOLDS), strict=True):
+        X, y, _ = design.stacked(fold)
+        values, vectors = np.linalg.eigh(np.cov(X.T))
+        values, vectors = values[::-1], vectors[:, ::-1]
+        n = int(np.argmax(np.cumsum(values) / values.sum() >= 0.999)) + 1
+        scores = LinearRegression().fit((X - X.mean(0)) @ vectors[:, :n], y)
+        assert model.fitted["n_components"] == n
+        near(predicted(model, design), scores.predict((design.x - X.mean(0)) @ vectors[:, :n]))
+    assert PCR().fit_design(design, FOLDS[0]).fitted["contribution"] >= 0.95
+
+
+@pytest.mark.parametrize("fold", [FOLDS[0], FOLDS[3], [2], [0, 3], [1, 2, 5]])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_ridge_is_scikit_learns_at_the_penalty_of_a_plain_loop(fold, seed):
+    design = make_design(seed)
+    model = Ridge().fit_design(design, fold)
+    X, y, _ = design.stacked(fold)
+    near(predicted(model, design), SkRidge(alpha=model.fitted["alpha"], solver="svd").fit(X, y).predict(design.x))
+
+    def maker(k):
+        return lambda X, y: SkRidge(alpha=k * ((X - X.mean(0)) ** 2).sum() / P, solver="svd").fit(X, y)
+
+    grid = np.geomspace(1e2, 1e-6, 25)
+    assert model.fitted["k"] == pytest.approx(grid[brute_choice(design, fold, [maker(k) for k in grid])])
+
+
+@pytest.mark.parametrize("fold", [FOLDS[0], FOLDS[3], [2], [0, 3], [1, 2, 5]])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pls_is_scikit_learns_at_the_number_of_components_of_a_plain_loop(fold, seed):
+    design = make_design(seed)
+
+    def maker(n):
+        return lambda X, y: PLSRegression(n, scale=False).fit(X, y)
+
+    n = brute_choice(design, fold, [maker(n + 1) for n in range(P)]) + 1
+    model = PLS().fit_design(design, fold)
+    assert model.fitted["n_components"] == n
+    X, y, _ = design.stacked(fold)
+    near(predicted(model, design), np.ravel(maker(n)(X, y).predict(design.x)))
+
+
+@pytest.mark.parametrize("fold", [FOLDS[0], FOLDS[3], [2], [0, 3], [1, 2, 5]])
+def test_pcr_lbo_takes_the_number_of_components_of_a_plain_loop(fold):
+    design = make_design(2)
+
+    class Direct:
+        def __init__(self, n, X, y):
+            _, _, vt = np.linalg.svd(X - X.mean(0), full_matrices=False)
+            self.v, self.mean = vt[:n].T, X.mean(0)
+            self.fit = LinearRegression().fit((X - self.mean) @ self.v, y)
+
+        def predict(self, X):
+            return self.fit.predict((X - self.mean) @ self.v)
+
+    makers = [lambda X, y, n=n: Direct(n + 1, X, y) for n in range(P)]
+    n = brute_choice(design, fold, makers)
+    model = PCRByLeaveBatchOut().fit_design(design, fold)
+    assert model.fitted["n_components"] == n + 1
+    near(predicted(model, design), makers[n](*design.stacked(fold)[:2]).predict(design.x))
+
+
+def test_a_driver_in_rpm_among_the_inputs_makes_ridge_scale_by_the_training_std():
+    x = make_design().x.copy()
+    x[:, 5] = np.repeat(np.random.default_rng(7).choice([2000.0, 4000.0, 6000.0], K * 2), N // 2)
+    design = make_design(x=x, units=("K",) * 5 + ("rpm",))
+    for fold in (FOLDS[0], [2], [0, 3]):
+        model = Ridge().fit_design(design, fold)
+        X, y, _ = design.stacked(fold)
+        same = make_pipeline(StandardScaler(), SkRidge(alpha=model.fitted["alpha"], solver="svd")).fit(X, y)
+        near(predicted(model, design), same.predict(design.x))
+    for cls in LINEAR:  # rev/s instead of rpm is the same machine
+        other = make_design(x=x / [1, 1, 1, 1, 1, 60], units=("K",) * 5 + ("Hz",))
+        near(predicted(cls().fit_design(other, FOLDS[0]), other), predicted(cls().fit_design(design, FOLDS[0]), design))
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_all_folds_at_once_are_the_folds_one_by_one(cls):
+    design = make_design(3)
+    together = cls().fit_folds(design, FOLDS)
+    for fold, model in zip(FOLDS, together, strict=True):
+        near(predicted(model, design), predicted(cls().fit_design(design, fold), design), rtol=1e-9)
+    all_rows = together[0].predict_folds(design, together)
+    near(all_rows[:, 4], predicted(together[4], design), rtol=1e-12)
+    assert cls().fit_folds(design, []) == []
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_a_shifted_or_stretched_error_gives_a_shifted_or_stretched_prediction(cls):
+    design = make_design(1)
+    base = predicted(cls().fit_design(design, FOLDS[2]), design)
+    near(predicted(cls().fit_design(make_design(1, y_um=design.y_um + 50), FOLDS[2]), design), base + 50)
+    near(predicted(cls().fit_design(make_design(1, y_um=design.y_um * -3), FOLDS[2]), design), base * -3)
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_a_subset_of_the_design_is_a_design_of_its_own(cls):
+    design = make_design(4)
+    sub, own = design.subset(("T4", "T1")), make_design(4, x=design.x[:, [4, 1]])
+    for fold in (FOLDS[1], [6]):
+        near(predicted(cls().fit_design(sub, fold), sub), predicted(cls().fit_design(own, fold), own))
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_rows_with_a_hole_are_left_out_of_the_fit_and_stay_holes_in_the_prediction(cls):
+    design = make_design(5)
+    x, y_um = design.x.copy(), design.y_um.copy()
+    x[5:9, 2], y_um[70:80] = np.nan, np.nan
+    holed = make_design(5, x=x, y_um=y_um)
+    keep = holed.usable
+    offsets = np.concatenate([[0], np.cumsum([keep[design.rows(k)].sum() for k in range(K)])])
+    cut = Design(holed.inputs, "z_um", holed.batch_ids, x[keep], y_um[keep], holed.time_s[keep], offsets, 300.0)
+    for fold in ([0, 1, 2, 3], [0]):
+        p = predicted(cls().fit_design(holed, fold), holed)
+        near(p[keep], predicted(cls().fit_design(cut, fold), cut))
+        assert np.flatnonzero(np.isnan(p)).tolist() == [5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_a_prediction_never_sees_the_recorded_error(cls):
+    design = make_design()
+    model = cls().fit_design(design, FOLDS[0])
+    blind = make_design(y_um=np.full(K * N, np.nan))
+    np.testing.assert_array_equal(predicted(model, blind), predicted(model, design))
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_stored_as_json_it_predicts_the_same(cls):
+    design = make_design()
+    model = cls().fit_design(design, FOLDS[0])
+    plain = model.as_plain()
+    plain["fitted"]["coef_um_per_K"] = plain["fitted"]["coef_um_per_K"].tolist()
+    back = json.loads(json.dumps(plain, allow_nan=False))
+    back["fitted"]["coef_um_per_K"] = np.array(back["fitted"]["coef_um_per_K"])
+    again = family_from_plain(back)
+    assert type(again) is cls and again.n_parameters() == P + 1
+    np.testing.assert_array_equal(predicted(again, design), predicted(model, design))
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_an_error_that_never_moves_or_inputs_that_never_move_give_the_mean(cls):
+    flat = make_design(y_um=np.full(K * N, 3.5))
+    near(predicted(cls().fit_design(flat, FOLDS[0]), flat), np.full(K * N, 3.5))
+    still = make_design(x=np.full((K * N, P), 21.7))
+    near(predicted(cls().fit_design(still, FOLDS[0]), still), np.full(K * N, still.stacked(FOLDS[0])[1].mean()))
+
+
+@pytest.mark.parametrize("cls", LINEAR)
+def test_too_few_rows_are_told_in_one_line(cls):
+    y_um = make_design().y_um.copy()
+    y_um[N + 3 : 3 * N] = np.nan
+    design = make_design(y_um=y_um)
+    with pytest.raises(InputError) as error:
+        cls().fit_folds(design, [[0], [1, 2]])
+    assert str(error.value) == (
+        f"{cls.key}: batches K2, K3 have 3 usable rows (target 'z_um' and all 6 inputs recorded and not masked), "
+        "expected at least 4; add batches, or drop the inputs that are missing"
+    )
+    with pytest.raises(InputError, match="no inputs given for z_um; name at least one channel"):
+        cls().fit_design(design.subset(()), [0])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: PCR(contribution=1.2), "pcr: contribution 1.2; expected above 0 and at most 1"),
+        (lambda: PLS(max_components=0), "pls: max_components 0; expected at least 1"),
+        (lambda: Ridge(least=0.0), "expected 0 < least <= most"),
+    ],
+)
+def test_options_out_of_range_are_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_chunked_and_whole_choice_agree(monkeypatch):
+    design = make_design(6)
+    whole = [m.fitted for m in PLS().fit_folds(design, FOLDS)]
+    monkeypatch.setattr("models.linear._AT_ONCE", 5 * P * P)
+    for one, other in zip(whole, [m.fitted for m in PLS().fit_folds(design, FOLDS)], strict=True):
+        assert one["n_components"] == other["n_components"]
+        near(one["coef_um_per_K"], other["coef_um_per_K"])
+
+
+def test_every_linear_family_is_simpler_than_the_default_rank():
+    assert all(issubclass(cls, Linear) and cls.rank < 50 for cls in LINEAR)
+    assert len({cls.rank for cls in LINEAR}) == len(LINEAR)
