@@ -127,12 +127,22 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan) -> Crossing:
     design = Design.build(kept, inputs, target)
     folds = {p: folds_of(p, kept) for p in plan.protocols}
     chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = {}
-    trainings = [tuple(range(len(kept))), *(f.train for group in folds.values() for f in group)]
     n_all = range(1, len(inputs) + 1)
-    for key in plan.selectors:
-        selector = SELECTORS[key]()
-        for train in dict.fromkeys(trainings):
-            chosen[key, train] = selector.select_design(design, train, n_all)
+
+    def choose(train: tuple[int, ...]) -> None:
+        for key in plan.selectors:
+            if (key, train) not in chosen:
+                chosen[key, train] = SELECTORS[key]().select_design(design, train, n_all)
+
+    choose(tuple(range(len(kept))))
+    for protocol, group in folds.items():
+        for fold in list(group):
+            try:
+                choose(fold.train)
+            except InputError as error:
+                # A single batch can have too few complete rows to learn from; the other folds still stand.
+                group.remove(fold)
+                lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
     return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost))
 
 

@@ -131,3 +131,13 @@ def test_a_batch_without_a_usable_target_is_left_out_and_named(toy_batches) -> N
     crossing = prepare([batches[0], replace(batches[1], table=table), *batches[2:]], "z", QUICK)
     assert crossing.design.batch_ids == ("b00", "b02", "b03")
     assert ("z", "batch b01 is left out: no usable z") in crossing.excluded
+
+
+def test_a_batch_that_cannot_teach_alone_loses_its_fold_only(toy_batches) -> None:
+    batches = toy_batches(5)
+    table = batches[3].table.copy()
+    table.loc[2:, "z"] = np.nan
+    crossing = prepare([*batches[:3], replace(batches[3], table=table), batches[4]], "z", QUICK)
+    assert [f.name for f in crossing.folds["train-on-one"]] == ["b00", "b01", "b02", "b04"]
+    assert len(crossing.folds["leave-batch-out"]) == 5
+    assert any("train-on-one without fold b03" in reason for _, reason in crossing.excluded)
