@@ -1,0 +1,149 @@
+"""Where a sheet's data begin and which of its columns is which channel."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from data.errors import InputError
+from data.machine import Machine
+from data.readers.base import Sheet
+from data.readers.cells import parse_number
+from data.readers.text import normalise
+
+_UNIT_ROWS = 3  # rows between header and data that may hold units or descriptions
+
+
+class NotThisTable(InputError):
+    """A sheet without any column of the machine file: no recording of this machine."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """First data row, position of time and of each channel found, and what was left aside."""
+
+    first_row: int
+    time: int
+    positions: Mapping[str, int]
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+def wanted_columns(machine: Machine) -> dict[str, str | int]:
+    """Channel -> column (name or position) for every channel that the file must give."""
+    found: dict[str, str | int] = {}
+    for name, part in machine.channels.items():
+        if part.source == "file":
+            found[name] = name if part.column is None else part.column
+    return found
+
+
+def hints(machine: Machine) -> list[str]:
+    """The column names that a recording is expected to have."""
+    columns = [machine.recording.time.column, *wanted_columns(machine).values()]
+    return [c for c in columns if isinstance(c, str)]
+
+
+def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) -> Layout:
+    """Find header, units row, first data row and the columns.
+
+    Raises:
+        NotThisTable: no column of the machine file is there.
+        InputError: no time column; no error channel although the machine file has some.
+    """
+    wanted = wanted_columns(machine)
+    time = machine.recording.time.column
+    header: Sequence[Any] = ()
+    row = -1
+    if machine.recording.header:
+        row = _header_row(sheet.head, hints(machine), where)
+        header = sheet.head[row]
+    width = len(header) or max((len(r) for r in sheet.head[-200:]), default=0)
+    by_name: dict[str, int] = {}
+    for i, cell in enumerate(header):
+        if cell is not None and str(cell).strip():
+            by_name.setdefault(normalise(cell), i)
+
+    def position(column: str | int) -> int | None:
+        if isinstance(column, str):
+            return by_name.get(normalise(column))
+        return column if 0 <= column < width else None
+
+    positions = {name: p for name, c in wanted.items() if (p := position(c)) is not None}
+    at = position(time)
+    got = _some([str(c) for c in header]) if header else f"{width} columns"
+    if not positions:
+        raise _unknown(where, width, got, machine)
+    if at is None:
+        raise InputError(f"{where}: time column {time!r} is missing; got {got}; correct recording.time.column")
+    errors = [n for n in machine.names("error") if n in wanted]
+    if need_error and errors and not any(n in positions for n in errors):
+        raise InputError(
+            f"{where}: no error channel; got {got}, expected column {_some([str(wanted[n]) for n in errors])};"
+            " correct column: of the error channels"
+        )
+    known = set(positions.values()) | {at} | {p for c in machine.ignore if (p := position(_plain(c))) is not None}
+    named = sum(bool(str(c or "").strip()) for c in header) if header else width
+    first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
+    counts = {
+        "preamble_rows": max(row, 0) if header else first,
+        "unit_rows": sum(bool(r) for r in sheet.head[row + 1 : first]) if header else 0,
+        "unknown_columns": max(0, named - len(known)),
+        "missing_channels": len(wanted) - len(positions),
+    }
+    return Layout(first, at, positions, {k: v for k, v in counts.items() if v})
+
+
+def _plain(column: str) -> str | int:
+    return int(column) if column.isdigit() else column
+
+
+def _some(names: Sequence[str], n: int = 3) -> str:
+    return ", ".join(repr(x[:40]) for x in names[:n]) + (" …" if len(names) > n else "")
+
+
+def _unknown(where: str, width: int, got: str, machine: Machine) -> NotThisTable:
+    expected = _some([str(c) for c in wanted_columns(machine).values()])
+    return NotThisTable(
+        f"{where}: none of its {width} columns is a channel of machine {machine.machine};"
+        f" got {got}, expected {expected};"
+        " correct column: in the machine file, or take the machine file of this recording"
+    )
+
+
+def _header_row(head: Sequence[Sequence[Any]], names: Sequence[str], where: str) -> int:
+    wanted = {normalise(n) for n in names}
+    best, best_row = 0, -1
+    for i, row in enumerate(head):
+        found = len(wanted & {normalise(c) for c in row if c is not None})
+        if found > best:
+            best, best_row = found, i
+    if best_row >= 0:
+        return best_row
+    filled = [i for i, row in enumerate(head) if row]
+    if not filled:
+        raise NotThisTable(
+            f"{where}: the table is empty; expected a header and at least 2 rows; record or copy it again"
+        )
+    return filled[0]
+
+
+def _first_data_row(sheet: Sheet, start: int, time: int, positions: Sequence[int], header: bool) -> int:
+    """Row of the first data: behind units, or, without a header, behind any title lines."""
+    for i in range(start, len(sheet.head) if not header else min(len(sheet.head), start + _UNIT_ROWS)):
+        row = sheet.head[i]
+        clock = row[time] if time < len(row) else None
+        if not row or (clock is None and header):
+            continue
+        values = [row[p] for p in positions if p < len(row)]
+        numbers = any(parse_number(v, sheet.decimal) is not None for v in values)
+        if header and (numbers or _is_clock(clock)):
+            return i
+        if not header and numbers and _is_clock(clock):
+            return i
+    return start
+
+
+def _is_clock(cell: Any) -> bool:
+    return not isinstance(cell, str) or bool(re.match(r"\s*[-+\"]?\d", cell))

@@ -1,0 +1,252 @@
+"""One recording file to its batches: read, put in order, on the grid, in the units that the lake keeps.
+
+`Batch.repairs` counts, for every batch; the keys of rows always add up: ``rows_in = rows_used + rows_dropped``.
+
+| key | what |
+|---|---|
+| `rows_in` | data rows of the source that belong to this batch (no blank lines, no header, units or title lines) |
+| `rows_used` | source rows that went into at least one value of the grid (a mean, an interpolation, a held driver) |
+| `rows_dropped` | source rows that contributed nothing: the sum of the six reasons below |
+| `ragged_rows` | dropped: too many or too few cells, e.g. a last line that was cut |
+| `unparsable_time` | dropped: time empty or unreadable |
+| `time_outliers` | dropped: a lone row whose time is far off |
+| `rows_before_run` | dropped: before the first run of a recording that is cut (counted with the first batch) |
+| `rows_empty` | dropped: not one readable value |
+| `rows_between` | dropped: between two grid points, needed by neither |
+| `rows_out` | rows of the grid |
+| `duplicates`, `backward_steps`, `clock_restarts` | repaired times, see `data.timegrid` |
+| `gaps`, `channel_gaps` | holes longer than max_gap_s: of all channels, of single ones |
+| `unparsable_values` | cells that are no number; empty cells and "NaN" are not counted |
+| `missing_channels`, `unknown_columns` | channels without a column, columns without a channel |
+| `preamble_rows`, `unit_rows`, `skipped_sheets` | title lines, lines between header and data, sheets of other content |
+| `start_unreadable` | 1 if the file's name does not fit start_from_name |
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import fnmatch
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from data.readers import has_reader, reader_for
+from data.readers.base import Sheet
+from data.readers.header import Layout, NotThisTable, hints, locate
+from data.rows import Rows, cut_runs, join, stream
+from data.schedule import scheduled
+from data.timegrid import repair_time, to_grid
+from data.units import check_canonical, convert
+
+
+def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list[Path]]:
+    """(recordings, other files) of a directory, both sorted; the patterns are `recording.files`, case does not matter.
+
+    The schedule file and hidden files are neither.
+
+    Raises:
+        InputError: no such directory.
+    """
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such directory; give the folder of the recordings")
+    schedule = machine.recording.schedule
+    deep = any("/" in pattern for pattern in machine.recording.files)
+    recordings: list[Path] = []
+    others: list[Path] = []
+    for path in sorted(directory.rglob("*") if deep else directory.iterdir()):
+        relative = path.relative_to(directory).as_posix()
+        if not path.is_file() or path.name.startswith(".") or (schedule and relative == schedule.file):
+            continue
+        patterns = (p.lower().removeprefix("./").replace("**/", "*") for p in machine.recording.files)
+        fits = any(fnmatch.fnmatchcase(relative.lower(), p) for p in patterns)
+        known = has_reader(path) and not path.name.startswith("~$")
+        (recordings if fits and known else others).append(path)
+    return recordings, others
+
+
+def read_batches(path: Path, machine: Machine, need_error: bool = True) -> Iterator[Batch]:
+    """The batches of one file, without findings, one at a time.
+
+    Several where a workbook has several sheets of recordings (`stem-sheet`) or where `recording.split` cuts a long
+    one (`stem-01`, `stem-02`, …). A bad sheet or stretch does not hold back the good ones: its error comes last.
+    With `need_error=False` a file without error channels is good as well (to predict from it).
+
+    Raises:
+        InputError: the file, a sheet or a stretch cannot be used; one line.
+    """
+    _check_file(path)
+    check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
+    with reader_for(path).open(path, hints(machine)) as sheets:
+        tables: list[tuple[Sheet, Layout]] = []
+        errors: list[InputError] = []
+        skipped: list[InputError] = []
+        several = len(sheets) > 1
+        for sheet in sheets:
+            try:
+                where = f"{path.name} sheet {sheet.name!r}" if several else path.name
+                tables.append((sheet, locate(sheet, machine, where, need_error)))
+            except NotThisTable as error:
+                skipped.append(error)
+            except InputError as error:
+                errors.append(error)
+        if not tables and not errors:
+            raise skipped[0]
+        extra = {"skipped_sheets": len(skipped)} if skipped else {}
+        for sheet, layout in tables:
+            batch_id = f"{path.stem}-{sheet.name}" if len(tables) + len(errors) > 1 else path.stem
+            where = f"{path.name} sheet {sheet.name!r}" if several else path.name
+            try:
+                yield from _sheet_batches(sheet, layout, machine, path, batch_id, where, need_error, extra, errors)
+            except InputError as error:
+                errors.append(error)
+            extra = {}
+    if errors:
+        more = f" (and {len(errors) - 1} more parts of the file cannot be used)" if len(errors) > 1 else ""
+        raise InputError(f"{errors[0]}{more}")
+
+
+def _check_file(path: Path) -> None:
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory, expected one recording file; give the file, or ingest the directory")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the path of a recording")
+    if path.stat().st_size == 0:
+        raise InputError(
+            f"{path.name}: the file is empty (0 bytes); expected a header and at least 2 rows; copy it again"
+        )
+
+
+def _sheet_batches(
+    sheet: Sheet, layout: Layout, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool,
+    extra: dict[str, int], errors: list[InputError],
+) -> Iterator[Batch]:  # fmt: skip
+    blocks = stream(sheet, layout, machine, where)
+    split = machine.recording.split
+    extra = {**extra, **layout.counts}
+    if split is None:
+        rows = join(list(blocks))
+        yield _batch(rows, machine, path, batch_id, where, need_error, extra, 0.0)
+        return
+    if split.driver not in machine.channels:
+        raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
+    still = 0.5 * (machine.channels[split.driver].resolution or 0.0)
+    first: float | None = None
+    for k, rows in enumerate(cut_runs(blocks, split.driver, split.min_run_s, still, where)):
+        if first is None:
+            first = float(rows.time_s[np.isfinite(rows.time_s)][0])
+        part_id = f"{batch_id}-{k + 1:02d}"
+        try:
+            yield _batch(rows, machine, path, part_id, f"{where} part {k + 1:02d}", need_error, extra, first)
+        except InputError as error:
+            errors.append(error)
+        extra = {}
+
+
+def _batch(
+    rows: Rows, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool, extra: dict[str, int],
+    file_start: float,
+) -> Batch:  # fmt: skip
+    """`file_start` is the file's first time in s, needed where its name gives the start and the file is cut."""
+    recording = machine.recording
+    repaired = repair_time(rows.time_s, recording.max_gap_s)
+    n_rows = len(rows)
+    if len(repaired.order) < 2:
+        raise _too_few(rows, len(repaired.order), machine, where)
+    held = set(machine.names("driver"))
+    keep = slice(None) if _untouched(repaired.order, n_rows) else repaired.order
+    values = {n: v[keep] for n, v in rows.columns.items()}
+    unreadable = int(rows.unreadable.sum())
+    filled = np.zeros(len(repaired.order), bool)
+    for v in values.values():
+        if not filled.all():
+            filled |= ~np.isnan(v)
+    rows.columns.clear()
+    grid = to_grid(repaired.time_s, values, held, recording.step_s, recording.max_gap_s, where)
+    used = grid.used & filled
+    repairs = {
+        "rows_in": n_rows + rows.ragged + rows.before_run,
+        "rows_used": int(used.sum()),
+        "rows_out": len(grid.time_s),
+        "ragged_rows": rows.ragged,
+        "rows_before_run": rows.before_run,
+        **{"time_outliers": 0, "clock_restarts": 0, **repaired.counts},
+        "rows_empty": int((~filled).sum()),
+        "rows_between": int((filled & ~used).sum()),
+        "channel_gaps": grid.channel_gaps,
+        "unparsable_values": unreadable,
+        **extra,
+    }
+    reasons = ("ragged_rows", "unparsable_time", "time_outliers", "rows_before_run", "rows_empty", "rows_between")
+    repairs["rows_dropped"] = sum(repairs[r] for r in reasons)
+
+    columns = {"time_s": grid.time_s}
+    labels: dict[str, object] = {}
+    from_schedule: dict[str, np.ndarray] = {}
+    if recording.schedule:
+        from_schedule, labels = scheduled(recording.schedule, path.parent, (batch_id, path.stem), grid.time_s)
+    for name, part in machine.channels.items():
+        column = (from_schedule if part.source == "schedule" else grid.columns).get(name)
+        if column is None and part.source == "schedule":
+            raise InputError(
+                f"machine file {machine.machine}: channel {name!r} has source: schedule, but no stage of"
+                " recording.schedule gives it; add it there"
+            )
+        if column is None:
+            columns[name] = np.full(len(grid.time_s), np.nan)
+        else:
+            here = f"machine file {machine.machine}: channel {name!r}"
+            columns[name] = convert(column, part.unit_in_file or part.unit, part.unit, here)
+    _check_filled(columns, machine, where, need_error, unreadable)
+    start = _start(path, machine, repaired.start, file_start)
+    if start is None and recording.start_from_name:
+        repairs["start_unreadable"] = 1
+    return Batch(
+        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns), channels=machine.batch_channels(),
+        start=start, simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
+    )  # fmt: skip
+
+
+def _untouched(order: np.ndarray, n_rows: int) -> bool:
+    return len(order) == n_rows and bool((np.diff(order) == 1).all())
+
+
+def _too_few(rows: Rows, usable: int, machine: Machine, where: str) -> InputError:
+    time = machine.recording.time
+    seen = len(rows) + rows.ragged
+    if seen < 2 or not len(rows):
+        return InputError(f"{where}: {seen} data rows, expected at least 2; record or copy it again")
+    return InputError(
+        f"{where}: {usable} of {seen} rows have a readable time in column {time.column!r} as {time.unit}, expected at"
+        " least 2; correct recording.time (unit, format)"
+    )
+
+
+def _check_filled(columns: dict[str, np.ndarray], machine: Machine, where: str, need_error: bool, bad: int) -> None:
+    """Something was recorded, and at least one error channel has a value."""
+    told = f"; {bad} cells are no numbers" if bad else ""
+    from_file = [n for n, c in machine.channels.items() if c.source == "file"]
+    if not any(np.isfinite(columns[n]).any() for n in from_file):
+        raise InputError(f"{where}: no channel has a value, all are empty or NaN{told}; record again")
+    errors = machine.names("error")
+    if need_error and errors and not any(np.isfinite(columns[n]).any() for n in errors):
+        raise InputError(
+            f"{where}: no error channel has a value, {', '.join(errors)} are all empty or NaN{told};"
+            " expected the displacement; record again"
+        )
+
+
+def _start(path: Path, machine: Machine, batch_start: float, file_start: float) -> pd.Timestamp | None:
+    pattern = machine.recording.start_from_name
+    stamped = machine.recording.time.unit == "timestamp" and batch_start > 0
+    if pattern:
+        try:
+            named = pd.Timestamp(dt.datetime.strptime(path.stem, pattern))
+            return named + pd.Timedelta(seconds=batch_start - file_start) if machine.recording.split else named
+        except ValueError:
+            pass  # counted as start_unreadable; a time column may still tell
+    return pd.Timestamp(0) + pd.Timedelta(seconds=round(batch_start, 6)) if stamped else None

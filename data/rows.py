@@ -1,0 +1,164 @@
+"""Source rows of one table as arrays, before they become a batch; cutting a long recording where the spindle starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from data.machine import Machine
+from data.readers.base import Sheet
+from data.readers.cells import stamp_format, to_float, to_seconds
+from data.readers.header import Layout
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Rows:
+    """Consecutive source rows: time_s (n,) as the file gives it, columns name -> (n,) in the file's units.
+
+    `unreadable` (n,) counts unreadable cells a row; `ragged` rows could not be split into columns and `before_run`
+    rows stand before the first run: both are in no array, but belong to this stretch.
+    """
+
+    time_s: Array
+    columns: dict[str, Array]
+    unreadable: NDArray[np.uint16]
+    ragged: int = 0
+    before_run: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def part(self, begin: int, end: int) -> Rows:
+        """Rows begin..end; ragged rows stay with the stretch that holds the first row."""
+        cut = slice(begin, end)
+        values = {n: v[cut] for n, v in self.columns.items()}
+        return Rows(self.time_s[cut], values, self.unreadable[cut], self.ragged if begin == 0 else 0)
+
+
+def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterator[Rows]:
+    """The sheet's data rows, block by block."""
+    time = machine.recording.time
+    pattern = time.format
+    if time.unit == "timestamp" and pattern is None:
+        samples = [row[layout.time] for row in sheet.head[layout.first_row :][:200] if layout.time < len(row)]
+        pattern = stamp_format([s for s in samples if isinstance(s, str) and not _is_number(s)], where)
+    positions = sorted({layout.time, *layout.positions.values()})
+    text = (layout.time,) if time.unit == "timestamp" else ()
+    for block in sheet.blocks(layout.first_row, positions, text):
+        time_s = to_seconds(block.columns[layout.time], time.unit, pattern, sheet.decimal)
+        unreadable = np.zeros(len(time_s), np.uint16)
+        values: dict[str, Array] = {}
+        for name, position in layout.positions.items():
+            values[name], bad = to_float(block.columns[position], sheet.decimal)
+            if bad is not None:
+                unreadable += bad
+        yield Rows(time_s, values, unreadable, block.ragged_rows)
+
+
+def _is_number(text: str) -> bool:
+    return text.strip().replace(".", "", 1).replace(",", "", 1).isdigit()
+
+
+def join(parts: Sequence[Rows]) -> Rows:
+    """One after the other. The parts are emptied on the way, so that no channel is held twice."""
+    if len(parts) == 1:
+        return parts[0]
+    values = {}
+    for name in list(parts[0].columns) if parts else []:
+        values[name] = np.concatenate([p.columns.pop(name) for p in parts])
+    return Rows(
+        np.concatenate([p.time_s for p in parts]) if parts else np.zeros(0),
+        values,
+        np.concatenate([p.unreadable for p in parts]) if parts else np.zeros(0, np.uint16),
+        sum(p.ragged for p in parts),
+        sum(p.before_run for p in parts),
+    )
+
+
+def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float, where: str) -> Iterator[Rows]:
+    """Batches of a long recording: from where |driver| rises above `still` to the next such rise.
+
+    Runs shorter than `min_run_s` start no batch; they belong to the stop in which they lie. A recording that begins
+    running begins with a batch; rows before the first run are counted (`before_run` of the first batch) and dropped.
+    A batch is given out as soon as the next one has begun: only one is held in memory.
+
+    Raises:
+        InputError: the driver is not in the file, or never runs for min_run_s.
+    """
+    pending: list[Rows] = []
+    running: list[NDArray[np.bool_]] = []
+    clock: list[Array] = []
+    before_run, started, last_on, last_time = 0, False, False, np.nan
+    longest = 0.0
+    for rows in blocks:
+        if driver not in rows.columns:
+            raise InputError(
+                f"{where}: recording.split needs the driver {driver!r}, which is not in the file; correct its column"
+            )
+        on = _filled(np.where(np.isnan(rows.columns[driver]), np.nan, np.abs(rows.columns[driver]) > still), last_on)
+        time = _filled(rows.time_s, last_time)
+        if len(rows):
+            last_on, last_time = bool(on[-1]), float(time[-1])
+        pending.append(rows)
+        running.append(on > 0)
+        clock.append(time)
+        cuts, run_s = _starts(np.concatenate(running), np.concatenate(clock), min_run_s, started)
+        longest = max(longest, run_s)
+        for k, cut in enumerate(cuts):
+            done, pending = _split(pending, cut - (cuts[k - 1] if k else 0))
+            if started:
+                whole = join(done)
+                whole.before_run, before_run = before_run, 0
+                yield whole
+            else:
+                before_run = sum(len(p) + p.ragged for p in done)
+            started = True
+        if len(cuts):
+            running = [np.concatenate(running)[cuts[-1] :]]
+            clock = [np.concatenate(clock)[cuts[-1] :]]
+    if not started:
+        raise InputError(
+            f"{where}: {driver} never runs for {min_run_s:g} s (longest run {longest:g} s); nothing to cut;"
+            " correct recording.split"
+        )
+    whole = join(pending)
+    whole.before_run = before_run
+    yield whole
+
+
+def _filled(values: Array, before: float) -> Array:
+    """NaN replaced by the last value before it."""
+    there = ~np.isnan(values)
+    last = np.maximum.accumulate(np.where(there, np.arange(len(values)), -1)) if len(values) else np.zeros(0, int)
+    return np.where(last >= 0, values[np.maximum(last, 0)], before)
+
+
+def _starts(on: NDArray[np.bool_], time: Array, min_run_s: float, started: bool) -> tuple[list[int], float]:
+    """Rows where a run of at least min_run_s begins (row 0 only before anything has started), and the longest run."""
+    edges = np.diff(on.astype(np.int8), prepend=np.int8(0), append=np.int8(0))
+    begin, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    if len(begin) == 0:
+        return [], 0.0
+    length = time[np.minimum(end, len(time) - 1)] - time[begin]
+    cuts = [int(b) for b, run_s in zip(begin, length, strict=True) if run_s >= min_run_s and (b > 0 or not started)]
+    return cuts, float(np.nanmax(length, initial=0.0))
+
+
+def _split(parts: list[Rows], n: int) -> tuple[list[Rows], list[Rows]]:
+    done: list[Rows] = []
+    for i, part in enumerate(parts):
+        if n >= len(part) and (n > 0 or part.ragged):
+            done.append(part)
+            n -= len(part)
+            continue
+        if n > 0:
+            done.append(part.part(0, n))
+        return done, [part.part(n, len(part)) if n else part, *parts[i + 1 :]]
+    return done, []
