@@ -29,6 +29,10 @@ class Registry(Mapping[str, Any]):
         module, name = self._members[key].split(":")
         return getattr(import_module(module), name)
 
+    def add(self, key: str, where: str) -> None:
+        """Add a member at run time, for trying one out: `where` is ``"module:Class"``."""
+        self._members[key] = where
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._members)
 

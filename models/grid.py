@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -163,7 +164,7 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
             if any(c is None for c in picked):
                 continue
             columns = np.array(picked, int)
-            keys = {"protocol": protocol, "selector": selector, "family": key, "n_tsp": n_tsp}
+            keys: dict[str, Any] = {"protocol": protocol, "selector": selector, "family": key, "n_tsp": n_tsp}
             table = score_rows(crossing.design.batch_ids, folds, judged, columns, protocol)
             scores.append(table.assign(**keys))
             inputs = crossing.inputs(selector, crossing.everything, n_tsp)

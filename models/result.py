@@ -59,6 +59,7 @@ class GridResult:
     def load(cls, folder: Path) -> GridResult:
         """The inverse of `save`."""
         meta: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        values = {f.name: meta[f.name] if f.name in meta else pd.read_parquet(folder / f"{f.name}.parquet")
-                  for f in fields(cls)}  # fmt: skip
+        tables = [f.name for f in fields(cls) if f.name not in meta]
+        values = {k: v for k, v in meta.items() if k != "schema"}
+        values |= {name: pd.read_parquet(folder / f"{name}.parquet") for name in tables}
         return cls(**values)
