@@ -1,0 +1,117 @@
+"""Checks that find faults in recordings: a registry, one file per check, and the three entries below.
+
+A check runs over what the checks before it left unmasked; the order of the registry is the order of the
+checks. Thresholds come from resolution, noise and physics, never from one machine's history.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from data.batch import Batch, Finding
+from data.machine import Machine, Overrule
+from data.registry import Registry
+
+CHECKS = Registry(
+    "check",
+    {
+        "wrong_unit": "data.checks.wrong_unit:WrongUnit",
+        "out_of_range": "data.checks.out_of_range:OutOfRange",
+        "saturated": "data.checks.saturated:Saturated",
+        "interruption": "data.checks.interruption:Interruption",
+        "error_held": "data.checks.error_held:ErrorHeld",
+        "dead": "data.checks.dead:Dead",
+        "frozen": "data.checks.frozen:Frozen",
+        "jump_no_return": "data.checks.jump_no_return:JumpNoReturn",
+        "spike": "data.checks.spike:Spike",
+        "gap": "data.checks.gap:Gap",
+        "clock": "data.checks.clock:Clock",
+        "offset": "data.checks.offset:Offset",
+        "swapped": "data.checks.swapped:Swapped",
+        "unexplained": "data.checks.unexplained:Unexplained",
+    },
+)
+USER = "user"  # the check's name in findings that the machine file's overrule adds
+MOST_MASKED = 0.2  # an input that lacks more than this share of any batch cannot serve all batches
+
+
+def check_batch(batch: Batch, machine: Machine) -> tuple[Finding, ...]:
+    """Run every check of one recording; findings in the registry's order, those the batch came with not repeated."""
+    found: tuple[Finding, ...] = ()
+    for check in CHECKS.values():
+        found += tuple(check().batch(batch.with_findings(found), machine))
+    return found
+
+
+def check_machine(batches: Sequence[Batch], machine: Machine) -> list[Batch]:
+    """Add what only the batches together can show, then the user's word; safe to repeat.
+
+    Returns the batches in the given order with findings of `check_batch` kept, those of several batches added, and
+    `machine.overrule` applied: matching findings get its reason, `mask: true` adds a mask of its own.
+    """
+    known = [b.with_findings(_own(b)) for b in batches]
+    for check in CHECKS.values():
+        for k, found in check().across(known, machine).items():
+            known[k] = known[k].with_findings(known[k].findings + tuple(found))
+    return [_overruled(b, machine.overrule) for b in known]
+
+
+def usable_channels(
+    batches: Sequence[Batch], names: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Channels that can be model inputs in every batch, and the others with the reason.
+
+    A channel that is missing or masked in more than a fifth of the rows of any batch is left out: otherwise
+    that batch could not be predicted.
+    """
+    usable, excluded = [], []
+    for name in names:
+        bad = [w for b in batches if (w := _shortage(b, name))]
+        if bad:
+            more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
+            excluded.append((name, f"{name} is {', '.join(bad[:3])}{more}"))
+        else:
+            usable.append(name)
+    return tuple(usable), tuple(excluded)
+
+
+def _shortage(batch: Batch, name: str) -> str:
+    """What is wrong with a channel in one batch, in words; empty when it is usable."""
+    if name not in batch.table.columns or not np.isfinite(batch.values(name)).any():
+        return f"missing in {batch.batch_id}"
+    lacking = float(np.mean(~np.isfinite(batch.masked(name))))
+    if lacking <= MOST_MASKED:
+        return ""
+    causes = sorted({f.check for f in batch.findings if f.masks and not f.overruled and f.channel in (name, None)})
+    return f"unusable in {lacking:.0%} of {batch.batch_id} ({', '.join(causes) or 'not recorded'})"
+
+
+def _own(batch: Batch) -> tuple[Finding, ...]:
+    """Findings of the batch alone, without what an earlier `check_machine` added."""
+    alone = {k for k, c in CHECKS.items() if "batch" in vars(c)}
+    kept = [replace(f, overruled="") for f in batch.findings if f.check in alone or f.check not in (*CHECKS, USER)]
+    return tuple(dict.fromkeys(kept))
+
+
+def _overruled(batch: Batch, rules: Sequence[Overrule]) -> Batch:
+    findings = list(batch.findings)
+    for rule in rules:
+        if not fnmatchcase(batch.batch_id, rule.batch):
+            continue
+        if rule.mask:
+            named = [None] if rule.channel == "*" else [n for n in batch.channels if fnmatchcase(n, rule.channel)]
+            findings += [Finding(USER, n, rule.reason, rule.start_s, rule.end_s) for n in named]
+            continue
+        findings = [replace(f, overruled=rule.reason) if _meant(f, rule) else f for f in findings]
+    return batch.with_findings(tuple(findings))
+
+
+def _meant(f: Finding, rule: Overrule) -> bool:
+    if f.check == USER or not fnmatchcase(f.check, rule.check) or not fnmatchcase(f.channel or "*", rule.channel):
+        return False
+    begin, end = f.start_s or 0.0, np.inf if f.end_s is None else f.end_s
+    return begin <= (np.inf if rule.end_s is None else rule.end_s) and end >= (rule.start_s or 0.0)

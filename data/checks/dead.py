@@ -1,0 +1,73 @@
+"""A temperature that takes no part: constant through a batch in which the others move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from data.batch import Batch, Finding
+from data.checks.base import THERMAL, Array, Check, smallest_step
+from data.machine import Machine
+
+_STEPS = 30.0
+_FLOOR_K = 3.0
+_BATCHES = 5
+
+
+class Dead(Check):
+    """Alone: wholly constant while the median of the others moves by 3 K and 30 of its resolution steps.
+
+    Against its own history: it moves by less than a tenth of what it usually moves for this much movement
+    of the others, where that usual share is steady (six times its scatter).
+    """
+
+    key = "dead"
+    words = "takes no part in the machine's warming"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        moved = {n: _range_K(batch.masked(n)) for n in batch.names(*THERMAL)}
+        found = []
+        for name in batch.names("temperature"):
+            others = [v for n, v in moved.items() if n != name and np.isfinite(v)]
+            if not moved[name] <= 1e-9 or len(others) < 2 or np.isfinite(batch.masked(name)).sum() < 10:
+                continue
+            usual = float(np.median(others))
+            if usual >= max(_FLOOR_K, _STEPS * smallest_step(batch, name)):
+                level = batch.values(name)[np.isfinite(batch.values(name))][0]
+                words = f"{name} stays at {level:.5g} degC all through while the others move by {usual:.1f} K"
+                found.append(self.finding(name, words))
+        return found
+
+    def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
+        names = batches[0].names(*THERMAL) if batches else ()
+        if len(batches) < _BATCHES or len(names) < 3:
+            return {}
+        moved = np.array([[_range_K(b.masked(n)) if n in b.channels else np.nan for n in names] for b in batches])
+        found: dict[int, list[Finding]] = {}
+        for j, name in enumerate(names):
+            rest = np.delete(moved, j, axis=1)
+            usual = np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in rest])
+            share = moved[:, j] / np.where(usual > 0, usual, np.nan)
+            known = share[np.isfinite(share)]
+            if len(known) < _BATCHES:
+                continue
+            centre = float(np.median(known))
+            scatter = 1.4826 * float(np.median(np.abs(known - centre)))
+            for k, batch in enumerate(batches):
+                expected = centre * usual[k]
+                if not np.isfinite(share[k]) or any(f.check == self.key and f.channel == name for f in batch.findings):
+                    continue
+                least = max(_FLOOR_K, _STEPS * smallest_step(batch, name))
+                if centre > 6.0 * scatter and share[k] < 0.1 * centre and expected > least:
+                    words = (
+                        f"{name} moves by {moved[k, j]:.1f} K while the others move by {usual[k]:.1f} K; in the other "
+                        f"batches it moves {centre:.2f} times as much as they do"
+                    )
+                    found.setdefault(k, []).append(self.finding(name, words))
+        return found
+
+
+def _range_K(values: Array) -> float:
+    ok = values[np.isfinite(values)]
+    return float(np.ptp(ok)) if len(ok) >= 10 else float("nan")

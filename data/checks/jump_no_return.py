@@ -1,0 +1,112 @@
+"""A step of one channel that the machine cannot make."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data.batch import Batch, Finding
+from data.checks.base import Array, Bools, Check, clock, excess, load_changes, step_limit
+from data.machine import Machine
+
+_RATE_K_PER_MIN = 8.0  # 1 kW into the smallest instrumented body, about 7.5 kJ/K
+_FLOOR_K = 1.0  # less is within what a draught or a splash of coolant does
+_FLOOR_UM = 12.0  # slip of a joint and the shift of a spindle with speed stay below 10 µm
+_TYPICAL = 3.0  # times the channel's own liveliest tenth of steps
+_BACK_S = 900.0
+
+
+class JumpNoReturn(Check):
+    """A step beyond noise, resolution and the channel's own liveliness, away from driver changes and not
+    shared by others; or a temperature that rises faster than 1 kW into 7.5 kJ/K. Masked from the first odd step to the
+    batch's end, or to the step that brings it back.
+    """
+
+    key = "jump_no_return"
+    words = "a step of one channel that noise, load and neighbours do not explain"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        if batch.n_rows < 12:
+            return []
+        loaded = load_changes(batch)
+        names = batch.names("temperature", "error")
+        steps = {n: excess(batch.masked(n)) for n in names}
+        odd = {n: np.abs(np.nan_to_num(steps[n])) > self._limit(batch, n, steps[n], loaded) for n in names}
+        found = []
+        for name in names:
+            role = batch.channels[name].role
+            same = [n for n in names if n != name and batch.channels[n].role == role]
+            shared = np.sum([_near(odd[n]) for n in same], axis=0) if same else np.zeros(batch.n_rows)
+            # one companion is still a pair of wires in one plug; two are the machine itself
+            alone = odd[name] & (shared < max(2, 0.2 * len(same))) & ~loaded
+            alone &= _grows(batch.masked(name))
+            if role == "temperature":
+                alone |= self._too_fast(batch, name)
+            row = self._staying(batch.masked(name), steps[name], alone)
+            if row is not None:
+                found.append(self._told(batch, name, row, steps[name]))
+        return found
+
+    def _limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
+        channel = batch.channels[name]
+        quiet = np.abs(e[~loaded & np.isfinite(e)])
+        lively = float(np.quantile(quiet, 0.9)) if len(quiet) else 0.0
+        floor = _FLOOR_UM if channel.role == "error" else _FLOOR_K
+        if channel.role == "error" and not batch.names("driver"):
+            floor *= 3.0  # starts and stops are then unknown
+        return max(step_limit(quiet, channel.resolution), _TYPICAL * lively, floor)
+
+    def _too_fast(self, batch: Batch, name: str) -> Bools:
+        v = batch.masked(name)
+        limit = _RATE_K_PER_MIN * batch.step_s / 60.0 + 3.0 * (batch.channels[name].resolution or 0.0)
+        with np.errstate(invalid="ignore"):
+            return np.concatenate([[False], np.abs(np.diff(v)) > limit])
+
+    def _staying(self, v: Array, e: Array, alone: Bools) -> int | None:
+        """The first odd row whose step is still there two rows later; one that returns at once is a spike."""
+        for row in np.flatnonzero(alone):
+            after = v[row + 2 : row + 5]
+            after = after[np.isfinite(after)]
+            before = v[max(0, row - 4) : row]
+            before = before[np.isfinite(before)]
+            if len(after) and len(before) and abs(np.median(after) - np.median(before)) > 0.5 * abs(e[row]):
+                return int(row)
+        return None
+
+    def _told(self, batch: Batch, name: str, row: int, e: Array) -> Finding:
+        channel, t = batch.channels[name], batch.time_s
+        unit = "K" if channel.unit == "degC" else channel.unit
+        v = batch.masked(name)
+        small = step_limit(e, channel.resolution)
+        first = row
+        for r in range(row, max(0, row - int(_BACK_S / batch.step_s)), -1):
+            if abs(e[r]) > small:
+                first = r
+        settled = min(len(v) - 1, row + max(3, int(_BACK_S / batch.step_s)))
+        tail = v[row : settled + 1]
+        size = float(tail[np.isfinite(tail)][-1] - v[first - 1])
+        back = np.flatnonzero((np.sign(e) == -np.sign(size)) & (np.abs(e) > 0.6 * abs(size)))
+        back = back[back > row + 1]
+        end = int(back[0]) - 1 if len(back) else None
+        words = (
+            f"{name} steps by {size:+.1f} {unit} at {clock(t[row])}, which noise ({small / 8:.2g} {unit}), load and "
+            "the other channels do not explain, and "
+        )
+        words += "does not return" if end is None else f"comes back at {clock(t[end])}"
+        return self.finding(name, words, float(t[first]), None if end is None else float(t[end]))
+
+
+def _near(flags: Bools) -> Bools:
+    """True also one row beside: resampling can move a step by one."""
+    out = flags.copy()
+    out[1:] |= flags[:-1]
+    out[:-1] |= flags[1:]
+    return out
+
+
+def _grows(v: Array) -> Bools:
+    """Rows whose step is twice those of the rows before: what follows a load change only dies away."""
+    step = np.abs(np.nan_to_num(np.diff(v, prepend=v[:1])))
+    before = np.zeros_like(step)
+    before[2:] = step[:-2]
+    before[3:] = np.maximum(before[3:], step[:-3])
+    return step > 2.0 * before

@@ -1,0 +1,70 @@
+"""A channel pinned at the end of its instrument's range."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data.batch import Batch, Finding
+from data.checks.base import Check, clock, constant_runs, excess, smallest_step, span_words, step_limit
+from data.machine import Machine
+
+_ROWS = 5
+
+
+class Saturated(Check):
+    """Five or more equal samples at the batch's extreme, at a full-scale value, reached by a jump.
+
+    Full scale is 1, 2, 2.5 or 5 times a power of ten, or an end of the machine file's range. The jump
+    keeps a quiet channel that happens to sit at a round value out of it.
+    """
+
+    key = "saturated"
+    words = "pinned at a full-scale value"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        found = []
+        for name in batch.names("error", "temperature", "ambient"):
+            v = batch.masked(name)
+            if not np.isfinite(v).any():
+                continue
+            channel = batch.channels[name]
+            ends = (float(np.nanmin(v)), float(np.nanmax(v)))
+            limit = step_limit(excess(v), channel.resolution)
+            for a, b in constant_runs(v):
+                rail = _rail(float(v[a]), smallest_step(batch, name), channel.low, channel.high)
+                if b - a + 1 < _ROWS or min(abs(v[a] - e) for e in ends) > 1e-6 or rail is None:
+                    continue
+                if channel.role != "error" and abs(rail) < 100.0:
+                    continue
+                arrived = _jump(v, a)
+                if arrived > max(limit, 0.05 * abs(rail)):
+                    found.append(
+                        self.finding(
+                            name,
+                            f"{name} jumps by {arrived:.1f} {channel.unit} at {clock(batch.time_s[a])} to its "
+                            f"full scale {rail:g} {channel.unit} and stays there {span_words(batch, a, b)}",
+                            float(batch.time_s[a]),
+                            float(batch.time_s[b]),
+                        )
+                    )
+        return found
+
+
+def _jump(v: np.ndarray, row: int) -> float:
+    """Step up to the run from the last good rows before it; a resampled row may stand half-way."""
+    before = v[max(0, row - 3) : row]
+    before = before[np.isfinite(before)]
+    return float(np.max(np.abs(v[row] - before))) if len(before) else 0.0
+
+
+def _rail(value: float, resolution: float, low: float | None, high: float | None) -> float | None:
+    size = abs(value)
+    if size < 5.0:
+        return None
+    near = max(resolution, 1e-4 * size)
+    decade = 10.0 ** np.floor(np.log10(size * 1.0001))
+    rails = [np.sign(value) * decade * k for k in (1.0, 2.0, 2.5, 5.0, 10.0)]
+    for rail in [*rails, low, high]:
+        if rail is not None and abs(value - rail) <= near:
+            return float(rail)
+    return None
