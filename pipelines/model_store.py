@@ -1,0 +1,196 @@
+"""A fitted model as plain data: `model.json`, `arrays.npz` and the `machine.yml` it belongs to. Never pickle.
+
+A stored model needs neither MLflow nor the recordings: `load(folder).predict(batch)`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine, parse_machine
+from models.base import Family, family_from_plain
+from models.region import Region, outside
+
+SCHEMA = "thermodrift.model/1"
+FILES = ("model.json", "arrays.npz", "machine.yml")
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StoredModel:
+    """A family ready to predict, the machine it is for, where it was trained, and what is known about it."""
+
+    family: Family
+    machine: Machine
+    region: Region
+    info: dict[str, Any] = field(default_factory=dict)  # training_id, cell, n_batches, simulated, …
+
+    @property
+    def simulated(self) -> bool:
+        return bool(self.info.get("simulated", False))
+
+    def channels(self) -> tuple[str, ...]:
+        """The channels that a recording must have."""
+        needed: dict[str, None] = {}
+        for name in self.family.inputs:
+            channel, _, kind = name.partition("@")
+            needed[channel] = None
+            if kind == "ambient":
+                needed |= dict.fromkeys(self.machine.names("ambient")[:1])
+        return tuple(needed)
+
+    def predict(self, batch: Batch) -> Array:
+        """Error_um (n,) of a batch, zero at its start.
+
+        Raises:
+            InputError: an input is not in the batch, or was nowhere recorded.
+        """
+        absent = [c for c in self.channels() if c not in batch.table or not np.isfinite(batch.values(c)).any()]
+        if absent:
+            words = ", ".join(f"{c!r} (column {self._column(c)!r})" for c in absent)
+            have = [c for c in batch.names("temperature", "ambient", "driver") if c in batch.table]
+            raise InputError(
+                f"{batch.source or 'batch'} {batch.batch_id}: the model of {self.machine.machine} needs {words}, "
+                f"which the recording does not have; it has {', '.join(have) or 'no input at all'}; "
+                "give a recording with every input, or a model with fewer"
+            )
+        return self.family.predict(batch)
+
+    def outside(self, batch: Batch) -> list[str]:
+        """For every row, which inputs, drivers or start temperatures lie beyond what training saw, joined by ", "."""
+        region = {name: limits for name, limits in self.region.items() if name.partition("@")[0] in batch.table}
+        out = [""] * batch.n_rows
+        for name, hit in outside(batch, region, self.family.inputs).items():
+            for i in np.flatnonzero(hit):
+                out[i] += f", {name}" if out[i] else name
+        return out
+
+    def _column(self, channel: str) -> str | int:
+        part = self.machine.channels.get(channel)
+        return channel if part is None or part.column is None else part.column
+
+
+def save(
+    folder: Path,
+    family: Family,
+    machine_yaml: str,
+    region: Mapping[str, Sequence[float]],
+    info: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the three files; `machine_yaml` is the text of the machine file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, NDArray[Any]] = {}
+    plain = _to_json(family.as_plain(), arrays)
+    document = {
+        "schema": SCHEMA,
+        **plain,
+        "region": {k: [float(v) for v in limits] for k, limits in region.items()},
+        "info": dict(info or {}),
+    }
+    (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
+    np.savez(folder / "arrays.npz", allow_pickle=False, **arrays)
+    (folder / "machine.yml").write_text(machine_yaml, encoding="utf-8")
+
+
+def load(folder: Path) -> StoredModel:
+    """Read a stored model from its folder, or from the folder of the MLflow model around it.
+
+    Raises:
+        InputError: no model there, a file damaged, or a model of another version.
+    """
+    inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
+    try:
+        document = json.loads((inner / "model.json").read_text(encoding="utf-8"))
+        machine_yaml = (inner / "machine.yml").read_text(encoding="utf-8")
+        with np.load(inner / "arrays.npz", allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, BadZipFile, ValueError) as error:
+        raise InputError(
+            f"model folder {folder}: not a stored model ({error}); expected the files {', '.join(FILES)}"
+        ) from None
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        got = document.get("schema") if isinstance(document, dict) else type(document).__name__
+        raise InputError(f"model folder {folder}: got schema {got!r}, expected {SCHEMA!r}; train the model again")
+    plain = _from_json(document, arrays)
+    machine = parse_machine(machine_yaml, str(inner / "machine.yml"))
+    return StoredModel(
+        family_from_plain(plain), machine, {k: (low, high) for k, (low, high) in plain["region"].items()}, plain["info"]
+    )
+
+
+def frame_to_batch(model: StoredModel, table: pd.DataFrame, batch_id: str = "frame") -> Batch:
+    """A batch from a plain table: time_s (regular) and channels by name, in the machine file's canonical units.
+
+    Raises:
+        InputError: no time_s, or an irregular one.
+    """
+    if "time_s" not in table:
+        raise InputError(f"table of {batch_id}: no column 'time_s'; give the time from the start in s")
+    time_s = table["time_s"].to_numpy(float)
+    step = np.diff(time_s)
+    if len(step) and not (step[0] > 0 and np.allclose(step, step[0], rtol=0.01)):
+        raise InputError(
+            f"table of {batch_id}: 'time_s' is not a regular grid (steps {np.nanmin(step):g} to {np.nanmax(step):g} s);"
+            " bring it to one step, or give the file itself to `thermodrift predict`"
+        )
+    channels = {n: c for n, c in model.machine.batch_channels().items() if n in table}
+    columns = table[["time_s", *channels]].astype(float).reset_index(drop=True)
+    return Batch(model.machine.machine, batch_id, columns, channels)
+
+
+def predict_frame(model: StoredModel, table: pd.DataFrame) -> pd.DataFrame:
+    """Predictions for a plain table, in its row order: predicted_um, outside_region.
+
+    A column batch_id cuts the table into batches; each starts at zero.
+    """
+    groups = [("frame", np.arange(len(table)))]
+    if "batch_id" in table and table["batch_id"].notna().any():
+        groups = [(str(k), np.asarray(v)) for k, v in table.groupby("batch_id", sort=False).indices.items()]
+    predicted, outside = np.full(len(table), np.nan), np.zeros(len(table), bool)
+    for batch_id, rows in groups:
+        batch = frame_to_batch(model, table.iloc[rows], batch_id)
+        predicted[rows] = model.predict(batch)
+        outside[rows] = [bool(words) for words in model.outside(batch)]
+    return pd.DataFrame({"predicted_um": predicted, "outside_region": outside}, index=table.index)
+
+
+def _to_json(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype == object:
+            raise TypeError("an array of objects is not plain data")
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return {"$array": name}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"$float": str(value)}
+    if isinstance(value, Mapping):
+        return {str(k): _to_json(v, arrays) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_json(v, arrays) for v in value]
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise TypeError(f"{type(value).__name__} is not plain data; fitted takes numbers, strings, lists and arrays")
+
+
+def _from_json(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {"$array"}:
+            return arrays[value["$array"]]
+        if set(value) == {"$float"}:
+            return float(value["$float"])
+        return {k: _from_json(v, arrays) for k, v in value.items()}
+    return [_from_json(v, arrays) for v in value] if isinstance(value, list) else value

@@ -1,0 +1,184 @@
+"""`mlflow.yml`: store, names and the promotion rule; and the folder that everything is written to."""
+
+from __future__ import annotations
+
+import os
+import string
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from data.errors import InputError, closest
+from models.protocols import PROTOCOLS
+from pipelines import TELEMETRY_OFF
+
+PROJECT_ROOT = Path(__file__).resolve().parent.parent
+_prefect_home_set_here = ""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TrackingPart(_Part):
+    """Where runs and their files go; `{home}` stands for `home()`."""
+
+    store: str = "sqlite:///{home}/mlflow.db"
+    artifacts: str | None = "{home}/artifacts"
+
+    @field_validator("store", "artifacts")
+    @classmethod
+    def _only_home(cls, value: str | None) -> str | None:
+        return None if value is None else _placeholders(value, {"home"}, set())
+
+
+class NamesPart(_Part):
+    """Patterns of names; both carry `{machine}` and `{target}`."""
+
+    experiment: str = "{machine}/{target}"
+    model: str = "{machine}-{target}"
+
+    @field_validator("experiment", "model")
+    @classmethod
+    def _both(cls, value: str) -> str:
+        return _placeholders(value, {"machine", "target"}, {"machine", "target"})
+
+    @field_validator("model")
+    @classmethod
+    def _no_separator(cls, value: str) -> str:
+        if "/" in value or ":" in value:
+            raise ValueError("a registered model's name must not contain / or :")
+        return value
+
+
+class PromotionRule(_Part):
+    """Which cell becomes the champion, and when a newcomer may replace one."""
+
+    protocol: str = "leave-batch-out"
+    score: Literal["S_mean + S_std", "S_mean", "max_abs"] = "S_mean + S_std"
+    min_tsp_stability: Annotated[float, Field(ge=0, le=1)] = 0.7
+    tie_percent: Annotated[float, Field(ge=0, lt=100)] = 2.0
+    significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    min_batches: Annotated[int, Field(ge=2)] = 5
+
+    @field_validator("protocol")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in PROTOCOLS:
+            raise ValueError(f"unknown protocol; {closest(value, PROTOCOLS)}")
+        return value
+
+
+class _File(_Part):
+    tracking: TrackingPart = TrackingPart()
+    names: NamesPart = NamesPart()
+    promotion: PromotionRule = PromotionRule()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`mlflow.yml` with the home folder filled in."""
+
+    home: Path
+    store_uri: str
+    artifacts_uri: str | None
+    names: NamesPart
+    promotion: PromotionRule
+
+    def experiment(self, machine: str, target: str) -> str:
+        """Name of the experiment of one machine's error channel."""
+        return self.names.experiment.format(machine=machine, target=target)
+
+    def model(self, machine: str, target: str) -> str:
+        """Name of the registered model of one machine's error channel."""
+        return self.names.model.format(machine=machine, target=target)
+
+    @property
+    def store_file(self) -> Path | None:
+        """The SQLite file of the store, None for a server."""
+        return Path(self.store_uri.removeprefix("sqlite:///")) if self.store_uri.startswith("sqlite:") else None
+
+
+def home() -> Path:
+    """The folder that everything is written to: THERMODRIFT_HOME, else var/ in the project; absolute."""
+    given = os.environ.get("THERMODRIFT_HOME", "").strip()
+    return Path(given).expanduser().resolve() if given else PROJECT_ROOT / "var"
+
+
+def configure_environment() -> None:
+    """Telemetry of mlflow and prefect off and PREFECT_HOME below `home()`; call it before prefect is imported.
+
+    A PREFECT_HOME that the user set stays. Logs are quietened when `pipelines` is imported.
+    """
+    global _prefect_home_set_here
+    os.environ.update(TELEMETRY_OFF)
+    if os.environ.get("PREFECT_HOME", "") in ("", _prefect_home_set_here):
+        _prefect_home_set_here = os.environ["PREFECT_HOME"] = str(home() / "prefect")
+
+
+def load(path: Path | str | None = None) -> Settings:
+    """Read and check a settings file; without a path the project's `mlflow.yml`, or the defaults if it has none.
+
+    Raises:
+        InputError: file missing, not YAML, an unknown key (with the closest), a wrong value; one line each.
+    """
+    where = Path(path) if path is not None else PROJECT_ROOT / "mlflow.yml"
+    parsed = _File() if path is None and not where.exists() else _parse(where)
+    base = home()
+    store = parsed.tracking.store.format(home=base.as_posix())
+    if store.startswith("sqlite:") and not Path(store.removeprefix("sqlite:///")).is_absolute():
+        raise InputError(
+            f"settings file {where}: key 'tracking.store': got {store!r}; a SQLite store needs an absolute path, "
+            "for example sqlite:///{home}/mlflow.db"
+        )
+    artifacts = parsed.tracking.artifacts
+    if artifacts is not None:
+        artifacts = artifacts.format(home=base.as_posix())
+        artifacts = artifacts if "://" in artifacts else (base / artifacts).as_uri()
+    return Settings(base, store, artifacts, parsed.names, parsed.promotion)
+
+
+def _parse(where: Path) -> _File:
+    try:
+        raw = yaml.safe_load(where.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"settings file {where}: cannot be read ({error}); give the path of a .yml file") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        at = f" line {mark.line + 1}" if mark else ""
+        raise InputError(f"settings file {where}{at}: not valid YAML ({getattr(error, 'problem', error)})") from None
+    if raw is None:
+        raw = {}
+    if not isinstance(raw, dict):
+        raise InputError(f"settings file {where}: expected a mapping with the keys {', '.join(_File.model_fields)}")
+    try:
+        return _File.model_validate(raw)
+    except ValidationError as error:
+        raise InputError(f"settings file {where}: {_one_line(error)}") from None
+
+
+def _one_line(error: ValidationError) -> str:
+    problems = error.errors()
+    first = problems[0]
+    key = ".".join(str(p) for p in first["loc"])
+    if first["type"] == "extra_forbidden":
+        part: Any = _File
+        for step in first["loc"][:-1]:
+            part = part.model_fields[str(step)].annotation
+        text = f"unknown key {key!r}; {closest(str(first['loc'][-1]), part.model_fields)}"
+    else:
+        text = f"key {key!r}: got {first['input']!r}; {first['msg'].removeprefix('Value error, ')}"
+    return text + (f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else "")
+
+
+def _placeholders(value: str, allowed: set[str], needed: set[str]) -> str:
+    found = {name for _, name, _, _ in string.Formatter().parse(value) if name is not None}
+    if found - allowed:
+        unknown = sorted(found - allowed)[0]
+        raise ValueError(f"unknown placeholder {{{unknown}}}; {closest(unknown, allowed)}")
+    if needed - found:
+        raise ValueError(f"placeholder {{{sorted(needed - found)[0]}}} is missing")
+    return value

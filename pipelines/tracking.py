@@ -1,0 +1,311 @@
+"""Trainings in MLflow: an experiment per machine and error channel, a parent run per training, a run per model.
+
+The parent run keeps the whole `GridResult` as Parquet, so that a report is made from tracked runs alone.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import numpy as np
+import pandas as pd
+from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
+from mlflow.exceptions import MlflowException
+from mlflow.tracking import MlflowClient
+
+from data.errors import InputError, WorkError
+from models.result import GridResult
+from pipelines.promotion import choose, score_um
+from pipelines.settings import PromotionRule, Settings, load
+
+CELL_METRICS = (
+    "S_mean_um", "S_std_um", "max_abs_um", "eta", "compensation_effect", "grey_degree", "rmse_um", "tsp_stability",
+)  # fmt: skip
+_GRID = "grid"
+_METRICS_AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
+_DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
+
+
+_OPENING = threading.Lock()  # MLflow's own lock on a first migration holds between processes only
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Training:
+    """One tracked training of one error channel. `promotion` is what `registry.promote` recorded, empty if nothing."""
+
+    training_id: str
+    started: pd.Timestamp
+    simulated: bool
+    result: GridResult
+    params: dict[str, str] = field(default_factory=dict)
+    promotion: dict[str, Any] = field(default_factory=dict)
+
+
+def open_store(settings: Settings, say: Callable[[str], None] = _silent) -> MlflowClient:
+    """A client of the tracking store; makes the SQLite file at the first use, which takes seconds and is said.
+
+    Threads may call it at once.
+
+    Raises:
+        WorkError: the store does not answer, or is of an older MLflow.
+    """
+    file = settings.store_file
+    with _OPENING, store_errors(settings):
+        if file is not None and not file.exists():
+            say(f"first use: making the tracking store {file} (takes some seconds, once)")
+        client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+        client.search_experiments(max_results=1)
+    return client
+
+
+@contextmanager
+def store_errors(settings: Settings) -> Iterator[None]:
+    """Turns MLflow's trouble into one line."""
+    try:
+        yield
+    except MlflowException as error:
+        text = str(error).splitlines()[0]
+        if "out-of-date database schema" in text:
+            text = f"it is of an older MLflow; make a copy, then run: mlflow db upgrade {settings.store_uri}"
+        raise WorkError(f"tracking store {settings.store_uri}: {text}") from error
+
+
+def log_training(
+    result: GridResult,
+    settings: Settings,
+    *,
+    figures: dict[str, bytes] | None = None,
+    params: dict[str, Any] | None = None,
+    say: Callable[[str], None] = _silent,
+) -> str:
+    """Track one training and give back its id (the parent run's).
+
+    Parent run: the tables as Parquet under grid/, figures (file name -> bytes) under figures/, the lake's batches as
+    dataset inputs. One child run per selector × family: metrics ``leave_batch_out/S_mean_um`` and so on with n_tsp
+    as step, and ``leave_batch_out/fold_S_um`` at the best n_tsp with the fold's index as step.
+
+    Raises:
+        WorkError: the store does not answer.
+    """
+    client = open_store(settings, say)
+    with store_errors(settings):
+        experiment_id = _experiment(client, result, settings)
+        common = {"simulated": _yes(result.simulated), "machine": result.machine, "target": result.target}
+        name = f"{result.machine} {result.target} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
+        parent = client.create_run(experiment_id, tags={**common, "kind": "training"}, run_name=name).info.run_id
+        status = "FAILED"
+        try:
+            _log_parent(client, parent, result, settings.promotion, params or {})
+            _log_files(client, parent, result, figures or {})
+            client.log_inputs(parent, datasets=_dataset_inputs(result))
+            for (selector, family), cells in result.cells.groupby(["selector", "family"], sort=False):
+                _log_cell(client, experiment_id, parent, common, str(selector), str(family), cells, result, settings)
+            status = "FINISHED"
+        finally:
+            client.set_terminated(parent, status)
+    return str(parent)
+
+
+def trainings(machine: str | None = None, target: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
+    """Finished trainings, newest first: training_id, machine, target, started, n_batches, best, score_um, simulated,
+    promotion (champion, challenger, unchanged or empty), model. Empty where there is none.
+
+    Raises:
+        WorkError: the store does not answer.
+    """
+    settings = settings or load()
+    client = open_store(settings)
+    runs: list[Run] = []
+    with store_errors(settings):
+        experiments = client.search_experiments(filter_string="tags.kind = 'thermodrift'")
+        ids, token = [e.experiment_id for e in experiments], None
+        while ids:
+            page = client.search_runs(
+                ids, "tags.kind = 'training' and attributes.status = 'FINISHED'", page_token=token,
+                order_by=["attributes.start_time DESC"],
+            )  # fmt: skip
+            runs += page
+            token = page.token
+            if not token:
+                break
+    columns = ["training_id", "machine", "target", "started", "n_batches", "best", "score_um", "simulated",
+               "promotion", "model"]  # fmt: skip
+    table = pd.DataFrame([_training_row(r) for r in runs], columns=columns)
+    for column, wanted in (("machine", machine), ("target", target)):
+        if wanted is not None:
+            table = table[table[column] == wanted]
+    return table.reset_index(drop=True)
+
+
+def load_training(training_id: str, settings: Settings) -> Training:
+    """A training with all its tables.
+
+    Raises:
+        InputError: no such training.
+    """
+    client = open_store(settings)
+    try:
+        run = client.get_run(training_id)
+    except MlflowException:
+        run = None
+    if run is None or run.data.tags.get("kind") != "training":
+        raise InputError(f"training {training_id!r} is not in {settings.store_uri}; `thermodrift status` lists them")
+    with store_errors(settings):
+        folder = mlflow.artifacts.download_artifacts(
+            run_id=training_id, artifact_path=_GRID, tracking_uri=settings.store_uri
+        )
+    try:
+        result = GridResult.load(Path(folder))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"training {training_id}: its tables in {folder} cannot be read ({error})") from None
+    tags = run.data.tags
+    return Training(
+        training_id, _when(run), tags.get("simulated") == "true", result, dict(run.data.params),
+        json.loads(tags.get("promotion", "{}")),
+    )  # fmt: skip
+
+
+def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str, Any]) -> None:
+    """Keep on the training what became of it."""
+    client.set_tag(training_id, "promotion", json.dumps(promotion, ensure_ascii=False))
+
+
+def _experiment(client: MlflowClient, result: GridResult, settings: Settings) -> str:
+    name = settings.experiment(result.machine, result.target)
+    found = client.get_experiment_by_name(name)
+    if found is not None:
+        if found.lifecycle_stage == "deleted":
+            client.restore_experiment(found.experiment_id)
+        if found.tags.get("simulated") != _yes(result.simulated):
+            client.set_experiment_tag(found.experiment_id, "simulated", _yes(result.simulated))
+        return str(found.experiment_id)
+    where = f"{settings.artifacts_uri}/{result.machine}/{result.target}" if settings.artifacts_uri else None
+    tags = {"simulated": _yes(result.simulated), "machine": result.machine, "target": result.target}
+    return str(client.create_experiment(name, artifact_location=where, tags={**tags, "kind": "thermodrift"}))
+
+
+def _log_parent(
+    client: MlflowClient, run_id: str, result: GridResult, rule: PromotionRule, params: dict[str, Any]
+) -> None:
+    now = int(time.time() * 1000)
+    metrics: dict[str, float] = {
+        "n_batches": len(result.batches),
+        "n_cells": len(result.cells),
+        "n_findings": len(result.findings),
+    }
+    tags: list[RunTag] = []
+    if rule.protocol in set(result.cells["protocol"]):
+        best = choose(result.cells, rule)
+        metrics |= {"best_score_um": best.score_um, "best_S_mean_um": best.S_mean_um, "best_S_std_um": best.S_std_um}
+        tags = [RunTag("best", best.name), RunTag("best_cell", best.cell), RunTag("trusted", _yes(best.trusted))]
+    client.log_batch(
+        run_id,
+        metrics=[Metric(k, float(v), now, 0) for k, v in metrics.items() if np.isfinite(v)],
+        params=[Param(k, str(v)) for k, v in list(params.items())[:100]],
+        tags=tags,
+    )
+
+
+def _log_files(client: MlflowClient, run_id: str, result: GridResult, figures: dict[str, bytes]) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        result.save(Path(scratch) / _GRID)
+        if figures:
+            (Path(scratch) / "figures").mkdir()
+        for name, content in figures.items():
+            (Path(scratch) / "figures" / name).write_bytes(content)
+        client.log_artifacts(run_id, scratch)
+
+
+def _dataset_inputs(result: GridResult) -> list[DatasetInput]:
+    out = []
+    for row in result.batches.to_dict("records"):
+        digest, version = str(row["digest"]), row.get("version", 1)
+        source = json.dumps({"source": str(row.get("source", "")), "batch": row["batch_id"], "version": int(version)})
+        dataset = Dataset(
+            name=str(row["batch_id"]), digest=digest[:_DIGEST_LENGTH] or f"v{version}", source_type="thermodrift_lake",
+            source=source, profile=json.dumps({"num_rows": int(row["n_rows"])}),
+        )  # fmt: skip
+        tags = [InputTag("mlflow.data.context", "training"), InputTag("digest", digest or f"v{version}")]
+        out.append(DatasetInput(dataset, tags))
+    return out
+
+
+def _log_cell(
+    client: MlflowClient,
+    experiment_id: str,
+    parent: str,
+    common: dict[str, str],
+    selector: str,
+    family: str,
+    cells: pd.DataFrame,
+    result: GridResult,
+    settings: Settings,
+) -> None:
+    now = int(time.time() * 1000)
+    metrics: list[Metric] = []
+    for row in cells.to_dict("records"):
+        prefix = str(row["protocol"]).replace("-", "_")
+        for name in CELL_METRICS:
+            if np.isfinite(row[name]):
+                metrics.append(Metric(f"{prefix}/{name}", float(row[name]), now, int(row["n_tsp"])))
+    params = {"selector": selector, "family": family}
+    judged = cells[cells["protocol"] == settings.promotion.protocol]
+    judged = judged.assign(score_um=score_um(judged, settings.promotion))
+    judged = judged[np.isfinite(judged["score_um"])]
+    if len(judged):
+        best = judged.loc[judged["score_um"].idxmin()]
+        params |= {"best_n_tsp": str(best["n_tsp"]), "best_inputs": str(best["inputs"])[:6000]}
+        metrics.append(Metric("best_score_um", float(best["score_um"]), now, int(best["n_tsp"])))
+        s = result.scores
+        picked = s[
+            (s["protocol"].to_numpy() == best["protocol"]) & (s["selector"].to_numpy() == selector)
+            & (s["family"].to_numpy() == family) & (s["n_tsp"].to_numpy() == best["n_tsp"])
+        ]  # fmt: skip
+        key = f"{str(best['protocol']).replace('-', '_')}/fold_S_um"
+        per_fold = picked.groupby("fold", sort=False)["S_um"].mean()
+        metrics += [Metric(key, float(v), now, i) for i, v in enumerate(per_fold) if np.isfinite(v)]
+    tags = {**common, "kind": "cell", "mlflow.parentRunId": parent, "selector": selector, "family": family}
+    run_id = client.create_run(experiment_id, tags=tags, run_name=f"{selector} × {family}").info.run_id
+    for first in range(0, len(metrics) or 1, _METRICS_AT_ONCE):
+        chunk = metrics[first : first + _METRICS_AT_ONCE]
+        client.log_batch(run_id, metrics=chunk, params=[Param(k, v) for k, v in params.items()] if not first else [])
+    client.set_terminated(run_id)
+
+
+def _training_row(run: Run) -> dict[str, Any]:
+    tags = run.data.tags
+    promotion = json.loads(tags.get("promotion", "{}"))
+    version = f"{promotion['name']} version {promotion['version']}" if promotion else ""
+    return {
+        "training_id": run.info.run_id,
+        "machine": tags["machine"],
+        "target": tags["target"],
+        "started": _when(run),
+        "n_batches": int(run.data.metrics.get("n_batches", 0)),
+        "best": tags.get("best", ""),
+        "score_um": run.data.metrics.get("best_score_um", float("nan")),
+        "simulated": tags.get("simulated") == "true",
+        "promotion": promotion.get("outcome", ""),
+        "model": version,
+    }
+
+
+def _when(run: Run) -> pd.Timestamp:
+    return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
+
+
+def _yes(value: bool) -> str:
+    return "true" if value else "false"

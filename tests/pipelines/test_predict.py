@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
+
+from data.errors import InputError
+from data.machine import parse_machine
+from models import FAMILIES
+from models.base import Family
+from pipelines import model_store, registry, tracking
+from pipelines.predict import load_model, predict_file
+from pipelines.promotion import choose
+
+
+@pytest.fixture(scope="module")
+def promoted(store):
+    batches = toy_batches("toy-predict", 6)
+    result = toy_result(batches, {"none|mlr|2": [1.0] * 6})
+    model, region = toy_model(batches)
+    training_id = tracking.log_training(result, store)
+    choice = choose(result.cells, store.promotion)
+    return registry.promote(result, choice, model, machine_yaml("toy-predict"), training_id, store, region), training_id
+
+
+@pytest.fixture
+def stored(tmp_path) -> Path:
+    batches = toy_batches("toy-folder", 4)
+    model, region = toy_model(batches)
+    model_store.save(tmp_path / "model", model, machine_yaml("toy-folder"), region, {"simulated": True})
+    return tmp_path / "model"
+
+
+def law_um(table: pd.DataFrame) -> np.ndarray:
+    front, bed = (table[c] - table[c].iloc[0] for c in ("front", "bed"))
+    return (GAIN_UM_PER_K[0] * front + GAIN_UM_PER_K[1] * bed).to_numpy()
+
+
+@pytest.mark.parametrize("uri", ["models:/{name}@champion", "models:/{name}/1", "models:/{name}", "runs:/{run}/model"])
+def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monkeypatch, uri):
+    promotion, training_id = promoted
+    monkeypatch.chdir(tmp_path)
+    table = toy_batches("toy-predict", 3)[2].table
+    Path("run7.csv").write_text(table.drop(columns="z").to_csv(index=False))
+    if uri.startswith("runs:"):
+        uri = f"runs:/{training_id}/model"
+    got = predict_file(uri.format(name=promotion.name, run=training_id), Path("run7.csv"), store)
+    assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "simulated"]
+    assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
+    assert not got["outside_region"].any()
+    assert got["simulated"].all()
+
+
+def test_a_file_without_an_input_is_told_in_one_line(stored, store, tmp_path):
+    table = toy_batches("toy-folder", 1)[0].table
+    (tmp_path / "run.csv").write_text(table.drop(columns="bed").to_csv(index=False))
+    with pytest.raises(InputError) as caught:
+        predict_file(str(stored), tmp_path / "run.csv", store)
+    assert "bed" in str(caught.value)
+    assert "run.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_batch_without_an_input_is_told(stored):
+    model = model_store.load(stored)
+    table = toy_batches("toy-folder", 1)[0].table.drop(columns="bed")
+    with pytest.raises(InputError, match=r"needs 'bed' \(column 'bed'\).*it has front, speed; give a recording"):
+        model.predict(model_store.frame_to_batch(model, table))
+    table["bed"] = np.nan
+    with pytest.raises(InputError, match="needs 'bed'"):
+        model.predict(model_store.frame_to_batch(model, table))
+
+
+def test_rows_beyond_the_training_are_marked_with_what(stored):
+    model = model_store.load(stored)
+    batch = toy_batches("toy-folder", 1)[0]
+    table = batch.table.copy()
+    table.loc[40:, "front"] += 30.0
+    table.loc[50:, "speed"] = 9000.0
+    outside = model.outside(model_store.frame_to_batch(model, table))
+    assert outside[:40] == [""] * 40
+    assert outside[45] == "front"
+    assert outside[55] == "front, speed"
+    cold = batch.table.assign(front=batch.table["front"] - 15)
+    assert set(model.outside(model_store.frame_to_batch(model, cold))) == {"front@start"}
+
+
+def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
+    assert {p.name for p in stored.iterdir()} == set(model_store.FILES)
+    document = json.loads((stored / "model.json").read_text())
+    assert document["schema"] == "thermodrift.model/1"
+    assert document["region"]["speed"] == [4000.0, 4000.0]
+    batch = toy_batches("toy-folder", 4)[1]
+    before, _ = toy_model(toy_batches("toy-folder", 4))
+    assert np.array_equal(model_store.load(stored).predict(batch), before.predict(batch))
+
+
+def test_every_kind_of_plain_data_comes_back(tmp_path, monkeypatch):
+    class Odd(Family):
+        key = "odd"
+        words = source = "test"
+
+        def fit_design(self, design, train):
+            return self._learned(design, {})
+
+        def predict_design(self, design, batches):
+            return [design.x[design.rows(k)].sum(axis=1) for k in batches]
+
+    odd = Odd()
+    odd.inputs, odd.target = ("front@lag30min",), "z"
+    odd.fitted = {
+        "w": np.arange(6.0).reshape(2, 3), "n": np.int64(3), "f": float("inf"), "words": "ä µm", "flag": True,
+        "list": [1, 2.5, "x", np.array([1, 2])], "nested": {"deep": np.array([[True]])}, "none": None,
+    }  # fmt: skip
+    monkeypatch.setitem(FAMILIES._members, "odd", "here:Odd")
+    monkeypatch.setattr("data.registry.import_module", lambda _: type("here", (), {"Odd": Odd}))
+    model_store.save(tmp_path, odd, machine_yaml("m"), {})
+    got = model_store.load(tmp_path).family.fitted
+    assert np.array_equal(got["w"], odd.fitted["w"])
+    assert got["nested"]["deep"].dtype == bool
+    assert got["list"][:3] == [1, 2.5, "x"]
+    assert (got["n"], got["f"], got["words"], got["flag"], got["none"]) == (3, float("inf"), "ä µm", True, None)
+    odd.fitted = {"bad": object()}
+    with pytest.raises(TypeError, match="object is not plain data"):
+        model_store.save(tmp_path, odd, machine_yaml("m"), {})
+
+
+def test_a_damaged_or_foreign_folder_is_told(stored, store, tmp_path):
+    with pytest.raises(InputError, match="not a stored model"):
+        load_model(str(tmp_path), store)
+    with pytest.raises(InputError, match=r"no such folder; expected models:/NAME@champion"):
+        load_model(str(tmp_path / "nowhere"), store)
+    text = (stored / "model.json").read_text()
+    (stored / "model.json").write_text(text.replace("thermodrift.model/1", "thermodrift.model/9"))
+    with pytest.raises(InputError, match=r"got schema 'thermodrift.model/9', expected 'thermodrift.model/1'"):
+        load_model(str(stored), store)
+    (stored / "model.json").write_text(text)
+    np.savez(stored / "arrays.npz", a0=np.array([object()], dtype=object))
+    with pytest.raises(InputError, match="not a stored model"):  # a pickled array is refused, never loaded
+        load_model(str(stored), store)
+
+
+@pytest.mark.parametrize(
+    ("uri", "words"),
+    [
+        ("models:/toy-predcit-z@champion", "unknown model 'toy-predcit-z'; did you mean 'toy-predict-z'?"),
+        ("models:/toy-predict-z@champoin", "has no alias 'champoin'; did you mean 'champion'?"),
+        ("models:/toy-predict-z/7", "has no version '7'; Allowed: 1, champion"),
+        ("models:/", "expected models:/NAME@alias"),
+        ("runs:/0123/model", "no run '0123' in sqlite"),
+    ],
+)
+def test_unknown_models_are_told_with_the_closest(promoted, store, uri, words):
+    with pytest.raises(InputError) as caught:
+        load_model(uri, store)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_table_of_several_batches_starts_each_at_zero(stored):
+    model = model_store.load(stored)
+    parts = [b.table.assign(batch_id=b.batch_id) for b in toy_batches("toy-folder", 2)]
+    table = pd.concat(parts[::-1], ignore_index=True)
+    got = model_store.predict_frame(model, table)
+    assert np.allclose(got["predicted_um"], np.concatenate([law_um(p) for p in parts[::-1]]), atol=1e-6)
+    table["time_s"] **= 2
+    with pytest.raises(InputError, match="table of b01: 'time_s' is not a regular grid"):
+        model_store.predict_frame(model, table)
+    with pytest.raises(InputError, match="no column 'time_s'"):
+        model_store.predict_frame(model, table.drop(columns="time_s"))
+
+
+def test_needed_channels_follow_from_the_features(stored):
+    model = model_store.load(stored)
+    with_room = machine_yaml("m") + "  room: {role: ambient, unit: degC}\n"
+    model.family.inputs = ("front@lag30min", "bed@ambient", "front")
+    other = model_store.StoredModel(model.family, parse_machine(with_room, "test"), {})
+    assert other.channels() == ("front", "bed", "room")

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import mlflow
+import numpy as np
+import pytest
+from mlflow.tracking import MlflowClient
+from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
+
+from data.errors import InputError
+from pipelines import registry, tracking
+from pipelines.promotion import Choice, choose
+
+
+def train(store, machine: str, S_um: list[float], *, batches_given: bool = False, yaml: str = "", force: bool = False):
+    """Log and promote a training over len(S_um) batches."""
+    batches = toy_batches(machine, len(S_um))
+    result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
+    training_id = tracking.log_training(result, store)
+    model, region = toy_model(batches)
+    choice = choose(result.cells, store.promotion)
+    return registry.promote(
+        result, choice, model, yaml or machine_yaml(machine), training_id, store, region,
+        batches if batches_given else (), force=force,
+    )  # fmt: skip
+
+
+def aliases(store, name: str) -> dict[str, int]:
+    return {a: int(v) for a, v in MlflowClient(store.store_uri).get_registered_model(name).aliases.items()}
+
+
+@pytest.fixture(scope="module")
+def story(store):
+    """First model, a better one, a worse one."""
+    worse = [5.0, 6.0, 5.5, 6.5, 5.0, 6.0]
+    better = [*(s - 1 for s in worse), 5.0]
+    return [train(store, "toy-story", s) for s in (worse, better, [9.0] * 8)]
+
+
+def test_the_first_becomes_champion(story):
+    assert (story[0].outcome, story[0].version, story[0].name) == ("champion", 1, "toy-story-z")
+    assert "first model of this machine and channel" in story[0].words
+
+
+def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
+    assert (story[1].outcome, story[1].version) == ("champion", 2)
+    assert story[1].comparison is not None
+    assert story[1].comparison.n_batches == 6  # the seventh is new, and the champion was never tried on it
+    client = MlflowClient(store.store_uri)
+    assert client.get_model_version("toy-story-z", "2").tags["replaces"] == "1"
+    assert client.get_model_version("toy-story-z", "1").tags["was_champion_until"]
+
+
+def test_a_worse_one_is_challenger_with_the_reason(story, store):
+    assert (story[2].outcome, story[2].version, story[2].champion_version) == ("challenger", 3, 2)
+    assert "not shown to be better, the champion stays" in story[2].words
+    tags = MlflowClient(store.store_uri).get_model_version("toy-story-z", "3").tags
+    assert "not shown to be better" in tags["reason"]
+    assert tags["simulated"] == "true"
+    assert aliases(store, "toy-story-z") == {"champion": 2, "challenger": 3}
+
+
+def test_what_became_of_it_is_kept_with_the_training(story, store):
+    table = tracking.trainings("toy-story", "z", store)
+    assert table["promotion"].tolist() == ["challenger", "champion", "champion"]
+    kept = tracking.load_training(table["training_id"][0], store).promotion
+    assert kept["comparison"]["n_batches"] == 7
+    assert kept["words"] == story[2].words
+
+
+def test_status_lists_every_version(story, store):
+    table = registry.status(store)
+    table = table[table["name"] == "toy-story-z"]
+    assert table["version"].tolist() == [3, 2, 1]
+    assert table["aliases"].tolist() == ["challenger", "champion", ""]
+    assert table["n_batches"].tolist() == [8, 7, 6]
+    assert table["simulated"].all()
+
+
+def test_the_same_again_changes_nothing(store):
+    first = train(store, "toy-same", [5.0] * 6)
+    again = train(store, "toy-same", [5.0] * 6)
+    assert (again.outcome, again.version) == ("unchanged", first.version)
+    assert "nothing new registered" in again.words
+    commented = train(store, "toy-same", [5.0] * 6, yaml=machine_yaml("toy-same") + "# a remark\n")
+    assert commented.outcome == "unchanged"
+    other = train(store, "toy-same", [5.0] * 6, yaml=machine_yaml("toy-same") + "description: other\n")
+    assert (other.outcome, other.version) == ("challenger", 2)
+
+
+def test_too_few_batches_in_common_keep_the_champion(store):
+    train(store, "toy-few", [5.0] * 4)
+    got = train(store, "toy-few", [1.0] * 9)
+    assert got.outcome == "challenger"
+    assert "4 batches in common, need at least 5: the champion stays" in got.words
+
+
+def test_the_champions_own_prediction_counts_on_batches_new_to_it(store):
+    train(store, "toy-unseen", [5.0] * 4)
+    got = train(store, "toy-unseen", [1.0] * 9, batches_given=True)
+    assert got.comparison is not None
+    assert got.comparison.n_batches == 9
+    # The toy law is exact, so the champion's S on its five new batches is 0.
+    assert got.comparison.old_S_mean_um == pytest.approx(4 * 5 / 9, abs=1e-6)
+    assert "(5 of them new to the champion)" in got.words
+
+
+def test_by_force(store):
+    train(store, "toy-force", [5.0] * 6)
+    beaten = train(store, "toy-force", [9.0] * 7)
+    assert beaten.outcome == "challenger"
+    forced = train(store, "toy-force", [9.0] * 7, force=True)
+    assert (forced.version, forced.champion_version) == (2, 2)
+    assert aliases(store, "toy-force-z") == {"champion": 2}
+    assert registry.rollback("toy-force-z", store).version == 1
+
+
+def test_roll_back_goes_to_the_version_before_and_no_further(store):
+    train(store, "toy-back", [5.0, 6.0, 5.0, 6.0, 5.0, 6.0])
+    train(store, "toy-back", [4.0, 5.0, 4.0, 5.0, 4.0, 5.0, 4.0])
+    back = registry.rollback("toy-back-z", store)
+    assert back.version == 1
+    assert aliases(store, "toy-back-z")["champion"] == 1
+    client = MlflowClient(store.store_uri)
+    assert client.get_model_version("toy-back-z", "2").tags["rolled_back"] == "true"
+    assert "was_champion_until" not in client.get_model_version("toy-back-z", "1").tags
+    with pytest.raises(InputError, match="champion version 1 replaced none; nothing to go back to"):
+        registry.rollback("toy-back-z", store)
+    with pytest.raises(InputError, match="unknown model 'toy-bakc-z'; did you mean 'toy-back-z'"):
+        registry.rollback("toy-bakc-z", store)
+
+
+def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story, store):
+    """Held against the law that the toy batches follow."""
+    folder = mlflow.artifacts.download_artifacts(
+        artifact_uri=MlflowClient(store.store_uri).get_model_version("toy-story-z", "2").source,
+        tracking_uri=store.store_uri,
+    )
+    names = {p.name for p in Path(folder).rglob("*") if p.is_file()}
+    assert {"model.json", "arrays.npz", "machine.yml", "pyfunc_model.py", "requirements.txt"} <= names
+    assert not [n for n in names if n.endswith((".pkl", ".pickle", ".joblib"))]
+    mlflow.set_tracking_uri(store.store_uri)
+    loaded = mlflow.pyfunc.load_model("models:/toy-story-z@champion")
+    table = toy_batches("toy-story", 7)[3].table
+    got = loaded.predict(table[["time_s", "front", "bed"]])
+    front, bed = (table[c] - table[c].iloc[0] for c in ("front", "bed"))
+    assert np.allclose(got["predicted_um"], GAIN_UM_PER_K[0] * front + GAIN_UM_PER_K[1] * bed, atol=1e-6)
+    assert not got["outside_region"].any()
+    assert loaded.metadata.signature.inputs.input_names() == ["time_s", "front", "bed", "speed", "batch_id"]
+
+
+def test_a_choice_that_is_not_to_be_trusted_says_so(store):
+    batches = toy_batches("toy-zero", 6)
+    result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})
+    choice: Choice = choose(result.cells, store.promotion)
+    from models.zero import Zero
+
+    got = registry.promote(
+        result, choice, Zero().fit(batches, (), "z"), machine_yaml("toy-zero"),
+        tracking.log_training(result, store), store, {},
+    )  # fmt: skip
+    assert not got.trusted
+    assert "nothing beats zero (best other: 9.00 µm): do not trust" in got.words

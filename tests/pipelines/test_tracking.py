@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import mlflow
+import numpy as np
+import pandas as pd
+import pytest
+from mlflow.tracking import MlflowClient
+from toy_training import toy_batches, toy_result
+
+from data.errors import InputError, WorkError
+from pipelines import tracking
+from pipelines.settings import NamesPart, PromotionRule, Settings
+
+S_UM = {
+    "none|zero|0": [9.0, 8.0, 10.0],
+    "none|mlr|2": [1.0, 2.0, 1.5],
+    "correlation|mlr|1": [5.0, 5.0, 5.0],
+    "correlation|mlr|2": [1.0, 4.0, 1.5],
+}
+
+
+@pytest.fixture(scope="module")
+def logged(store) -> tuple[Settings, str, object]:
+    result = toy_result(toy_batches("toy-tracked", 3), S_UM)
+    figures = {"heat.png": b"\x89PNG not really"}
+    return store, tracking.log_training(result, store, figures=figures, params={"seed": 0}), result
+
+
+def children(settings: Settings, training_id: str) -> dict[str, object]:
+    client = MlflowClient(settings.store_uri)
+    experiment = client.get_run(training_id).info.experiment_id
+    found = client.search_runs([experiment], f"tags.mlflow.parentRunId = '{training_id}'")
+    return {r.info.run_name: r for r in found}
+
+
+def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
+    settings, training_id, _ = logged
+    runs = children(settings, training_id)
+    assert set(runs) == {"none × zero", "none × mlr", "correlation × mlr"}
+    run = runs["correlation × mlr"]
+    assert run.data.params["best_n_tsp"] == "2"
+    assert run.info.status == "FINISHED"
+    client = MlflowClient(settings.store_uri)
+    history = client.get_metric_history(run.info.run_id, "leave_batch_out/S_mean_um")
+    assert {m.step: m.value for m in history} == {1: 5.0, 2: pytest.approx(6.5 / 3)}
+    folds = client.get_metric_history(run.info.run_id, "leave_batch_out/fold_S_um")
+    assert {m.step: m.value for m in folds} == {0: 1.0, 1: 4.0, 2: 1.5}
+    assert {"leave_batch_out/" + m for m in tracking.CELL_METRICS} <= set(run.data.metrics)
+
+
+def test_the_parent_carries_batches_figures_and_the_best(logged):
+    settings, training_id, result = logged
+    run = MlflowClient(settings.store_uri).get_run(training_id)
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["best"] == "mlr on 2 points by none"
+    inputs = {i.dataset.name: i for i in run.inputs.dataset_inputs}
+    assert list(inputs) == ["b00", "b01", "b02"]
+    tags = {t.key: t.value for t in inputs["b01"].tags}
+    assert tags["digest"] == result.batches["digest"][1]
+    folder = mlflow.artifacts.download_artifacts(run_id=training_id, tracking_uri=settings.store_uri)
+    assert (Path(folder) / "figures" / "heat.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_simulated_is_written_on_experiment_and_every_run(logged):
+    settings, training_id, _ = logged
+    client = MlflowClient(settings.store_uri)
+    run = client.get_run(training_id)
+    experiment = client.get_experiment(run.info.experiment_id)
+    assert experiment.name == "toy-tracked/z"
+    assert experiment.tags["simulated"] == "true"
+    assert all(r.data.tags["simulated"] == "true" for r in [run, *children(settings, training_id).values()])
+
+
+def test_a_training_comes_back_whole(logged):
+    settings, training_id, result = logged
+    got = tracking.load_training(training_id, settings)
+    assert got.simulated
+    assert got.promotion == {}
+    assert got.params == {"seed": "0"}
+    for table in ("batches", "scores", "cells", "subsets", "predictions"):
+        pd.testing.assert_frame_equal(getattr(got.result, table), getattr(result, table), check_dtype=False)
+
+
+def test_trainings_are_listed_newest_first(logged):
+    settings, training_id, _ = logged
+    later = tracking.log_training(toy_result(toy_batches("toy-tracked", 3), S_UM), settings)
+    table = tracking.trainings("toy-tracked", "z", settings)
+    assert table["training_id"].tolist() == [later, training_id]
+    assert table["n_batches"].tolist() == [3, 3]
+    assert table["score_um"][0] == pytest.approx(1.5 + np.std([1, 2, 1.5], ddof=1))
+    assert tracking.trainings("nobody", None, settings).empty
+
+
+def test_an_unfinished_training_is_not_listed(store, monkeypatch):
+    def broken(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(tracking, "_log_files", broken)
+    with pytest.raises(OSError, match="disk full"):
+        tracking.log_training(toy_result(toy_batches("toy-broken", 3), S_UM), store)
+    assert tracking.trainings("toy-broken", None, store).empty
+
+
+def test_an_unknown_training_is_told(logged):
+    settings, training_id, _ = logged
+    with pytest.raises(InputError, match="training 'nonsense' is not in"):
+        tracking.load_training("nonsense", settings)
+    child = next(iter(children(settings, training_id).values()))
+    with pytest.raises(InputError, match="is not in"):  # a model's run is no training
+        tracking.load_training(child.info.run_id, settings)
+
+
+def test_the_first_use_is_said_and_a_broken_store_is_told(tmp_path, monkeypatch):
+    said: list[str] = []
+    file = tmp_path / "mlflow.db"
+    file.write_bytes(b"no database at all, but long enough to be looked at as one" * 40)
+    settings = Settings(tmp_path, f"sqlite:///{file}", None, NamesPart(), PromotionRule())
+    monkeypatch.setattr(tracking, "MlflowClient", lambda *_, **__: FakeClient())
+    tracking.open_store(settings, said.append)
+    assert said == []
+    file.unlink()
+    tracking.open_store(settings, said.append)
+    assert said == [f"first use: making the tracking store {file} (takes some seconds, once)"]
+    monkeypatch.setattr(FakeClient, "trouble", "no such table: experiments\n(Background …)")
+    with pytest.raises(WorkError) as caught:
+        tracking.open_store(settings)
+    assert str(caught.value) == f"tracking store sqlite:///{file}: no such table: experiments"
+    monkeypatch.setattr(FakeClient, "trouble", "Detected out-of-date database schema (found version 1)")
+    with pytest.raises(WorkError, match=r"of an older MLflow; .* mlflow db upgrade sqlite"):
+        tracking.open_store(settings)
+
+
+class FakeClient:
+    trouble = ""
+
+    def search_experiments(self, **_: object) -> list[object]:
+        if self.trouble:
+            raise mlflow.exceptions.MlflowException(self.trouble)
+        return []
