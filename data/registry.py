@@ -29,6 +29,9 @@ class Registry(Mapping[str, Any]):
         module, name = self._members[key].split(":")
         return getattr(import_module(module), name)
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._members  # Mapping's own waits for a KeyError
+
     def add(self, key: str, where: str) -> None:
         """Add a member at run time, for trying one out: `where` is ``"module:Class"``."""
         self._members[key] = where
