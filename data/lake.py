@@ -42,13 +42,14 @@ Status = Literal["new", "unchanged", "refreshed", "new_version"]
 
 @dataclass(frozen=True)
 class Stored:
-    """What `put` did with a batch."""
+    """What `put` did with a batch; `replaces` is the source of the version before a new one."""
 
     status: Status
     version: int
     digest: str
     machine: str
     batch_id: str
+    replaces: str = ""
 
 
 @dataclass(frozen=True)
@@ -287,6 +288,7 @@ def _enter(manifest: dict[str, Any], s: Staged) -> Stored:
     entries = manifest["machines"].setdefault(s.machine, {}).setdefault(s.batch_id, [])
     now = datetime.now(UTC).isoformat(timespec="seconds")
     status: Status = "new_version" if entries else "new"
+    replaces = ""
     if entries and entries[-1]["digest"] == s.digest:
         last = entries[-1]
         status = "unchanged" if last["file"] == s.file else "refreshed"
@@ -295,7 +297,7 @@ def _enter(manifest: dict[str, Any], s: Staged) -> Stored:
             last["file"] = s.file
     else:
         for entry in entries:
-            entry["current"] = False
+            entry["current"], replaces = False, entry["source"]
         entries.append(
             {
                 "version": len(entries) + 1,
@@ -310,7 +312,7 @@ def _enter(manifest: dict[str, Any], s: Staged) -> Stored:
                 "earlier": [],
             }
         )
-    return Stored(status, entries[-1]["version"], s.digest, s.machine, s.batch_id)
+    return Stored(status, entries[-1]["version"], s.digest, s.machine, s.batch_id, replaces)
 
 
 def _same(current: Path, version: Path) -> bool:

@@ -1,0 +1,218 @@
+"""Ingest with readers and checks replaced by plain ones, then once through the real door."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import data.ingest
+from data.batch import Batch, Channel, Finding
+from data.errors import InputError, WorkError
+from data.ingest import COLUMNS, IngestReport, ingest
+from data.lake import Lake
+from data.machine import Machine, parse_machine
+
+MACHINE = parse_machine(
+    """
+machine: vmc
+recording: {files: ["*.csv"], time: {column: t, unit: s}, step_s: 60, max_gap_s: 300}
+channels:
+  T1: {role: temperature, unit: degC, resolution: 0.1, range: [-10, 90]}
+  z_um: {role: error, unit: um, resolution: 0.1, range: [-500, 500]}
+""",
+    "test",
+)
+
+
+def fake_batches(path: Path, machine: Machine) -> Iterator[Batch]:
+    """Reads `id,value,rows,dropped` lines, one batch each; `!` is an unusable line, `?` an unforeseen failure."""
+    for line in path.read_text().splitlines()[1:]:
+        if line == "!":
+            raise InputError(f"{path}: row 7: not a number")
+        if line == "?":
+            raise ValueError("first\nsecond")
+        name, value, rows, dropped = line.split(",")
+        table = pd.DataFrame({"time_s": np.arange(3) * 60.0, "T1": float(value)})
+        channels = {"T1": Channel("T1", "temperature", "degC")}
+        repairs = {"rows_in": int(rows), "rows_dropped": int(dropped)}
+        yield Batch(machine.machine, name, table, channels, source=str(path), repairs=repairs)
+
+
+@pytest.fixture
+def lake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lake:
+    monkeypatch.setattr(data.ingest, "read_batches", fake_batches)
+    monkeypatch.setattr(data.ingest, "check_batch", lambda b, m: (Finding("spike", "T1", "one"),))
+    return Lake(tmp_path / "lake")
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(["header", *lines, ""]))
+    return path
+
+
+def balanced(report: IngestReport) -> None:
+    frame = report.as_frame()
+    assert tuple(frame.columns) == COLUMNS
+    assert report.rows_in == report.rows_stored + report.rows_dropped
+    assert report.rows_in == frame["rows_in"].sum() and report.rows_stored == frame["rows_stored"].sum()
+    for row in report.rows:
+        assert row.rows_in is None or row.rows_in == row.rows_stored + (row.rows_dropped or 0)
+
+
+def test_files_go_in_once_with_findings_and_row_counts(tmp_path: Path, lake: Lake) -> None:
+    files = [write(tmp_path / "a.csv", "a1,1.0,100,5", "a2,2.0,50,0"), write(tmp_path / "b.csv", "b,3.0,20,20")]
+    said: list[str] = []
+    report = ingest(files, MACHINE, lake, said.append)
+    balanced(report)
+    assert said == ["1/2 a.csv", "2/2 b.csv"]
+    assert [(r.batch_id, r.status, r.version, r.findings) for r in report.rows] == [
+        ("a1", "new", 1, 1),
+        ("a2", "new", 1, 1),
+        ("b", "new", 1, 1),
+    ]
+    assert (report.rows_in, report.rows_stored, report.rows_dropped) == (170, 145, 25)
+    assert lake.load("vmc", "a1").findings == (Finding("spike", "T1", "one"),)
+    again = ingest(files, MACHINE, lake)
+    assert {r.status for r in again.rows} == {"unchanged"}
+    write(tmp_path / "b.csv", "b,3.5,20,1")
+    changed = ingest(files, MACHINE, lake)
+    assert [(r.status, r.version, r.reason) for r in changed.rows][2] == ("new_version", 2, "")
+
+
+def test_findings_of_the_reader_stay_before_those_of_the_checks(
+    tmp_path: Path, lake: Lake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = Finding("clock", None, "set back once", masks=False)
+    monkeypatch.setattr(data.ingest, "read_batches", lambda p, m: (b.with_findings((own,)) for b in fake_batches(p, m)))
+    ingest([write(tmp_path / "a.csv", "a,1,3,0")], MACHINE, lake)
+    assert [f.check for f in lake.load("vmc", "a").findings] == ["clock", "spike"]
+
+
+def test_a_directory_of_mixed_files(tmp_path: Path, lake: Lake) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    good = write(folder / "good.csv", "good,1,3,0")
+    write(folder / "bad.csv", "!", "never,1,3,0")
+    notes = write(folder / "notes.md", "words")
+    report = ingest([folder, good, folder], MACHINE, lake)
+    balanced(report)
+    assert [(Path(r.file).name, r.status) for r in report.rows] == [("bad.csv", "quarantined"), ("good.csv", "new")]
+    assert report.ignored == [notes]
+    (entry,) = lake.quarantined("vmc")
+    assert entry.reason == f"{folder / 'bad.csv'}: row 7: not a number" == report.quarantined[0].reason
+    assert entry.copy is not None and entry.copy.read_bytes() == (folder / "bad.csv").read_bytes()
+    assert (report.rows_in, report.rows_stored, report.rows_dropped) == (5, 3, 2)
+
+
+def test_a_file_that_breaks_half_way_keeps_its_first_batches(tmp_path: Path, lake: Lake) -> None:
+    file = write(tmp_path / "a.csv", "a1,1,2,1", "?")
+    write(tmp_path / "b.csv", "b,2,3,0")
+    report = ingest([file, tmp_path / "b.csv"], MACHINE, lake)
+    balanced(report)
+    assert [(r.batch_id, r.status) for r in report.rows] == [("a1", "new"), ("", "quarantined"), ("b", "new")]
+    (entry,) = lake.quarantined("vmc")
+    assert entry.reason == (
+        f"{file}: cannot be used (ValueError: first second); expected a recording as the machine file of vmc "
+        "describes it; export it again"
+    )
+
+
+def test_two_files_with_one_id_are_a_conflict_and_neither_is_lost(tmp_path: Path, lake: Lake) -> None:
+    one, two = write(tmp_path / "one.csv", "run,1,3,0"), write(tmp_path / "two.csv", "run,2,4,0", "more,2,4,0")
+    for status in ("new", "unchanged"):  # the same again is the same again
+        report = ingest([one, two], MACHINE, lake)
+        balanced(report)
+        assert [(r.batch_id, r.status) for r in report.rows] == [
+            ("run", status),
+            ("run", "conflict"),
+            ("more", status),
+        ]
+        assert (report.rows_stored, report.rows_dropped) == (7, 4)
+        (entry,) = lake.quarantined("vmc")
+        assert entry.name == "two.csv"
+        assert entry.reason == report.quarantined[0].reason
+        assert entry.reason == (
+            f"{two}: batch 'run' has other content than the batch of that id in {one}; the first one is stored, "
+            "this one is left out; give one of them another name and ingest it again"
+        )
+    assert lake.load("vmc", "run").values("T1")[0] == 1.0
+    assert len(lake.versions("vmc", "run")) == 1
+
+
+def test_two_files_with_one_id_and_one_content_are_no_conflict(tmp_path: Path, lake: Lake) -> None:
+    report = ingest([write(tmp_path / f"{n}.csv", "run,1,3,0") for n in "ab"], MACHINE, lake)
+    assert [r.status for r in report.rows] == ["new", "unchanged"] and not lake.quarantined("vmc")
+
+
+def test_another_file_later_is_a_new_version_that_names_the_old_source(tmp_path: Path, lake: Lake) -> None:
+    one, two = write(tmp_path / "one.csv", "run,1,3,0"), write(tmp_path / "two.csv", "run,2,3,0")
+    ingest([one], MACHINE, lake)
+    (row,) = ingest([two], MACHINE, lake).rows
+    assert (row.status, row.version) == ("new_version", 2)
+    assert row.reason == f"follows the version from {one}, which stays in the lake"
+
+
+def test_a_missing_path_stops_before_anything_is_read(tmp_path: Path, lake: Lake) -> None:
+    good = write(tmp_path / "a.csv", "a,1,3,0")
+    with pytest.raises(InputError, match=r"gone\.csv: no such file or directory; nothing was read"):
+        ingest([good, tmp_path / "gone.csv"], MACHINE, lake)
+    assert not lake.root.exists()
+
+
+def test_a_file_without_a_batch_goes_to_quarantine(tmp_path: Path, lake: Lake) -> None:
+    report = ingest([write(tmp_path / "empty.csv")], MACHINE, lake)
+    assert report.quarantined[0].reason.endswith("no batch in it; expected a recording of at least two rows")
+
+
+def test_a_lake_that_cannot_be_written_ends_the_work(tmp_path: Path, lake: Lake) -> None:
+    lake.root.write_text("a file stands where the lake should be")
+    with pytest.raises(WorkError, match=r"lake .*: cannot be written .*; nothing stored was lost"):
+        ingest([write(tmp_path / "a.csv", "a,1,3,0")], MACHINE, lake)
+
+
+def test_a_batch_that_the_lake_refuses_goes_to_quarantine(
+    tmp_path: Path, lake: Lake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(data.ingest, "read_batches", lambda p, m: (replace(b, channels={}) for b in fake_batches(p, m)))
+    report = ingest([write(tmp_path / "a.csv", "a,1,3,0")], MACHINE, lake)
+    assert "column 'T1' is no channel of the batch" in report.quarantined[0].reason
+
+
+def test_through_the_real_readers_and_checks(tmp_path: Path) -> None:
+    """Real CSV in, the same numbers out; every kind of unusable file beside it is named."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    wanted = {}
+    for name in ("run1", "run2"):
+        n = 120
+        t = np.arange(n) * 60.0
+        frame = pd.DataFrame(
+            {
+                "t": t,
+                "T1": np.round(20.0 + 5.0 * (1.0 - np.exp(-t / 3600.0)) + rng.normal(0, 0.05, n), 1),
+                "z_um": np.round(30.0 * (1.0 - np.exp(-t / 3600.0)) + rng.normal(0, 0.3, n), 1),
+            }
+        )
+        wanted[name] = frame
+        frame.to_csv(folder / f"{name}.csv", index=False)
+    (folder / "empty.csv").write_bytes(b"")
+    (folder / "junk.csv").write_bytes(rng.bytes(4096))
+    (folder / "one_row.csv").write_text("t,T1,z_um\n0,20.0,0.0\n")
+    (folder / "others.csv").write_text("time,a,b\n0,1,2\n60,1,2\n120,1,2\n")
+    (folder / "readme.md").write_text("not a recording")
+    lake = Lake(tmp_path / "lake")
+    report = ingest([folder], MACHINE, lake)
+    balanced(report)
+    assert {Path(r.file).name for r in report.quarantined} == {"empty.csv", "junk.csv", "one_row.csv", "others.csv"}
+    assert all("\n" not in r.reason and Path(r.file).name in r.reason for r in report.quarantined)
+    assert len(lake.quarantined("vmc")) == 4 and [p.name for p in report.ignored] == ["readme.md"]
+    assert report.rows_stored == 240
+    for batch in lake.load_all("vmc"):
+        for mine, theirs in (("time_s", "t"), ("T1", "T1"), ("z_um", "z_um")):
+            np.testing.assert_allclose(batch.table[mine], wanted[batch.batch_id][theirs], atol=1e-9)
+    assert {r.status for r in ingest([folder], MACHINE, lake).batches} == {"unchanged"}
+    assert len(lake.quarantined("vmc")) == 4
