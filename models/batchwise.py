@@ -1,0 +1,52 @@
+"""Small helpers of the families that run along a batch: rows padded to one rectangle, steps, words for errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from features.design import Design
+
+Array = NDArray[np.float64]
+
+
+def padded(design: Design, values: Array) -> Array:
+    """Rows (n, …) laid out per batch, (K, longest, …), zeros behind a batch's end."""
+    at_batch, at_row = _places(design)
+    lengths = np.diff(design.offsets)
+    out = np.zeros((design.n_batches, int(lengths.max(initial=0)), *values.shape[1:]))
+    out[at_batch, at_row] = values
+    return out
+
+
+def unpadded(design: Design, values: Array) -> Array:
+    """The inverse of `padded`: (K, longest, …) back to rows (n, …)."""
+    at_batch, at_row = _places(design)
+    return values[at_batch, at_row]
+
+
+def steps_s(design: Design) -> Array:
+    """Sampling step of every batch, s, (K,); NaN for a batch of one row."""
+    out = np.full(design.n_batches, np.nan)
+    for k in range(design.n_batches):
+        time_s = design.time_s[design.rows(k)]
+        if len(time_s) > 1:
+            out[k] = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
+    return out
+
+
+def too_few_rows(key: str, design: Design, train: Sequence[int], got: int, need: int) -> InputError:
+    """The error of a training set with too few usable rows."""
+    names = [design.batch_ids[k] for k in train]
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return InputError(
+        f"family {key}: got {got} usable rows of {design.target or 'the target'} in {shown or 'no batch'}, "
+        f"need at least {need}; give more batches or overrule a check in the machine file"
+    )
+
+
+def _places(design: Design) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return design.group, np.arange(len(design.group)) - design.offsets[design.group]

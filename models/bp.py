@@ -1,0 +1,123 @@
+"""BP net: a p–h–1 tanh network trained by Levenberg–Marquardt, several starts averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from features.design import Design
+from models.base import Array, Family
+from models.batchwise import too_few_rows
+from models.levenberg_marquardt import Nets, train
+
+_STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
+_LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit spread
+
+
+class BP(Family):
+    """Back-propagation net p–`hidden`–1, tanh, linear output; the mean of `starts` nets of seeded starts.
+
+    Inputs and target are standardised by the training rows of the fold. Batches are decimated evenly to at most
+    `max_rows` usable rows each. Every net takes at most `iterations` Levenberg–Marquardt steps with weight `decay`
+    (on standardised data), the same for every fold: a net has no spare batch for early stopping in train-on-one,
+    and the decay bounds what it can say far away: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
+
+    Source: the year-round study's 2–3–1 net; M. Hagan and M. Menhaj, IEEE Trans. Neural Networks 5 (1994).
+    """
+
+    key = "bp"
+    words = "BP neural network, Levenberg–Marquardt"
+    source = "Hagan and Menhaj 1994"
+    closed_form = False
+    rank = 70
+
+    def __init__(
+        self,
+        hidden: int = 3,
+        starts: int = 3,
+        decay: float = 3e-3,
+        iterations: int = 30,
+        max_rows: int = 20,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.hidden, self.starts, self.decay = int(hidden), int(starts), float(decay)
+        self.iterations, self.max_rows, self.seed = int(iterations), int(max_rows), int(seed)
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """All folds' nets trained as stacks of similar row counts.
+
+        Raises:
+            InputError: fewer than 2 usable rows in a fold.
+        """
+        kept = self._decimated(design)
+        rows = [np.concatenate([kept[k] for k in fold]) if len(fold) else np.empty(0, np.int64) for fold in folds]
+        for f, fold in enumerate(folds):
+            if len(rows[f]) < 2:
+                raise too_few_rows(self.key, design, fold, len(rows[f]), 2)
+        out: dict[int, Self] = {}
+        for stack in self._stacks([len(r) for r in rows], len(design.inputs)):
+            out |= dict(zip(stack, self._fit_stack(design, [rows[f] for f in stack]), strict=True))
+        return [out[f] for f in range(len(folds))]
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        return [self._predict(design.x[design.rows(k)]) for k in batches]
+
+    def n_parameters(self) -> int:
+        return int(np.size(self.fitted["nets"]))
+
+    def _predict(self, x: Array) -> Array:
+        f = self.fitted
+        nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden)
+        u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
+        out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None])[0].mean(axis=0)
+        return out
+
+    def _decimated(self, design: Design) -> list[NDArray[np.int64]]:
+        kept = []
+        for k in range(design.n_batches):
+            usable = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
+            if len(usable) > self.max_rows:
+                usable = usable[np.round(np.linspace(0, len(usable) - 1, self.max_rows)).astype(int)]
+            kept.append(usable)
+        return kept
+
+    def _stacks(self, counts: Sequence[int], n_inputs: int) -> list[list[int]]:
+        """Folds in the order of their rows, cut where the rows double or the stack is full."""
+        per_row = self.starts * (self.hidden * (n_inputs + 2) + 1)
+        stacks: list[list[int]] = []
+        for f in sorted(range(len(counts)), key=lambda i: counts[i]):
+            last = stacks[-1] if stacks else []
+            full = (len(last) + 1) * counts[f] * per_row > _STACK_VALUES
+            if not last or full or counts[f] > 2 * counts[last[0]]:
+                stacks.append([])
+            stacks[-1].append(f)
+        return stacks
+
+    def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
+        n, p, starts = max(len(r) for r in rows), len(design.inputs), self.starts
+        x_t, y, known = np.zeros((len(rows), p, n)), np.zeros((len(rows), n)), np.zeros((len(rows), n))
+        scales = []
+        for s, r in enumerate(rows):
+            x, y_um = design.x[r], design.y_um[r]
+            x_mean, x_spread = x.mean(axis=0), np.maximum(x.std(axis=0), _LEAST_SPREAD)
+            y_mean, y_spread = float(y_um.mean()), float(y_um.std()) or 1.0
+            x_t[s, :, : len(r)] = ((x - x_mean) / x_spread).T
+            y[s, : len(r)], known[s, : len(r)] = (y_um - y_mean) / y_spread, 1.0
+            scales.append({"x_mean": x_mean, "x_spread": x_spread, "y_mean": y_mean, "y_spread": y_spread})
+        first = Nets.drawn(starts, p, self.hidden, self.seed)
+        nets = Nets(np.tile(first.parameters, (len(rows), 1)), p, self.hidden)
+        nets, steps = train(nets, np.repeat(x_t, starts, axis=0), np.repeat(y, starts, axis=0),
+                            np.repeat(known, starts, axis=0), self.decay, self.iterations)  # fmt: skip
+        parts = nets.parameters.reshape(len(rows), starts, -1)
+        taken = steps.reshape(len(rows), starts)
+        return [
+            self._learned(design, {"nets": parts[s], **scales[s], "steps": taken[s], "n_rows": len(rows[s])})
+            for s in range(len(rows))
+        ]

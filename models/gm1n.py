@@ -1,0 +1,194 @@
+"""GM(1,N): the grey model, cumulated sequences behind one first-order lag, always run free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from scipy.signal import lfilter
+
+from data.errors import InputError, closest
+from features.design import Design
+from features.rises import hold_last
+from models.base import Array, Family, Plain
+from models.batchwise import padded, steps_s, too_few_rows, unpadded
+
+RESPONSES = ("difference", "whitening")
+_A_HIGHEST = 2.0  # beyond it the recursion's pole (1 − a/2)/(1 + a/2) is negative: the prediction would zigzag
+_RCOND = 1e-4  # sums of sensors of 0.1 K: directions weaker than this are rounding, and wreck other batches
+
+
+class GM1N(Family):
+    """Grey model GM(1,N) of the error x1 and N − 1 inputs; (a, b) by least squares over all training batches.
+
+    `x1⁰(k) + a z(k) = Σ b_i x_i¹(k)`, `z(k) = (x1¹(k) + x1¹(k−1))/2`, `¹` the cumulated sum (1-AGO), begun anew in
+    every batch. A free run knows no measured error, so it starts from x1⁰(1) = 0: the errors are zeroed at the
+    batch's first sample. Responses:
+
+    - `difference`: `x̂1⁰(k) = (Σ b_i x_i¹(k) − a x̂1¹(k−1))/(1 + a/2)`, the fitted equation solved row by row;
+    - `whitening`: `x̂1¹(k+1) = s(k+1)/a · (1 − exp(−a k))`, `s = Σ b_i x_i¹`, differenced. It is the published
+      one, exact only for inputs whose cumulated sum stays constant.
+
+    a is kept in [step/`slowest_h`, 2]: below, the response has no end in sight (a near 0 divides, a < 0 explodes);
+    above, it zigzags. Where least squares leaves that range, a is set to the bound, b is fitted anew, and `fitted`
+    says so in `bound`. Directions of the scaled sums below 1e-4 of the strongest are dropped. Training uses usable
+    rows; the sums bridge holes by the last input and by a straight line in the error. Predictions bridge missing
+    inputs by the last one, and are NaN where a batch lacks one wholly.
+
+    Source: J. Deng, Introduction to grey system theory, J. Grey System 1 (1989); with the recursive response,
+    because the whitening response's premise of constant inputs never holds for rising temperatures.
+    """
+
+    key = "gm1n"
+    words = "grey model GM(1,N), free-running"
+    source = "Deng 1989"
+    rowwise = False
+    rank = 30
+
+    def __init__(self, response: str = "difference", slowest_h: float = 24.0) -> None:
+        super().__init__()
+        if response not in RESPONSES:
+            raise InputError(f"family gm1n: unknown response {response!r}: {closest(response, RESPONSES)}")
+        self.response = response
+        self.slowest_h = float(slowest_h)
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """Every fold from the batches' triangular factors: each batch is read once, whatever the number of folds.
+
+        Raises:
+            InputError: too few usable rows, or training batches of different steps.
+        """
+        columns = len(design.inputs) + 2
+        factors, counts = np.zeros((design.n_batches, columns, columns)), np.zeros(design.n_batches, int)
+        for k in sorted({k for fold in folds for k in fold}):
+            rows = _equations(design, k)
+            counts[k] = len(rows)
+            r = np.linalg.qr(rows, mode="r")
+            factors[k, : len(r)] = r
+        member = np.zeros((len(folds), design.n_batches))
+        for f, fold in enumerate(folds):
+            member[f, list(fold)] = 1.0
+        if len(folds) == 1:  # a single fold needs its own batches only
+            factors, member_used = factors[list(folds[0])], np.ones((1, len(folds[0])))
+        else:
+            member_used = member
+        stacked = (member_used[:, :, None, None] * factors).reshape(len(folds), -1, columns)
+        triangles = np.linalg.qr(stacked, mode="r")
+        steps = steps_s(design)
+        out = []
+        for f, fold in enumerate(folds):
+            step_s = _common_step(design, fold, steps)
+            got = int(counts[list(fold)].sum())
+            if got < columns or not np.isfinite(step_s):
+                raise too_few_rows(self.key, design, fold, got, columns)
+            out.append(self._learned(design, self._solve(triangles[f], step_s) | {"n_rows": got}))
+        return out
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Error_um (n_k,) per batch, from a zero error at its start.
+
+        Raises:
+            InputError: a batch of another step than the model learned from.
+        """
+        rows = self._respond(design, [self], batches)[:, 0]
+        return [rows[design.rows(k)] for k in batches]
+
+    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+        return self._respond(design, fitted, range(design.n_batches))
+
+    def n_parameters(self) -> int:
+        return 1 + len(self.inputs)
+
+    def _solve(self, triangle: Array, step_s: float) -> Plain:
+        """(a, b) from the R factor of [−z, X¹ | x1⁰] by a truncated SVD of its columns scaled to unit norm."""
+        norm = np.linalg.norm(triangle[:, :-1], axis=0)
+        norm[norm == 0] = 1.0
+        left, right = triangle[:, :-1] / norm, triangle[:, -1]
+        solution, _, _, singular = np.linalg.lstsq(left, right, rcond=_RCOND)
+        a, b = float(solution[0] / norm[0]), solution[1:] / norm[1:]
+        lowest = min(step_s / (3600.0 * self.slowest_h), _A_HIGHEST)
+        bound = "none" if lowest <= a <= _A_HIGHEST else ("lowest" if a < lowest else "highest")
+        if bound != "none":
+            a = float(np.clip(a, lowest, _A_HIGHEST))
+            b = np.linalg.lstsq(left[:, 1:], right - a * triangle[:, 0], rcond=_RCOND)[0] / norm[1:]
+        least = singular[singular > 0]
+        condition = float(singular[0] / least[-1]) if len(least) else float("inf")
+        return {"a": a, "b": b, "step_s": step_s, "bound": bound, "condition": condition}
+
+    def _respond(self, design: Design, models: Sequence[Self], batches: Sequence[int]) -> Array:
+        """Free run of every model on the given batches, (n, F); other rows are not to be read."""
+        steps = steps_s(design)
+        for k in batches:
+            for m in models:
+                learned_s = m.fitted["step_s"]
+                if abs(steps[k] - learned_s) > 1e-3 * learned_s:
+                    raise InputError(
+                        f"family gm1n: batch {design.batch_ids[k]} has a step of {steps[k]:g} s, the model learned "
+                        f"from {learned_s:g} s and its sums count rows; resample the batch to {learned_s:g} s"
+                    )
+        held = _bridged(design, design.x)
+        out = np.empty((len(design.time_s), len(models)))
+        for f, m in enumerate(models):
+            drive = padded(design, held @ m.fitted["b"])
+            out[:, f] = unpadded(design, response(drive, m.fitted["a"], self.response))
+        return out
+
+
+def response(drive: Array, a: float, kind: str = "difference") -> Array:
+    """x̂1⁰ (K, n) from Σ b_i x_i⁰ (K, n), zero in the first row, by either response."""
+    if drive.shape[1] == 0:
+        return drive.copy()
+    if kind == "whitening":
+        cumulated = np.cumsum(drive, axis=1) / a * -np.expm1(-a * np.arange(drive.shape[1]))
+        return np.diff(cumulated, axis=1, prepend=0.0)
+    # The recursion on sums, differenced: x⁰(k) = r x⁰(k−1) + c u(k), where u(1) counts in the second row.
+    u = drive.copy()
+    u[:, 0] = 0.0
+    u[:, 1:2] += drive[:, :1]
+    c = 1.0 / (1.0 + a / 2.0)
+    out: Array = lfilter([c], [1.0, -(1.0 - a / 2.0) * c], u, axis=1)
+    return out
+
+
+def _bridged(design: Design, values: Array) -> Array:
+    """Inputs (n, p) with holes held batch by batch; NaN where a batch has none at all."""
+    if np.isfinite(values).all():
+        return values
+    out = values.copy()
+    for k in range(design.n_batches):
+        for j in range(values.shape[1]):
+            out[design.rows(k), j] = hold_last(values[design.rows(k), j])
+    return out
+
+
+def _equations(design: Design, k: int) -> Array:
+    """Rows [−z, x_i¹ | x1⁰] of one batch from its second row on, (m, p + 2), usable rows only."""
+    rows = design.rows(k)
+    usable, y_um = design.usable[rows], design.y_um[rows]
+    if usable.sum() < 2:
+        return np.empty((0, len(design.inputs) + 2))
+    n = np.arange(len(y_um))
+    known = np.isfinite(y_um)
+    y_um = np.interp(n, n[known], y_um[known])
+    cumulated = np.cumsum(y_um)
+    z = (cumulated[1:] + cumulated[:-1]) / 2.0
+    x = np.column_stack([hold_last(column) for column in design.x[rows].T]) if design.inputs else np.empty((len(n), 0))
+    return np.column_stack([-z, np.cumsum(x, axis=0)[1:], y_um[1:]])[usable[1:]]
+
+
+def _common_step(design: Design, train: Sequence[int], steps: Array) -> float:
+    known = [k for k in train if np.isfinite(steps[k])]
+    if not known:
+        return float("nan")
+    first = known[0]
+    for k in known:
+        if abs(steps[k] - steps[first]) > 1e-3 * steps[first]:
+            raise InputError(
+                f"family gm1n: batch {design.batch_ids[k]} has a step of {steps[k]:g} s, batch "
+                f"{design.batch_ids[first]} of {steps[first]:g} s; its sums count rows: ingest both at one step"
+            )
+    return float(steps[first])
