@@ -42,14 +42,16 @@ class StoredModel:
         return bool(self.info.get("simulated", False))
 
     def channels(self) -> tuple[str, ...]:
-        """The channels that a recording must have."""
+        """The channels that a recording must have: those of the inputs, and a driver that `fitted` names."""
+        drivers = self.machine.names("driver")
+        named = [v for v in self.family.fitted.values() if isinstance(v, str) and v in drivers]
         needed: dict[str, None] = {}
         for name in self.family.inputs:
             channel, _, kind = name.partition("@")
             needed[channel] = None
             if kind == "ambient":
                 needed |= dict.fromkeys(self.machine.names("ambient")[:1])
-        return tuple(needed)
+        return tuple(needed | dict.fromkeys(named))
 
     def predict(self, batch: Batch) -> Array:
         """Error_um (n,) of a batch, zero at its start.

@@ -10,8 +10,9 @@ from mlflow.exceptions import MlflowException
 
 from data.errors import InputError
 from pipelines import model_store
+from pipelines.model_log import local_folder
 from pipelines.model_store import StoredModel
-from pipelines.registry import CHAMPION, find_version, local_folder
+from pipelines.registry import CHAMPION, find_version
 from pipelines.settings import Settings
 from pipelines.tracking import open_store, store_errors
 

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, Literal
 
-import mlflow
 import pandas as pd
 import yaml
 from filelock import FileLock
 from mlflow.entities.model_registry import ModelVersion
 from mlflow.exceptions import MlflowException
-from mlflow.models import ModelSignature
 from mlflow.protos.databricks_pb2 import RESOURCE_DOES_NOT_EXIST, ErrorCode
 from mlflow.tracking import MlflowClient
-from mlflow.types import ColSpec, Schema
 
 from data.batch import Batch
 from data.errors import InputError, closest
@@ -29,14 +23,14 @@ from features.rises import zeroed_error_um
 from models.base import Family
 from models.metrics import residual_std_um
 from models.result import GridResult
-from pipelines import model_store, pyfunc_model
+from pipelines import model_store
+from pipelines.model_log import local_folder, log_version
 from pipelines.promotion import Choice, Comparison, compare_paired, left_out
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
 CHAMPION, CHALLENGER = "champion", "challenger"
 Outcome = Literal["champion", "challenger", "unchanged"]
-_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,7 @@ def promote(
     client = open_store(settings)
     with FileLock(settings.home / "locks" / f"{name}.lock"), store_errors(settings):
         champion = _by_alias(client, name, CHAMPION)
-        same = [v for v in _versions(client, name) if v.tags.get("fingerprint") == fingerprint]
+        same = [v for v in _versions(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags]
         if same and (champion is not None or force):
             version = same[0].version
             words = f"{name}: same batches, cell and machine file as version {version}; nothing new registered"
@@ -125,7 +119,7 @@ def promote(
             "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
             **({"replaces": champion.version} if champion is not None and replaces else {}),
         }  # fmt: skip
-        new = _register(client, name, family, machine_yaml, region, info, tags, training_id, settings)
+        new = log_version(client, name, family, machine_yaml, region, info, tags, training_id, settings)
         client.update_model_version(name, new, ("SIMULATED. " if result.simulated else "") + choice.words)
         client.set_registered_model_tag(name, "simulated", _text(result.simulated))
         if replaces:
@@ -134,6 +128,7 @@ def promote(
         else:
             client.set_registered_model_alias(name, CHALLENGER, new)
             outcome = "challenger"
+        client.set_model_version_tag(name, new, "outcome", outcome)  # last: what lacks it was interrupted
         stays = new if replaces or champion is None else champion.version
         words = f"{name} version {new} is {outcome}: {why}; {choice.words}"
         done = Promotion(outcome, name, int(new), int(stays), choice.cell, choice.trusted, words, comparison)
@@ -149,17 +144,16 @@ def rollback(name: str, settings: Settings) -> Promotion:
     """
     client = open_store(settings)
     (settings.home / "locks").mkdir(parents=True, exist_ok=True)
-    with FileLock(settings.home / "locks" / f"{name}.lock"):
+    with FileLock(settings.home / "locks" / f"{name}.lock"), store_errors(settings):
         present = find_version(client, name, CHAMPION)
         previous = present.tags.get("replaces")
         if not previous:
             raise InputError(f"model {name!r}: champion version {present.version} replaced none; nothing to go back to")
         back = find_version(client, name, previous)
-        with store_errors(settings):
-            client.set_registered_model_alias(name, CHAMPION, back.version)
-            client.set_model_version_tag(name, present.version, "was_champion_until", _now())
-            client.set_model_version_tag(name, present.version, "rolled_back", "true")
-            client.delete_model_version_tag(name, back.version, "was_champion_until")
+        client.set_registered_model_alias(name, CHAMPION, back.version)
+        client.set_model_version_tag(name, present.version, "was_champion_until", _now())
+        client.set_model_version_tag(name, present.version, "rolled_back", "true")
+        client.delete_model_version_tag(name, back.version, "was_champion_until")
     words = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
     return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
                      back.tags.get("trusted") != "false", words)  # fmt: skip
@@ -245,78 +239,12 @@ def _score_unseen(
     return pd.DataFrame(rows, columns=["batch_id", "digest", "S_um"])
 
 
-def local_folder(uri: str, settings: Settings) -> str:
-    """Where the files of a model lie on this machine; fetched if the store is elsewhere."""
-    with store_errors(settings):
-        return str(mlflow.artifacts.download_artifacts(artifact_uri=uri, tracking_uri=settings.store_uri))
-
-
-def _register(
-    client: MlflowClient,
-    name: str,
-    family: Family,
-    machine_yaml: str,
-    region: Mapping[str, Sequence[float]],
-    info: dict[str, Any],
-    tags: dict[str, str],
-    training_id: str,
-    settings: Settings,
-) -> str:
-    """Log the model below the training's run and make a version of it; returns its number."""
-    mlflow.set_tracking_uri(settings.store_uri)
-    mlflow.set_registry_uri(settings.store_uri)
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        model_store.save(folder, family, machine_yaml, region, info)
-        stored = model_store.load(folder)
-        channels = stored.channels()
-        drivers = [d for d in stored.machine.names("driver") if d not in channels]
-        signature = ModelSignature(
-            inputs=Schema([
-                ColSpec("double", "time_s"), *(ColSpec("double", c) for c in channels),
-                *(ColSpec("double", d, required=False) for d in drivers), ColSpec("string", "batch_id", required=False),
-            ]),
-            outputs=Schema([ColSpec("double", "predicted_um"), ColSpec("boolean", "outside_region")]),
-        )  # fmt: skip
-        with mlflow.start_run(run_id=training_id):
-            logged = mlflow.pyfunc.log_model(
-                name="model",
-                python_model=str(Path(pyfunc_model.__file__).resolve()),
-                artifacts={f: str(folder / f) for f in model_store.FILES},
-                signature=signature,
-                input_example=_example(stored, [*channels, *drivers]),
-                pip_requirements=_requirements(family),
-            )
-    try:
-        client.create_registered_model(name, tags={"machine": tags["machine"], "target": tags["target"]})
-    except MlflowException as error:
-        if error.error_code != "RESOURCE_ALREADY_EXISTS":
-            raise
-    made = client.create_model_version(name, logged.model_uri, run_id=training_id, tags=tags, model_id=logged.model_id)
-    return str(made.version)
-
-
 def _crown(client: MlflowClient, name: str, new: str, previous: ModelVersion | None) -> None:
     client.set_registered_model_alias(name, CHAMPION, new)
     if previous is not None:
         client.set_model_version_tag(name, previous.version, "was_champion_until", _now())
     if CHALLENGER in client.get_registered_model(name).aliases:  # it lost to an older champion
         client.delete_registered_model_alias(name, CHALLENGER)
-
-
-def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.DataFrame:
-    """Three rows in the middle of each channel's plausible range."""
-    step_s = stored.machine.recording.step_s
-    columns: dict[str, list[float]] = {"time_s": [0.0, step_s, 2 * step_s]}
-    for c in channels:
-        low, high = stored.machine.channels[c].range or (20.0, 20.0)
-        columns[c] = [0.5 * (low + high)] * 3
-    return pd.DataFrame(columns)
-
-
-def _requirements(family: Family) -> list[str]:
-    torch = ("torch",) if hasattr(sys.modules[type(family).__module__], "torch") else ()
-    return [f"{p}=={installed(p).partition('+')[0]}" for p in (*_PACKAGES, *torch)]
 
 
 def _fingerprint(result: GridResult, choice: Choice, machine_yaml: str) -> str:

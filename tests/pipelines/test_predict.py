@@ -99,6 +99,29 @@ def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
     assert np.array_equal(model_store.load(stored).predict(batch), before.predict(batch))
 
 
+@pytest.mark.parametrize("key", list(FAMILIES))
+def test_every_family_is_stored_without_loss(key, tmp_path):
+    batches = toy_batches("toy-family", 5)
+    cls = FAMILIES[key]
+    fitted = cls().fit(batches[:4], ("front", "bed") if cls.uses_inputs else (), "z")
+    model_store.save(tmp_path, fitted, machine_yaml("toy-family"), {})
+    model = model_store.load(tmp_path)
+    assert np.array_equal(model.predict(batches[4]), fitted.predict(batches[4]), equal_nan=True)
+    assert model.family.n_parameters() == fitted.n_parameters()
+    assert model.family.options() == fitted.options()
+
+
+def test_a_driver_that_the_model_follows_must_be_there(tmp_path):
+    batches = toy_batches("toy-driver", 4)
+    model_store.save(tmp_path, FAMILIES["thermal_exponential"]().fit(batches, (), "z"), machine_yaml("toy-driver"), {})
+    model = model_store.load(tmp_path)
+    assert model.channels() == ("speed",)
+    table = batches[0].table
+    assert np.isfinite(model.predict(model_store.frame_to_batch(model, table))).all()
+    with pytest.raises(InputError, match="needs 'speed'"):
+        model.predict(model_store.frame_to_batch(model, table.drop(columns="speed")))
+
+
 def test_every_kind_of_plain_data_comes_back(tmp_path, monkeypatch):
     class Odd(Family):
         key = "odd"

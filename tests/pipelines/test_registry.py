@@ -89,6 +89,21 @@ def test_the_same_again_changes_nothing(store):
     assert (other.outcome, other.version) == ("challenger", 2)
 
 
+def test_an_interrupted_registration_is_done_again(store, monkeypatch):
+    train(store, "toy-cut", [5.0] * 6)
+    with monkeypatch.context() as cut:
+        cut.setattr(registry.MlflowClient, "set_registered_model_alias", _power_cut)
+        with pytest.raises(OSError, match="power cut"):
+            train(store, "toy-cut", [4.0] * 7)
+    again = train(store, "toy-cut", [4.0] * 7)
+    assert (again.outcome, again.version) == ("champion", 3)
+    assert registry.rollback("toy-cut-z", store).version == 1
+
+
+def _power_cut(*_: object) -> None:
+    raise OSError("power cut")
+
+
 def test_too_few_batches_in_common_keep_the_champion(store):
     train(store, "toy-few", [5.0] * 4)
     got = train(store, "toy-few", [1.0] * 9)
