@@ -124,33 +124,43 @@ def parse_number(cell: Any, decimal: str = ".") -> float | None:
     return value if np.isfinite(value) else None
 
 
+def stamp_formats(samples: Sequence[str]) -> list[str]:
+    """The strptime patterns (or "ISO8601") in which nearly all samples read as a time; the likeliest first."""
+    cells = pd.Series([s.strip() for s in samples if s.strip()], dtype=str)
+    if len(cells) == 0:
+        return []
+    need = max(1, int(0.8 * len(cells)))
+    if cells.str.match(r"\d{4}\D").all() and _parse(cells, _ISO).notna().sum() >= need:
+        return [_ISO]
+    patterns = [f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in (" ", "T")] + list(_TIMES) + list(_DATES)
+    fits = [p for p in patterns if _parse(cells.iloc[:3], p).notna().any() and _parse(cells, p).notna().sum() >= need]
+    fits = [p for p in fits if _parse(cells, p).dropna().is_monotonic_increasing] or fits
+    starts: dict[Any, str] = {}
+    for pattern in fits:  # patterns that say the same count once
+        starts.setdefault(_parse(cells, pattern).dropna().iloc[0], pattern)
+    return list(starts.values())
+
+
 def stamp_format(samples: Sequence[str], where: str) -> str:
-    """The strptime pattern (or "ISO8601") in which all, or nearly all, samples read as a time.
+    """The one pattern that fits; "ISO8601" where there are no samples.
 
     Raises:
         InputError: none fits, or day and month cannot be told apart.
     """
-    cells = pd.Series([s.strip() for s in samples if s.strip()], dtype=str)
-    if len(cells) == 0:
+    if not any(s.strip() for s in samples):
         return _ISO
-    need = max(1, int(0.8 * len(cells)))
-    dated = cells.str.match(r"\d{4}\D").all()
-    if dated and _parse(cells, _ISO).notna().sum() >= need:
-        return _ISO
-    patterns = [f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in (" ", "T")] + list(_TIMES) + list(_DATES)
-    fits = [p for p in patterns if _parse(cells.iloc[:3], p).notna().any() and _parse(cells, p).notna().sum() >= need]
+    fits = stamp_formats(samples)
     if not fits:
+        first = next(s for s in samples if s.strip())
         raise InputError(
-            f"{where}: no known time format fits {cells.iloc[0]!r}; set recording.time.format to its strptime pattern"
+            f"{where}: no known time format fits {first[:40]!r}; set recording.time.format to its strptime pattern"
         )
-    rising = [p for p in fits if _parse(cells, p).dropna().is_monotonic_increasing] or fits
-    starts = {_parse(cells, p).dropna().iloc[0] for p in rising}
-    if len(starts) > 1:
+    if len(fits) > 1:
         raise InputError(
-            f"{where}: {cells.iloc[0]!r} can be {rising[0]!r} or {rising[1]!r};"
+            f"{where}: time {samples[0]!r} can be {fits[0]!r} or {fits[1]!r};"
             " set recording.time.format to the right one"
         )
-    return rising[0]
+    return fits[0]
 
 
 def _parse(cells: pd.Series[Any], pattern: str) -> pd.Series[Any]:

@@ -14,7 +14,7 @@ from data.readers.cells import parse_number
 
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _SEPARATORS = (",", ";", "\t", "|")
-_WORDS = ("温度", "时间", "時間", "日時", "位移", "変位", "主轴", "主軸", "转速", "回転", "环境", "室温", "進給", 
+_WORDS = ("温度", "时间", "時間", "日時", "位移", "変位", "主轴", "主軸", "转速", "回転", "环境", "室温", "進給",
           "轴", "軸", "℃", "°C", "µm", "temperatur", "weg", "zeit", "vorschub", "drehzahl")  # fmt: skip
 _EUROPEAN = frozenset("äöüßéèêàâçîôûñóíáúåøæÄÖÜÉµ°²³±·–€")
 _POINT = re.compile(r"\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*")

@@ -1,0 +1,169 @@
+"""Guesses about a column that nobody has described: each with the reason, for a person to confirm."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.readers.text import normalise
+from data.units import known_unit, quantity
+
+Array = NDArray[np.float64]
+
+_TIME = re.compile(r"time|zeit|时间|時間|時刻|日時|timestamp|elapsed|datum|date|^t$|^t ?[\[(]")
+_SETPOINT = re.compile(r"set ?_?point|sollwert|\bset\b|command")
+_AMBIENT = re.compile(r"amb|room|hall|umgebung|raum|环境|環境|室温|雰囲気|\bair\b|luft")
+_ERROR = re.compile(r"disp|err|drift|deviat|\bweg|位移|変位|変形|误差|誤差|\bgap\b|probe|^d[xyz](\b|_)|strain|dehnung")
+_DRIVER = re.compile(
+    r"rpm|speed|drehzahl|转速|轉速|回転|feed|vorschub|進給|进给|power|leistung|current|strom|load|heater|"
+    r"^q\d|torque|coolant|pump|flow|volt"
+)
+_TEMPERATURE = re.compile(r"temp|^t[a-z]?_?\d|^pt_?\d|thermo|温")
+_POSITION = re.compile(r"\bpos|axis|achse")
+_LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%"}
+_NICE_STEPS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1800, 3600)
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A value and why it was taken."""
+
+    value: str
+    why: str
+
+
+def is_time_name(name: str) -> bool:
+    return bool(_TIME.search(normalise(name)))
+
+
+def unit_in_name(name: str) -> str | None:
+    """A unit in brackets, or behind the last underscore or blank, by its known name: ``"ch1_um"`` -> ``um``."""
+    if m := re.search(r"[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$", name):
+        return known_unit(m[1])
+    if m := re.search(r"(?<=\w)[_ /]([^_\s]+)$", name.strip()):
+        tail = m[1]
+        if len(tail) > 1 or tail in _LONE_LETTERS or tail in "°℃":
+            return known_unit(tail)
+    return None
+
+
+def role(name: str, unit: str | None, values: Array) -> Guess:
+    """Role of a channel from its name and unit, else from its values."""
+    folded = normalise(name)
+    kind = quantity(unit) if unit else None
+    if _SETPOINT.search(folded):
+        return Guess("driver", "its name sounds like a set point")
+    if kind == "temperature" or (kind is None and _TEMPERATURE.search(folded)):
+        if _AMBIENT.search(folded):
+            return Guess("ambient", "a temperature whose name sounds like the room")
+        return Guess("temperature", f"its unit {unit}" if kind else "its name")
+    if kind == "length":
+        if _ERROR.search(folded) or unit in ("um", "nm"):
+            return Guess("error", f"a length in {unit}")
+        return Guess("position", f"a length in {unit}")
+    if kind is not None and not _ERROR.search(folded):
+        return Guess("driver", f"its unit {unit}")
+    if kind is None:
+        for pattern, value in ((_AMBIENT, "ambient"), (_ERROR, "error"), (_DRIVER, "driver"), (_POSITION, "position")):
+            if pattern.search(folded):
+                return Guess(value, "its name")
+    return _role_of_values(values)
+
+
+def _role_of_values(values: Array) -> Guess:
+    v = values[np.isfinite(values)]
+    span = float(np.ptp(v)) if len(v) else 0.0
+    if span == 0.0:
+        return Guess("driver", "it never changes; its values tell nothing")
+    jump = np.abs(np.diff(v))
+    if jump.max() >= 0.25 * span and (np.mean(jump == 0) > 0.8 or jump.max() >= 0.6 * span):
+        return Guess("driver", "it jumps between levels")
+    if np.median(v) >= 8 and v.min() > -40 and v.max() < 200 and abs(v[0]) > 0.3 * span:
+        return Guess("temperature", f"smooth, {v.min():.3g} to {v.max():.3g}")
+    if abs(v[0]) <= 0.5 * span:
+        return Guess("error", "smooth, and starts near zero")
+    return Guess("driver", "neither like a temperature nor like a displacement")
+
+
+def unit(of_role: str, name: str, values: Array) -> Guess:
+    """Unit in the file for a channel of that role."""
+    written = unit_in_name(name)
+    if written:
+        return Guess(written, "its name says so")
+    v = values[np.isfinite(values)]
+    size = float(np.max(np.abs(v))) if len(v) else 0.0
+    middle = float(np.median(v)) if len(v) else 0.0
+    if of_role in ("temperature", "ambient"):
+        if 230.0 <= middle <= 420.0:
+            return Guess("K", f"values around {middle:.4g}")
+        return Guess("degC", f"values around {middle:.3g}; say degF if so")
+    if of_role == "error":
+        if size < 0.5:
+            return Guess("mm", f"never above {size:.2g}")
+        return Guess("um", f"up to {size:.3g}")
+    if of_role == "position":
+        return Guess("mm", "usual for positions")
+    folded = normalise(name)
+    if re.search(r"rpm|speed|drehzahl|转速|回転", folded):
+        return Guess("rpm", "usual for a speed")
+    if re.search(r"feed|vorschub|進給|进给", folded):
+        return Guess("mm/min", "usual for a feed")
+    return Guess("1", "the name does not say; put the true unit")
+
+
+def resolution(values: Array) -> float | None:
+    """Smallest step of an instrument that shows multiples of one; None if the values are on no such lattice."""
+    v = np.unique(values[np.isfinite(values)])[:20_000]
+    if len(v) < 3:
+        return None
+    steps = np.diff(v)
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(v).max()))]
+    if len(steps) == 0:
+        return None
+    smallest = float(f"{steps.min():.3g}")
+    multiples = steps / smallest
+    on_lattice = np.mean(np.abs(multiples - np.round(multiples)) < 0.1)
+    repeated = np.mean(multiples < 1.5)
+    return smallest if on_lattice > 0.95 and repeated > 0.05 else None
+
+
+def plausible_range(of_role: str, low: float, high: float) -> tuple[float, float] | None:
+    """Wider than what was seen, and as wide as is usual for the role; None where nothing was seen."""
+    if not np.isfinite([low, high]).all():
+        return None
+    span = max(high - low, abs(high), 1e-6)
+    if of_role in ("temperature", "ambient"):
+        return min(-20.0, _nice(low - span, False)), max(120.0, _nice(high + span, True))
+    if of_role == "error":
+        return _nice(-3.0 * max(abs(low), abs(high), 1e-6), False), _nice(3.0 * max(abs(low), abs(high), 1e-6), True)
+    return (_nice(low - span, False) if low < 0 else min(0.0, low)), _nice(high + 0.5 * span, True)
+
+
+def _nice(x: float, up: bool) -> float:
+    """Rounded away from the data to one digit."""
+    if x == 0.0:
+        return 0.0
+    unit_of_digit = 10.0 ** np.floor(np.log10(abs(x)))
+    return float(f"{(np.ceil if up else np.floor)(x / unit_of_digit) * unit_of_digit:.6g}")
+
+
+def time_unit(name: str, step: float, length: float) -> Guess:
+    """s, min or h of a numeric time column with that median step and length."""
+    written = unit_in_name(name)
+    if written is None and (m := re.search(r"(?:^|[_ ])(s|min|h)$", normalise(name))):
+        written = m[1]
+    if written in ("s", "min", "h"):
+        return Guess(written, "its name says so")
+    if step < 0.02 and length < 200:
+        return Guess("h", f"steps of {step:.3g} over {length:.4g} fit hours")
+    if step < 1.0 and length >= 20 and step * length > 10:
+        return Guess("min", f"steps of {step:.3g} over {length:.4g} fit minutes")
+    return Guess("s", f"steps of {step:.3g} over {length:.4g} fit seconds")
+
+
+def grid_step_s(interval_s: float) -> float:
+    """The nearest usual step that is not finer than the samples."""
+    return next((s for s in _NICE_STEPS_S if s >= interval_s * 0.999), float(np.ceil(interval_s)))
