@@ -1,0 +1,143 @@
+"""Ingest of a large CSV recording against pyarrow alone (streamed CSV to Parquet), in one run.
+
+    python benchmarks/ingest.py [--gb 1.0] [--rounds 3]
+
+Both ways run in processes of their own, taking turns; time and peak memory are theirs, without the
+interpreter's start. Prints a table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
+
+STEP_S = 0.1
+RUN_S, STOP_S = 1800.0, 600.0
+TEMPERATURES = 16
+ROWS_A_BLOCK = int((RUN_S + STOP_S) / STEP_S)
+MACHINE = f"""
+machine: bench
+recording:
+  files: ["*.csv"]
+  time: {{column: time_s, unit: s}}
+  step_s: {STEP_S}
+  max_gap_s: 5
+  split: {{driver: spindle_rpm, min_run_s: 600}}
+channels:
+  spindle_rpm: {{role: driver, unit: rpm, resolution: 1, range: [0, 20000]}}
+  x_um: {{role: error, unit: um, resolution: 0.01, range: [-500, 500]}}
+  y_um: {{role: error, unit: um, resolution: 0.01, range: [-500, 500]}}
+  z_um: {{role: error, unit: um, resolution: 0.01, range: [-500, 500]}}
+""" + "".join(
+    f"  T{i:02d}: {{role: temperature, unit: degC, resolution: 0.01, range: [-10, 90]}}\n" for i in range(TEMPERATURES)
+)
+
+
+def write_recording(path: Path, size_bytes: float) -> int:
+    """Blocks of running and standing, 20 channels at 10 Hz; gives the rows written."""
+    rng = np.random.default_rng(0)
+    rows = 0
+    level = np.zeros(TEMPERATURES + 3)
+    with path.open("wb") as file:
+        while file.tell() < size_bytes:
+            t = np.arange(ROWS_A_BLOCK) * STEP_S
+            running = t < RUN_S
+            tau_s = np.linspace(600.0, 3000.0, len(level))
+            aim = np.where(running[0], rng.uniform(3.0, 12.0, len(level)), 0.0)
+            rise = aim + (level - aim) * np.exp(-np.minimum(t, RUN_S)[:, None] / tau_s)
+            rise *= np.exp(-np.maximum(t - RUN_S, 0.0)[:, None] / tau_s)
+            level = rise[-1]
+            noise = rng.normal(0.0, 0.02, rise.shape)
+            columns: dict[str, object] = {"time_s": np.round(t + rows * STEP_S, 1)}
+            columns["spindle_rpm"] = np.where(running, rng.integers(20, 120) * 100, 0)
+            for k, name in enumerate([*(f"T{i:02d}" for i in range(TEMPERATURES)), "x_um", "y_um", "z_um"]):
+                columns[name] = np.round((20.0 if k < TEMPERATURES else 0.0) + rise[:, k] + noise[:, k], 2)
+            pc.write_csv(pa.table(columns), file, pc.WriteOptions(include_header=rows == 0, quoting_style="none"))
+            rows += ROWS_A_BLOCK
+    return rows
+
+
+def with_ingest(csv: Path, out: Path) -> dict[str, float]:
+    from data.ingest import ingest
+    from data.lake import Lake
+    from data.machine import parse_machine
+
+    machine = parse_machine(MACHINE, "benchmark")
+    began = time.perf_counter()
+    report = ingest([csv], machine, Lake(out))
+    return {"s": time.perf_counter() - began, "rows": report.rows_stored, "batches": len(report.batches)}
+
+
+def with_pyarrow(csv: Path, out: Path) -> dict[str, float]:
+    out.mkdir()
+    rows = 0
+    began = time.perf_counter()
+    with pc.open_csv(csv) as reader, pq.ParquetWriter(out / "all.parquet", reader.schema) as writer:
+        for block in reader:
+            writer.write_batch(block)
+            rows += block.num_rows
+    return {"s": time.perf_counter() - began, "rows": rows, "batches": 1}
+
+
+WAYS = {"pyarrow alone": with_pyarrow, "ingest": with_ingest}
+
+
+def one(way: str, csv: str, out: str) -> None:
+    """In a child process: run one way and tell its time and peak memory."""
+    import resource
+
+    result = WAYS[way](Path(csv), Path(out))
+    result["peak_MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    result["disk_MB"] = sum({p.stat().st_ino: p.stat().st_size for p in Path(out).rglob("*.parquet")}.values()) / 1e6
+    sys.stdout.write(json.dumps(result))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--gb", type=float, default=1.0, help="size of the CSV in GB (1e9 bytes)")
+    parser.add_argument("--rounds", type=int, default=3)
+    args = parser.parse_args()
+    results: dict[str, list[dict[str, float]]] = {way: [] for way in WAYS}
+    with tempfile.TemporaryDirectory() as folder:
+        csv = Path(folder) / "recording.csv"
+        rows = write_recording(csv, args.gb * 1e9)
+        size_MB = csv.stat().st_size / 1e6
+        batch_MB = ROWS_A_BLOCK * (TEMPERATURES + 5) * 8 / 1e6
+        print(
+            f"{size_MB:.0f} MB of CSV, {rows} rows, {TEMPERATURES + 4} channels; one batch {batch_MB:.0f} MB in memory"
+        )
+        for k in range(args.rounds):
+            for way in WAYS:
+                child = [sys.executable, __file__, "--one", way, str(csv), f"{folder}/{k} {way}"]
+                done = subprocess.run(child, check=True, capture_output=True, text=True)
+                results[way].append(json.loads(done.stdout))
+    print(f"{'':14}{'median s':>10}{'MB/s':>8}{'peak MB':>9}{'rows':>10}{'batches':>9}{'Parquet MB':>12}")
+    for way, runs in results.items():
+        s = statistics.median(r["s"] for r in runs)
+        peak = statistics.median(r["peak_MB"] for r in runs)
+        last = runs[-1]
+        print(
+            f"{way:14}{s:10.2f}{size_MB / s:8.0f}{peak:9.0f}{last['rows']:10}{last['batches']:9}{last['disk_MB']:12.1f}"
+        )
+    ratios = [p["s"] / i["s"] for p, i in zip(results["pyarrow alone"], results["ingest"], strict=True)]
+    print(
+        f"ingest at {statistics.median(ratios):.2f} of pyarrow's speed (rounds {min(ratios):.2f} to {max(ratios):.2f})"
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--one"]:
+        one(*sys.argv[2:])
+    else:
+        main()
