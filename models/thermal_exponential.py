@@ -1,0 +1,234 @@
+"""Thermal exponential: one or two first-order lags behind the spindle speed, without any temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from features.design import Design
+from features.rises import hold_last
+from models.base import Array, Family, Plain
+from models.batchwise import padded, steps_s, too_few_rows, unpadded
+
+EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it stays where one speed tells nothing
+_TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
+_LEAST_RATIO = 2.0  # of two time constants: closer ones give huge amplitudes of opposite sign
+_MOST_STEPS = 12
+_WORTH = 0.01  # a second lag must lower the sum of squares by this share
+
+
+class ThermalExponential(Family):
+    """Baseline `y = Σ_j A_j · lag_τj[(n/1000)^m]`; at constant speed `Σ_j A_j (n/1000)^m (1 − exp(−t/τ_j))`.
+
+    n is the first driver in rpm; a standstill cools down. Without such a driver in every training batch the load is 1
+    from the start: time alone. m is chosen from `EXPONENTS`, τ from 2 min to 12 h and not above twice the
+    longest training batch, amplitudes by least squares (variable projection), all batches pooled.
+    A batch to predict that lacks the speed gets the training batches' mean load.
+
+    Source: G. Golub and V. Pereyra, The differentiation of pseudo-inverses and nonlinear least squares problems
+    whose variables separate, SIAM J. Numer. Anal. 10 (1973); the law is Newton's warm-up of one or two bodies.
+    """
+
+    key = "thermal_exponential"
+    words = "exponential warm-up driven by spindle speed or time alone"
+    source = "Newton's law of cooling; Golub and Pereyra 1973"
+    uses_inputs = False
+    rowwise = False
+    rank = 5
+
+    def __init__(self, lags: int = 2) -> None:
+        super().__init__()
+        self.lags = int(lags)
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """A grid over (m, τ) whose sums all folds share, then τ refined fold by fold.
+
+        Raises:
+            InputError: too few usable rows.
+        """
+        need = 2 * self.lags + 1
+        known = np.isfinite(design.y_um)
+        counts = np.bincount(design.group[known], minlength=design.n_batches)
+        for fold in folds:
+            if counts[list(fold)].sum() < need:
+                raise too_few_rows(self.key, design, fold, int(counts[list(fold)].sum()), need)
+        channel, speed = _speed_rpm(design)
+        has_speed = ~np.isnan(speed.sum(axis=1))
+        by_law: dict[bool, list[int]] = {}
+        for f, fold in enumerate(folds):
+            by_law.setdefault(bool(channel) and bool(has_speed[list(fold)].all()), []).append(f)
+        out: dict[int, Self] = {}
+        for follows, members in by_law.items():
+            loads = [_load(speed, m) for m in EXPONENTS] if follows else [np.ones_like(speed)]
+            grid = _Sums.build(design, loads, known)
+            for f in members:
+                m, taus_s = grid.best(folds[f], self.lags)
+                plain = _refined(design, list(folds[f]), loads[m], known, taus_s)
+                plain |= {"exponent": EXPONENTS[m], "speed_channel": channel if follows else ""}
+                out[f] = self._learned(design, plain)
+        return [out[f] for f in range(len(folds))]
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Error_um (n_k,) per batch: 0 at its start, from time and speed alone."""
+        taus_s, amplitudes = np.atleast_1d(self.fitted["tau_s"]), np.atleast_1d(self.fitted["amplitude_um"])
+        name = self.fitted["speed_channel"]
+        load = np.ones((design.n_batches, int(np.diff(design.offsets).max(initial=0))))
+        if name:
+            speed = _held(design, name)
+            missing = np.isnan(speed.sum(axis=1))
+            load = _load(np.where(missing[:, None], 0.0, speed), self.fitted["exponent"])
+            load[missing] = self.fitted["mean_load"]
+        steps = steps_s(design)
+        total = np.zeros_like(load)
+        for tau_s, amplitude in zip(taus_s, amplitudes, strict=True):
+            total += amplitude * lag_response(load, tau_s, steps)
+        rows = unpadded(design, total)
+        return [rows[design.rows(k)] for k in batches]
+
+    def n_parameters(self) -> int:
+        return 2 * int(np.size(self.fitted["tau_s"])) + (1 if self.fitted["speed_channel"] else 0)
+
+
+def lag_response(load: Array, tau_s: float, step_s: Array) -> Array:
+    """τ dv/dt + v = load from v = 0 at the first row, exact for a load held over each step, (K, n); steps (K,)."""
+    driven = load.copy()
+    driven[:, :1] = 0.0
+    out = np.zeros_like(load)
+    for step in np.unique(step_s[np.isfinite(step_s)]):
+        keep = float(np.exp(-step / tau_s))
+        which = step_s == step
+        out[which] = lfilter([1.0 - keep], [1.0, -keep], driven[which], axis=1)
+    return out
+
+
+class _Sums:
+    """Cross-products of the lag responses per batch: gram (K, M, T, T), with_y (K, M, T), yy and longest_s (K,)."""
+
+    def __init__(self, gram: Array, with_y: Array, yy: Array, longest_s: Array) -> None:
+        self.gram, self.with_y, self.yy, self.longest_s = gram, with_y, yy, longest_s
+
+    @classmethod
+    def build(cls, design: Design, loads: Sequence[Array], known: NDArray[np.bool_]) -> _Sums:
+        steps = steps_s(design)
+        weight = padded(design, known.astype(float))
+        y = padded(design, np.where(known, design.y_um, 0.0))
+        gram = np.empty((design.n_batches, len(loads), len(_TAU_GRID_S), len(_TAU_GRID_S)))
+        with_y = np.empty(gram.shape[:3])
+        for m, load in enumerate(loads):
+            lags = np.stack([lag_response(load, tau, steps) for tau in _TAU_GRID_S], axis=1) * weight[:, None]
+            gram[:, m] = lags @ lags.transpose(0, 2, 1)
+            with_y[:, m] = np.einsum("ktn,kn->kt", lags, y)
+        ends = np.diff(design.offsets) - 1
+        return cls(gram, with_y, (y**2).sum(axis=1), np.nan_to_num(ends * steps))
+
+    def best(self, fold: Sequence[int], lags: int) -> tuple[int, Array]:
+        """Index of the exponent and the time constants, s, with the least sum of squares over a fold."""
+        batches = list(fold)
+        gram, h = self.gram[batches].sum(axis=0), self.with_y[batches].sum(axis=0)
+        limit_s = max(2.0 * float(self.longest_s[batches].max()), float(_TAU_GRID_S[1]))
+        allowed = np.less_equal(_TAU_GRID_S, limit_s)
+        power = np.einsum("mtt->mt", gram)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one = np.where(allowed & (power > 0), h**2 / power, 0.0)
+            det = power[:, :, None] * power[:, None, :] - gram**2
+            cross = h[:, :, None] * h[:, None, :]
+            two = h[:, :, None] ** 2 * power[:, None, :] - 2 * cross * gram + h[:, None, :] ** 2 * power[:, :, None]
+            apart = _TAU_GRID_S[None, :] >= _LEAST_RATIO * _TAU_GRID_S[:, None]
+            fine = apart & allowed[None, :] & (det > 1e-9 * power[:, :, None] * power[:, None, :])
+            two = np.where(fine, two / det, 0.0)
+        gain = two.max(axis=(1, 2)) if lags > 1 else one.max(axis=1)
+        # A tie within rounding goes to the first exponent: a single speed cannot tell them apart.
+        m = int(np.argmax(gain >= gain.max() * (1.0 - 1e-9)))
+        if lags > 1:
+            i, j = np.unravel_index(int(two[m].argmax()), two[m].shape)
+            alone = self.yy[batches].sum() - one[m].max()
+            if two[m, i, j] - one[m].max() > _WORTH * alone:
+                return m, _TAU_GRID_S[[i, j]]
+        return m, _TAU_GRID_S[[int(one[m].argmax())]]
+
+
+def _refined(design: Design, batches: list[int], load: Array, known: NDArray[np.bool_], taus_s: Array) -> Plain:
+    """Time constants polished by Gauss–Newton steps on log τ, halved until they help; amplitudes solved anew."""
+    steps = steps_s(design)[batches]
+    use = (padded(design, known.astype(float)) > 0)[batches]
+    y = padded(design, np.where(known, design.y_um, 0.0))[batches][use]
+    load = load[batches]
+
+    def solve(log_tau: Array) -> tuple[float, Array, list[Array], Array]:
+        lags = [lag_response(load, float(np.exp(v)), steps) for v in log_tau]
+        basis = np.stack([lag[use] for lag in lags])
+        amplitude: Array = np.linalg.lstsq(basis @ basis.T, basis @ y, rcond=1e-12)[0].astype(float)
+        residual = y - amplitude @ basis
+        return float(residual @ residual), amplitude, lags, basis
+
+    log_tau = np.log(taus_s)
+    sse, amplitude, lags, basis = solve(log_tau)
+    for _ in range(_MOST_STEPS):
+        slopes = [_lag_slope(load, float(np.exp(v)), steps, lag)[use] for v, lag in zip(log_tau, lags, strict=True)]
+        rows = np.vstack([basis, amplitude[:, None] * np.stack(slopes)])
+        step = np.linalg.lstsq(rows @ rows.T, rows @ (y - amplitude @ basis), rcond=1e-12)[0][len(taus_s) :]
+        for share in (1.0, 0.3, 0.1):
+            trial = _allowed(log_tau + np.clip(share * step, -1.0, 1.0))
+            found = solve(trial)
+            if found[0] < sse:
+                break
+        else:
+            break
+        moved = float(np.abs(trial - log_tau).max())
+        log_tau, (sse, amplitude, lags, basis) = trial, found
+        if moved < 1e-5:
+            break
+    inside = padded(design, np.ones(len(design.time_s)))[batches] > 0
+    return {"tau_s": np.exp(log_tau), "amplitude_um": amplitude, "mean_load": float(load[inside].mean())}
+
+
+def _allowed(log_tau: Array) -> Array:
+    """Inside the range of τ and, for two, at least `_LEAST_RATIO` apart."""
+    low, high, apart = np.log(_TAU_GRID_S[0] / 2), np.log(_TAU_GRID_S[-1]), np.log(_LEAST_RATIO)
+    if len(log_tau) == 1:
+        return np.clip(log_tau, low, high)
+    middle, half = log_tau.mean(), max((log_tau[1] - log_tau[0]) / 2, apart / 2)
+    first = np.clip(middle - half, low, high - apart)
+    return np.array([first, np.clip(middle + half, first + apart, high)])
+
+
+def _lag_slope(load: Array, tau_s: float, step_s: Array, lag: Array) -> Array:
+    """d lag / d log τ, (K, n), from the recursion's own derivative."""
+    out = np.zeros_like(load)
+    for step in np.unique(step_s[np.isfinite(step_s)]):
+        keep = float(np.exp(-step / tau_s))
+        which = step_s == step
+        driven = np.zeros_like(load[which])
+        driven[:, 1:] = keep * step / tau_s * (lag[which, :-1] - load[which, 1:])
+        out[which] = lfilter([1.0], [1.0, -keep], driven, axis=1)
+    return out
+
+
+def _load(speed_rpm: Array, exponent: float) -> Array:
+    return np.asarray((np.abs(speed_rpm) / 1000.0) ** exponent, float)
+
+
+def _speed_rpm(design: Design) -> tuple[str, Array]:
+    """Name of the spindle speed's driver and the speed per batch (K, longest); "" and zeros without one."""
+    names = [n for n, u in zip(design.driver_names, design.driver_units, strict=False) if u == "rpm"]
+    names += [n for n in design.driver_names if "rpm" in n.lower()]
+    if not names:
+        return "", np.zeros((design.n_batches, int(np.diff(design.offsets).max(initial=0))))
+    return names[0], _held(design, names[0])
+
+
+def _held(design: Design, name: str) -> Array:
+    """A driver with holes held, (K, longest); NaN throughout where a batch has none of it."""
+    if name not in design.driver_names:
+        return np.full((design.n_batches, int(np.diff(design.offsets).max(initial=0))), np.nan)
+    column = design.drivers[:, design.driver_names.index(name)].copy()
+    for k in range(design.n_batches):
+        column[design.rows(k)] = hold_last(column[design.rows(k)])
+    return padded(design, column)
