@@ -19,7 +19,7 @@ from mlflow.types import ColSpec, Schema
 from models.base import Family
 from pipelines import model_store, pyfunc_model
 from pipelines.settings import Settings
-from pipelines.tracking import store_errors
+from pipelines.tracking import open_store, store_errors
 
 _PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 
@@ -33,14 +33,11 @@ def log_version(
     info: dict[str, Any],
     tags: dict[str, str],
     training_id: str,
-    settings: Settings,
 ) -> str:
     """Log a fitted model below its training's run and make a registered version of it; returns its number.
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
-    mlflow.set_tracking_uri(settings.store_uri)
-    mlflow.set_registry_uri(settings.store_uri)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         model_store.save(folder, family, machine_yaml, region, info)
@@ -74,6 +71,7 @@ def log_version(
 
 def local_folder(uri: str, settings: Settings) -> str:
     """Where the files of a model lie on this machine; fetched if the store is elsewhere."""
+    open_store(settings)
     with store_errors(settings):
         return str(mlflow.artifacts.download_artifacts(artifact_uri=uri, tracking_uri=settings.store_uri))
 

@@ -119,7 +119,7 @@ def promote(
             "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
             **({"replaces": champion.version} if champion is not None and replaces else {}),
         }  # fmt: skip
-        new = log_version(client, name, family, machine_yaml, region, info, tags, training_id, settings)
+        new = log_version(client, name, family, machine_yaml, region, info, tags, training_id)
         client.update_model_version(name, new, ("SIMULATED. " if result.simulated else "") + choice.words)
         client.set_registered_model_tag(name, "simulated", _text(result.simulated))
         if replaces:

@@ -66,6 +66,9 @@ def open_store(settings: Settings, say: Callable[[str], None] = _silent) -> Mlfl
     with _OPENING, store_errors(settings):
         if file is not None and not file.exists():
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
+        # A logged model's files are looked up in the process-wide store, whatever store is asked for.
+        mlflow.set_tracking_uri(settings.store_uri)
+        mlflow.set_registry_uri(settings.store_uri)
         client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
         client.search_experiments(max_results=1)
     return client

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +56,32 @@ def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monk
     assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
     assert not got["outside_region"].any()
     assert got["simulated"].all()
+
+
+def test_a_new_process_in_another_folder_finds_the_model(promoted, store, tmp_path):
+    """Nothing that an earlier call left in this process may be needed, and nothing may be written where one stands."""
+    table = toy_batches("toy-predict", 3)[2].table
+    (tmp_path / "run7.csv").write_text(table.drop(columns="z").to_csv(index=False))
+    code = (
+        "from pathlib import Path\n"
+        "from pipelines import settings\n"
+        "from pipelines.predict import predict_file\n"
+        "got = predict_file('models:/toy-predict-z@champion', Path('run7.csv'), settings.load())\n"
+        "print(got['predicted_um'].iloc[-1])\n"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW_")}
+    root = str(Path(model_store.__file__).parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**env, "THERMODRIFT_HOME": str(store.home), "PYTHONPATH": root},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert float(done.stdout) == pytest.approx(law_um(table)[-1], abs=1e-6)
+    assert [p.name for p in tmp_path.iterdir()] == ["run7.csv"]
 
 
 def test_a_file_without_an_input_is_told_in_one_line(stored, store, tmp_path):
