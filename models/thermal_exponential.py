@@ -18,6 +18,7 @@ EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it stays where on
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
 _LEAST_RATIO = 2.0  # of two time constants: closer ones give huge amplitudes of opposite sign
 _MOST_STEPS = 12
+_EXACT = 1e-9  # share of the sum of squares below which one lag leaves rounding only
 _WORTH = 0.01  # a second lag must lower the sum of squares by this share
 
 
@@ -69,8 +70,11 @@ class ThermalExponential(Family):
             loads = [_load(speed, m) for m in EXPONENTS] if follows else [np.ones_like(speed)]
             grid = _Sums.build(design, loads, known)
             for f in members:
-                m, taus_s = grid.best(folds[f], self.lags)
-                plain = _refined(design, list(folds[f]), loads[m], known, taus_s)
+                m, one_s, two_s = grid.best(folds[f], self.lags)
+                sse, plain = _refined(design, list(folds[f]), loads[m], known, one_s)
+                if two_s is not None and sse > _EXACT * grid.yy[list(folds[f])].sum():
+                    sse_two, plain_two = _refined(design, list(folds[f]), loads[m], known, two_s)
+                    plain = plain_two if sse - sse_two > _WORTH * sse else plain
                 plain |= {"exponent": EXPONENTS[m], "speed_channel": channel if follows else ""}
                 out[f] = self._learned(design, plain)
         return [out[f] for f in range(len(folds))]
@@ -128,8 +132,8 @@ class _Sums:
         ends = np.diff(design.offsets) - 1
         return cls(gram, with_y, (y**2).sum(axis=1), np.nan_to_num(ends * steps))
 
-    def best(self, fold: Sequence[int], lags: int) -> tuple[int, Array]:
-        """Index of the exponent and the time constants, s, with the least sum of squares over a fold."""
+    def best(self, fold: Sequence[int], lags: int) -> tuple[int, Array, Array | None]:
+        """Exponent's index with the least sum of squares over a fold, its best τ alone and best pair of τ, s."""
         batches = list(fold)
         gram, h = self.gram[batches].sum(axis=0), self.with_y[batches].sum(axis=0)
         limit_s = max(2.0 * float(self.longest_s[batches].max()), float(_TAU_GRID_S[1]))
@@ -146,16 +150,17 @@ class _Sums:
         gain = two.max(axis=(1, 2)) if lags > 1 else one.max(axis=1)
         # A tie within rounding goes to the first exponent: a single speed cannot tell them apart.
         m = int(np.argmax(gain >= gain.max() * (1.0 - 1e-9)))
-        if lags > 1:
-            i, j = np.unravel_index(int(two[m].argmax()), two[m].shape)
-            alone = self.yy[batches].sum() - one[m].max()
-            if two[m, i, j] - one[m].max() > _WORTH * alone:
-                return m, _TAU_GRID_S[[i, j]]
-        return m, _TAU_GRID_S[[int(one[m].argmax())]]
+        alone = _TAU_GRID_S[[int(one[m].argmax())]]
+        if lags < 2 or two[m].max() <= one[m].max():
+            return m, alone, None
+        i, j = np.unravel_index(int(two[m].argmax()), two[m].shape)
+        return m, alone, _TAU_GRID_S[[i, j]]
 
 
-def _refined(design: Design, batches: list[int], load: Array, known: NDArray[np.bool_], taus_s: Array) -> Plain:
-    """Time constants polished by Gauss–Newton steps on log τ, halved until they help; amplitudes solved anew."""
+def _refined(
+    design: Design, batches: list[int], load: Array, known: NDArray[np.bool_], taus_s: Array
+) -> tuple[float, Plain]:
+    """Time constants polished by Gauss–Newton steps on log τ, shortened until they help; amplitudes solved anew."""
     steps = steps_s(design)[batches]
     use = (padded(design, known.astype(float)) > 0)[batches]
     y = padded(design, np.where(known, design.y_um, 0.0))[batches][use]
@@ -186,7 +191,7 @@ def _refined(design: Design, batches: list[int], load: Array, known: NDArray[np.
         if moved < 1e-5:
             break
     inside = padded(design, np.ones(len(design.time_s)))[batches] > 0
-    return {"tau_s": np.exp(log_tau), "amplitude_um": amplitude, "mean_load": float(load[inside].mean())}
+    return sse, {"tau_s": np.exp(log_tau), "amplitude_um": amplitude, "mean_load": float(load[inside].mean())}
 
 
 def _allowed(log_tau: Array) -> Array:
