@@ -13,13 +13,15 @@ from data.machine import Machine
 _STEPS = 30.0
 _FLOOR_K = 3.0
 _BATCHES = 5
+_NEIGHBOURS = 3
+_STEADY = 4.0
 
 
 class Dead(Check):
     """Alone: wholly constant while the median of the others moves by 3 K and 30 of its resolution steps.
 
-    Against its own history: it moves by less than a tenth of what it usually moves for this much movement
-    of the others, where that usual share is steady (six times its scatter).
+    Against its own history: it moves by less than a tenth of what the three others with the steadiest ratio to it
+    let expect, where that ratio is steady (four times its scatter below 1).
     """
 
     key = "dead"
@@ -47,25 +49,32 @@ class Dead(Check):
         found: dict[int, list[Finding]] = {}
         for j, name in enumerate(names):
             rest = np.delete(moved, j, axis=1)
-            usual = np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in rest])
-            share = moved[:, j] / np.where(usual > 0, usual, np.nan)
-            known = share[np.isfinite(share)]
-            if len(known) < _BATCHES:
+            ratio = moved[:, [j]] / np.where(rest > 0, rest, np.nan)
+            enough = np.isfinite(ratio).sum(axis=0) >= _BATCHES
+            if not enough.any():
                 continue
-            centre = float(np.median(known))
-            scatter = 1.4826 * float(np.median(np.abs(known - centre)))
+            ratio, rest = ratio[:, enough], rest[:, enough]
+            usual = np.nanmedian(ratio, axis=0)
+            scatter = 1.4826 * np.nanmedian(np.abs(ratio / np.maximum(usual, 1e-9) - 1.0), axis=0)
+            near = np.argsort(scatter, kind="stable")[:_NEIGHBOURS]
+            if _STEADY * float(np.median(scatter[near])) > 1.0:
+                continue
+            expected = _median_of_rows(usual[near] * rest[:, near])
+            least = max(_FLOOR_K, _STEPS * smallest_step(batches[0], name))
             for k, batch in enumerate(batches):
-                expected = centre * usual[k]
-                if not np.isfinite(share[k]) or any(f.check == self.key and f.channel == name for f in batch.findings):
+                if any(f.check == self.key and f.channel == name for f in batch.findings):
                     continue
-                least = max(_FLOOR_K, _STEPS * smallest_step(batch, name))
-                if centre > 6.0 * scatter and share[k] < 0.1 * centre and expected > least:
+                if expected[k] > least and moved[k, j] < 0.1 * expected[k]:
                     words = (
-                        f"{name} moves by {moved[k, j]:.1f} K while the others move by {usual[k]:.1f} K; in the other "
-                        f"batches it moves {centre:.2f} times as much as they do"
+                        f"{name} moves by {moved[k, j]:.1f} K where its neighbours let expect {expected[k]:.1f} K from "
+                        "the other batches"
                     )
                     found.setdefault(k, []).append(self.finding(name, words))
         return found
+
+
+def _median_of_rows(values: Array) -> Array:
+    return np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in values])
 
 
 def _range_K(values: Array) -> float:

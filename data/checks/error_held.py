@@ -37,6 +37,7 @@ class ErrorHeld(Check):
                 change[a + 1 : b + 1] = 0.0
             together += change * np.isfinite(np.concatenate([[0.0], np.diff(v)]))
         code = np.cumsum(together > 0).astype(float)
+        code[~np.any([np.isfinite(batch.masked(name)) for name in names], axis=0)] = np.nan
         runs = [(a, b) for a, b in constant_runs(code) if b - a + 1 >= _ROWS]
         still = standing(batch)
         held = [(a, b) for a, b in runs if self._is_held(batch, names, code, a, b, runs, still)]
@@ -73,7 +74,7 @@ class ErrorHeld(Check):
         for c, d in runs:
             if d - c >= n / 2:
                 outside[c:d] = False
-        changing = float((np.diff(code)[outside] > 0).mean()) if outside.sum() > 20 else 0.5
+        changing = float(np.nanmean(np.diff(code)[outside] > 0)) if outside.sum() > 20 else 0.5
         if n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE):
             return False
         coarse = max(smallest_step(batch, name) for name in names)

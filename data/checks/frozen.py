@@ -11,7 +11,8 @@ from data.machine import Machine
 _ROWS = 10
 _SECONDS = 1200.0
 _CHANCE = 1e-9
-_RESTLESS = 0.85
+_RESTLESS = 0.75
+_TURNING = 0.2
 _STEPS = 15.0  # flat to one step for L at a turning point, a smooth curve has left by 5 steps at most after L more
 _FLOOR = {"um": 5.0, "degC": 1.0}
 _SIGMAS = 6.0
@@ -20,7 +21,7 @@ _SIGMAS = 6.0
 class Frozen(Check):
     """Two ways to tell.
 
-    Noise above the resolution (85 % of the samples differ from the one before) makes so many equal samples
+    Noise above the resolution (75 % of the samples differ from the one before) makes so many equal samples
     impossible: chance below 1e-9 and three times the longest other run. Or the other temperatures, fitted
     outside the stretch, and the channel's own slope at the stretch's ends both say that it moves in it by
     15 resolution steps, by 1 K or 5 µm, and by six sigma of that fit.
@@ -56,8 +57,11 @@ class Frozen(Check):
             return ""
         changing = float((np.abs(d[outside]) > 1e-9).mean())
         n = b - a
+        # white noise turns back in two steps of three, a trend never; heating mixes both
+        steps = d[outside & (np.abs(d) > 1e-9)]
+        turning = float((steps[1:] * steps[:-1] < 0).mean()) if len(steps) > 10 else 0.0
         # a sensor that rounding holds for minutes may rest for an hour when the machine comes to rest
-        if changing < _RESTLESS or n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE):
+        if changing < _RESTLESS or turning < _TURNING or n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE):
             return ""
         if n + 1 <= 3 * longest_other:
             return ""

@@ -57,7 +57,7 @@ class Swapped(Check):
 
 
 def _fingerprints(batch: Batch, names: list[str]) -> Array:
-    """Start level, K, and rises at the stated times as shares of the batch's typical rise: (p, 1 + times)."""
+    """Start level, K, and rises at the stated times as shares of the batch's typical largest rise: (p, 1 + times)."""
     out = np.full((len(names), 1 + len(_AT)), np.nan)
     rises = np.full((len(names), len(_AT)), np.nan)
     for i, name in enumerate(names):
@@ -74,6 +74,6 @@ def _fingerprints(batch: Batch, names: list[str]) -> Array:
     if not ok.any():
         return out
     out[:, 0] -= np.median(out[ok, 0])
-    typical = float(np.median(np.abs(rises[ok, -1])))
+    typical = float(np.median(np.abs(rises[ok]).max(axis=1)))
     out[:, 1:] = rises / typical if typical > 0.5 else np.nan
     return out

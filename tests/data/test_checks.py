@@ -1,0 +1,338 @@
+"""Every check finds its fault at the right channel and time, and says nothing about clean recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Finding
+from data.checks import CHECKS, check_batch, check_machine, usable_channels
+from data.errors import InputError
+from data.machine import Machine, Overrule, parse_machine
+
+MACHINE = """
+machine: toy
+recording: {step_s: 300, max_gap_s: 900}
+channels:
+  front: {role: temperature, unit: degC, resolution: 0.1, range: [-20, 90]}
+  rear: {role: temperature, unit: degC, resolution: 0.1, range: [-20, 90]}
+  head: {role: temperature, unit: degC, resolution: 0.1, range: [-20, 90]}
+  column: {role: temperature, unit: degC, resolution: 0.1, range: [-20, 90]}
+  bed: {role: temperature, unit: degC, resolution: 0.1, range: [-20, 90]}
+  room: {role: ambient, unit: degC, resolution: 0.1, range: [-20, 50]}
+  spindle_rpm: {role: driver, unit: rpm, resolution: 1}
+  x: {role: error, unit: um, resolution: 1, range: [-500, 500]}
+  z: {role: error, unit: um, resolution: 1, range: [-500, 500]}
+"""
+THERMAL = ("front", "rear", "head", "column", "bed")
+TAU_S = np.array([1200.0, 1800.0, 3600.0, 10000.0, 28000.0])
+GAIN_K = np.array([20.0, 14.0, 10.0, 6.0, 2.0])  # at 6000 rpm
+OFFSET_K = np.array([0.1, -0.1, 0.2, -0.2, 0.1])
+STANDING_S, STOP_S, STEP_S = 300.0, 6 * 3600.0, 300.0
+
+
+def toy_machine(**changes: object) -> Machine:
+    return parse_machine(MACHINE, "toy").model_copy(update=changes)
+
+
+def toy_batch(seed: int, step_s: float = STEP_S) -> Batch:
+    """A clean run of 6 h and a stop of 2 h: first-order parts, quantised 0.1 K and 1 µm, speed shift, 0.7 µm noise."""
+    rng = np.random.default_rng(seed)
+    machine = toy_machine()
+    time_s = np.arange(0.0, 8 * 3600.0 + 1.0, step_s)
+    share = rng.choice([1 / 3, 2 / 3, 1.0])
+    speed = np.where((time_s >= STANDING_S) & (time_s < STOP_S), 6000.0 * share, 0.0)
+    start = rng.uniform(3.0, 32.0)
+    drift = rng.uniform(-1.0, 5.0)
+    room = start + drift * time_s / time_s[-1] + 0.3 * np.sin(2 * np.pi * time_s / rng.uniform(1500, 5000))
+    rise = np.zeros((len(time_s), 5))
+    now = rng.uniform(-2.0, 4.0) * np.array([0.0, 0.0, 0.2, 0.6, 1.0])
+    gain = GAIN_K * share**1.4 * rng.uniform(0.85, 1.15)
+    for i in range(len(time_s)):
+        rise[i] = now
+        air = np.array([0.2, 0.2, 0.4, 0.6, 0.7]) * (room[i] - start)
+        goal = gain * (speed[i] > 0) + air
+        now = goal + (now - goal) * np.exp(-step_s / TAU_S)
+    truth = start + rise
+    table = pd.DataFrame({"time_s": time_s})
+    for j, name in enumerate(THERMAL):
+        table[name] = np.round(truth[:, j] + OFFSET_K[j], 1)
+    table["room"] = np.round(room, 1)
+    table["spindle_rpm"] = speed
+    shift = 4.0 * (speed / 6000.0) ** 2
+    x = 0.8 * rise[:, 2] - 1.5 * rise[:, 3]
+    z = 2.0 * rise[:, 0] + 2.5 * rise[:, 2] - 2.0 * rise[:, 3] - shift
+    for name, error in (("x", x), ("z", z)):
+        samples = np.round((error - error[0])[:, None] + rng.normal(0, 0.7, (len(time_s), 5)))
+        table[name] = samples.mean(axis=1)  # five samples of 1 µm a row
+    return Batch("toy", f"b{seed:02d}", table[["time_s", *machine.channels]], machine.batch_channels())
+
+
+def changed(batch: Batch, name: str, values: np.ndarray) -> Batch:
+    return replace(batch, table=batch.table.assign(**{name: values}), findings=())
+
+
+def added(batch: Batch, name: str, first: int, last: int | None, amount: float) -> Batch:
+    v = batch.values(name).copy()
+    v[first:last] += amount
+    return changed(batch, name, v)
+
+
+def findings(batch: Batch) -> tuple[Finding, ...]:
+    return check_batch(batch, toy_machine())
+
+
+def row_of(batch: Batch, finding: Finding) -> int:
+    assert finding.start_s is not None
+    return round(finding.start_s / batch.step_s)
+
+
+def the_one(batch: Batch, check: str, channel: str | None) -> Finding:
+    """The fault is found, and nothing is claimed of other channels."""
+    found = findings(batch)
+    assert [f for f in found if f.masks and f.channel != channel] == [], [f.words for f in found]
+    hits = [f for f in found if f.check == check and f.channel == channel]
+    assert hits, [(f.check, f.words) for f in found]
+    return hits[0]
+
+
+SEEDS = range(6)
+
+
+@pytest.mark.parametrize("step_s", [60.0, 300.0])
+def test_clean_batches_raise_nothing(step_s: float) -> None:
+    machine = toy_machine()
+    batches = [toy_batch(seed, step_s) for seed in range(30)]
+    batches = [b.with_findings(check_batch(b, machine)) for b in batches]
+    told = [f.words for b in check_machine(batches, machine) for f in b.findings]
+    assert told == []
+
+
+def test_every_check_says_what_it_is() -> None:
+    for key, check in CHECKS.items():
+        assert check.key == key
+        assert check.words
+    with pytest.raises(InputError, match="unknown check 'spyke': did you mean 'spike'"):
+        CHECKS["spyke"]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_jump_of_a_sensor_is_masked_to_the_end(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row = int(rng.integers(8, 65))
+    name = THERMAL[seed % 5]
+    size = float(rng.uniform(5.0, 40.0) * rng.choice([-1, 1]))
+    bad = added(toy_batch(seed), name, row, None, size)
+    found = the_one(bad, "jump_no_return", name) if abs(size) < 20 else findings(bad)[0]
+    assert found.channel == name and abs(row_of(bad, found) - row) <= 1 and found.end_s is None
+    masked = bad.with_findings((found,)).masked(name)
+    assert np.isnan(masked[row:]).all() and np.isfinite(masked[: row - 1]).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_loose_contact_is_masked_until_it_comes_back(seed: int) -> None:
+    row = 10 + 8 * seed
+    bad = added(toy_batch(seed), "bed", row, row + 6, 12.0)
+    found = the_one(bad, "jump_no_return", "bed")
+    assert row_of(bad, found) == row and found.end_s == (row + 5) * STEP_S
+    assert "comes back at" in found.words
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_knocked_probe_is_found_but_not_a_speed_shift(seed: int) -> None:
+    row = 20 + 5 * seed
+    bad = added(toy_batch(seed), "x", row, None, 40.0)
+    assert abs(row_of(bad, the_one(bad, "jump_no_return", "x")) - row) <= 1
+    shifted = added(toy_batch(seed), "x", round(STOP_S / STEP_S), None, 12.0)
+    assert findings(shifted) == ()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("name", "size"), [("column", 8.0), ("room", -10.0), ("z", 40.0)])
+def test_a_spike_is_masked_alone(seed: int, name: str, size: float) -> None:
+    row = 12 + 8 * seed
+    bad = added(toy_batch(seed), name, row, row + 1, size)
+    found = the_one(bad, "spike", name)
+    assert found.start_s == found.end_s == row * STEP_S
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_samples_out_of_range(seed: int) -> None:
+    row = 10 + 9 * seed
+    bad = added(toy_batch(seed), "rear", row, row + 5, 850.0)
+    found = the_one(bad, "out_of_range", "rear")
+    assert (found.start_s, found.end_s) == (row * STEP_S, (row + 4) * STEP_S)
+    assert "outside -20 to 90" in found.words
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_probe_at_its_full_scale(seed: int) -> None:
+    row = 20 + 7 * seed
+    batch = toy_batch(seed)
+    v = batch.values("x").copy()
+    v[row:] = 99.9998
+    found = the_one(changed(batch, "x", v), "saturated", "x")
+    assert found.start_s == row * STEP_S and "full scale 100 um" in found.words
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_frozen_channels(seed: int) -> None:
+    batch = toy_batch(seed)
+    v = batch.values("z").copy()
+    v[30:50] = v[30]
+    assert the_one(changed(batch, "z", v), "frozen", "z").start_s == 31 * STEP_S
+    t = batch.values("front").copy()
+    row = round(STOP_S / STEP_S) + 2
+    t[row:] = t[row]  # while the machine cools
+    if abs(batch.values("front")[-1] - t[row]) > 4.0:
+        assert abs(row_of(batch, the_one(changed(batch, "front", t), "frozen", "front")) - row) <= 2
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_dead_sensor(seed: int) -> None:
+    batch = toy_batch(seed)
+    flat = changed(batch, "front", np.full(batch.n_rows, batch.values("front")[0]))
+    if np.median([np.ptp(batch.values(n)) for n in ("rear", "head", "column", "bed", "room")]) > 3.0:
+        assert the_one(flat, "dead", "front").start_s is None
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_interruption_costs_the_errors_their_zero(seed: int) -> None:
+    row = 20 + 6 * seed
+    rng = np.random.default_rng(seed)
+    bad = toy_batch(seed)
+    for name in (*THERMAL, "room"):
+        bad = added(bad, name, row, None, float(rng.uniform(3.0, 6.0)))
+    found = findings(bad)
+    assert {(f.check, f.channel) for f in found} == {("interruption", "x"), ("interruption", "z")}
+    assert all(row - 1 <= row_of(bad, f) <= row and f.end_s is None for f in found)
+    assert "cannot be tied to the zero" in found[0].words
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("driver", [0.0, np.nan])
+def test_errors_held_while_the_spindle_stands(seed: int, driver: float) -> None:
+    batch = toy_batch(seed)
+    stop = round(STOP_S / STEP_S)
+    table = batch.table.copy()
+    table.loc[stop:, ["x", "z"]] = table.loc[stop, ["x", "z"]].to_numpy()
+    table.loc[stop:, "spindle_rpm"] = driver
+    found = findings(replace(batch, table=table))
+    assert {(f.check, f.channel) for f in found} == {("error_held", "x"), ("error_held", "z")}
+    assert all(f.start_s == (stop + 1) * STEP_S and f.end_s == batch.time_s[-1] for f in found)
+    assert "while the spindle stands" in found[0].words
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_wrong_units_name_the_right_one(seed: int) -> None:
+    batch = toy_batch(seed)
+    kelvin = changed(batch, "head", batch.values("head") + 273.15)
+    assert "set unit_in_file: K" in the_one(kelvin, "wrong_unit", "head").words
+    warm = batch
+    for name in (*THERMAL, "room"):
+        warm = changed(warm, name, batch.values(name) - batch.values("room")[0] + 25.0)
+    fahrenheit = changed(warm, "bed", warm.values("bed") * 1.8 + 32.0)
+    assert "set unit_in_file: degF" in the_one(fahrenheit, "wrong_unit", "bed").words
+    exact = batch.values("z") + np.random.default_rng(seed).normal(0, 0.1, batch.n_rows)
+    assert "set unit_in_file: mm" in the_one(changed(batch, "z", exact / 1000.0), "wrong_unit", "z").words
+
+
+def test_gaps_and_repairs_are_told_without_a_mask() -> None:
+    batch = toy_batch(0)
+    v = batch.values("rear").copy()
+    v[20:30] = np.nan
+    table = changed(batch, "rear", v).table
+    table.loc[40:44, ["x", "z", *THERMAL, "room"]] = np.nan
+    found = findings(replace(batch, table=table, repairs={"duplicates": 3, "rows_in": 400}))
+    assert [(f.check, f.channel, f.masks) for f in found] == [
+        ("gap", None, False),
+        ("gap", "rear", False),
+        ("clock", None, False),
+    ]
+    assert "clock: 3 rows with the time of another row" in found[2].words
+    assert "rear has no values from 1 h 40 min to 2 h 25 min (50 min)" in found[1].words
+
+
+def year() -> list[Batch]:
+    return [toy_batch(seed) for seed in range(12)]
+
+
+def test_a_sensor_that_reads_30_K_more_from_some_day_on() -> None:
+    batches = [added(b, "head", 0, None, 30.0) if k >= 8 else b for k, b in enumerate(year())]
+    machine = toy_machine()
+    known = check_machine([b.with_findings(check_batch(b, machine)) for b in batches], machine)
+    told = [(k, f.check, f.channel) for k, b in enumerate(known) for f in b.findings]
+    assert told == [(k, "offset", "head") for k in range(8, 12)]
+    assert np.isnan(known[8].masked("head")).all()
+    usable, excluded = usable_channels(known, (*THERMAL, "room"))
+    assert usable == ("front", "rear", "column", "bed", "room")
+    assert excluded == (
+        ("head", "head is unusable in 100% of b08 (offset), unusable in 100% of b09 (offset), "
+                 "unusable in 100% of b10 (offset) and 1 more"),
+    )  # fmt: skip
+
+
+def test_two_sensors_that_changed_places() -> None:
+    batches = year()
+    front, column = batches[7].values("front"), batches[7].values("column")
+    batches[7] = changed(changed(batches[7], "front", column), "column", front)
+    known = check_machine(batches, toy_machine())
+    told = [(k, f.check, f.channel) for k, b in enumerate(known) for f in b.findings if f.masks]
+    assert told == [(7, "swapped", "front"), (7, "swapped", "column")]
+
+
+def test_an_air_sensor_is_dead_by_its_own_history() -> None:
+    batches = year()
+    still = batches[3].values("rear")[0] + 0.1 * np.random.default_rng(0).integers(0, 2, batches[3].n_rows)
+    batches[3] = changed(batches[3], "rear", np.round(still, 1))
+    known = check_machine(batches, toy_machine())
+    assert ("dead", "rear") in [(f.check, f.channel) for f in known[3].findings]
+    assert not any(f.masks for k, b in enumerate(known) for f in b.findings if k != 3)
+
+
+def test_a_drifting_probe_is_odd_but_not_masked() -> None:
+    batches = year()
+    drift = np.linspace(0, 150.0, batches[5].n_rows)
+    batches[5] = changed(batches[5], "x", np.round(batches[5].values("x") + drift))
+    known = check_machine(batches, toy_machine())
+    told = [(k, f.check, f.channel, f.masks) for k, b in enumerate(known) for f in b.findings]
+    assert told == [(5, "unexplained", "x", False)]
+    assert np.isfinite(known[5].masked("x")).all()
+
+
+def test_the_machine_file_overrules() -> None:
+    rules = [
+        Overrule(batch="b0*", channel="bed", check="jump*", reason="sensor was moved on purpose"),
+        Overrule(batch="b01", channel="x", mask=True, start_s=600.0, end_s=1200.0, reason="probe touched"),
+    ]
+    machine = toy_machine(overrule=rules)
+    bad = added(toy_batch(0), "bed", 30, None, 15.0)
+    batches = [b.with_findings(check_batch(b, machine)) for b in (bad, toy_batch(1))]
+    once = check_machine(batches, machine)
+    assert [f.overruled for f in once[0].findings] == ["sensor was moved on purpose"]
+    assert np.isfinite(once[0].masked("bed")).all()
+    assert np.flatnonzero(np.isnan(once[1].masked("x"))).tolist() == [2, 3, 4]
+    assert [f.check for f in once[1].findings] == ["user"]
+    assert [b.findings for b in check_machine(once, machine)] == [b.findings for b in once]
+
+
+def test_an_overrule_outside_its_time_leaves_the_mask() -> None:
+    machine = toy_machine(overrule=[Overrule(channel="bed", end_s=600.0, reason="early only")])
+    bad = added(toy_batch(0), "bed", 30, None, 15.0)
+    known = check_machine([bad.with_findings(check_batch(bad, machine))], machine)
+    assert np.isnan(known[0].masked("bed")[30:]).all()
+
+
+def test_a_missing_channel_is_no_input() -> None:
+    batch = toy_batch(0)
+    lacking = changed(batch, "bed", np.full(batch.n_rows, np.nan))
+    usable, excluded = usable_channels([batch, replace(lacking, batch_id="b77")], ("bed", "rear"))
+    assert usable == ("rear",) and excluded == (("bed", "bed is missing in b77"),)
+
+
+def test_a_batch_of_two_rows_is_survived() -> None:
+    batch = toy_batch(0)
+    assert findings(replace(batch, table=batch.table.iloc[:2].reset_index(drop=True))) == ()
