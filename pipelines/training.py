@@ -1,0 +1,249 @@
+"""The yearly job as one list of steps: ingest → features → grid → track → promote → report.
+
+The steps are plain functions; a `Caller` decides how they run. `DirectCaller` calls them here and now,
+`pipelines.flows.PrefectCaller` as tasks of a flow: same functions, same numbers.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.checks import check_machine
+from data.errors import InputError
+from data.ingest import IngestReport, ingest
+from data.lake import Lake
+from data.machine import Machine, load_machine
+from models import FAMILIES
+from models.grid import Crossing, FamilyResult, Plan, assemble, cross_family, prepare, refit
+from models.region import region_of
+from models.result import GridResult
+from pipelines import promotion, registry, tracking
+from pipelines.report import figure_pngs, write_report
+from pipelines.settings import Settings, home
+
+T = TypeVar("T")
+R = TypeVar("R")
+Say = Callable[[str], None]
+RETRIES = 2  # for steps that touch a share or a store, where a second try can succeed
+
+
+class Caller(Protocol):
+    """How steps are run."""
+
+    def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
+        """`work` on every item, results in the items' order; an exception of any of them is raised."""
+
+
+class DirectCaller:
+    """Steps as plain calls, two at a time."""
+
+    def __init__(self, threads: int = 2, done: Callable[[str, int, int], None] | None = None) -> None:
+        self.threads, self.done = threads, done
+
+    def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
+        results: list[R] = []
+        with threadpool_limits(limits=1), ThreadPoolExecutor(self.threads) as pool:
+            for future in [pool.submit(work, item) for item in items]:
+                results.append(future.result())
+                if self.done:
+                    self.done(step, len(results), len(items))
+        return results
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train. `recordings` empty: what the lake holds. `targets` empty: every error channel."""
+
+    machine_file: Path
+    recordings: tuple[Path, ...] = ()
+    targets: tuple[str, ...] = ()
+    plan: Plan = field(default_factory=Plan)
+    report: Path | None = None
+    promote: bool = True
+    only_if_new: bool = False  # stop where the last training saw the same batches
+
+
+@dataclass
+class TrainOutcome:
+    """What came of it, for the command line and for tests."""
+
+    machine: str
+    simulated: bool
+    ingested: IngestReport | None = None
+    results: dict[str, GridResult] = field(default_factory=dict)
+    training_ids: dict[str, str] = field(default_factory=dict)
+    choices: dict[str, promotion.Choice] = field(default_factory=dict)
+    promotions: dict[str, registry.Promotion] = field(default_factory=dict)
+    report: Path | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    stopped: str = ""  # why nothing was trained
+
+
+def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = lambda text: None) -> TrainOutcome:
+    """Run the yearly job.
+
+    Raises:
+        InputError: machine file or recordings that cannot be used, or too few batches to train on.
+    """
+    machine = load_machine(request.machine_file)
+    outcome = TrainOutcome(machine.machine, machine.simulated)
+    clock = _Clock(outcome.seconds)
+    lake = Lake(home() / "lake")
+    if request.recordings:
+        say(f"ingest {', '.join(p.name for p in request.recordings)}")
+        work = partial(ingest, machine=machine, lake=lake)
+        outcome.ingested = caller.map("ingest", work, [request.recordings], retries=RETRIES)[0]
+        clock("ingest")
+    batches = load_batches(lake, machine)
+    targets = request.targets or machine.names("error")
+    _check_targets(targets, machine)
+    if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
+        outcome.stopped = "the last training saw the same batches; nothing new to learn"
+        return outcome
+    say(f"features and selectors of {len(batches)} batches")
+    crossings = dict(
+        zip(targets, caller.map("prepare", partial(_prepare, batches, request.plan), targets), strict=True)
+    )
+    clock("features")
+    say("grid")
+    jobs = [(t, f) for f in sorted(request.plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
+    done = dict(zip(jobs, caller.map("grid", partial(_cross, crossings), jobs), strict=True))
+    for t in targets:
+        outcome.results[t] = assemble(crossings[t], [done[t, f] for f in request.plan.families])
+    clock("grid")
+    say("track")
+    track = partial(_track, outcome.results, settings, say)
+    outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
+    clock("track")
+    for t in targets:
+        outcome.choices[t] = promotion.choose(outcome.results[t].cells, settings.promotion)
+    if request.promote:
+        say("promote")
+        promote = partial(_promote, outcome, crossings, request.machine_file, settings)
+        outcome.promotions = dict(zip(targets, caller.map("promote", promote, targets, retries=RETRIES), strict=True))
+        clock("promote")
+    say("report")
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
+    outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
+    clock("report")
+    return outcome
+
+
+def load_batches(lake: Lake, machine: Machine) -> list[Batch]:
+    """A machine's batches from the lake, with the checks that need several batches and the user's overrules.
+
+    Raises:
+        InputError: the lake has no batch of the machine.
+    """
+    batches = lake.load_all(machine.machine)
+    if not batches:
+        raise InputError(f"the lake has no batch of {machine.machine}; call `thermodrift ingest` or give --recordings")
+    return check_machine(batches, machine)
+
+
+def promote_tracked(
+    training_id: str, machine_file: Path, cell: str, force: bool, settings: Settings
+) -> registry.Promotion:
+    """Promote a cell of a tracked training, refitted on the versions of the batches that it was judged on.
+
+    Raises:
+        InputError: unknown training or cell, another machine's file, or a batch version that the lake does not hold.
+    """
+    result = tracking.load_training(training_id, settings).result
+    machine = load_machine(machine_file)
+    if machine.machine != result.machine:
+        raise InputError(f"training {training_id} is of {result.machine}, the machine file of {machine.machine}")
+    lake = Lake(home() / "lake")
+    batches = []
+    for row in result.batches.itertuples():
+        held = {v.digest: v.version for v in lake.versions(machine.machine, row.batch_id)}
+        if row.digest not in held:
+            raise InputError(
+                f"the lake does not hold batch {row.batch_id} as training {training_id} saw it; train again"
+            )
+        batches.append(lake.load(machine.machine, row.batch_id, held[row.digest]))
+    batches = check_machine(batches, machine)
+    if cell:
+        choice = promotion.pick(result.cells, settings.promotion, cell)
+    else:
+        choice = promotion.choose(result.cells, settings.promotion)
+    family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target)
+    text = machine_file.read_text(encoding="utf-8")
+    region = region_of(batches, family.inputs)
+    return registry.promote(result, choice, family, text, training_id, settings, region, batches, force=force)
+
+
+class _Clock:
+    """Seconds per step."""
+
+    def __init__(self, into: dict[str, float]) -> None:
+        self.into, self.last = into, time.perf_counter()
+
+    def __call__(self, step: str) -> None:
+        now = time.perf_counter()
+        self.into[step], self.last = round(now - self.last, 2), now
+
+
+def _check_targets(targets: Sequence[str], machine: Machine) -> None:
+    allowed = machine.names("error")
+    for t in targets:
+        if t not in allowed:
+            raise InputError(f"machine {machine.machine}: no error channel {t!r}; allowed: {', '.join(allowed)}")
+
+
+def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch], settings: Settings) -> bool:
+    digests = {b.digest for b in batches}
+    for target in targets:
+        past = tracking.trainings(machine, target, settings)
+        if past.empty:
+            return False
+        last = tracking.load_training(str(past.iloc[0]["training_id"]), settings)
+        if set(last.result.batches["digest"]) != digests:
+            return False
+    return True
+
+
+def _prepare(batches: Sequence[Batch], plan: Plan, target: str) -> Crossing:
+    return prepare(batches, target, plan)
+
+
+def _cross(crossings: dict[str, Crossing], job: tuple[str, str]) -> FamilyResult:
+    return cross_family(crossings[job[0]], job[1])
+
+
+def _track(results: dict[str, GridResult], settings: Settings, say: Say, target: str) -> str:
+    result = results[target]
+    return tracking.log_training(result, settings, figures=figure_pngs(result), say=say)
+
+
+def _promote(
+    outcome: TrainOutcome, crossings: dict[str, Crossing], machine_file: Path, settings: Settings, target: str
+) -> registry.Promotion:
+    choice, crossing = outcome.choices[target], crossings[target]
+    family = refit(crossing, choice.selector, choice.family, choice.n_tsp)
+    return registry.promote(
+        outcome.results[target],
+        choice,
+        family,
+        machine_file.read_text(encoding="utf-8"),
+        outcome.training_ids[target],
+        settings,
+        region_of(crossing.batches, family.inputs),
+        crossing.batches,
+    )
+
+
+def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:
+    trainings = [tracking.load_training(i, settings) for i in outcome.training_ids.values()]
+    return write_report(trainings, path, settings)
