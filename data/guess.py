@@ -14,14 +14,14 @@ from data.units import known_unit, quantity
 Array = NDArray[np.float64]
 
 _TIME = re.compile(r"time|zeit|时间|時間|時刻|日時|timestamp|elapsed|datum|date|^t$|^t ?[\[(]")
-_SETPOINT = re.compile(r"set ?_?point|sollwert|\bset\b|command")
+_SETPOINT = re.compile(r"set ?point|sollwert|\bset\b|command")
 _AMBIENT = re.compile(r"amb|room|hall|umgebung|raum|环境|環境|室温|雰囲気|\bair\b|luft")
-_ERROR = re.compile(r"disp|err|drift|deviat|\bweg|位移|変位|変形|误差|誤差|\bgap\b|probe|^d[xyz](\b|_)|strain|dehnung")
+_ERROR = re.compile(r"disp|err|drift|deviat|\bweg|位移|変位|変形|误差|誤差|\bgap\b|probe|^d[xyz]\b|strain|dehnung")
 _DRIVER = re.compile(
     r"rpm|speed|drehzahl|转速|轉速|回転|feed|vorschub|進給|进给|power|leistung|current|strom|load|heater|"
     r"^q\d|torque|coolant|pump|flow|volt"
 )
-_TEMPERATURE = re.compile(r"temp|^t[a-z]?_?\d|^pt_?\d|thermo|温")
+_TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
 _POSITION = re.compile(r"\bpos|axis|achse")
 _LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%"}
 _NICE_STEPS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1800, 3600)
@@ -52,7 +52,7 @@ def unit_in_name(name: str) -> str | None:
 
 def role(name: str, unit: str | None, values: Array) -> Guess:
     """Role of a channel from its name and unit, else from its values."""
-    folded = normalise(name)
+    folded = normalise(name.replace("_", " "))
     kind = quantity(unit) if unit else None
     if _SETPOINT.search(folded):
         return Guess("driver", "its name sounds like a set point")

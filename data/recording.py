@@ -43,6 +43,8 @@ from data.schedule import scheduled
 from data.timegrid import repair_time, to_grid
 from data.units import check_canonical, convert
 
+_FIRST_STAMP_S = 3.0e8  # mid-1979: an earlier stamp is a clock without a date
+
 
 def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list[Path]]:
     """(recordings, other files) of a directory, both sorted; the patterns are `recording.files`, case does not matter.
@@ -135,13 +137,18 @@ def _sheet_batches(
     if split.driver not in machine.channels:
         raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
     still = 0.5 * (machine.channels[split.driver].resolution or 0.0)
-    first: float | None = None
-    for k, rows in enumerate(cut_runs(blocks, split.driver, split.min_run_s, still, where)):
-        if first is None:
-            first = float(rows.time_s[np.isfinite(rows.time_s)][0])
+    first: list[float] = []
+
+    def noting_the_start() -> Iterator[Rows]:
+        for rows in blocks:
+            if not first:
+                first.extend(rows.time_s[np.isfinite(rows.time_s)][:1].tolist())
+            yield rows
+
+    for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
         part_id = f"{batch_id}-{k + 1:02d}"
         try:
-            yield _batch(rows, machine, path, part_id, f"{where} part {k + 1:02d}", need_error, extra, first)
+            yield _batch(rows, machine, path, part_id, f"{where} part {k + 1:02d}", need_error, extra, first[0])
         except InputError as error:
             errors.append(error)
         extra = {}
@@ -242,7 +249,7 @@ def _check_filled(columns: dict[str, np.ndarray], machine: Machine, where: str, 
 
 def _start(path: Path, machine: Machine, batch_start: float, file_start: float) -> pd.Timestamp | None:
     pattern = machine.recording.start_from_name
-    stamped = machine.recording.time.unit == "timestamp" and batch_start > 0
+    stamped = machine.recording.time.unit == "timestamp" and batch_start > _FIRST_STAMP_S
     if pattern:
         try:
             named = pd.Timestamp(dt.datetime.strptime(path.stem, pattern))

@@ -51,8 +51,13 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
         pattern = stamp_format([s for s in samples if isinstance(s, str) and not _is_number(s)], where)
     positions = sorted({layout.time, *layout.positions.values()})
     text = (layout.time,) if time.unit == "timestamp" else ()
+    no_date = pattern is not None and not any(d in pattern for d in ("%d", "%j", "8601"))
+    late = np.nan
     for block in sheet.blocks(layout.first_row, positions, text):
         time_s = to_seconds(block.columns[layout.time], time.unit, pattern, sheet.decimal)
+        if no_date and len(time_s):
+            time_s = _past_midnight(time_s, late)
+            late = float(_filled(time_s, late)[-1])
         unreadable = np.zeros(len(time_s), np.uint16)
         values: dict[str, Array] = {}
         for name, position in layout.positions.items():
@@ -60,6 +65,16 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
             if bad is not None:
                 unreadable += bad
         yield Rows(time_s, values, unreadable, block.ragged_rows)
+
+
+def _past_midnight(time_s: Array, before: float) -> Array:
+    """A clock without a date goes on after 24 h; `before` is the last time of the block before."""
+    day_s = 86400.0
+    first_day = 0.0 if np.isnan(before) else before // day_s
+    clock = time_s % day_s
+    known = _filled(clock, before % day_s)
+    steps = np.diff(known, prepend=known[0] if np.isnan(before) else before % day_s)
+    return clock + day_s * (first_day + np.cumsum(steps < -day_s / 2))
 
 
 def _is_number(text: str) -> bool:

@@ -2,7 +2,8 @@
 
 Repair of the time column, in this order
 1. unreadable times: the row is dropped (`unparsable_time`);
-2. a lone row whose time is far off on both sides: dropped (`time_outliers`);
+2. a lone row whose time is far off on both sides, or a first or last one ten recordings away: dropped
+   (`time_outliers`);
 3. a step back beyond `max_gap_s` into time that is already covered: the clock was restarted or set back; the rest is
    carried on one sampling interval after the last row (`clock_restarts`). How long the pause was nobody knows;
 4. any other step back: rows out of order, sorted (`backward_steps` counts every step back that was found);
@@ -27,6 +28,7 @@ from data.errors import InputError
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 _FAR_INTERVALS = 5.0
+_END_SPANS = 10.0
 _MANY_JUMPS = 1000
 _ENDLESS_S = 1e13  # no clock shows this; keeps differences finite
 _EPS = 1e-6  # of a step: 60 s reached by minutes × 60
@@ -79,8 +81,8 @@ def _lone(t: Array, step: Array, far: float) -> NDArray[np.bool_]:
     before, after = step[:-1], step[1:]
     fits = t[2:] >= t[:-2]
     lone[1:-1] = fits & (((before > far) & (after < -far)) | ((before < -far) & (after > far)))
-    lone[0] = abs(step[0]) > max(far, np.ptp(t[1:]))
-    lone[-1] = abs(step[-1]) > max(far, np.ptp(t[:-1])) and not (step[-1] < 0 and t[-1] >= t[0])
+    lone[0] = abs(step[0]) > max(far, _END_SPANS * np.ptp(t[1:]))
+    lone[-1] = abs(step[-1]) > max(far, _END_SPANS * np.ptp(t[:-1]))
     return lone
 
 

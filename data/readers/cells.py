@@ -69,8 +69,8 @@ def _text_to_float(column: Any, decimal: str) -> tuple[Array, NDArray[np.bool_] 
         numbers = pc.replace_substring(numbers, decimal, ".")
     values = _numpy(numbers.cast(pa.float64())).copy()
     rest = np.flatnonzero(~np.asarray(plain.to_numpy(**_copying(plain)), bool))
-    values[~np.isfinite(values)] = np.nan  # 1e999
-    bad = np.zeros(len(values), bool)
+    bad = np.isinf(values)  # 1e999
+    values[bad] = np.nan
     if len(rest):
         cells = pc.take(text, pa.array(rest)).to_pylist()
         read = {cell: parse_number(cell, decimal) for cell in set(cells)}
@@ -88,10 +88,10 @@ def _patterns(decimal: str) -> tuple[re.Pattern[str], re.Pattern[str], re.Patter
     d, o = re.escape(decimal), re.escape("," if decimal == "." else ".")
     exponent = r"([eE][+-]?\d+)?"
     return (
-        re.compile(rf"[+-]?(\d+({d}\d*)?|{d}\d+){exponent}"),
-        re.compile(rf"[+-]?\d{{1,3}}(({o}\d{{3}})+{d}\d+|({o}\d{{3}}){{2,}})"),
-        re.compile(rf"[+-]?\d{{1,3}}(({d}\d{{3}})+{o}\d+|({d}\d{{3}}){{2,}})"),
-        re.compile(rf"[+-]?(?!\d{{1,3}}{o}\d{{3}}$)(\d+{o}\d*|{o}\d+){exponent}"),
+        re.compile(rf"[+-]?(\d+({d}\d*)?|{d}\d+){exponent}", re.ASCII),
+        re.compile(rf"[+-]?\d{{1,3}}(({o}\d{{3}})+{d}\d+|({o}\d{{3}}){{2,}})", re.ASCII),
+        re.compile(rf"[+-]?\d{{1,3}}(({d}\d{{3}})+{o}\d+|({d}\d{{3}}){{2,}})", re.ASCII),
+        re.compile(rf"[+-]?(?!\d{{1,3}}{o}\d{{3}}$)(\d+{o}\d*|{o}\d+){exponent}", re.ASCII),
     )
 
 

@@ -100,7 +100,7 @@ def find_separator(lines: Sequence[str], hints: Sequence[str]) -> str:
         for line in [ln for ln in lines if ln.strip()][-50:]:
             cells = split(line, separator)
             good = sum(parse_number(c) is not None for c in cells)
-            total += good * good / len(cells) if len(cells) > 1 else 0.0
+            total += good * good / max(1, sum(bool(c.strip()) for c in cells)) if len(cells) > 1 else 0.0
         return total
 
     return max(_SEPARATORS, key=numbers)
