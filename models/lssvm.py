@@ -17,6 +17,7 @@ from models.bordered import bordered_inverse, left_out
 
 Rows = NDArray[np.int64]
 SCALES = {"K": 10.0, "degC": 10.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}
+LINEAR_WEIGHT = 10.0  # at equal weight the RBF takes half of every slope, and keeps it at home
 _OTHER_SCALE = 10.0  # inputs without a known unit are taken for rises
 _LEAST_ROWS_PER_BATCH = 8
 _ROWS_AT_ONCE = 4096  # of a prediction: bounds the kernel's memory
@@ -25,7 +26,7 @@ _ROWS_AT_ONCE = 4096  # of a prediction: bounds the kernel's memory
 class LSSVM(Family):
     """Least-squares support vector regression: `[[0, 1ᵀ], [1, Ω + I/γ]] [b; α] = [0; y]`.
 
-    `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `u_i·u_j/p` with `linear`: an RBF alone falls back to b outside the
+    `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `10 u_i·u_j/p` with `linear`: an RBF alone falls back to b outside the
     trained seasons, the linear part goes on. u are the p inputs divided by a fixed scale per unit (`SCALES`: 10 K,
     10 K/h, 1000 rpm, …), the same for every fold, so all folds share one kernel; σ is in those scales. The model is
     linear in y, so scaling y would change nothing.
@@ -178,7 +179,7 @@ def kernel(u: Array, v: Array, sigma: float, linear: bool) -> Array:
     dot = u @ v.T
     square = (u**2).sum(axis=1)[:, None] + (v**2).sum(axis=1) - 2.0 * dot
     omega: Array = np.exp(np.minimum(-square / (2.0 * p * sigma**2), 0.0))
-    return omega + dot / p if linear else omega
+    return omega + LINEAR_WEIGHT * dot / p if linear else omega
 
 
 @dataclass

@@ -1,0 +1,137 @@
+"""The BP net and its trainer: gradient, optimum, bounds, seeds."""
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from data.errors import InputError
+from features.design import Design
+from models.bp import BP
+from models.levenberg_marquardt import Nets, train
+
+
+def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:
+    """Batches of rises; `ambient` scales each batch's rises (a cold machine rises more)."""
+    rng = np.random.default_rng(seed)
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    parts = []
+    for k, n in enumerate(sizes):
+        size = 1.0 if ambient is None else ambient[k]
+        parts.append(size * np.cumsum(rng.uniform(0, 0.8, (n, p)), axis=0))
+    x = np.vstack(parts)
+    y = law(x) if law else 3 * x[:, 0] - 2 * x[:, -1] + rng.normal(0, 0.5, len(x))
+    time_s = np.concatenate([np.arange(n) * 60.0 for n in sizes])
+    return Design(tuple(f"t{j}" for j in range(p)), "z", tuple(f"K{k + 1}" for k in range(len(sizes))), x, y, time_s,
+                  offsets, 60.0)  # fmt: skip
+
+
+def test_jacobian_is_the_difference_quotient():
+    nets = Nets.drawn(4, 3, 2, seed=1)
+    x_t = np.random.default_rng(0).normal(size=(4, 3, 7))
+    out, hidden = nets.outputs(x_t)
+    jacobian = nets.jacobian(x_t, hidden, nets.parameters)
+    assert jacobian.shape == (4, 2 * 5 + 1, 7) and out.shape == (4, 7)
+    for j in range(11):
+        ahead, behind = nets.parameters.copy(), nets.parameters.copy()
+        ahead[:, j] += 1e-6
+        behind[:, j] -= 1e-6
+        slope = (nets.outputs(x_t, ahead)[0] - nets.outputs(x_t, behind)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[:, j], slope, atol=1e-8)
+
+
+def test_training_ends_where_the_penalised_gradient_vanishes():
+    rng = np.random.default_rng(0)
+    x_t, y = rng.normal(size=(2, 2, 50)), rng.normal(size=(2, 50))
+    known = np.ones((2, 50))
+    decay = 1e-2
+    nets, steps = train(Nets.drawn(2, 2, 2, seed=0), x_t, y, known, decay, 500)
+    assert (steps < 500).all()
+    out, hidden = nets.outputs(x_t)
+    penalty = np.full(9, decay)
+    penalty[-1] = 0.0
+    gradient = (nets.jacobian(x_t, hidden, nets.parameters) @ (y - out)[:, :, None])[..., 0] / 50
+    np.testing.assert_allclose(gradient, penalty * nets.parameters, atol=2e-3)
+
+
+def test_recovers_a_net_of_its_own_shape():
+    def law(x):
+        return 20 * np.tanh(0.15 * x[:, 0] - 0.1 * x[:, 1]) + 5
+
+    design = make_design(law=law)
+    model = BP(decay=0.0, iterations=200, max_rows=100).fit_design(design, [0, 1, 2])
+    left = model.predict_design(design, [3])[0] - design.y_um[design.rows(3)]
+    assert np.sqrt(np.mean(left**2)) < 0.02 * np.std(design.y_um)
+
+
+def test_padding_and_neighbours_change_nothing():
+    design = make_design()
+    folds = [[0, 1, 2], [1], [0, 3], [3], [0, 1, 2, 3]]
+    for fold, model in zip(folds, BP().fit_folds(design, folds), strict=True):
+        alone = BP().fit_design(design, fold)
+        for k in range(4):
+            np.testing.assert_allclose(
+                model.predict_design(design, [k])[0], alone.predict_design(design, [k])[0], atol=1e-6
+            )
+
+
+def test_small_stacks_give_what_one_stack_gives(monkeypatch):
+    design, folds = make_design(), [[0, 1, 2], [1, 2, 3], [0, 2, 3]]
+    want = BP().fit_folds(design, folds)
+    monkeypatch.setattr("models.bp._STACK_VALUES", 1)
+    for a, b in zip(want, BP().fit_folds(design, folds), strict=True):
+        np.testing.assert_allclose(a.predict_design(design, [3])[0], b.predict_design(design, [3])[0], atol=1e-6)
+
+
+def test_same_seed_same_net_other_seed_other_net_whatever_the_threads():
+    design = make_design(p=4)
+    predict = [BP(seed=s).fit_design(design, [0, 1, 2]).predict_design(design, [3])[0] for s in (0, 0, 1)]
+    np.testing.assert_array_equal(predict[0], predict[1])
+    assert np.abs(predict[0] - predict[2]).max() > 1e-6
+    with threadpool_limits(limits=1):
+        one = BP().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
+    with threadpool_limits(limits=2):
+        two = BP().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
+    np.testing.assert_allclose(one, two, atol=1e-6)
+
+
+@pytest.mark.parametrize("train", [[0, 1], [0], [2]])
+def test_a_season_never_seen_does_not_explode(train):
+    """Trained on small summer rises, asked for winter's of ten times their size, and the other way round."""
+    design = make_design(sizes=(60, 60, 60, 60), ambient=(1.0, 1.2, 10.0, 12.0), p=4)
+    model = BP().fit_design(design, train)
+    keep = np.isin(design.group, train)
+    width = np.ptp(design.y_um[keep])
+    for part in model.predict_design(design, range(4)):
+        assert np.abs(part - design.y_um[keep].mean()).max() < 3 * width
+    f = model.fitted
+    v, c = f["nets"][:, 3 * 5 : 3 * 6], f["nets"][:, -1]
+    bound = f["y_spread"] * np.mean(np.abs(c) + np.abs(v).sum(axis=1))
+    huge = Design(design.inputs, "z", ("far",), np.full((1, 4), 1e6), np.zeros(1), np.zeros(1), np.array([0, 1]), 60.0)
+    assert abs(model.predict_design(huge, [0])[0][0] - f["y_mean"]) <= bound * (1 + 1e-12)
+
+
+def test_rows_are_decimated_evenly_and_holes_left_out():
+    design = make_design(sizes=(100, 30))
+    x, y = design.x.copy(), design.y_um.copy()
+    x[5, 0], y[110:125] = np.nan, np.nan
+    holed = Design(design.inputs, "z", design.batch_ids, x, y, design.time_s, design.offsets, 60.0)
+    model = BP(max_rows=20).fit_design(holed, [0, 1])
+    assert model.fitted["n_rows"] == 20 + 15
+    got = np.concatenate(model.predict_design(holed, [0, 1]))
+    assert np.flatnonzero(np.isnan(got)).tolist() == [5]
+
+
+def test_a_sensor_that_never_moved_and_a_flat_error_do_no_harm():
+    design = make_design()
+    x = design.x.copy()
+    x[design.group == 0, 1] = 0.0
+    still = Design(design.inputs, "z", design.batch_ids, x, np.where(design.group == 0, 0.0, design.y_um),
+                   design.time_s, design.offsets, 60.0)  # fmt: skip
+    for part in BP().fit_design(still, [0]).predict_design(still, range(4)):
+        assert np.abs(part).max() < 1.0
+
+
+def test_too_few_rows_in_words():
+    design = make_design()
+    with pytest.raises(InputError, match="family bp: got 0 usable rows of z in no batch, need at least 2"):
+        BP().fit_design(design, [])
