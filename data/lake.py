@@ -257,6 +257,7 @@ class Lake:
 
     def _publish(self, manifest: dict[str, Any], batches: Iterable[Sequence[str]]) -> None:
         """Let the current files of these batches be what the manifest says."""
+        folders = set()
         for machine, batch_id in batches:
             entries = manifest["machines"][machine][batch_id]
             folder, name = self.root / f"machine={safe_name(machine)}", f"{safe_name(batch_id)}.parquet"
@@ -275,12 +276,15 @@ class Lake:
                 except OSError:  # a file system without hard links
                     shutil.copyfile(version, temporary)
                 temporary.replace(at)
+                folders.add(target.parent)
             if at != target:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 at.replace(target)
+                folders.add(target.parent)
             for stale in standing:
                 stale.unlink(missing_ok=True)
-            _sync(target.parent)
+        for changed in folders:
+            _sync(changed)
 
 
 def _enter(manifest: dict[str, Any], s: Staged) -> Stored:

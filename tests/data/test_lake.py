@@ -1,8 +1,10 @@
 """The lake against plain readers, plain copies of what was put, and random histories."""
 
+import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,13 @@ from data.lake import Lake
 from data.lakefile import content_digest, safe_name
 
 FINDING = Finding("frozen", "T1", "T1 stands at 20.0 degC for 3 h", 0.0, 60.0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_disk() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda fd: None)
+        yield
 
 
 def make(
