@@ -22,7 +22,7 @@ class Nets:
 
     @classmethod
     def drawn(cls, n_nets: int, n_inputs: int, n_hidden: int, seed: int) -> Nets:
-        """Starts of unit-variance activations (Nguyen and Widrow's spread), the same for every fold of a seed."""
+        """Random starts that give hidden sums of about unit variance, the same for every fold of a seed."""
         rng = np.random.default_rng(seed)
         w = rng.normal(size=(n_nets, n_hidden, n_inputs)) / np.sqrt(n_inputs)
         b = rng.uniform(-1.0, 1.0, size=(n_nets, n_hidden))
@@ -64,7 +64,7 @@ def train(
     known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that helps, × 10 after one that
     does not) and stops by itself, so a net's result does not depend on its neighbours.
 
-    Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994), eqs. 9–17.
+    Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
     theta = nets.parameters.copy()
     count = np.maximum(known.sum(axis=1), 1.0)

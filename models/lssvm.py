@@ -35,7 +35,7 @@ class LSSVM(Family):
     quarters of one or two batches), least mean RMS over the batches left out. Batches are decimated evenly, all to
     at most `max_rows` over the number of batches in the design (at least 8 each); `fitted` tells the rows kept.
 
-    Source: J. Suykens et al., Least squares support vector machines (2002), eq. 3.4; left-out residuals from the
+    Source: J. Suykens et al., Least squares support vector machines (2002); left-out residuals from the
     inverse: G. Cawley, Leave-one-out cross-validation based model selection criteria for weighted LS-SVMs (2006).
     """
 
