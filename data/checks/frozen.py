@@ -6,6 +6,8 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check, constant_runs, smallest_step, span_words
+from data.checks.jump_no_return import JumpNoReturn
+from data.checks.spike import Spike
 from data.machine import Machine
 
 _ROWS = 10
@@ -13,6 +15,7 @@ _SECONDS = 1200.0
 _CHANCE = 1e-9
 _RESTLESS = 0.75
 _TURNING = 0.2
+_STEP_OF_NOISE, _WIDE = 1.5, 0.1  # a tenth of the steps is wider than one step of the display
 _STEPS = 15.0  # flat to one step for L at a turning point, a smooth curve has left by 5 steps at most after L more
 _FLOOR = {"um": 5.0, "degC": 1.0}
 _SIGMAS = 6.0
@@ -21,7 +24,8 @@ _SIGMAS = 6.0
 class Frozen(Check):
     """Two ways to tell.
 
-    Noise above the resolution (75 % of the samples differ from the one before) makes so many equal samples
+    Noise above the resolution (75 % of the samples differ from the one before, or half of them and often by
+    more than one step of the display) makes so many equal samples
     impossible: chance below 1e-9 and three times the longest other run. Or the other temperatures, fitted
     outside the stretch, and the channel's own slope at the stretch's ends both say that it moves in it by
     15 resolution steps, by 1 K or 5 µm, and by six sigma of that fit.
@@ -32,6 +36,8 @@ class Frozen(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
+        # a sensor that jumps or spikes is no witness for the others
+        jumping = {f.channel for check in (JumpNoReturn(), Spike()) for f in check.batch(batch, machine)}
         for name in batch.names("temperature", "ambient", "error"):
             v = batch.masked(name)
             runs = sorted(constant_runs(v), key=lambda r: r[0] - r[1])
@@ -40,7 +46,9 @@ class Frozen(Check):
                 if b - a + 1 < _ROWS or b - a + 1 == np.isfinite(v).sum():
                     continue  # a wholly constant batch is a dead channel
                 others = max((d - c + 1 for c, d in runs if (c, d) != (a, b) and (c, d) not in claimed), default=1)
-                reason = self._no_flicker(batch, v, a, b, others) or self._should_move(batch, name, v, a, b)
+                reason = self._no_flicker(batch, name, v, a, b, others) or self._should_move(
+                    batch, name, jumping, v, a, b
+                )
                 if reason:
                     claimed.append((a, b))
                     words = (
@@ -49,7 +57,7 @@ class Frozen(Check):
                     found.append(self.finding(name, words, float(batch.time_s[a + 1]), float(batch.time_s[b])))
         return found
 
-    def _no_flicker(self, batch: Batch, v: Array, a: int, b: int, longest_other: int) -> str:
+    def _no_flicker(self, batch: Batch, name: str, v: Array, a: int, b: int, longest_other: int) -> str:
         d = np.diff(v)
         outside = np.isfinite(d)
         outside[a:b] = False
@@ -61,16 +69,22 @@ class Frozen(Check):
         steps = d[outside & (np.abs(d) > 1e-9)]
         turning = float((steps[1:] * steps[:-1] < 0).mean()) if len(steps) > 10 else 0.0
         # a sensor that rounding holds for minutes may rest for an hour when the machine comes to rest
-        if changing < _RESTLESS or turning < _TURNING or n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE):
+        coarse = _STEP_OF_NOISE * (batch.channels[name].resolution or np.inf)
+        noisy = changing > 0.5 and len(steps) > 10 and float((np.abs(steps) > coarse).mean()) > _WIDE
+        if (
+            not (changing > _RESTLESS or noisy)
+            or turning < _TURNING
+            or n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE)
+        ):
             return ""
         if n + 1 <= 3 * longest_other:
             return ""
         return f"elsewhere {changing:.0%} of its samples change and no run is longer than {longest_other} samples"
 
-    def _should_move(self, batch: Batch, name: str, v: Array, a: int, b: int) -> str:
+    def _should_move(self, batch: Batch, name: str, jumping: set[str | None], v: Array, a: int, b: int) -> str:
         if (b - a) * batch.step_s < _SECONDS:
             return ""
-        inputs = [n for n in batch.names(*THERMAL) if n != name]
+        inputs = [n for n in batch.names(*THERMAL) if n != name and n not in jumping]
         x = np.column_stack([batch.masked(n) for n in inputs]) if inputs else np.empty((len(v), 0))
         x = x[:, np.isfinite(x).all(axis=0) & (np.ptp(np.nan_to_num(x), axis=0) > 0)]
         out = np.isfinite(v)
@@ -97,9 +111,15 @@ def _own_movement(v: Array, a: int, b: int) -> float:
     window = max(3, length // 4)
     moves = [0.0]
     if a >= window:
-        moves.append(abs(float(v[a] - v[a - window])) / window * length)
+        moves.append(_slope(v[a - window : a + 1]) * length)
     if b + 1 + window < len(v):
-        moves.append(abs(float(v[b + 1 + window] - v[b + 1])) / window * length)
+        moves.append(_slope(v[b + 1 : b + 2 + window]) * length)
     if b + 1 < len(v):
         moves.append(abs(float(v[b + 1] - v[b])))
     return max(m for m in moves if np.isfinite(m))
+
+
+def _slope(v: Array) -> float:
+    """Mean step without the largest one, which may be a jump."""
+    d = np.diff(v)
+    return abs(float(d.sum() - d[np.argmax(np.abs(d))])) / (len(d) - 1)

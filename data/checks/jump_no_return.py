@@ -37,7 +37,10 @@ class JumpNoReturn(Check):
             same = [n for n in names if n != name and batch.channels[n].role == role]
             shared = np.sum([_near(odd[n]) for n in same], axis=0) if same else np.zeros(batch.n_rows)
             # one companion is still a pair of wires in one plug; two are the machine itself
-            alone = odd[name] & (shared < max(2, 0.2 * len(same))) & ~loaded
+            alone = odd[name] & (shared < max(2, 0.2 * len(same)))
+            alone &= ~loaded | (
+                np.abs(np.nan_to_num(steps[name])) > self._loaded_limit(batch, name, steps[name], loaded)
+            )
             alone &= _grows(batch.masked(name))
             if role == "temperature":
                 alone |= self._too_fast(batch, name)
@@ -54,6 +57,12 @@ class JumpNoReturn(Check):
         if channel.role == "error" and not batch.names("driver"):
             floor *= 3.0  # starts and stops are then unknown
         return max(step_limit(quiet, channel.resolution), _TYPICAL * lively, floor)
+
+    def _loaded_limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
+        """After a load change: three times the floor and the channel's own liveliness in such rows."""
+        rows = np.abs(e[loaded & np.isfinite(e)])
+        lively = float(np.quantile(rows, 0.9)) if len(rows) else 0.0
+        return _TYPICAL * max(lively, _FLOOR_UM if batch.channels[name].role == "error" else _FLOOR_K)
 
     def _too_fast(self, batch: Batch, name: str) -> Bools:
         v = batch.masked(name)
