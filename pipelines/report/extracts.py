@@ -72,6 +72,12 @@ def is_baseline(cells: pd.DataFrame) -> pd.Series:
     return cells["family"].isin(BASELINES)
 
 
+def zero_um(cells: pd.DataFrame) -> float:
+    """S_mean without a model, NaN where it was not run."""
+    zero = cells.loc[cells["family"] == "zero", "S_mean_um"]
+    return float(zero.iloc[0]) if len(zero) else float("nan")
+
+
 def S_by_batch(result: GridResult, cells: pd.DataFrame) -> list[pd.DataFrame]:
     """Per row of `cells` its scores per fold and batch."""
     wanted = cells[CELL_KEYS].assign(row=range(len(cells)))

@@ -49,7 +49,9 @@ def figure_pngs(result: GridResult) -> dict[str, bytes]:
 def _families(result: GridResult, cells: object, protocol: str) -> bytes:
     best = best_per(cells, "family").iloc[::-1]  # type: ignore[arg-type]
     names = [
-        family_label(r.family) if r.n_tsp == 0 else f"{family_label(r.family)}, {r.n_tsp} by {selector_label(r.selector)}"
+        family_label(r.family)
+        if r.n_tsp == 0
+        else f"{family_label(r.family)}, {r.n_tsp} by {selector_label(r.selector)}"
         for r in best.itertuples()
     ]
     fig = Figure(figsize=(6.4, 0.9 + 0.3 * len(best)), layout="tight")

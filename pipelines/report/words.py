@@ -2,20 +2,114 @@
 
 from __future__ import annotations
 
-INK, BLUE, ORANGE = "#1f2933", "#0072b2", "#d55e00"  # Okabe & Ito 2008: safe for the colour-blind
+import math
+from html import escape
 
+from models import FAMILIES
+
+# Okabe & Ito 2008, safe for the colour-blind; yellow, unreadable on white, replaced by olive.
+INK, BLUE, ORANGE, GREEN = "#1f2933", "#0072b2", "#d55e00", "#00755a"
+_PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7d6608", "#4b3f72")
+_SYMBOLS = ("circle", "square", "diamond", "triangle-up")
+NOTHING = "–"
+_HUGE = 10_000.0
 
 _FAMILIES = {"zero": "no model", "mean_curve": "mean curve", "thermal_exponential": "thermal exponential",
-             "pcr_lbo": "PCR (leave-batch-out)", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
+             "pcr_lbo": "PCR (inner leave-batch-out)", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
 _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc": "FCGC"}
 _SHOUTED = {"mlr", "pcr", "pls", "bp"}
+_SHORT = {"pcr_lbo": "PCR (inner)", "thermal_exponential": "thermal exp."}
 
 
-def family_label(key: str) -> str:
+def family_label(key: str, short: bool = False) -> str:
     """A family's name for people."""
+    if short and key in _SHORT:
+        return _SHORT[key]
     return _FAMILIES.get(key) or (key.upper() if key in _SHOUTED else key.replace("_", " "))
 
 
 def selector_label(key: str) -> str:
     """A selector's name for people."""
     return _SELECTORS.get(key) or key.replace("_", " ")
+
+
+def cell_label(selector: str, family: str, n_tsp: int) -> str:
+    """A cell in words: ``ridge on 4 points by FCGC``."""
+    if not n_tsp:
+        return family_label(family)
+    if selector == "none":
+        return f"{family_label(family)} on all {n_tsp} points"
+    return f"{family_label(family)} on {count(n_tsp, 'point')} by {selector_label(selector)}"
+
+
+def family_style(key: str) -> tuple[str, str]:
+    """Colour and marker of a family, the same on every page."""
+    keys = [k for k in FAMILIES if FAMILIES[k].uses_inputs]
+    i = keys.index(key) if key in keys else len(keys)
+    return _PALETTE[i % len(_PALETTE)], _SYMBOLS[i % len(_SYMBOLS)]
+
+
+def plain(text: str) -> str:
+    """A name that stands in a figure: plotly reads < and & as markup."""
+    return escape(str(text), quote=False)
+
+
+def count(n: int, noun: str) -> str:
+    """``1 batch``, ``3 batches``, ``2 points``."""
+    plural = noun + ("es" if noun.endswith("ch") else "s")
+    return f"{n} {noun if n == 1 else plural}"
+
+
+def decimals(S_std_um: float, n: int) -> int:
+    """Decimals of a mean over n batches: two where its standard error is below 0.1 µm, else one."""
+    return 2 if n > 0 and math.isfinite(S_std_um) and S_std_um / math.sqrt(n) < 0.1 else 1
+
+
+def number(value: float, digits: int = 1, sign: bool = False) -> str:
+    """A number with fixed digits; a dash for none, a power of ten where it has run away."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    if abs(value) >= _HUGE:
+        power = math.floor(math.log10(abs(value)))
+        raised = str(power).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f"{value / 10**power:.1f}·10{raised}".replace("-", "−")
+    text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+    return text.replace("-", "−")
+
+
+def plus_minus(mean: float, std: float, digits: int) -> str:
+    """``2.9 ± 0.8``; without a spread the mean alone."""
+    return f"{number(mean, digits)} ± {number(std, digits)}" if math.isfinite(std) else number(mean, digits)
+
+
+def percent(share: float) -> str:
+    """``87 %`` of a share 0..1."""
+    return f"{100 * share:.0f} %" if math.isfinite(share) else NOTHING
+
+
+def p_words(p: float) -> str:
+    """A p-value with honest digits."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def between(start_s: float, end_s: float) -> str:
+    """A stretch of a batch in h:min from its start; NaN is the batch's end on that side."""
+    open_start, open_end = not math.isfinite(start_s), not math.isfinite(end_s)
+    if open_start and open_end:
+        return "whole batch"
+    if open_start:
+        return f"start to {_clock(end_s)}"
+    if open_end:
+        return f"{_clock(start_s)} to end"
+    return _clock(start_s) if start_s == end_s else f"{_clock(start_s)} to {_clock(end_s)}"
+
+
+def _clock(time_s: float) -> str:
+    minutes = round(time_s / 60)
+    return f"{minutes // 60}:{minutes % 60:02d}"
+
+
+def listed(names: list[str], most: int = 12) -> str:
+    """``a, b and c``; a long list is cut and counted."""
+    shown = names if len(names) <= most else [*names[:most], f"{len(names) - most} more"]
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""

@@ -3,56 +3,79 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import re
 from collections.abc import Sequence
-from html import escape
+from functools import cache
 from pathlib import Path
+from uuid import uuid4
+
+import pandas as pd
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
 
 from data.errors import InputError
-from pipelines.report.extracts import best_per, protocols_of, scored
+from pipelines.report.layout import Strip
+from pipelines.report.page import page
 from pipelines.settings import Settings
 from pipelines.tracking import Training
 
 FORMATS = (".html", ".md")
+_TEMPLATES = Path(__file__).parent / "templates"
+_MARKDOWN = re.compile(r"[\\|*`\[\]<]|(?<!\w)_|_(?!\w)")  # an underscore inside a word is only itself
 
 
 def write_report(trainings: Sequence[Training], path: Path, settings: Settings) -> Path:
     """One page from tracked trainings; the suffix of `path`, .html or .md, decides the format.
 
-    The folder is made; the file appears whole or not at all.
+    The HTML page holds everything it needs and asks no network. The folder is made; the file appears whole or not
+    at all.
 
     Raises:
-        InputError: no training given, or another suffix.
+        InputError: no training given, one without a judged cell, another suffix, or a place that cannot be written.
     """
     path = Path(path)
     if path.suffix not in FORMATS:
         raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html or .md")
-    if not trainings:
-        raise InputError(f"report {path}: got no training; give at least one tracked training")
-    lines = []
-    for t in trainings:
-        lines.append(f"## {t.result.machine} {t.result.target}")
-        protocol = protocols_of(t.result)[0]
-        for row in best_per(scored(t.result, protocol, settings.promotion), "family").to_dict("records"):
-            lines.append(f"{row['family']} {row['selector']} {row['S_mean_um']:.1f} ± {row['S_std_um']:.1f} µm")
-    text = "\n".join(lines)
-    if path.suffix == ".html":
-        text = f"<!doctype html><meta charset=utf-8><title>report</title><pre>{escape(text)}</pre>"
-    _write(path, text)
+    shown = page(trainings, settings)
+    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
+    html = path.suffix == ".html"
+    text = _environment(html).get_template(f"report{path.suffix}.j2").render(page=shown, written=written)
+    try:
+        _write(path, text)
+    except OSError as error:
+        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
     return path
+
+
+@cache
+def _environment(html: bool) -> Environment:
+    env = Environment(
+        loader=FileSystemLoader(_TEMPLATES), autoescape=html, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, keep_trailing_newline=True, finalize=None if html else _markdown,
+    )  # fmt: skip
+    env.tests["strip"] = lambda cell: isinstance(cell, Strip)
+    if html:
+        env.globals["style"] = Markup((_TEMPLATES / "style.css").read_text(encoding="utf-8"))
+        env.globals["script"] = Markup((_TEMPLATES / "figures.js").read_text(encoding="utf-8"))
+        env.globals["plotly_js"] = Markup(get_plotlyjs().replace("</script", "<\\/script"))
+        env.filters["raw"] = Markup
+    return env
+
+
+def _markdown(value: object) -> object:
+    """Names and words as they are: what Markdown would read as markup gets a backslash."""
+    return _MARKDOWN.sub(r"\\\g<0>", value).replace("\n", " ") if isinstance(value, str) else value
 
 
 def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".part")
+    scratch = path.with_name(f".{path.name}.{uuid4().hex}.part")
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
+        with scratch.open("w", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(scratch).chmod(0o666 & ~umask)
-        Path(scratch).replace(path)
+        scratch.replace(path)
     finally:
-        Path(scratch).unlink(missing_ok=True)
+        scratch.unlink(missing_ok=True)

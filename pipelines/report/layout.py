@@ -1,0 +1,125 @@
+"""What a page is made of: tables, strips of dots and figures, without a word of HTML or Markdown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import plotly.graph_objects as go
+
+_MANTISSAS = (1, 2, 5)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A logarithmic axis in µm that all strips of a table share; positions in 0..100."""
+
+    low_um: float
+    high_um: float
+
+    @classmethod
+    def over(cls, values_um: Sequence[float], cap_um: float) -> Scale:
+        """From the least positive value to the greatest, at most `cap_um`."""
+        good = [v for v in values_um if math.isfinite(v) and v > 0] or [1.0]
+        low = min(good)
+        high = max(min(max(good), cap_um) if cap_um > low else max(good), 2 * low)
+        return cls(low / 1.1, high * 1.1)
+
+    def at(self, value_um: float) -> float:
+        """Position of a value, kept inside the axis."""
+        if not value_um > self.low_um:
+            return 0.0
+        share = math.log(value_um / self.low_um) / math.log(self.high_um / self.low_um)
+        return round(100 * min(share, 1.0), 1)
+
+    @property
+    def ticks(self) -> list[tuple[float, str]]:
+        """1, 2, 5, 10, … inside the axis (1, 10, … where that would crowd), with their positions."""
+        powers = range(math.floor(math.log10(self.low_um)), math.ceil(math.log10(self.high_um)) + 1)
+        for mantissas in (_MANTISSAS, (1, 3), (1,)):
+            values = [m * 10.0**p for p in powers for m in mantissas]
+            inside = [v for v in values if self.low_um <= v <= self.high_um]
+            if len(inside) <= 6:
+                break
+        return [(self.at(v), f"{v:g}") for v in inside]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A dot per batch on a table's scale, and their mean; `beyond` counts the dots that leave it."""
+
+    dots: tuple[float, ...]
+    mean: float
+    beyond: int
+    words: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's head and how its cells stand."""
+
+    title: str
+    unit: str = ""
+    kind: Literal["text", "number", "strip", "wide"] = "text"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row's cells; `mark` says in a word why it stands out."""
+
+    cells: tuple[str | Strip, ...]
+    mark: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its caption, the strips' scale and notes below."""
+
+    caption: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    simulated: bool = False
+    scale: Scale | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Key:
+    """One entry of a figure's legend."""
+
+    label: str
+    color: str
+    symbol: str = "line"  # line, dash, circle, square, diamond, triangle-up
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure; `size` says how much of the page's width it takes."""
+
+    figure: go.Figure
+    title: str
+    size: Literal["full", "half", "third"] = "full"
+
+    @property
+    def height(self) -> int:
+        """Height on the page, px."""
+        return int(self.figure.layout.height)
+
+    @property
+    def json(self) -> str:
+        """The figure for a script element: no < can end it early."""
+        text: str = self.figure.to_json()
+        return text.replace("<", "\\u003c")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Figures that stand together under one caption and legend."""
+
+    caption: str
+    plots: tuple[Plot, ...]
+    simulated: bool = False
+    keys: tuple[Key, ...] = ()
+    notes: tuple[str, ...] = field(default=())

@@ -1,0 +1,208 @@
+"""Tables of scores: overview, leaderboards, one per protocol and never two protocols in one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from models.result import CELL_KEYS, GridResult
+from pipelines.promotion import Choice
+from pipelines.report.extracts import MAIN_PROTOCOL, S_by_batch, best_per, is_baseline, zero_um
+from pipelines.report.layout import Column, Row, Scale, Strip, Table
+from pipelines.report.words import (
+    cell_label,
+    count,
+    family_label,
+    listed,
+    number,
+    percent,
+    plus_minus,
+    selector_label,
+)
+from pipelines.settings import PromotionRule
+
+PROMOTED = "promoted"
+_MOST_GROUPS = 6
+_WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
+
+
+def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: str, simulated: bool) -> Table:
+    """A row per channel: name, its cells from `extracts.scored`, the promoted cell, decimals."""
+    out = []
+    for name, cells, choice, digits in rows:
+        zero = cells[cells["family"] == "zero"]
+        nothing = float(zero["S_mean_um"].iloc[0]) if len(zero) else math.nan
+        own = _row_of(cells, choice)
+        out.append(
+            Row(
+                (
+                    name,
+                    plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else number(math.nan),
+                    plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+                    number(float(own["max_abs_um"]), 1) if own is not None else number(math.nan),
+                    percent(1 - choice.S_mean_um / nothing) if nothing else number(math.nan),
+                    cell_label(choice.selector, choice.family, choice.n_tsp),
+                    listed(list(choice.inputs)) or "none",
+                )
+            )
+        )
+    columns = (
+        Column("error channel"),
+        Column("no model", "µm", "number"),
+        Column("chosen model", "µm", "number"),
+        Column("max |e|", "µm", "number"),
+        Column("less error", "", "number"),
+        Column("model"),
+        Column("points", "", "wide"),
+    )
+    caption = f"S_mean ± S_std on left-out batches ({protocol})"
+    return Table(caption, columns, tuple(out), simulated)
+
+
+def leaderboard(
+    result: GridResult,
+    cells: pd.DataFrame,
+    key: str,
+    choice: Choice | None,
+    rule: PromotionRule,
+    digits: int,
+    caption: str,
+) -> Table:
+    """The best cell of every family or selector under one protocol, least score first; baselines always in it.
+
+    Args:
+        cells: one protocol's cells from `extracts.scored`.
+        key: family or selector.
+        choice: the promoted cell; it gets a row of its own where it is no row's best.
+    """
+    base = is_baseline(cells)
+    rows = best_per(cells[~base], key)
+    own = _row_of(cells, choice) if choice else None
+    if own is not None and not (rows[CELL_KEYS] == own[CELL_KEYS]).all(axis=1).any():
+        rows = pd.concat([rows, own.to_frame().T.astype(cells.dtypes)], ignore_index=True)
+    rows = pd.concat([rows, cells[base]], ignore_index=True).drop_duplicates(CELL_KEYS)
+    rows = rows.sort_values("score_um", kind="stable").reset_index(drop=True)
+    protocol = str(rows["protocol"].iloc[0])
+    per_batch = [part["S_um"].to_numpy(float) for part in S_by_batch(result, rows)]
+    nothing = zero_um(cells)
+    scale = Scale.over(np.concatenate(per_batch).tolist(), 2.5 * nothing if nothing > 0 else math.inf)
+    groups = _groups(result, rows, protocol)
+    names = list(dict.fromkeys(g for row in groups for g in row))
+    body = []
+    for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
+        chosen = own is not None and all(row[k] == own[k] for k in CELL_KEYS)
+        unstable = row["n_tsp"] and row["tsp_stability"] < rule.min_tsp_stability
+        body.append(
+            Row(
+                (
+                    family_label(row["family"]),
+                    selector_label(row["selector"]) if row["n_tsp"] else number(math.nan),
+                    str(row["n_tsp"]) if row["n_tsp"] else number(math.nan),
+                    number(row["S_mean_um"], digits),
+                    number(row["S_std_um"], digits),
+                    number(row["max_abs_um"], 1),
+                    _strip(values, float(row["S_mean_um"]), scale, digits),
+                    *(number(group.get(n, math.nan), digits) for n in names),
+                    percent(row["S_mean_um"] / nothing) if nothing else number(math.nan),
+                    number(row["fit_S_um"], digits),
+                    (number(row["tsp_stability"], 2) + (" unstable" if unstable else "")) if row["n_tsp"] else "–",
+                ),
+                PROMOTED if chosen else "",
+            )
+        )
+    columns = (
+        Column("family"),
+        Column("selector"),
+        Column("points", "n", "number"),
+        Column("S_mean", "µm", "number"),
+        Column("S_std", "µm", "number"),
+        Column("max |e|", "µm", "number"),
+        Column("S per model" if protocol == "train-on-one" else "S per batch", "µm", "strip"),
+        *(Column(n, "S_mean, µm", "number") for n in names),
+        Column("of no model", "", "number"),
+        Column("fitted S", "µm", "number"),
+        Column("stability of points", "", "number"),
+    )
+    dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
+    notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}."]
+    return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
+
+
+def batches(result: GridResult, choice: Choice, digits: int) -> Table:
+    """Every batch: when, how it ran, and its S without a model and left out by the promoted one."""
+    s = result.scores[result.scores["protocol"] == MAIN_PROTOCOL]
+    own = s[(s["selector"] == choice.selector) & (s["family"] == choice.family) & (s["n_tsp"] == choice.n_tsp)]
+    own = own.drop_duplicates("batch_id").set_index("batch_id")
+    zero = s[s["family"] == "zero"].drop_duplicates("batch_id").set_index("batch_id")
+    out = []
+    for row in result.batches.to_dict("records"):
+        b = row["batch_id"]
+        out.append(
+            Row(
+                (
+                    str(b),
+                    str(row.get("start") or "–").replace("T", " ")[:16],
+                    str(row.get("speed", "–")),
+                    number(float(row.get("start_ambient_degC", math.nan)), 1),
+                    f"{row['n_rows']}",
+                    number(_at(zero, b, "S_um"), digits),
+                    number(_at(own, b, "S_um"), digits),
+                    number(_at(own, b, "max_abs_um"), 1),
+                    number(_at(own, b, "bias_um"), 1, sign=True),
+                )
+            )
+        )
+    columns = (
+        Column("batch"),
+        Column("start"),
+        Column("speed"),
+        Column("start ambient", "°C", "number"),
+        Column("samples", "", "number"),
+        Column("S, no model", "µm", "number"),
+        Column("S, left out", "µm", "number"),
+        Column("max |e|", "µm", "number"),
+        Column("mean e", "µm", "number"),
+    )
+    label = cell_label(choice.selector, choice.family, choice.n_tsp)
+    return Table(f"Every batch, left out by {label}", columns, tuple(out), result.simulated)
+
+
+def _row_of(cells: pd.DataFrame, choice: Choice) -> pd.Series | None:
+    hit = cells[
+        (cells["selector"] == choice.selector) & (cells["family"] == choice.family) & (cells["n_tsp"] == choice.n_tsp)
+    ]
+    return hit.iloc[0] if len(hit) else None
+
+
+def _strip(values: np.ndarray, mean_um: float, scale: Scale, digits: int) -> Strip:
+    good = np.sort(values[np.isfinite(values)])
+    beyond = int((good > scale.high_um).sum())
+    if not len(good):
+        return Strip((), 0.0, 0, number(math.nan))
+    words = f"{number(good[0], digits)} to {number(good[-1], digits)}, median {number(float(np.median(good)), digits)}"
+    return Strip(tuple(scale.at(float(v)) for v in good), scale.at(mean_um), beyond, words)
+
+
+def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[str, float]]:
+    """Per row the mean S of every left-out season or speed; empty for the protocols of single batches."""
+    if protocol in (MAIN_PROTOCOL, "train-on-one"):
+        return [{} for _ in range(len(rows))]
+    parts = [part.groupby("fold", sort=False)["S_um"].mean() for part in S_by_batch(result, rows)]
+    if max((len(p) for p in parts), default=0) > _MOST_GROUPS:
+        return [{} for _ in range(len(rows))]
+    return [{str(k): float(v) for k, v in part.items()} for part in parts]
+
+
+def _at(table: pd.DataFrame, batch_id: str, column: str) -> float:
+    return float(table.loc[batch_id, column]) if batch_id in table.index and column in table else math.nan
+
+
+def protocol_note(result: GridResult, protocol: str) -> str:
+    """How many folds and batches a protocol's numbers rest on."""
+    s = result.scores[result.scores["protocol"] == protocol]
+    folds = s["fold"].nunique()
+    tested = len(result.batches) if protocol == "train-on-one" else s["batch_id"].nunique()
+    return f"{count(int(folds), 'fold')}, {count(int(tested), 'batch')} predicted"

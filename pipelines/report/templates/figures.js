@@ -1,0 +1,37 @@
+(function () {
+  "use strict";
+  const root = document.documentElement;
+  const plots = Array.from(document.querySelectorAll(".plot"));
+  const narrow = 520;
+  const paper = { full: [680, 0], half: [332, 270], third: [680, 235] };
+  const config = {
+    displaylogo: false, responsive: true,
+    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d"],
+  };
+  let drawn = 0;
+  plots.forEach(function (div) {
+    const spec = JSON.parse(document.getElementById(div.id + "-data").textContent);
+    if (div.clientWidth < narrow) {
+      spec.data.forEach(function (trace) { if (trace.type === "heatmap") { trace.showscale = false; } });
+      spec.layout.margin.r = 6;
+    }
+    const image = { format: "svg", filename: div.dataset.name };
+    Plotly.newPlot(div, spec.data, spec.layout, Object.assign({ toImageButtonOptions: image }, config))
+      .then(function () { div.dataset.height = spec.layout.height; drawn += 1; root.dataset.drawn = drawn; });
+  });
+  let closed = [];
+  window.addEventListener("beforeprint", function () {
+    closed = Array.from(document.querySelectorAll("details:not([open])"));
+    closed.forEach(function (part) { part.open = true; });
+    plots.forEach(function (div) {
+      const size = paper[div.dataset.size];
+      Plotly.relayout(div, { autosize: false, width: size[0], height: size[1] || Number(div.dataset.height) });
+    });
+  });
+  window.addEventListener("afterprint", function () {
+    closed.forEach(function (part) { part.open = false; });
+    plots.forEach(function (div) {
+      Plotly.relayout(div, { autosize: true, width: null, height: Number(div.dataset.height) });
+    });
+  });
+})();
