@@ -45,7 +45,9 @@ class CsvSheet(Sheet):
         widths = Counter(len(row) for row in self.head[first_row : first_row + 200] if row)
         if not widths:
             return
-        width = max(max(positions) + 1, widths.most_common(1)[0][0])
+        named = len(self.head[first_row - 1]) if first_row else 0
+        usual = widths.most_common(1)[0][0]
+        width = max(max(positions) + 1, named if 5 * widths[named] > widths.total() else usual)
         for lines in self._bytes(first_row):
             yield self._parse(lines, width, positions, text)
 

@@ -95,15 +95,23 @@ def find_separator(lines: Sequence[str], hints: Sequence[str]) -> str:
     if max(best.values()) > 0:
         return max(_SEPARATORS, key=lambda s: best[s])
 
+    sample = [line for line in lines if line.strip()][-50:]
+
     def numbers(separator: str) -> float:
+        rows = [split(line, separator) for line in sample]
+        width = Counter(len(row) for row in rows).most_common(1)[0][0] if rows else 1
         total = 0.0
-        for line in [ln for ln in lines if ln.strip()][-50:]:
-            cells = split(line, separator)
-            good = sum(parse_number(c) is not None for c in cells)
-            total += good * good / max(1, sum(bool(c.strip()) for c in cells)) if len(cells) > 1 else 0.0
+        for row in rows:
+            filled = [cell for cell in row if cell.strip()]
+            good = sum(_is_number(cell) and "\t" not in cell for cell in filled)
+            total += good * good / max(1, len(filled)) if len(row) == width > 1 else 0.0
         return total
 
-    return max(_SEPARATORS, key=numbers)
+    return max((";", "\t", "|", ","), key=numbers)  # the comma last: it may be a decimal mark
+
+
+def _is_number(cell: str) -> bool:
+    return parse_number(cell) is not None or parse_number(cell, ",") is not None
 
 
 def split(line: str, separator: str) -> list[str]:

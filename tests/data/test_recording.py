@@ -96,7 +96,7 @@ def test_every_source_row_is_accounted_for(tmp_path, kinds, step_s):
     try:
         batch = only(path, machine(f"{{step_s: {step_s}, max_gap_s: 900}}"))
     except InputError as error:
-        assert "expected at least 2 rows over one step" in str(error)
+        assert "at least 2" in str(error)
         return
     r = batch.repairs
     adds_up(batch)
