@@ -117,6 +117,8 @@ def configure_environment() -> None:
     os.environ.update(TELEMETRY_OFF)
     if os.environ.get("PREFECT_HOME", "") in ("", _prefect_home_set_here):
         _prefect_home_set_here = os.environ["PREFECT_HOME"] = str(home() / "prefect")
+    # Prefect makes its folder but not the one above it, and its server then dies without a word.
+    Path(os.environ["PREFECT_HOME"]).expanduser().mkdir(parents=True, exist_ok=True)
 
 
 def load(path: Path | str | None = None) -> Settings:
