@@ -38,7 +38,7 @@ from data.machine import Machine
 from data.readers import has_reader, reader_for
 from data.readers.base import Sheet
 from data.readers.header import Layout, NotThisTable, hints, locate
-from data.rows import Rows, cut_runs, join, stream
+from data.rows import Rows, cut_runs, gather, stream
 from data.schedule import scheduled
 from data.timegrid import repair_time, to_grid
 from data.units import check_canonical, convert
@@ -131,7 +131,7 @@ def _sheet_batches(
     split = machine.recording.split
     extra = {**extra, **layout.counts}
     if split is None:
-        rows = join(list(blocks))
+        rows = gather(blocks, sheet)
         yield _batch(rows, machine, path, batch_id, where, need_error, extra, 0.0)
         return
     if split.driver not in machine.channels:
@@ -213,7 +213,7 @@ def _batch(
     if start is None and recording.start_from_name:
         repairs["start_unreadable"] = 1
     return Batch(
-        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns), channels=machine.batch_channels(),
+        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns, copy=False), channels=machine.batch_channels(),
         start=start, simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
     )  # fmt: skip
 

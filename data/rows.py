@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,33 @@ def _past_midnight(time_s: Array, before: float) -> Array:
 
 def _is_number(text: str) -> bool:
     return text.strip().replace(".", "", 1).replace(",", "", 1).isdigit()
+
+
+def gather(blocks: Iterator[Rows], sheet: Sheet) -> Rows:
+    """All blocks of a sheet, written into place as they come: a long recording is held once, not twice."""
+    room, n, ragged = 0, 0, 0
+    names: tuple[str, ...] = ()
+    whole: list[NDArray[Any]] = []
+    for rows in blocks:
+        names = tuple(rows.columns)
+        arrays = [rows.time_s, rows.unreadable, *rows.columns.values()]
+        if n + len(rows) > room:
+            room = max(n + len(rows), int(1.02 * (n + len(rows)) / max(sheet.share_read, 1e-4)))
+            for i, array in enumerate(arrays):
+                grown = np.empty(room, array.dtype)
+                if len(whole) > i:
+                    grown[:n] = whole[i][:n]
+                    whole[i] = grown
+                else:
+                    whole.append(grown)
+        for to, array in zip(whole, arrays, strict=True):
+            to[n : n + len(rows)] = array
+        n += len(rows)
+        ragged += rows.ragged
+    if not whole:
+        return Rows(np.zeros(0), {}, np.zeros(0, np.uint16), ragged)
+    time_s, unreadable, *columns = (array[:n] for array in whole)
+    return Rows(time_s, dict(zip(names, columns, strict=True)), unreadable, ragged)
 
 
 def join(parts: Sequence[Rows]) -> Rows:

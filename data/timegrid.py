@@ -219,7 +219,7 @@ class _Sampled:
             self._marked["continuous"] = True
             self._mark(self._contributing())
         if self._on_grid and not self.coarse:
-            return v.copy()
+            return v
         left = np.maximum(self._left, 0)
         out = np.where(self._between, v[left] * (1.0 - self._weight) + v[self._right] * self._weight, np.nan)
         full = np.flatnonzero(~self._no_sample)

@@ -41,6 +41,7 @@ class Sheet(ABC):
     name: str = ""
     head: Sequence[Sequence[Any]] = ()  # first rows, cells as text or as Python values
     decimal: str = "."  # decimal mark of numbers in text cells
+    share_read: float = 1.0  # of the file, by the blocks given out so far: foretells how many rows will come
     words: str = ""  # how the text is written, for people: "semicolon, decimal comma, cp1252"
 
     @abstractmethod

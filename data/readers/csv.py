@@ -56,6 +56,7 @@ class CsvSheet(Sheet):
         end = self._newline.encode()
         wide = self.encoding.startswith("utf-16")
         decoder = codecs.getincrementaldecoder(self.encoding)("replace") if wide else None
+        size = self.path.stat().st_size
         with self.path.open("rb") as file:
             rest = b""
             while True:
@@ -72,6 +73,7 @@ class CsvSheet(Sheet):
                 if not wide and not piece.isascii():
                     piece = piece.decode(self.encoding, "replace").encode()
                 if piece:
+                    self.share_read = min(1.0, (file.tell() - len(rest)) / size)
                     yield piece
                 if last:
                     return

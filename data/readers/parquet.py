@@ -37,8 +37,11 @@ class ParquetSheet(Sheet):
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         skip = max(0, first_row - 1)
+        done, total = 0, self._file.metadata.num_rows
         names = list(dict.fromkeys(self._names[i] for i in positions))
         for batch in self._batches(names, _BLOCK_ROWS):
+            done += batch.num_rows
+            self.share_read = done / total
             if skip >= batch.num_rows:
                 skip -= batch.num_rows
                 continue

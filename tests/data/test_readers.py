@@ -333,3 +333,12 @@ def test_random_corruption_gives_a_batch_or_one_clear_line(tmp_path, kind, cut, 
             assert np.allclose(np.diff(batch.time_s), 10.0)
     except InputError as error:
         assert str(error).startswith("run.") and "\n" not in str(error)
+
+
+def test_a_block_without_any_whole_row(tmp_path, monkeypatch):
+    monkeypatch.setattr("data.readers.csv._BLOCK_BYTES", 32)
+    path = tmp_path / "run.csv"
+    path.write_text("t,front,z\n" + "0,1\n" * 20 + "".join(f"{10 * i},20,{i}\n" for i in range(50)))
+    batch = only(path, machine_for("t", "front", "z"))
+    assert batch.values("z").tolist() == list(range(50))
+    assert (batch.repairs["ragged_rows"], batch.repairs["rows_in"]) == (20, 70)
