@@ -42,15 +42,6 @@ _MOST_POINTS_SHOWN = 24
 
 
 @dataclass(frozen=True)
-class Protocol:
-    """Another protocol's table with what its numbers rest on."""
-
-    name: str
-    words: str
-    table: Table
-
-
-@dataclass(frozen=True)
 class Channel:
     """Everything the templates show of one error channel."""
 
@@ -65,7 +56,7 @@ class Channel:
     points: Panel | None
     frequency: Panel | None
     left_out: Panel | None
-    protocols: tuple[Protocol, ...]
+    protocols: tuple[Table, ...]
     batches: Table
     comparison: tuple[tuple[str, str], ...]
     trainings: Table | None
@@ -95,8 +86,7 @@ def channel_part(
         own = scored(result, other, rule)
         if len(own):
             caption = f"{name}: best cell of every family, {other}"
-            table = tables.leaderboard(result, own, "family", choice, rule, digits, caption)
-            others.append(Protocol(other, tables.protocol_note(result, other), table))
+            others.append(tables.leaderboard(result, own, "family", choice, rule, digits, caption))
     changes, change = _changes(name, group, choices)
     return Channel(
         anchor=anchor,
@@ -150,10 +140,10 @@ def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) 
     plots = tuple(
         Plot(
             figures.against_points(lines, flat, column, f"{short}, µm", choice.family, result.simulated),
-            f"{name} {short} against the number of points",
+            f"{name}: {short.lower().replace('s_', 'S_')}",
             "half",
         )
-        for column, short in (("S_mean_um", "accuracy S_mean"), ("S_std_um", "robustness S_std"))
+        for column, short in (("S_mean_um", "Accuracy S_mean"), ("S_std_um", "Robustness S_std"))
     )
     keys = [Key(f"{family_label(f)}, {selector_label(s)}", *family_style(f)) for f, s in at.items()]
     keys += [Key(family_label(f), "#5a6572", figures.flat_dash(f)) for f in flat["family"]]

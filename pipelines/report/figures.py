@@ -27,59 +27,68 @@ from pipelines.report.words import (
 )
 
 _FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif"
-_GRID, _MUTED = "#e4e8ec", "#5a6572"
-_BLUES = [[0.0, "#084d7d"], [0.35, "#3d8bbd"], [0.7, "#a9cde3"], [1.0, "#f3f5f7"]]
-_GREENS = [[0.0, "#ffffff"], [0.3, "#c9e6db"], [0.7, "#56ab8f"], [1.0, GREEN]]
+_GRID, _RULE, _MUTED = "#e4e8ec", "#b5bec8", "#5a6572"
+_BLUES = [[0.0, "#0b5a8f"], [0.45, "#6fabd0"], [1.0, "#f1f4f6"]]
+_GREENS = [[0.0, "#ffffff"], [0.5, "#8ecab4"], [1.0, GREEN]]
+_DASHES = {"zero": "dot", "mean_curve": "dash"}
 
 
 def heat_map(best: pd.DataFrame, top_um: float, digits: int, simulated: bool) -> go.Figure:
-    """Selector × family, best number of points of each pair.
+    """Selector × family, the best number of points of each pair; the colour is the logarithm of S_mean.
 
     Args:
-        best: selector, family, n_tsp, S_mean_um, S_std_um; the first rows are the best.
+        best: selector, family, n_tsp, S_mean_um, S_std_um; the order of appearance is the order shown.
         top_um: where the colours end (no model).
     """
-    families, selectors = list(dict.fromkeys(best["family"])), list(dict.fromkeys(best["selector"]))
-    at = {(r.family, r.selector): r for r in best.itertuples()}
-    rows = [[at.get((f, s)) for s in selectors] for f in families]
-    low = math.log10(max(float(best["S_mean_um"].min()), 1e-3))
-    high = max(math.log10(max(min(float(best["S_mean_um"].max()), top_um), 1e-3)), low + 0.1)
-    ticks = Scale(10**low / 1.001, 10**high * 1.001).ticks
-    values = [float(label) for _, label in ticks]
-    figure = go.Figure(
-        go.Heatmap(
-            x=[selector_label(s).replace(" ", "<br>", 1) for s in selectors],
-            y=[plain(family_label(f, short=True)) for f in families],
-            z=[[math.log10(max(r.S_mean_um, 1e-3)) if r else None for r in row] for row in rows],
-            text=[[f"{number(r.S_mean_um, digits)}<br>n = {r.n_tsp}" if r else "" for r in row] for row in rows],
-            customdata=[[_heat_words(r, digits) if r else "not tried" for r in row] for row in rows],
-            texttemplate="%{text}",
-            hovertemplate="%{customdata}<extra></extra>",
-            textfont={"size": 12},
-            colorscale=_BLUES,
-            zmin=low,
-            zmax=high,
-            xgap=2,
-            ygap=2,
-            colorbar={
-                "title": {"text": "S_mean, µm", "side": "right"},
-                "tickvals": [math.log10(v) for v in values],
-                "ticktext": [f"{v:g}" for v in values],
-                "thickness": 10,
-                "outlinewidth": 0,
-                "len": 0.9,
-            },
-        )
-    )
-    _dress(figure, 44 * len(families) + 90, simulated, below=True)
-    figure.update_xaxes(side="top", showgrid=False, tickangle=0, fixedrange=True, ticks="")
-    figure.update_yaxes(autorange="reversed", showgrid=False, fixedrange=True, ticks="", automargin=True)
-    return figure
+    rows = best.to_dict("records")
+    x = [selector_label(str(r["selector"])).replace(" ", "<br>", 1) for r in rows]
+    y = [plain(family_label(str(r["family"]))) for r in rows]
+    z = np.log10(np.maximum(best["S_mean_um"].to_numpy(float), 1e-3))
+    low = float(z.min())
+    high = max(min(float(z.max()), math.log10(max(top_um, 1e-3))), low + 0.1)
+    ticks = [float(label) for _, label in Scale(10**low / 1.001, 10**high * 1.001).ticks]
+    bar = {"title": {"text": "S_mean, µm", "side": "right"}, "tickvals": [math.log10(v) for v in ticks],
+           "ticktext": [f"{v:g}" for v in ticks], "thickness": 10, "outlinewidth": 0, "len": 1.0}  # fmt: skip
+    colored = {"type": "heatmap", "x": x, "y": y, "z": z, "colorscale": _BLUES, "zmin": low, "zmax": high,
+               "colorbar": bar, "customdata": [_heat_words(r, digits) for r in rows],
+               "hovertemplate": "%{customdata}<extra></extra>"}  # fmt: skip
+    text = [f"{number(r['S_mean_um'], digits)}<br>n = {r['n_tsp']}" for r in rows]
+    dark = (z - low) / (high - low) < 0.3
+    return _matrix(colored, text, dark, 44 * len(set(y)) + 84, 52, simulated)
 
 
-def _heat_words(row: Any, digits: int) -> str:
-    words = f"{cell_label(row.selector, row.family, row.n_tsp)}<br>S_mean {number(row.S_mean_um, digits)} µm"
-    return f"{words}, S_std {number(row.S_std_um, digits)} µm"
+def _heat_words(row: dict[Any, Any], digits: int) -> str:
+    words = f"{cell_label(row['selector'], row['family'], row['n_tsp'])}<br>S_mean {number(row['S_mean_um'], digits)}"
+    return f"{words} µm, S_std {number(row['S_std_um'], digits)} µm"
+
+
+def point_frequency(found: Sequence[Frequency], most: int, simulated: bool) -> go.Figure:
+    """How often each point was chosen (rows) per selector (columns), most often chosen first, at most `most` rows."""
+    total: dict[str, float] = {}
+    for f in found:
+        for name, share in f.share.items():
+            total[name] = total.get(name, 0.0) + share
+    names = sorted(total, key=lambda n: (-total[n], n))[:most]
+    x = [f"{selector_label(f.selector).replace(' ', '<br>', 1)}<br>n = {f.n_tsp}" for _ in names for f in found]
+    y = [plain(n) for n in names for _ in found]
+    z = np.array([f.share.get(n, 0.0) for n in names for f in found])
+    text = [percent(v) if v else "" for v in z]
+    colored = {"type": "heatmap", "x": x, "y": y, "z": z, "colorscale": _GREENS, "zmin": 0, "zmax": 1,
+               "showscale": False, "customdata": [percent(v) for v in z],
+               "hovertemplate": "%{y}: %{customdata} of the folds<extra></extra>"}  # fmt: skip
+    return _matrix(colored, text, z > 0.75, 27 * len(names) + 100, 68, simulated)
+
+
+def _matrix(colored: dict[str, Any], text: list[str], dark: Any, height: int, top: int, simulated: bool) -> go.Figure:
+    """A heat map with words in its cells, white on dark ones."""
+    words = {"type": "scatter", "mode": "text", "x": colored["x"], "y": colored["y"], "text": text, "hoverinfo": "skip",
+             "textfont": {"size": 12, "color": ["#ffffff" if d else INK for d in dark]}}  # fmt: skip
+    still = {"showgrid": False, "fixedrange": True, "ticks": "", "showline": False, "type": "category"}
+    layout = _layout(height, simulated, below=True, top=top)
+    layout["xaxis"] |= {**still, "side": "top", "tickangle": 0}
+    layout["yaxis"] |= {**still, "autorange": "reversed", "automargin": True}
+    layout["margin"] |= {"l": 20, "b": 28}
+    return go.Figure({"data": [{**colored, "xgap": 2, "ygap": 2}, words], "layout": layout})
 
 
 def against_points(
@@ -92,127 +101,66 @@ def against_points(
         flat: families without inputs: a level each.
         chosen: the family of the promoted cell, drawn stronger.
     """
-    figure = go.Figure()
     n_max = int(lines["n_tsp"].max()) if len(lines) else 1
+    data: list[dict[str, Any]] = []
     for row in flat.to_dict("records"):
-        figure.add_scatter(
-            x=[1, n_max],
-            y=[row[column]] * 2,
-            mode="lines",
-            name=family_label(row["family"]),
-            line={"color": _MUTED, "width": 1.2, "dash": flat_dash(row["family"])},
-            hovertemplate=f"{family_label(row['family'])}: %{{y:.3g}} µm<extra></extra>",
-        )
-    for family, part in lines.groupby("family", sort=False):
-        color, symbol = family_style(str(family))
-        part = part.sort_values("n_tsp")
-        figure.add_scatter(
-            x=part["n_tsp"],
-            y=part[column],
-            mode="lines+markers",
-            name=family_label(str(family)),
-            line={"color": color, "width": 2.6 if family == chosen else 1.4},
-            marker={"symbol": symbol, "size": 8 if family == chosen else 6},
-            hovertemplate=f"{cell_label(part['selector'].iloc[0], str(family), -1).split(' on ')[0]}, "
-            "%{x} points: %{y:.3g} µm<extra></extra>",
-        )
-    _dress(figure, 330, simulated)
-    step = max(1, math.ceil(n_max / 12))
-    figure.update_xaxes(title_text="number of points n", range=[0.6, n_max + 0.4], tick0=1, dtick=step)
-    values = pd.concat([lines[column], flat[column]]).to_numpy(float)
+        family = str(row["family"])
+        data.append({
+            "type": "scatter", "mode": "lines", "x": [1, n_max], "y": [row[column]] * 2, "name": family_label(family),
+            "line": {"color": _MUTED, "width": 1.3, "dash": flat_dash(family)},
+            "hovertemplate": f"{family_label(family)}: %{{y:.3g}} µm<extra></extra>",
+        })  # fmt: skip
+    for key, part in lines.groupby("family", sort=False):
+        family, part = str(key), part.sort_values("n_tsp")
+        color, symbol = family_style(family)
+        label = f"{family_label(family)}, {selector_label(str(part['selector'].iloc[0]))}"
+        strong = family == chosen
+        data.append({
+            "type": "scatter", "mode": "lines+markers", "x": part["n_tsp"], "y": part[column], "name": label,
+            "line": {"color": color, "width": 2.8 if strong else 1.4},
+            "marker": {"symbol": symbol, "size": 9 if strong else 6, "color": color},
+            "hovertemplate": f"{label}, %{{x}} points: %{{y:.3g}} µm<extra></extra>",
+        })  # fmt: skip
+    layout = _layout(330, simulated)
+    layout["xaxis"] |= {"title": {"text": "number of points n"}, "range": [0.6, n_max + 0.4], "tick0": 1,
+                        "dtick": max(1, math.ceil(n_max / 12))}  # fmt: skip
     top = float(flat[column].max()) if len(flat) else math.inf
-    scale = Scale.over(list(values), 1.2 * top)
-    figure.update_yaxes(
-        title_text=title,
-        type="log",
-        range=[math.log10(scale.low_um), math.log10(scale.high_um)],
-        tickvals=[float(label) for _, label in scale.ticks],
-        ticktext=[label for _, label in scale.ticks],
-    )
-    return figure
+    layout["yaxis"] |= _log_axis(Scale.over([*lines[column], *flat[column]], 1.2 * top), title)
+    return go.Figure({"data": data, "layout": layout})
+
+
+def _log_axis(scale: Scale, title: str) -> dict[str, Any]:
+    values = [float(label) for _, label in scale.ticks]
+    return {"title": {"text": title}, "type": "log", "range": [math.log10(scale.low_um), math.log10(scale.high_um)],
+            "tickvals": values, "ticktext": [f"{v:g}" for v in values]}  # fmt: skip
 
 
 def flat_dash(family: str) -> str:
     """The dash of a level."""
-    return {"zero": "dot", "mean_curve": "dash"}.get(family, "dashdot")
-
-
-def point_frequency(found: Sequence[Frequency], most: int, simulated: bool) -> go.Figure:
-    """How often each point was chosen (rows) per selector (columns), most often chosen first, at most `most` rows."""
-    total: dict[str, float] = {}
-    for f in found:
-        for name, share in f.share.items():
-            total[name] = total.get(name, 0.0) + share
-    names = sorted(total, key=lambda n: (-total[n], n))[:most]
-    z = [[f.share.get(n, 0.0) for f in found] for n in names]
-    figure = go.Figure(
-        go.Heatmap(
-            x=[f"{selector_label(f.selector).replace(' ', '<br>', 1)}<br>n = {f.n_tsp}" for f in found],
-            y=[plain(n) for n in names],
-            z=z,
-            text=[[percent(v) if v else "" for v in row] for row in z],
-            texttemplate="%{text}",
-            textfont={"size": 12},
-            hovertemplate="%{y} in %{text} of the folds<extra></extra>",
-            colorscale=_GREENS,
-            zmin=0,
-            zmax=1,
-            showscale=False,
-            xgap=2,
-            ygap=2,
-        )
-    )
-    _dress(figure, 26 * len(names) + 100, simulated, below=True)
-    figure.update_xaxes(side="top", showgrid=False, fixedrange=True, tickangle=0, ticks="")
-    figure.update_yaxes(autorange="reversed", showgrid=False, fixedrange=True, ticks="", automargin=True)
-    return figure
+    return _DASHES.get(family, "dashdot")
 
 
 def left_out(batch: LeftOut, target: str, residual_range_um: tuple[float, float], simulated: bool) -> go.Figure:
     """Recording and left-out prediction above, their difference below."""
-    figure = go.Figure()
-    figure.add_scatter(
-        x=batch.time_h,
-        y=batch.recorded_um,
-        mode="lines",
-        name="recorded",
-        line={"color": INK, "width": 1.4},
-        hovertemplate="recorded %{y:.1f} µm<extra></extra>",
-    )
-    figure.add_scatter(
-        x=batch.time_h,
-        y=batch.predicted_um,
-        mode="lines",
-        name="predicted",
-        line={"color": BLUE, "width": 2.2},
-        hovertemplate="predicted %{y:.1f} µm<extra></extra>",
-    )
-    figure.add_scatter(
-        x=batch.time_h,
-        y=batch.recorded_um - batch.predicted_um,
-        mode="lines",
-        name="residual",
-        line={"color": ORANGE, "width": 1.4},
-        yaxis="y2",
-        hovertemplate="residual %{y:.1f} µm<extra></extra>",
-    )
-    _dress(figure, 340, simulated)
-    figure.update_layout(
-        xaxis={"title": {"text": "time since start, h"}, "anchor": "y2"},
-        yaxis={"title": {"text": f"{plain(target)}, µm"}, "domain": [0.44, 1.0]},
-        yaxis2={
-            "title": {"text": "residual, µm"},
-            "domain": [0.0, 0.34],
-            "range": list(residual_range_um),
-            "zeroline": True,
-            "zerolinecolor": _MUTED,
-            "zerolinewidth": 1,
-            "anchor": "x",
-        },
-        hovermode="x unified",
-    )
-    _axes(figure)
-    return figure
+    residual_um = batch.recorded_um - batch.predicted_um
+    lines = [
+        ("recorded", batch.recorded_um, INK, 1.3, "y"),
+        ("predicted", batch.predicted_um, BLUE, 2.2, "y"),
+        ("residual", residual_um, ORANGE, 1.3, "y2"),
+    ]
+    data = [
+        {"type": "scatter", "mode": "lines", "x": batch.time_h, "y": y, "name": name, "yaxis": axis,
+         "line": {"color": color, "width": width}, "hovertemplate": f"{name} %{{y:.1f}} µm<extra></extra>"}
+        for name, y, color, width, axis in lines
+    ]  # fmt: skip
+    layout = _layout(350, simulated)
+    layout["xaxis"] |= {"title": {"text": "time since start, h"}, "anchor": "y2"}
+    layout["yaxis2"] = dict(layout["yaxis"]) | {
+        "title": {"text": "residual, µm"}, "domain": [0.0, 0.36], "range": list(residual_range_um), "nticks": 5,
+        "zeroline": True, "zerolinecolor": _MUTED, "zerolinewidth": 1, "anchor": "x",
+    }  # fmt: skip
+    layout["yaxis"] |= {"title": {"text": f"{plain(target)}, µm"}, "domain": [0.44, 1.0]}
+    return go.Figure({"data": data, "layout": {**layout, "hovermode": "x"}})
 
 
 def residual_range_um(batches: Sequence[LeftOut]) -> tuple[float, float]:
@@ -229,70 +177,43 @@ def before_and_after(both: pd.DataFrame, simulated: bool) -> go.Figure:
     Args:
         both: batch_id, S_um_old, S_um_new in the batches' order.
     """
-    x = [plain(b) for b in both["batch_id"]]
-    figure = go.Figure()
-    for old, new, name in zip(both["S_um_old"], both["S_um_new"], x, strict=True):
-        figure.add_shape(type="line", x0=name, x1=name, y0=old, y1=new, line={"color": "#b5bec8", "width": 2})
-    figure.add_scatter(
-        x=x,
-        y=both["S_um_old"],
-        mode="markers",
-        name="earlier",
-        marker={"size": 8, "color": "white", "line": {"color": _MUTED, "width": 1.6}},
-        hovertemplate="%{x}: earlier %{y:.2f} µm<extra></extra>",
-    )
-    figure.add_scatter(
-        x=x,
-        y=both["S_um_new"],
-        mode="markers",
-        name="newest",
-        marker={"size": 8, "color": BLUE},
-        hovertemplate="%{x}: newest %{y:.2f} µm<extra></extra>",
-    )
-    _dress(figure, 330, simulated)
-    figure.update_xaxes(type="category", tickangle=-60, tickfont={"size": 10}, automargin=True)
-    figure.update_yaxes(title_text="S on the left-out batch, µm", rangemode="tozero")
-    return figure
+    x = [plain(str(b)) for b in both["batch_id"]]
+    old, new = both["S_um_old"].to_numpy(float), both["S_um_new"].to_numpy(float)
+    ring = {"size": 9, "color": "white", "line": {"color": _MUTED, "width": 1.6}}
+    markers = [("earlier", old, ring), ("newest", new, {"size": 9, "color": BLUE})]
+    data: list[dict[str, Any]] = [
+        {"type": "scatter", "mode": "lines", "x": np.repeat(x, 3), "hoverinfo": "skip", "connectgaps": False,
+         "y": np.column_stack([old, new, np.full(len(x), np.nan)]).ravel(), "line": {"color": _RULE, "width": 2}}
+    ]  # fmt: skip
+    data += [
+        {"type": "scatter", "mode": "markers", "x": x, "y": y, "name": name, "marker": marker,
+         "hovertemplate": f"%{{x}}: {name} %{{y:.2f}} µm<extra></extra>"}
+        for name, y, marker in markers
+    ]  # fmt: skip
+    layout = _layout(340, simulated)
+    layout["xaxis"] |= {"type": "category", "tickangle": -60, "tickfont": {"size": 10}, "automargin": True}
+    layout["yaxis"] |= {"title": {"text": "S on the left-out batch, µm"}, "rangemode": "tozero"}
+    return go.Figure({"data": data, "layout": layout})
 
 
-def _dress(figure: go.Figure, height: int, simulated: bool, below: bool = False) -> None:
-    figure.update_layout(
-        template=None,
-        height=height,
-        autosize=True,
-        margin={"l": 62, "r": 12, "t": 22, "b": 46},
-        font={"family": _FONT, "size": 12, "color": INK},
-        paper_bgcolor="white",
-        plot_bgcolor="white",
-        showlegend=False,
-        hoverlabel={"bgcolor": "white", "font": {"family": _FONT, "size": 12}},
-    )
-    _axes(figure)
-    if simulated:
-        figure.add_annotation(
-            text="SIMULATED",
-            xref="paper",
-            yref="paper",
-            x=1,
-            y=0 if below else 1,
-            xanchor="right",
-            yanchor="top" if below else "bottom",
-            showarrow=False,
-            yshift=-4 if below else 4,
-            font={"size": 10, "color": ORANGE},
-        )
-
-
-def _axes(figure: go.Figure) -> None:
-    look = {
-        "gridcolor": _GRID,
-        "zeroline": False,
-        "ticks": "outside",
-        "ticklen": 4,
-        "tickcolor": "#b5bec8",
-        "linecolor": "#b5bec8",
-        "title_standoff": 8,
+def _layout(height: int, simulated: bool, below: bool = False, top: int = 22) -> dict[str, Any]:
+    """The look that all figures share; simulated data are called so inside the picture."""
+    axis = {"gridcolor": _GRID, "zeroline": False, "ticks": "outside", "ticklen": 4, "tickcolor": _RULE,
+            "showline": True, "linecolor": _RULE}  # fmt: skip
+    label = {"text": "SIMULATED", "xref": "paper", "yref": "paper", "showarrow": False,
+             "font": {"size": 10, "color": ORANGE}, "x": 1 if below else 0, "xanchor": "right" if below else "left",
+             "y": 0 if below else 1, "yanchor": "top" if below else "bottom", "yshift": -4 if below else 3}  # fmt: skip
+    return {
+        "template": None,
+        "height": height,
+        "autosize": True,
+        "margin": {"l": 58, "r": 14, "t": top, "b": 46},
+        "font": {"family": _FONT, "size": 12, "color": INK},
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "showlegend": False,
+        "hoverlabel": {"bgcolor": "white", "font": {"family": _FONT, "size": 12}},
+        "xaxis": dict(axis),
+        "yaxis": dict(axis),
+        "annotations": [label] if simulated else [],
     }
-    figure.update_xaxes(**look)
-    figure.update_yaxes(**look)
-    figure.update_layout(yaxis2={"zeroline": True}) if "yaxis2" in figure.layout else None

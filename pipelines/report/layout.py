@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import plotly.graph_objects as go
 
-_MANTISSAS = (1, 2, 5)
+_MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
+_CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
 
 
 @dataclass(frozen=True)
@@ -36,14 +38,26 @@ class Scale:
 
     @property
     def ticks(self) -> list[tuple[float, str]]:
-        """1, 2, 5, 10, … inside the axis (1, 10, … where that would crowd), with their positions."""
-        powers = range(math.floor(math.log10(self.low_um)), math.ceil(math.log10(self.high_um)) + 1)
-        for mantissas in (_MANTISSAS, (1, 3), (1,)):
-            values = [m * 10.0**p for p in powers for m in mantissas]
-            inside = [v for v in values if self.low_um <= v <= self.high_um]
-            if len(inside) <= 6:
+        """Round values inside the axis, as many as it holds without crowding, with their positions."""
+        best: list[float] = []
+        for values in (*self._even(), *self._powers()):
+            best = [v for v in values if self.low_um <= v <= self.high_um]
+            at = [self.at(v) for v in best]
+            if 2 <= len(best) <= _MOST_TICKS and all(b - a >= _CLOSEST for a, b in pairwise(at)):
                 break
-        return [(self.at(v), f"{v:g}") for v in inside]
+        return [(self.at(v), f"{v:.3g}") for v in best or (self.low_um, self.high_um)]
+
+    def _even(self) -> list[list[float]]:
+        """Evenly spaced values, finest first, for an axis too short for powers of ten."""
+        if self.high_um > 3 * self.low_um:
+            return []
+        unit = 10.0 ** math.floor(math.log10(self.high_um - self.low_um))
+        steps = [m * unit for m in (0.1, 0.2, 0.5, 1.0, 2.0)]
+        return [[k * s for k in range(math.ceil(self.low_um / s), math.floor(self.high_um / s) + 1)] for s in steps]
+
+    def _powers(self) -> list[list[float]]:
+        powers = range(math.floor(math.log10(self.low_um)), math.ceil(math.log10(self.high_um)) + 1)
+        return [[m * 10.0**p for p in powers for m in mantissas] for mantissas in _MANTISSAS]
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,11 @@ class Column:
     title: str
     unit: str = ""
     kind: Literal["text", "number", "strip", "wide"] = "text"
+    name: str = ""  # what a row's maker calls it; the title where empty
+
+    @property
+    def key(self) -> str:
+        return self.name or self.title
 
 
 @dataclass(frozen=True)

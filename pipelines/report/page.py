@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from data.errors import InputError
+from data.registry import Registry
+from features.selectors import SELECTORS
+from models import FAMILIES
+from models.result import GridResult
 from pipelines.report import records, tables
 from pipelines.report.channel import Channel, channel_part
 from pipelines.report.extracts import protocols_of, scored
 from pipelines.report.layout import Table
 from pipelines.report.story import Verdict, promoted_cell, verdict
-from pipelines.report.words import count, decimals, listed, number
+from pipelines.report.words import count, decimals, family_label, listed, number, selector_label
 from pipelines.settings import Settings
 from pipelines.tracking import Training
 
@@ -38,6 +42,8 @@ class Page:
     few_findings: bool
     excluded: Table | None
     rule: str
+    families: tuple[tuple[str, str], ...]
+    selectors: tuple[tuple[str, str], ...]
     sources: tuple[tuple[str, str], ...]
 
 
@@ -86,10 +92,20 @@ def page(trainings: Sequence[Training], settings: Settings) -> Page:
         few_findings=not many,
         excluded=left if left.rows else None,
         rule=_rule_words(settings),
+        families=_members(FAMILIES, results, "family", family_label),
+        selectors=_members(SELECTORS, results, "selector", selector_label),
         sources=tuple(
             (f"{_name(t, len(machines) > 1)}, {t.started:%Y-%m-%d %H:%M} UTC", t.training_id) for t in trainings
         ),
     )
+
+
+def _members(
+    registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]
+) -> tuple[tuple[str, str], ...]:
+    """Label and words of every member that was tried, in the registry's order."""
+    tried = set().union(*(r.cells[column] for r in results))
+    return tuple((label(key), registry[key].words) for key in registry if key in tried)
 
 
 def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
@@ -134,6 +150,6 @@ def _rule_words(settings: Settings) -> str:
     return (
         f"The rule takes the cell of least {r.score} by {r.protocol} among those whose points are stable "
         f"(at least {r.min_tsp_stability:g}); within {r.tie_percent:g} % the simpler one. "
-        f"A newcomer replaces the champion only if it is better on the same batches (paired sign-flip test, {100 * r.significance:g} %, "
-        f"at least {r.min_batches} batches)."
+        "A newcomer replaces the champion only if it is better on the same batches "
+        f"(paired sign-flip test, {100 * r.significance:g} %, at least {r.min_batches} batches)."
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -148,7 +149,7 @@ def changed_batches(now: pd.DataFrame, earlier: pd.DataFrame) -> tuple[list[str]
     return [k for k, digest in a.items() if b.get(k) != digest], [k for k in b if k not in a]
 
 
-def _effect(finding: dict[str, object]) -> str:
+def _effect(finding: dict[Any, Any]) -> str:
     reason = _text(finding["overruled"])
     if reason:
         return f"used; overruled: {reason}"

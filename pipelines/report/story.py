@@ -52,19 +52,19 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     )
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
     if outcome == "champion":
-        words = f"version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
+        words = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
     elif outcome == "challenger":
         words = (
-            f"version {p['champion_version']} stays champion; version {p['version']}, {model}, is challenger: "
+            f"Version {p['champion_version']} stays champion; version {p['version']}, {model}, is challenger: "
             f"{score}; {_why_challenger(p)}."
         )
     elif outcome == "unchanged":
         words = (
-            f"nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
+            f"Nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
             f"Version {p['champion_version']} is champion."
         )
     else:
-        words = f"nothing was promoted. The rule would take {model}: {score}."
+        words = f"Nothing was promoted. The rule would take {model}: {score}."
     caution = ""
     if not (p.get("trusted", True) if p else choice.trusted):
         caution = "Do not trust this model: " + _distrust(choice)

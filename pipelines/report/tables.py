@@ -13,10 +13,10 @@ from pipelines.promotion import Choice
 from pipelines.report.extracts import MAIN_PROTOCOL, S_by_batch, best_per, is_baseline, zero_um
 from pipelines.report.layout import Column, Row, Scale, Strip, Table
 from pipelines.report.words import (
+    NOTHING,
     cell_label,
     count,
     family_label,
-    listed,
     number,
     percent,
     plus_minus,
@@ -26,6 +26,7 @@ from pipelines.settings import PromotionRule
 
 PROMOTED = "promoted"
 _MOST_GROUPS = 6
+_MAX = "max\u00a0|e|"
 _WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
 
 
@@ -40,12 +41,12 @@ def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: st
             Row(
                 (
                     name,
-                    plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else number(math.nan),
+                    plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else NOTHING,
                     plus_minus(choice.S_mean_um, choice.S_std_um, digits),
-                    number(float(own["max_abs_um"]), 1) if own is not None else number(math.nan),
-                    percent(1 - choice.S_mean_um / nothing) if nothing else number(math.nan),
+                    number(float(own["max_abs_um"]), 1) if own is not None else NOTHING,
+                    percent(1 - choice.S_mean_um / nothing) if nothing else NOTHING,
                     cell_label(choice.selector, choice.family, choice.n_tsp),
-                    listed(list(choice.inputs)) or "none",
+                    ", ".join(choice.inputs) or "none",
                 )
             )
         )
@@ -53,8 +54,8 @@ def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: st
         Column("error channel"),
         Column("no model", "µm", "number"),
         Column("chosen model", "µm", "number"),
-        Column("max |e|", "µm", "number"),
-        Column("less error", "", "number"),
+        Column(_MAX, "µm", "number"),
+        Column("removed", "", "number"),
         Column("model"),
         Column("points", "", "wide"),
     )
@@ -91,44 +92,51 @@ def leaderboard(
     scale = Scale.over(np.concatenate(per_batch).tolist(), 2.5 * nothing if nothing > 0 else math.inf)
     groups = _groups(result, rows, protocol)
     names = list(dict.fromkeys(g for row in groups for g in row))
+    columns = _columns(key, protocol, names)
     body = []
     for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
         chosen = own is not None and all(row[k] == own[k] for k in CELL_KEYS)
-        unstable = row["n_tsp"] and row["tsp_stability"] < rule.min_tsp_stability
-        body.append(
-            Row(
-                (
-                    family_label(row["family"]),
-                    selector_label(row["selector"]) if row["n_tsp"] else number(math.nan),
-                    str(row["n_tsp"]) if row["n_tsp"] else number(math.nan),
-                    number(row["S_mean_um"], digits),
-                    number(row["S_std_um"], digits),
-                    number(row["max_abs_um"], 1),
-                    _strip(values, float(row["S_mean_um"]), scale, digits),
-                    *(number(group.get(n, math.nan), digits) for n in names),
-                    percent(row["S_mean_um"] / nothing) if nothing else number(math.nan),
-                    number(row["fit_S_um"], digits),
-                    (number(row["tsp_stability"], 2) + (" unstable" if unstable else "")) if row["n_tsp"] else "–",
-                ),
-                PROMOTED if chosen else "",
-            )
-        )
-    columns = (
-        Column("family"),
-        Column("selector"),
+        unstable = row["tsp_stability"] < rule.min_tsp_stability
+        cells_of: dict[str, str | Strip] = {
+            "family": family_label(row["family"]),
+            "selector": selector_label(row["selector"]) if row["n_tsp"] else NOTHING,
+            "points": str(row["n_tsp"]) if row["n_tsp"] else NOTHING,
+            "S_mean": number(row["S_mean_um"], digits),
+            "S_std": number(row["S_std_um"], digits),
+            _MAX: number(row["max_abs_um"], 1),
+            "strip": _strip(values, float(row["S_mean_um"]), scale, digits),
+            "of no model": percent(row["S_mean_um"] / nothing) if nothing else NOTHING,
+            "fitted S": number(row["fit_S_um"], digits),
+            "stability": number(row["tsp_stability"], 2) + (" †" if unstable else "") if row["n_tsp"] else NOTHING,
+        } | {n: number(group.get(n, math.nan), digits) for n in names}
+        body.append(Row(tuple(cells_of[c.key] for c in columns), PROMOTED if chosen else ""))
+    dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
+    notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}; {_rests_on(result, protocol)}."]
+    if any("†" in str(cell) for row in body for cell in row.cells):
+        notes.append(f"† Below {rule.min_tsp_stability:g}: another training would choose other points.")
+    return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
+
+
+def _columns(key: str, protocol: str, groups: Sequence[str]) -> tuple[Column, ...]:
+    """The columns of a leaderboard; those of left-out groups take the place of the last three."""
+    first = [Column("family"), Column("selector")]
+    last = (
+        [Column(n, "µm", "number") for n in groups]
+        or [
+            Column("of no model", "", "number"),
+            Column("fitted S", "µm", "number"),
+            Column("stability of points", "", "number", "stability"),
+        ]
+    )  # fmt: skip
+    return (
+        *(first if key == "family" else reversed(first)),
         Column("points", "n", "number"),
         Column("S_mean", "µm", "number"),
         Column("S_std", "µm", "number"),
-        Column("max |e|", "µm", "number"),
-        Column("S per model" if protocol == "train-on-one" else "S per batch", "µm", "strip"),
-        *(Column(n, "S_mean, µm", "number") for n in names),
-        Column("of no model", "", "number"),
-        Column("fitted S", "µm", "number"),
-        Column("stability of points", "", "number"),
+        Column(_MAX, "µm", "number"),
+        Column("S per model" if protocol == "train-on-one" else "S per batch", "µm", "strip", "strip"),
+        *last,
     )
-    dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
-    notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}."]
-    return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
 
 
 def batches(result: GridResult, choice: Choice, digits: int) -> Table:
@@ -163,7 +171,7 @@ def batches(result: GridResult, choice: Choice, digits: int) -> Table:
         Column("samples", "", "number"),
         Column("S, no model", "µm", "number"),
         Column("S, left out", "µm", "number"),
-        Column("max |e|", "µm", "number"),
+        Column(_MAX, "µm", "number"),
         Column("mean e", "µm", "number"),
     )
     label = cell_label(choice.selector, choice.family, choice.n_tsp)
@@ -181,7 +189,7 @@ def _strip(values: np.ndarray, mean_um: float, scale: Scale, digits: int) -> Str
     good = np.sort(values[np.isfinite(values)])
     beyond = int((good > scale.high_um).sum())
     if not len(good):
-        return Strip((), 0.0, 0, number(math.nan))
+        return Strip((), 0.0, 0, NOTHING)
     words = f"{number(good[0], digits)} to {number(good[-1], digits)}, median {number(float(np.median(good)), digits)}"
     return Strip(tuple(scale.at(float(v)) for v in good), scale.at(mean_um), beyond, words)
 
@@ -197,12 +205,11 @@ def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[
 
 
 def _at(table: pd.DataFrame, batch_id: str, column: str) -> float:
-    return float(table.loc[batch_id, column]) if batch_id in table.index and column in table else math.nan
+    return float(table[column].get(batch_id, math.nan)) if column in table else math.nan
 
 
-def protocol_note(result: GridResult, protocol: str) -> str:
+def _rests_on(result: GridResult, protocol: str) -> str:
     """How many folds and batches a protocol's numbers rest on."""
     s = result.scores[result.scores["protocol"] == protocol]
-    folds = s["fold"].nunique()
     tested = len(result.batches) if protocol == "train-on-one" else s["batch_id"].nunique()
-    return f"{count(int(folds), 'fold')}, {count(int(tested), 'batch')} predicted"
+    return f"{count(int(s['fold'].nunique()), 'fold')}, {count(int(tested), 'batch')} predicted"

@@ -15,16 +15,13 @@ NOTHING = "–"
 _HUGE = 10_000.0
 
 _FAMILIES = {"zero": "no model", "mean_curve": "mean curve", "thermal_exponential": "thermal exponential",
-             "pcr_lbo": "PCR (inner leave-batch-out)", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
+             "pcr": "PCR 95 %", "pcr_lbo": "PCR tuned", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
 _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc": "FCGC"}
-_SHOUTED = {"mlr", "pcr", "pls", "bp"}
-_SHORT = {"pcr_lbo": "PCR (inner)", "thermal_exponential": "thermal exp."}
+_SHOUTED = {"mlr", "pls", "bp"}
 
 
-def family_label(key: str, short: bool = False) -> str:
+def family_label(key: str) -> str:
     """A family's name for people."""
-    if short and key in _SHORT:
-        return _SHORT[key]
     return _FAMILIES.get(key) or (key.upper() if key in _SHOUTED else key.replace("_", " "))
 
 
@@ -44,7 +41,7 @@ def cell_label(selector: str, family: str, n_tsp: int) -> str:
 
 def family_style(key: str) -> tuple[str, str]:
     """Colour and marker of a family, the same on every page."""
-    keys = [k for k in FAMILIES if FAMILIES[k].uses_inputs]
+    keys = list(FAMILIES)
     i = keys.index(key) if key in keys else len(keys)
     return _PALETTE[i % len(_PALETTE)], _SYMBOLS[i % len(_SYMBOLS)]
 

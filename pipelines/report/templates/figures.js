@@ -5,8 +5,9 @@
   const narrow = 520;
   const paper = { full: [680, 0], half: [332, 270], third: [680, 235] };
   const config = {
-    displaylogo: false, responsive: true,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d"],
+    displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: "",
+    displayModeBar: window.matchMedia("(hover: hover)").matches ? "hover" : false,
+    modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]], // nothing that sends data anywhere
   };
   let drawn = 0;
   plots.forEach(function (div) {
