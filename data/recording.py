@@ -213,8 +213,8 @@ def _batch(
     if start is None and recording.start_from_name:
         repairs["start_unreadable"] = 1
     return Batch(
-        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns, copy=False), channels=machine.batch_channels(),
-        start=start, simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
+        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns, copy=False),
+        channels=machine.batch_channels(), start=start, simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
     )  # fmt: skip
 
 

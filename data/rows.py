@@ -89,8 +89,8 @@ def gather(blocks: Iterator[Rows], sheet: Sheet) -> Rows:
     whole: list[NDArray[Any]] = []
     for rows in blocks:
         names = tuple(rows.columns)
-        arrays = [rows.time_s, rows.unreadable, *rows.columns.values()]
-        if n + len(rows) > room:
+        arrays: list[NDArray[Any]] = [rows.time_s, rows.unreadable, *rows.columns.values()]
+        if not whole or n + len(rows) > room:
             room = max(n + len(rows), int(1.02 * (n + len(rows)) / max(sheet.share_read, 1e-4)))
             for i, array in enumerate(arrays):
                 grown = np.empty(room, array.dtype)

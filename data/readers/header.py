@@ -119,6 +119,8 @@ def _header_row(head: Sequence[Sequence[Any]], names: Sequence[str], where: str)
         found = len(wanted & {normalise(c) for c in row if c is not None})
         if found > best:
             best, best_row = found, i
+        if best == len(wanted) > 0:
+            break
     if best_row >= 0:
         return best_row
     filled = [i for i, row in enumerate(head) if row]
