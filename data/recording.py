@@ -214,7 +214,8 @@ def _batch(
         repairs["start_unreadable"] = 1
     return Batch(
         machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns, copy=False),
-        channels=machine.batch_channels(), start=start, simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
+        channels=machine.batch_channels(), start=start,
+        simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
     )  # fmt: skip
 
 
