@@ -126,7 +126,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
     clock("track")
     for t in targets:
-        outcome.choices[t] = promotion.choose(outcome.results[t].cells, settings.promotion)
+        outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
     if request.promote:
         say("promote")
         promote = partial(_promote, outcome, crossings, request.machine_file, settings)
@@ -174,10 +174,7 @@ def promote_tracked(
             )
         batches.append(lake.load(machine.machine, row.batch_id, held[row.digest]))
     batches = check_machine(batches, machine)
-    if cell:
-        choice = promotion.pick(result.cells, settings.promotion, cell)
-    else:
-        choice = promotion.choose(result.cells, settings.promotion)
+    choice = promotion.decide(result, settings.promotion, cell)
     family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target)
     text = machine_file.read_text(encoding="utf-8")
     region = region_of(batches, family.inputs)

@@ -9,6 +9,8 @@ from scipy import stats
 from toy_training import toy_batches, toy_result
 
 from data.errors import InputError
+from models.result import GridResult
+from pipelines import promotion
 from pipelines.promotion import choose, compare_paired, left_out, pick, sign_flip_p
 from pipelines.settings import PromotionRule
 
@@ -151,3 +153,49 @@ def test_left_out_gives_the_scores_with_their_digests():
     got = left_out(result, "leave-batch-out", "none", "mlr", 2)
     assert got["S_um"].tolist() == [1, 2, 3]
     assert got["digest"].tolist() == [b.digest for b in batches]
+
+
+def _many_lucky_cells(seed: int, cells: int, gain_um: float) -> GridResult:
+    """K batches, `cells` cells whose S is that of doing nothing plus luck, and one that is truly better."""
+    rng = np.random.default_rng(seed)
+    ids = [f"b{i}" for i in range(8)]
+    rows, summary = [], []
+    for c in range(cells + 1):
+        family, selector = ("zero", "none") if c == 0 else ("mlr", "correlation")
+        s = np.full(8, 10.0) if c == 0 else 10.0 + 2.0 * rng.standard_normal(8) - (gain_um if c == 1 else 0.0)
+        keys = {"protocol": "leave-batch-out", "selector": selector, "family": family, "n_tsp": c}
+        rows += [
+            {**keys, "fold": b, "batch_id": b, "S_um": v, "max_abs_um": 2 * v} for b, v in zip(ids, s, strict=True)
+        ]
+        summary.append({
+            **keys, "S_mean_um": s.mean(), "S_std_um": s.std(ddof=1), "max_abs_um": 2 * s.max(), "n_batches": 8,
+            "n_parameters": c, "rank": 10, "tsp_stability": 1.0, "inputs": "a", "n_inputs": c, "simulated": False,
+        })  # fmt: skip
+    empty = pd.DataFrame()
+    return GridResult("toy", "z", False, empty, pd.DataFrame(rows), pd.DataFrame(summary), *(4 * [empty]))
+
+
+def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
+    rule = PromotionRule(tie_percent=0, score="S_mean")
+    choices = [promotion.decide(_many_lucky_cells(seed, 15, 0.0), rule) for seed in range(30)]
+    assert np.mean([c.S_mean_um for c in choices]) < 9.2  # luck looks like a µm
+    assert np.mean([c.nested_S_mean_um for c in choices]) == pytest.approx(10.0, abs=0.4)  # nothing was gained
+
+
+def test_a_lucky_winner_is_not_trusted_and_a_true_one_is() -> None:
+    rule = PromotionRule(tie_percent=0, score="S_mean")
+    lucky = [promotion.decide(_many_lucky_cells(s, 15, 0.0), rule) for s in range(10)]
+    true = [promotion.decide(_many_lucky_cells(s, 15, 6.0), rule) for s in range(10)]
+    assert sum(not c.trusted for c in lucky) >= 3 and all("do not trust" in c.words for c in lucky if not c.trusted)
+    assert all(c.trusted and c.nested_S_mean_um == pytest.approx(c.S_mean_um) for c in true)
+
+
+def test_without_the_batch_in_question_the_choice_is_made_by_hand() -> None:
+    result = _many_lucky_cells(3, 5, 0.0)
+    rule = PromotionRule(tie_percent=0)
+    got = promotion.score_of_choice(result, rule).set_index("batch_id")
+    s = result.scores.pivot(index="n_tsp", columns="batch_id", values="S_um")
+    for batch in s.columns:
+        others = s.drop(columns=batch)
+        best = (others.mean(axis=1) + others.std(axis=1)).idxmin()
+        assert got.loc[batch, "cell"].endswith(f"|{best}") and got.loc[batch, "S_um"] == s.loc[best, batch]
