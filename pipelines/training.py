@@ -166,13 +166,11 @@ def promote_tracked(
         raise InputError(f"training {training_id} is of {result.machine}, the machine file of {machine.machine}")
     lake = Lake(home() / "lake")
     batches = []
-    for row in result.batches.itertuples():
-        held = {v.digest: v.version for v in lake.versions(machine.machine, row.batch_id)}
-        if row.digest not in held:
-            raise InputError(
-                f"the lake does not hold batch {row.batch_id} as training {training_id} saw it; train again"
-            )
-        batches.append(lake.load(machine.machine, row.batch_id, held[row.digest]))
+    for batch_id, digest in result.batches[["batch_id", "digest"]].astype(str).to_numpy():
+        held = {v.digest: v.version for v in lake.versions(machine.machine, batch_id)}
+        if digest not in held:
+            raise InputError(f"the lake does not hold batch {batch_id} as training {training_id} saw it; train again")
+        batches.append(lake.load(machine.machine, batch_id, held[digest]))
     batches = check_machine(batches, machine)
     choice = promotion.decide(result, settings.promotion, cell)
     family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target)
