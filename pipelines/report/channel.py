@@ -21,7 +21,7 @@ from pipelines.report.extracts import (
     zero_um,
 )
 from pipelines.report.layout import Key, Panel, Plot, Table
-from pipelines.report.story import Verdict, comparison_rows
+from pipelines.report.story import Verdict, comparison_rows, mark_of
 from pipelines.report.words import (
     BLUE,
     INK,
@@ -77,8 +77,11 @@ def channel_part(
     protocol = protocols_of(result)[0]
     cells = scored(result, protocol, rule)
     digits = decimals(choice.S_std_um, choice.n_batches)
+    mark = mark_of(group[0])
     boards = tuple(
-        tables.leaderboard(result, cells, key, choice, rule, digits, f"{name}: best cell of every {key}, {protocol}")
+        tables.leaderboard(
+            result, cells, key, choice, rule, digits, f"{name}: best cell of every {key}, {protocol}", mark
+        )
         for key in ("family", "selector")
     )
     others = []
@@ -86,7 +89,7 @@ def channel_part(
         own = scored(result, other, rule)
         if len(own):
             caption = f"{name}: best cell of every family, {other}"
-            others.append(tables.leaderboard(result, own, "family", choice, rule, digits, caption))
+            others.append(tables.leaderboard(result, own, "family", choice, rule, digits, caption, mark))
     changes, change = _changes(name, group, choices)
     return Channel(
         anchor=anchor,
@@ -153,7 +156,7 @@ def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) 
         result.simulated,
         tuple(keys),
         ("Each family with its best selector; both axes are smaller-is-better, log scale. What runs out of the top is "
-         "worse than no model. The promoted family is drawn stronger.",),
+         "worse than no model. The chosen family is drawn stronger.",),
     )  # fmt: skip
 
 
@@ -188,7 +191,9 @@ def _left_out(name: str, result: GridResult, choice: Choice, digits: int) -> Pan
     )
     every = max(b.every for b in shown)
     keys = (Key("recorded", INK), Key("predicted, batch left out", BLUE), Key("residual", ORANGE))
-    notes = ["Batches by S; every prediction comes from a model that never saw the batch. Residual axes are equal."]
+    notes = [
+        "Batches by S; every prediction comes from a model that never saw the batch. Residual axes are equal; the recording stops where it is masked."
+    ]
     if every > 1:
         notes.append(f"Drawn: up to every {every}th sample.")
     label = cell_label(choice.selector, choice.family, choice.n_tsp)

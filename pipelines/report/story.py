@@ -71,6 +71,14 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), words, caution)
 
 
+def mark_of(training: Training) -> str:
+    """What the chosen cell's model is now: champion, challenger, or only chosen."""
+    p = training.promotion
+    if not p:
+        return "chosen"
+    return "champion" if p["version"] == p["champion_version"] else "challenger"
+
+
 def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
     """The paired comparison with the champion as label and value; empty where there was none."""
     c = promotion.get("comparison")

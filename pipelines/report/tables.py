@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,7 +25,6 @@ from pipelines.report.words import (
 )
 from pipelines.settings import PromotionRule
 
-PROMOTED = "promoted"
 _MOST_GROUPS = 6
 _MAX = "max\u00a0|e|"
 _WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
@@ -71,13 +71,14 @@ def leaderboard(
     rule: PromotionRule,
     digits: int,
     caption: str,
+    mark: str = "chosen",
 ) -> Table:
     """The best cell of every family or selector under one protocol, least score first; baselines always in it.
 
     Args:
         cells: one protocol's cells from `extracts.scored`.
         key: family or selector.
-        choice: the promoted cell; it gets a row of its own where it is no row's best.
+        choice: the promoted cell; it gets a row of its own where it is no row's best, and the `mark`.
     """
     base = is_baseline(cells)
     rows = best_per(cells[~base], key)
@@ -91,7 +92,7 @@ def leaderboard(
     nothing = zero_um(cells)
     scale = Scale.over(np.concatenate(per_batch).tolist(), 2.5 * nothing if nothing > 0 else math.inf)
     groups = _groups(result, rows, protocol)
-    names = list(dict.fromkeys(g for row in groups for g in row))
+    names = sorted({g for row in groups for g in row}, key=_group_order)
     columns = _columns(key, protocol, names)
     body = []
     for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
@@ -108,10 +109,13 @@ def leaderboard(
             "of no model": percent(row["S_mean_um"] / nothing) if nothing else NOTHING,
             "fitted S": number(row["fit_S_um"], digits),
             "stability": number(row["tsp_stability"], 2) + (" †" if unstable else "") if row["n_tsp"] else NOTHING,
-        } | {n: number(group.get(n, math.nan), digits) for n in names}
-        body.append(Row(tuple(cells_of[c.key] for c in columns), PROMOTED if chosen else ""))
+            **{n: number(group.get(n, math.nan), digits) for n in names},
+        }
+        body.append(Row(tuple(cells_of[c.key] for c in columns), mark if chosen else ""))
     dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
     notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}; {_rests_on(result, protocol)}."]
+    if any(isinstance(cell, Strip) and cell.beyond for row in body for cell in row.cells):
+        notes.append("A number with › counts the dots beyond the axis.")
     if any("†" in str(cell) for row in body for cell in row.cells):
         notes.append(f"† Below {rule.min_tsp_stability:g}: another training would choose other points.")
     return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
@@ -202,6 +206,13 @@ def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[
     if max((len(p) for p in parts), default=0) > _MOST_GROUPS:
         return [{} for _ in range(len(rows))]
     return [{str(k): float(v) for k, v in part.items()} for part in parts]
+
+
+def _group_order(name: str) -> tuple[int, float, str]:
+    """Seasons from cold to warm, speeds from slow to fast, words last."""
+    found = re.search(r"[\d.]+", name)
+    side = {"below": -1, "above": 1}.get(name.split(" ")[0], 0)
+    return (side if found else 2, float(found[0]) if found else 0.0, name)
 
 
 def _at(table: pd.DataFrame, batch_id: str, column: str) -> float:

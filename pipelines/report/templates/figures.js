@@ -13,8 +13,11 @@
   plots.forEach(function (div) {
     const spec = JSON.parse(document.getElementById(div.id + "-data").textContent);
     if (div.clientWidth < narrow) {
-      spec.data.forEach(function (trace) { if (trace.type === "heatmap") { trace.showscale = false; } });
       spec.layout.margin.r = 6;
+      spec.data.filter(function (trace) { return trace.type === "heatmap"; }).forEach(function (trace) {
+        trace.showscale = false; // the cells hold their numbers
+        spec.layout.xaxis.tickfont = { size: 9.5 };
+      });
     }
     const image = { format: "svg", filename: div.dataset.name };
     Plotly.newPlot(div, spec.data, spec.layout, Object.assign({ toImageButtonOptions: image }, config))
@@ -25,13 +28,15 @@
     closed = Array.from(document.querySelectorAll("details:not([open])"));
     closed.forEach(function (part) { part.open = true; });
     plots.forEach(function (div) {
-      const size = paper[div.dataset.size];
-      Plotly.relayout(div, { autosize: false, width: size[0], height: size[1] || Number(div.dataset.height) });
+      const width = paper[div.dataset.size][0], height = paper[div.dataset.size][1] || Number(div.dataset.height);
+      div.style.height = height + "px";
+      Plotly.relayout(div, { autosize: false, width: width, height: height });
     });
   });
   window.addEventListener("afterprint", function () {
     closed.forEach(function (part) { part.open = false; });
     plots.forEach(function (div) {
+      div.style.height = div.dataset.height + "px";
       Plotly.relayout(div, { autosize: true, width: null, height: Number(div.dataset.height) });
     });
   });
