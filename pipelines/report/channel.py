@@ -192,7 +192,8 @@ def _left_out(name: str, result: GridResult, choice: Choice, digits: int) -> Pan
     every = max(b.every for b in shown)
     keys = (Key("recorded", INK), Key("predicted, batch left out", BLUE), Key("residual", ORANGE))
     notes = [
-        "Batches by S; every prediction comes from a model that never saw the batch. Residual axes are equal; the recording stops where it is masked."
+        "Batches by S; every prediction comes from a model that never saw the batch. "
+        "Residual axes are equal; the recording stops where it is masked."
     ]
     if every > 1:
         notes.append(f"Drawn: up to every {every}th sample.")
@@ -229,5 +230,5 @@ def _changes(name: str, group: Sequence[Training], choices: Sequence[Choice]) ->
     order = {b: i for i, b in enumerate(now.batches["batch_id"])}
     both = both.sort_values("batch_id", key=lambda ids: ids.map(order), kind="stable")
     plot = Plot(figures.before_and_after(both, now.simulated), f"{name} before and after")
-    keys = (Key("earlier training", "#5a6572", "ring"), Key("newest training", BLUE, "circle"))
+    keys = (Key("earlier training", "#5a6572", "ring"), Key("newest training", BLUE, "disc"))
     return tuple(words), Panel(f"{name}: S of the shared batches, before and after", (plot,), now.simulated, keys)

@@ -110,7 +110,7 @@ class Key:
 
     label: str
     color: str
-    symbol: str = "line"  # line, dash, circle, square, diamond, triangle-up
+    symbol: str = "line"  # line, dot, dash, dashdot; circle, square, diamond, triangle-up on a line; ring, disc
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ def _members(
 ) -> tuple[tuple[str, str], ...]:
     """Label and words of every member that was tried, in the registry's order."""
     tried = set().union(*(r.cells[column] for r in results))
-    return tuple((label(key), registry[key].words) for key in registry if key in tried)
+    return tuple((label(key), registry[key].words.removeprefix(f"{label(key)}: ")) for key in registry if key in tried)
 
 
 def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:

@@ -156,7 +156,7 @@ def batches(result: GridResult, choice: Choice, digits: int) -> Table:
             Row(
                 (
                     str(b),
-                    str(row.get("start") or "–").replace("T", " ")[:16],
+                    str(row.get("start") or NOTHING).replace("T", " ")[:16].removesuffix(" 00:00"),
                     str(row.get("speed", "–")),
                     number(float(row.get("start_ambient_degC", math.nan)), 1),
                     f"{row['n_rows']}",
