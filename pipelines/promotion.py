@@ -187,11 +187,11 @@ def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
 
     The best of many cells has been chosen for its left-out score, which flatters it (Varma & Simon 2006,
     BMC Bioinformatics 7:91). Here batch k has no say in the choice that predicts it. Empty for train-on-one, where a
-    score belongs to the batch trained on.
+    score belongs to the batch trained on, and for two batches, where the other one alone has no spread.
     """
     columns = ["batch_id", "cell", "S_um"]
     scores = result.scores[result.scores["protocol"] == rule.protocol]
-    if scores.empty or (scores["batch_id"] == "*").any():
+    if scores.empty or (scores["batch_id"] == "*").any() or scores["batch_id"].nunique() < 3:
         return pd.DataFrame(columns=columns)
     cells = result.cells[result.cells["protocol"] == rule.protocol].reset_index(drop=True)
     keys = ["selector", "family", "n_tsp"]
