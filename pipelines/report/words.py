@@ -47,8 +47,8 @@ def family_style(key: str) -> tuple[str, str]:
 
 
 def plain(text: str) -> str:
-    """A name that stands in a figure: plotly reads < and & as markup."""
-    return escape(str(text), quote=False)
+    """A name that stands in a figure: plotly reads < and & as markup, and $ as mathematics."""
+    return escape(str(text), quote=False).replace("$", "&#36;")
 
 
 def count(n: int, noun: str) -> str:

@@ -1,0 +1,91 @@
+"""What became of a training, in sentences: every outcome word for word."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from report_training import COMPARISON, Maker, promotion, results, training
+
+from pipelines.promotion import choose
+from pipelines.report.story import verdict
+from pipelines.report.words import cell_label
+from pipelines.settings import PromotionRule
+
+RULE = PromotionRule()
+SCORE = r"\d+\.\d+ ± \d+\.\d+ µm on left-out batches \(leave-batch-out, 6 batches\)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "pattern"),
+    [
+        (
+            {"version": 1, "champion_version": 1, "words": "toy-z version 1 is champion: first model"},
+            rf"Version 1, {{cell}}, is champion: {SCORE}; it is the first model of this machine and channel\.",
+        ),
+        (
+            {"comparison": COMPARISON},
+            rf"Version 3, {{cell}}, is champion: {SCORE}; replaces version 2, 0\.60 µm better "
+            r"\(90 %: 0\.20 to 1\.00 µm\) on 28 batches\.",
+        ),
+        (
+            {
+                "comparison": COMPARISON | {"better": False, "difference_um": -0.6, "low_um": -1.0, "high_um": -0.2},
+                "words": "by force; against version 2: …",
+            },
+            rf"Version 3, {{cell}}, is champion: {SCORE}; replaces version 2 by force, 0\.60 µm worse "
+            r"\(90 %: 0\.20 to 1\.00 µm\) on 28 batches\.",
+        ),
+        (
+            {
+                "outcome": "challenger",
+                "champion_version": 2,
+                "comparison": COMPARISON
+                | {"better": False, "difference_um": -0.1, "low_um": -0.31, "high_um": 0.11, "p_value": 0.71},
+            },
+            rf"Version 2 stays champion; version 3, {{cell}}, is challenger: {SCORE}; on 28 batches it is "
+            r"0\.10 µm worse \(90 %: −0\.11 to 0\.31 µm\), p = 0\.71: not shown to be better\.",
+        ),
+        (
+            {
+                "outcome": "challenger",
+                "champion_version": 2,
+                "comparison": COMPARISON
+                | {"n_batches": 3, "words": "3 batches in common, need at least 5: the champion stays"},
+            },
+            rf"Version 2 stays champion; .*{SCORE}; 3 batches in common, need at least 5\.",
+        ),
+        (
+            {
+                "outcome": "challenger",
+                "champion_version": 2,
+                "words": "toy-z version 3: the champion (version 2) cannot be compared (gone); it stays; …",
+            },
+            rf"Version 2 stays champion; .*{SCORE}; it could not be compared with the champion \(gone\)\.",
+        ),
+        (
+            {"outcome": "unchanged", "champion_version": 2},
+            rf"Nothing new: batches, cell and machine file are those of version 3, {{cell}}: {SCORE}\. "
+            r"Version 2 is champion\.",
+        ),
+    ],
+)
+def test_what_became_of_a_training_in_one_sentence(
+    changes: dict[str, object], pattern: str, toy_batches: Maker
+) -> None:
+    result = results(toy_batches)["z"]
+    choice = choose(result.cells, RULE)
+    said = verdict("z", training(result, promotion(choice.cell, **changes)), choice)
+    assert re.fullmatch(
+        pattern.format(cell=re.escape(cell_label(choice.selector, choice.family, choice.n_tsp))), said.words
+    ), said.words
+    assert said.caution == ""
+
+
+def test_nothing_promoted_and_nothing_to_trust_are_said(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    only = result.cells["family"].isin(["zero", "mean_curve"])
+    choice = choose(result.cells[only], RULE)
+    said = verdict("z", training(result), choice)
+    assert said.words.startswith("Nothing was promoted. The rule would take mean curve: ")
+    assert said.caution == "Do not trust this model: nothing beats mean_curve."
