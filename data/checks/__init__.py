@@ -41,10 +41,11 @@ MOST_MASKED = 0.2  # an input that lacks more than this share of any batch canno
 
 def check_batch(batch: Batch, machine: Machine) -> tuple[Finding, ...]:
     """Run every check of one recording; findings in the registry's order, those the batch came with not repeated."""
-    found: tuple[Finding, ...] = ()
+    seen = batch.with_findings(())
     for check in CHECKS.values():
-        found += tuple(check().batch(batch.with_findings(found), machine))
-    return found
+        if found := check().batch(seen, machine):
+            seen = seen.with_findings((*seen.findings, *found))
+    return seen.findings
 
 
 def check_machine(batches: Sequence[Batch], machine: Machine) -> list[Batch]:

@@ -8,22 +8,19 @@ A check sees the batch with the masks of the checks before it, so one fault is t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 
 from data.batch import Batch, Finding
+from data.checks.signals import EQUAL, Array, Bools
 from data.machine import Machine
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 THERMAL = ("temperature", "ambient")
 SIGMAS = 8.0  # a clean year has some 1e6 samples; 8 sigma leaves room for tails heavier than Gaussian
 STEPS = 5.0  # resolution steps that no rounding explains
-_EQUAL = 1e-9  # resampling leaves rounding errors in a repeated value
+THIN_S = 10.0  # a sensor's own mass and a logger's filter spread a step over seconds
 SETTLE_S = 600.0  # after a start, stop or speed change the machine may move as fast as it likes
 
 
@@ -58,17 +55,13 @@ def stretches(flags: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def constant_runs(values: Array) -> list[tuple[int, int]]:
-    """First and last row of every run of two or more equal finite values."""
-    same = np.abs(np.diff(values)) <= _EQUAL * np.maximum(1.0, np.abs(values[1:]))
-    return [(a, b + 1) for a, b in stretches(same)]
-
-
-def excess(values: Array, half: int = 4) -> Array:
-    """Step into each row less the median step of the rows around it, shape (n,); row 0 is 0, NaN beside holes."""
-    steps = np.concatenate([[0.0], np.diff(values)])
-    trend = pd.Series(steps).rolling(2 * half + 1, center=True, min_periods=1).median().to_numpy()
-    return steps - trend
+def constant_runs(values: Array, rows: int = 2) -> list[tuple[int, int]]:
+    """First and last row of every run of `rows` or more equal finite values."""
+    same = np.abs(np.diff(values)) <= EQUAL * np.maximum(1.0, np.abs(values[1:]))
+    edges = np.flatnonzero(np.diff(same.astype(np.int8), prepend=np.int8(0), append=np.int8(0)))
+    first, last = edges[::2], edges[1::2]
+    long = last - first + 1 >= rows
+    return list(zip(first[long].tolist(), last[long].tolist(), strict=True))
 
 
 def robust_sigma(values: Array, resolution: float | None) -> float:
@@ -81,6 +74,29 @@ def robust_sigma(values: Array, resolution: float | None) -> float:
 def step_limit(e: Array, resolution: float | None) -> float:
     """Smallest step that neither noise nor rounding explains, in the channel's unit."""
     return max(SIGMAS * robust_sigma(e, resolution), STEPS * (resolution or 0.0))
+
+
+def thinned(batch: Batch) -> Batch | None:
+    """Every k-th row, THIN_S apart, of a recording at least twice as fast; None where it is not.
+
+    On a fast recording a step that the sensor or the logger spreads over seconds is no step from row to row. Values
+    are picked, not averaged: an average would share a sharp step out over two rows.
+    """
+    every = int(THIN_S / batch.step_s + 1e-9) if batch.step_s else 1
+    if every < 2:
+        return None
+    return replace(batch, table=batch.table.iloc[::every].reset_index(drop=True))
+
+
+def widened(found: Finding, batch: Batch, thin: Batch) -> Finding:
+    """A finding of `thinned` rows as one of all rows: it covers the rows between the picked ones as well."""
+    more = thin.step_s - batch.step_s
+    start_s, end_s = found.start_s, found.end_s
+    return replace(
+        found,
+        start_s=None if start_s is None else max(0.0, start_s - more),
+        end_s=None if end_s is None else min(float(batch.time_s[-1]), end_s + more),
+    )
 
 
 def smallest_step(batch: Batch, name: str) -> float:
@@ -98,10 +114,11 @@ def load_changes(batch: Batch) -> Bools:
         span = float(np.ptp(v)) if len(v) else 0.0
         if span > 0:
             hit[1:] |= np.abs(np.diff(v)) > 0.05 * span
-    out = hit.copy()
-    for row in np.flatnonzero(hit):
-        out[max(0, row - 1) : row + settle + 1] = True
-    return out
+    near = np.zeros(batch.n_rows + 1, np.int64)  # +1 where a stretch begins, -1 behind its end
+    rows = np.flatnonzero(hit)
+    np.add.at(near, np.maximum(rows - 1, 0), 1)
+    np.add.at(near, np.minimum(rows + settle + 1, batch.n_rows), -1)
+    return np.cumsum(near[:-1]) > 0
 
 
 def standing(batch: Batch) -> Bools:

@@ -8,6 +8,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check, smallest_step
+from data.checks.signals import signals
 from data.machine import Machine
 
 _STEPS = 30.0
@@ -28,7 +29,7 @@ class Dead(Check):
     words = "takes no part in the machine's warming"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        moved = {n: _range_K(batch.masked(n)) for n in batch.names(*THERMAL)}
+        moved = {n: self._moved_K(batch, n) for n in batch.names(*THERMAL)}
         found = []
         for name in batch.names("temperature"):
             others = [v for n, v in moved.items() if n != name and np.isfinite(v)]
@@ -40,6 +41,14 @@ class Dead(Check):
                 words = f"{name} stays at {level:.5g} degC all through while the others move by {usual:.1f} K"
                 found.append(self.finding(name, words))
         return found
+
+    @staticmethod
+    def _moved_K(batch: Batch, name: str) -> float:
+        seen = signals(batch)
+        if not seen.whole(name) or batch.n_rows < 10:
+            return _range_K(seen.values(name))
+        low, high = seen.extremes(name)
+        return high - low
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         names = batches[0].names(*THERMAL) if batches else ()

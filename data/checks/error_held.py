@@ -6,6 +6,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check, constant_runs, smallest_step, span_words, standing
+from data.checks.signals import EQUAL, signals
 from data.machine import Machine
 
 _ROWS = 5
@@ -25,30 +26,33 @@ class ErrorHeld(Check):
     words = "error channels held while the spindle stands"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        names = [n for n in batch.names("error") if np.isfinite(batch.masked(n)).sum() > _ROWS]
+        seen = signals(batch)
+        names = [n for n in batch.names("error") if np.isfinite(seen.values(n)).sum() > _ROWS]
         if not names or batch.n_rows < 2 * _ROWS:
             return []
-        together = np.zeros(batch.n_rows)
+        least = max(_ROWS, int(_SECONDS / batch.step_s))
+        if any(seen.whole(n) and not seen.rests(n, least) for n in names):
+            return []
+        together = np.zeros(batch.n_rows, bool)
+        together[0] = True
         for name in names:
-            v = batch.masked(name)
+            v = seen.values(name)
             # a channel already masked here has no say
-            change = np.ones(batch.n_rows)
-            for a, b in constant_runs(v):
-                change[a + 1 : b + 1] = 0.0
-            together += change * np.isfinite(np.concatenate([[0.0], np.diff(v)]))
-        code = np.cumsum(together > 0).astype(float)
-        code[~np.any([np.isfinite(batch.masked(name)) for name in names], axis=0)] = np.nan
-        runs = [(a, b) for a, b in constant_runs(code) if b - a + 1 >= _ROWS]
+            change = np.abs(np.diff(v))
+            together[1:] |= np.isfinite(change) & ~(change <= EQUAL * np.maximum(1.0, np.abs(v[1:])))
+        code = np.cumsum(together).astype(float)
+        code[~np.any([np.isfinite(seen.values(name)) for name in names], axis=0)] = np.nan
+        runs = constant_runs(code, _ROWS)
         still = standing(batch)
         held = [(a, b) for a, b in runs if self._is_held(batch, names, code, a, b, runs, still)]
         found = []
         for a, b in held:
             state = "while the spindle stands" if still[a + 1 : b].mean() > 0.5 else "though the spindle is said to run"
             for name in names:
-                seen = np.flatnonzero(np.isfinite(batch.masked(name)[a : b + 1]))
-                if len(seen) < 2:
+                there = np.flatnonzero(np.isfinite(seen.values(name)[a : b + 1]))
+                if len(there) < 2:
                     continue
-                last = a + int(seen[-1])
+                last = a + int(there[-1])
                 moved = _temperature_change(batch, a, last)
                 words = (
                     f"{name} repeats {batch.values(name)[a]:.1f} {batch.channels[name].unit} "

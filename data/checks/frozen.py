@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check, constant_runs, smallest_step, span_words
 from data.checks.jump_no_return import JumpNoReturn
+from data.checks.signals import signals
 from data.checks.spike import Spike
 from data.machine import Machine
 
@@ -36,18 +39,21 @@ class Frozen(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
-        # a sensor that jumps or spikes is no witness for the others
-        jumping = {f.channel for check in (JumpNoReturn(), Spike()) for f in check.batch(batch, machine)}
+        seen = signals(batch)
+        witnesses = _Witnesses(batch, machine)
         for name in batch.names("temperature", "ambient", "error"):
-            v = batch.masked(name)
+            if not seen.rests(name, _ROWS):
+                continue
+            v = seen.values(name)
             runs = sorted(constant_runs(v), key=lambda r: r[0] - r[1])
             claimed: list[tuple[int, int]] = []
-            for a, b in runs[:3]:
+            for k, (a, b) in enumerate(runs[:3]):
                 if b - a + 1 < _ROWS or b - a + 1 == np.isfinite(v).sum():
                     continue  # a wholly constant batch is a dead channel
-                others = max((d - c + 1 for c, d in runs if (c, d) != (a, b) and (c, d) not in claimed), default=1)
+                rest = [r for r in runs[:k] if r not in claimed] + runs[k + 1 : k + 2]
+                others = max((d - c + 1 for c, d in rest), default=1)
                 reason = self._no_flicker(batch, name, v, a, b, others) or self._should_move(
-                    batch, name, jumping, v, a, b
+                    batch, name, witnesses, v, a, b
                 )
                 if reason:
                     claimed.append((a, b))
@@ -58,6 +64,8 @@ class Frozen(Check):
         return found
 
     def _no_flicker(self, batch: Batch, name: str, v: Array, a: int, b: int, longest_other: int) -> str:
+        if b - a + 1 <= 3 * longest_other:
+            return ""
         d = np.diff(v)
         outside = np.isfinite(d)
         outside[a:b] = False
@@ -77,15 +85,18 @@ class Frozen(Check):
             or n * np.log(max(1.0 - changing, 1e-3)) > np.log(_CHANCE)
         ):
             return ""
-        if n + 1 <= 3 * longest_other:
-            return ""
         return f"elsewhere {changing:.0%} of its samples change and no run is longer than {longest_other} samples"
 
-    def _should_move(self, batch: Batch, name: str, jumping: set[str | None], v: Array, a: int, b: int) -> str:
+    def _should_move(self, batch: Batch, name: str, witnesses: _Witnesses, v: Array, a: int, b: int) -> str:
         if (b - a) * batch.step_s < _SECONDS:
             return ""
-        inputs = [n for n in batch.names(*THERMAL) if n != name and n not in jumping]
-        x = np.column_stack([batch.masked(n) for n in inputs]) if inputs else np.empty((len(v), 0))
+        unit = batch.channels[name].unit
+        least, own = max(_STEPS * smallest_step(batch, name), _FLOOR.get(unit, 0.0)), _own_movement(v, a, b)
+        if own < least:
+            return ""
+        seen = signals(batch)
+        inputs = [n for n in batch.names(*THERMAL) if n != name and n not in witnesses.jumping]
+        x = np.column_stack([seen.values(n) for n in inputs]) if inputs else np.empty((len(v), 0))
         x = x[:, np.isfinite(x).all(axis=0) & (np.ptp(np.nan_to_num(x), axis=0) > 0)]
         out = np.isfinite(v)
         out[a : b + 1] = False
@@ -97,12 +108,21 @@ class Frozen(Check):
         fit = z @ np.linalg.solve(gram, z[out].T @ (v[out] - v[out].mean()))
         sigma = float(np.std(v[out] - v[out].mean() - fit[out]))
         moved = float(np.ptp(fit[a : b + 1]))
-        unit = batch.channels[name].unit
-        least = max(_STEPS * smallest_step(batch, name), _FLOOR.get(unit, 0.0), _SIGMAS * sigma)
-        own = _own_movement(v, a, b)
+        least = max(least, _SIGMAS * sigma)
         if moved < least or own < least:
             return ""
         return f"the other temperatures say that it moves by {moved:.1f} {'K' if unit == 'degC' else unit} in this time"
+
+
+class _Witnesses:
+    """Who may speak for the other channels: a sensor that jumps or spikes may not. Asked only where it matters."""
+
+    def __init__(self, batch: Batch, machine: Machine) -> None:
+        self._batch, self._machine = batch, machine
+
+    @cached_property
+    def jumping(self) -> set[str | None]:
+        return {f.channel for check in (JumpNoReturn(), Spike()) for f in check.batch(self._batch, self._machine)}
 
 
 def _own_movement(v: Array, a: int, b: int) -> float:

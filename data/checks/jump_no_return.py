@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import Array, Bools, Check, clock, excess, load_changes, step_limit
+from data.checks.base import (
+    SIGMAS,
+    Array,
+    Bools,
+    Check,
+    clock,
+    load_changes,
+    robust_sigma,
+    step_limit,
+    thinned,
+    widened,
+)
+from data.checks.signals import Signals, signals
 from data.machine import Machine
 
 _RATE_K_PER_MIN = 8.0  # 1 kW into the smallest instrumented body, about 7.5 kJ/K
@@ -13,47 +25,60 @@ _FLOOR_K = 1.0  # less is within what a draught or a splash of coolant does
 _FLOOR_UM = 12.0  # slip of a joint and the shift of a spindle with speed stay below 10 µm
 _TYPICAL = 3.0  # times the channel's own liveliest tenth of steps
 _BACK_S = 900.0
+_MOST = 0.6
 
 
 class JumpNoReturn(Check):
     """A step beyond noise, resolution and the channel's own liveliness, away from driver changes and not
-    shared by others; or a temperature that rises faster than 1 kW into 7.5 kJ/K. Masked from the first odd step to the
-    batch's end, or to the step that brings it back.
+    shared by others; or a temperature that rises faster than noise and 1 kW into 7.5 kJ/K explain. Masked from the
+    first odd step to the batch's end, or to the step that brings it back. A fast recording is looked at row by row and
+    over 10 s, where a step spread over seconds shows.
     """
 
     key = "jump_no_return"
     words = "a step of one channel that noise, load and neighbours do not explain"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        if batch.n_rows < 12:
+        found = self._at(batch)
+        if thin := thinned(batch):
+            told = {f.channel for f in found}
+            found += [widened(f, batch, thin) for f in self._at(thin) if f.channel not in told]
+        return found
+
+    def _at(self, batch: Batch) -> list[Finding]:
+        seen = signals(batch)
+        names = batch.names("temperature", "error")
+        # a step less the median step around it is at most twice the largest step: the others cannot be odd
+        able = [n for n in names if seen.largest_step(n) > _floor(batch, n) / 2.0]
+        if batch.n_rows < 12 or not able:
             return []
         loaded = load_changes(batch)
-        names = batch.names("temperature", "error")
-        steps = {n: excess(batch.masked(n)) for n in names}
-        odd = {n: np.abs(np.nan_to_num(steps[n])) > self._limit(batch, n, steps[n], loaded) for n in names}
+        steps = {n: seen.excess(n) for n in able}
+        odd = {n: np.abs(np.nan_to_num(steps[n])) > self._limit(batch, n, steps[n], loaded) for n in able}
         found = []
-        for name in names:
+        for name in able:
             role = batch.channels[name].role
             same = [n for n in names if n != name and batch.channels[n].role == role]
-            shared = np.sum([_near(odd[n]) for n in same], axis=0) if same else np.zeros(batch.n_rows)
+            shared = np.sum([_near(odd[n]) for n in same if n in odd], axis=0, initial=0)
             # one companion is still a pair of wires in one plug; two are the machine itself
             alone = odd[name] & (shared < max(2, 0.2 * len(same)))
             alone &= ~loaded | (
                 np.abs(np.nan_to_num(steps[name])) > self._loaded_limit(batch, name, steps[name], loaded)
             )
-            alone &= _grows(batch.masked(name))
+            alone &= _grows(seen.values(name))
             if role == "temperature":
-                alone |= self._too_fast(batch, name)
-            row = self._staying(batch.masked(name), steps[name], alone)
+                # what most sensors do together is no sensor's fault: the recording was interrupted
+                alone |= self._too_fast(batch, name, seen) & (shared < max(2, _MOST * len(same)))
+            row = self._staying(seen.values(name), steps[name], alone)
             if row is not None:
-                found.append(self._told(batch, name, row, steps[name]))
+                found.append(self._told(batch, name, row, seen))
         return found
 
     def _limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
         channel = batch.channels[name]
         quiet = np.abs(e[~loaded & np.isfinite(e)])
         lively = float(np.quantile(quiet, 0.9)) if len(quiet) else 0.0
-        floor = _FLOOR_UM if channel.role == "error" else _FLOOR_K
+        floor = _floor(batch, name)
         if channel.role == "error" and not batch.names("driver"):
             floor *= 3.0  # starts and stops are then unknown
         return max(step_limit(quiet, channel.resolution), _TYPICAL * lively, floor)
@@ -62,11 +87,13 @@ class JumpNoReturn(Check):
         """After a load change: three times the floor and the channel's own liveliness in such rows."""
         rows = np.abs(e[loaded & np.isfinite(e)])
         lively = float(np.quantile(rows, 0.9)) if len(rows) else 0.0
-        return _TYPICAL * max(lively, _FLOOR_UM if batch.channels[name].role == "error" else _FLOOR_K)
+        return _TYPICAL * max(lively, _floor(batch, name))
 
-    def _too_fast(self, batch: Batch, name: str) -> Bools:
-        v = batch.masked(name)
-        limit = _RATE_K_PER_MIN * batch.step_s / 60.0 + 3.0 * (batch.channels[name].resolution or 0.0)
+    def _too_fast(self, batch: Batch, name: str, seen: Signals) -> Bools:
+        v, resolution = seen.values(name), batch.channels[name].resolution or 0.0
+        # from row to row of a fast recording the machine moves less than noise and draughts do
+        limit = max(_RATE_K_PER_MIN * batch.step_s / 60.0, _FLOOR_K) + 3.0 * resolution
+        limit = max(limit, SIGMAS * robust_sigma(seen.excess(name), resolution))
         with np.errstate(invalid="ignore"):
             return np.concatenate([[False], np.abs(np.diff(v)) > limit])
 
@@ -81,15 +108,15 @@ class JumpNoReturn(Check):
                 return int(row)
         return None
 
-    def _told(self, batch: Batch, name: str, row: int, e: Array) -> Finding:
-        channel, t = batch.channels[name], batch.time_s
+    def _told(self, batch: Batch, name: str, row: int, seen: Signals) -> Finding:
+        channel, t, e = batch.channels[name], batch.time_s, seen.excess(name)
         unit = "K" if channel.unit == "degC" else channel.unit
-        v = batch.masked(name)
+        v = seen.values(name)
         small = step_limit(e, channel.resolution)
-        first = row
-        for r in range(row, max(0, row - int(_BACK_S / batch.step_s)), -1):
-            if abs(e[r]) > small:
-                first = r
+        earliest = max(0, row - int(_BACK_S / batch.step_s)) + 1
+        with np.errstate(invalid="ignore"):
+            odd = np.flatnonzero(np.abs(e[earliest : row + 1]) > small)
+        first = earliest + int(odd[0]) if len(odd) else row
         settled = min(len(v) - 1, row + max(3, int(_BACK_S / batch.step_s)))
         tail = v[row : settled + 1]
         size = float(tail[np.isfinite(tail)][-1] - v[first - 1])
@@ -102,6 +129,10 @@ class JumpNoReturn(Check):
         )
         words += "does not return" if end is None else f"comes back at {clock(t[end])}"
         return self.finding(name, words, float(t[first]), None if end is None else float(t[end]))
+
+
+def _floor(batch: Batch, name: str) -> float:
+    return _FLOOR_UM if batch.channels[name].role == "error" else _FLOOR_K
 
 
 def _near(flags: Bools) -> Bools:

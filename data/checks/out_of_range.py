@@ -6,6 +6,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import Check, span_words, stretches
+from data.checks.signals import signals
 from data.machine import Machine
 
 
@@ -15,10 +16,14 @@ class OutOfRange(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
+        seen = signals(batch)
         for name, channel in batch.channels.items():
             if channel.low is None or channel.high is None:
                 continue
-            v = batch.masked(name)
+            least, most = seen.extremes(name)
+            if least >= channel.low and most <= channel.high:
+                continue
+            v = batch.masked(name)  # an infinite value is out of range as well
             with np.errstate(invalid="ignore"):
                 out = (v < channel.low) | (v > channel.high)
             for a, b in stretches(out):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import Check, clock, constant_runs, excess, smallest_step, span_words, step_limit
+from data.checks.base import Check, clock, constant_runs, smallest_step, span_words, step_limit
+from data.checks.signals import signals
 from data.machine import Machine
 
 _ROWS = 5
@@ -23,21 +24,22 @@ class Saturated(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
+        seen = signals(batch)
         for name in batch.names("error", "temperature", "ambient"):
-            v = batch.masked(name)
-            if not np.isfinite(v).any():
+            if not seen.rests(name, _ROWS):
                 continue
-            channel = batch.channels[name]
-            ends = (float(np.nanmin(v)), float(np.nanmax(v)))
-            limit = step_limit(excess(v), channel.resolution)
-            for a, b in constant_runs(v):
-                rail = _rail(float(v[a]), smallest_step(batch, name), channel.low, channel.high)
-                if b - a + 1 < _ROWS or min(abs(v[a] - e) for e in ends) > 1e-6 or rail is None:
+            channel, v = batch.channels[name], seen.values(name)
+            ends = seen.extremes(name)
+            for a, b in constant_runs(v, _ROWS):
+                if min(abs(v[a] - e) for e in ends) > 1e-6:
                     continue
-                if channel.role != "error" and abs(rail) < 100.0:
+                rail = _rail(float(v[a]), smallest_step(batch, name), channel.low, channel.high)
+                if rail is None or (channel.role != "error" and abs(rail) < 100.0):
                     continue
                 arrived = _jump(v, a)
-                if arrived > max(limit, 0.05 * abs(rail)):
+                if arrived <= 0.05 * abs(rail):
+                    continue
+                if arrived > step_limit(seen.excess(name), channel.resolution):
                     found.append(
                         self.finding(
                             name,

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 
 from data.batch import Batch, Finding
 from data.checks.base import SIGMAS, STEPS, Check, clock, load_changes, robust_sigma
+from data.checks.signals import rolling_median, signals
 from data.machine import Machine
 
 _FLOOR = {"temperature": 1.0, "ambient": 3.0, "error": 8.0}  # K, K, µm: below, air and slip can do it
 _TYPICAL = 3.0
 _ROWS = 2
+_HALF = 3  # rows on either side
 
 
 class Spike(Check):
@@ -23,12 +24,15 @@ class Spike(Check):
     words = "single samples far off their neighbours"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        loaded = load_changes(batch)
+        seen = signals(batch)
+        names = batch.names("temperature", "ambient", "error")
+        # who stands off the rows around by the floor got there in three steps at most
+        names = tuple(n for n in names if seen.largest_step(n) * _HALF > _FLOOR[batch.channels[n].role])
+        loaded = load_changes(batch) if names else np.zeros(0, bool)
         found = []
-        for name in batch.names("temperature", "ambient", "error"):
-            channel, v = batch.channels[name], batch.masked(name)
-            middle = pd.Series(v).rolling(7, center=True, min_periods=4).median().to_numpy()
-            off = np.abs(v - middle)
+        for name in names:
+            channel, v = batch.channels[name], seen.values(name)
+            off = np.abs(v - rolling_median(v, _HALF, least=4))
             quiet = off[np.isfinite(off) & ~loaded]
             if len(quiet) < 12:
                 continue

@@ -6,6 +6,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check
+from data.checks.signals import signals
 from data.machine import Machine
 
 _HOT_START_DEGC = 45.0  # no machine stands this warm when a run starts
@@ -39,11 +40,16 @@ class WrongUnit(Check):
         return abs(as_degc - usual) < _NEAR_K and start - usual > _FAR_K
 
     def _millimetres(self, batch: Batch, temperatures: list[str]) -> list[Finding]:
-        warmed = max((float(np.ptp(_finite(batch.values(n)))) for n in temperatures), default=0.0)
+        seen = signals(batch)
+        ends = [seen.extremes(n) for n in temperatures]
+        warmed = max((high - low for low, high in ends), default=0.0)
         found = []
         for name in batch.names("error"):
+            low, high = seen.extremes(name)
+            if batch.channels[name].unit != "um" or warmed < 3.0 or not high - low < _TINY_UM:
+                continue
             v = _finite(batch.values(name))
-            if batch.channels[name].unit != "um" or len(v) < 10 or warmed < 3.0:
+            if len(v) < 10:
                 continue
             steps = np.abs(np.diff(v))
             fine = (batch.channels[name].resolution or np.inf) / 10.0
@@ -62,7 +68,8 @@ class WrongUnit(Check):
 
 
 def _start(values: Array) -> float:
-    ok = _finite(values)
+    if len(ok := _finite(values[:50])) < 5:
+        ok = _finite(values)
     return float(np.median(ok[:5])) if len(ok) else float("nan")
 
 

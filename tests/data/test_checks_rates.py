@@ -1,0 +1,98 @@
+"""The checks judge seconds, not rows: one recording, thinned from 10 Hz to once a minute, shows the same faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Finding
+from data.checks import check_batch
+from data.checks.signals import rolling_median
+from data.machine import parse_machine
+
+THERMAL = ("front", "rear", "head", "column", "bed")
+MACHINE = parse_machine(
+    "machine: toy\nrecording: {step_s: 0.1, max_gap_s: 900}\nchannels:\n"
+    + "".join(
+        f"  {n}: {{role: temperature, unit: degC, resolution: 0.01, range: [-20, 90]}}\n" for n in (*THERMAL, "room")
+    )
+    + "  spindle_rpm: {role: driver, unit: rpm, resolution: 1}\n"
+    + "".join(f"  {n}: {{role: error, unit: um, resolution: 1, range: [-500, 500]}}\n" for n in "xz"),
+    "toy",
+)
+TAU_S = np.array([1200.0, 1800.0, 3600.0, 10000.0, 28000.0])
+RISE_K = np.array([20.0, 14.0, 10.0, 6.0, 2.0])
+STOP_S, END_S, FAULT_S = 6000.0, 8000.0, 3000.0
+RATES_S = [0.1, 1.0, 60.0]
+
+
+def recorded(step_s: float, noise_K: float = 0.02) -> Batch:
+    """100 min of running and 33 min of stop in closed form with white noise; every step_s / 0.1 s-th row."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, END_S, 0.1)
+    on, off = np.minimum(time_s, STOP_S)[:, None], np.maximum(time_s - STOP_S, 0.0)[:, None]
+    rise = RISE_K * (1.0 - np.exp(-on / TAU_S)) * np.exp(-off / TAU_S)
+    table = pd.DataFrame({"time_s": time_s})
+    for j, name in enumerate(THERMAL):
+        table[name] = np.round(20.0 + rise[:, j] + rng.normal(0.0, noise_K, len(time_s)), 2)
+    table["room"] = np.round(20.0 + 0.3 * np.sin(time_s / 600.0) + rng.normal(0.0, noise_K, len(time_s)), 2)
+    table["spindle_rpm"] = np.where(time_s < STOP_S, 6000.0, 0.0)
+    for name, error in (("x", 0.8 * rise[:, 2]), ("z", 2.0 * rise[:, 0] - rise[:, 3])):
+        table[name] = np.round(error + rng.normal(0.0, 0.7, len(time_s)))
+    return Batch("toy", "b", table.iloc[:: round(step_s / 0.1)].reset_index(drop=True), MACHINE.batch_channels())
+
+
+def stepped(batch: Batch, sizes: dict[str, float], spread_s: float) -> Batch:
+    """Channels that step at FAULT_S, at once or along a ramp of spread_s."""
+    share = np.clip((batch.time_s - FAULT_S) / max(spread_s, 1e-9), 0.0, 1.0)
+    new = {n: np.round(batch.values(n) + size * share, 2) for n, size in sizes.items()}
+    return replace(batch, table=batch.table.assign(**new))
+
+
+def findings(batch: Batch) -> tuple[Finding, ...]:
+    return check_batch(batch, MACHINE)
+
+
+@pytest.mark.parametrize("step_s", RATES_S)
+@pytest.mark.parametrize("noise_K", [0.0, 0.02, 0.3])
+def test_a_clean_recording_is_clean_at_every_rate(step_s: float, noise_K: float) -> None:
+    assert [f.words for f in findings(recorded(step_s, noise_K))] == []
+
+
+@pytest.mark.parametrize("step_s", RATES_S)
+@pytest.mark.parametrize("spread_s", [0.0, 4.0])
+@pytest.mark.parametrize(("name", "size"), [("bed", 6.0), ("x", 60.0)])
+def test_a_jump_is_found_though_the_logger_smooths_it(name: str, size: float, spread_s: float, step_s: float) -> None:
+    found = findings(stepped(recorded(step_s), {name: size}, spread_s))
+    assert [(f.check, f.channel, f.end_s) for f in found] == [("jump_no_return", name, None)]
+    assert FAULT_S - max(step_s, 10.0) <= (found[0].start_s or 0.0) <= FAULT_S + max(step_s, 0.5)
+
+
+@pytest.mark.parametrize("spread_s", [0.0, 5.0])
+def test_an_interruption_is_found_though_interpolation_spreads_it(spread_s: float) -> None:
+    together = {name: 3.0 + 0.4 * k for k, name in enumerate((*THERMAL, "room"))}
+    found = findings(stepped(recorded(0.1), together, spread_s))
+    assert {(f.check, f.channel) for f in found} == {("interruption", "x"), ("interruption", "z")}
+    assert all(FAULT_S - 20.0 <= (f.start_s or 0.0) <= FAULT_S for f in found)
+
+
+@pytest.mark.parametrize("step_s", RATES_S)
+def test_a_spike_is_masked_alone(step_s: float) -> None:
+    batch = recorded(step_s)
+    row = round(FAULT_S / step_s)
+    values = batch.values("column").copy()
+    values[row] += 5.0
+    found = findings(replace(batch, table=batch.table.assign(column=values)))
+    assert [(f.check, f.channel) for f in found] == [("spike", "column")]
+    assert found[0].start_s == found[0].end_s == batch.time_s[row]
+
+
+@pytest.mark.parametrize(("half", "least"), [(3, 4), (4, 1)])
+@pytest.mark.parametrize("n", [5, 18, 19, 200])
+def test_medians_by_exchange_are_medians(n: int, half: int, least: int) -> None:
+    values = np.round(np.random.default_rng(n).normal(size=n), 1)
+    plain = pd.Series(values).rolling(2 * half + 1, center=True, min_periods=least).median().to_numpy()
+    assert np.array_equal(rolling_median(values, half, least), plain, equal_nan=True)
