@@ -108,14 +108,18 @@ class FamilyResult:
     failures: list[tuple[str, str]]
 
 
+def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
+    """Batches that can teach or test: their error channel is not masked from end to end."""
+    return [b for b in batches if np.isfinite(b.masked(target)).sum() >= 2]
+
+
 def prepare(batches: Sequence[Batch], target: str, plan: Plan) -> Crossing:
     """Stack the batches and let every selector choose on every training set.
 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
     """
-    # A batch whose error channel is masked from end to end cannot teach or test anything.
-    kept = [b for b in batches if np.isfinite(b.masked(target)).sum() >= 2]
+    kept = with_target(batches, target)
     lost = [(target, f"batch {b.batch_id} is left out: no usable {target}") for b in batches if b not in kept]
     if len(kept) < 2:
         raise InputError(

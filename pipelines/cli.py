@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from data.errors import InputError, WorkError, closest
+from pipelines import screen
 from pipelines import settings as settings_module
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from data.ingest import IngestReport
-    from pipelines.training import TrainOutcome
 
 app = typer.Typer(
     name="thermodrift",
@@ -31,9 +19,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-out = Console(soft_wrap=True)
-err = Console(stderr=True, soft_wrap=True)
-
 MachineFile = Annotated[Path, typer.Option("--machine", help="machine file (.yml)")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables")]
 
@@ -53,7 +38,7 @@ def describe(
     if to.exists():
         raise InputError(f"{to} exists; give another --out or remove it first")
     to.write_text(text, encoding="utf-8")
-    out.print(f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`")
+    screen.line(f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`")
 
 
 @app.command()
@@ -68,14 +53,19 @@ def ingest(
     from data.machine import load_machine
 
     described = load_machine(machine)
-    with _progress(as_json) as (say, _):
+    with screen.progress(as_json) as (say, _):
         report = ingest_paths(paths, described, Lake(settings_module.home() / "lake"), progress=say)
     if as_json:
-        _print_json(json.loads(report.as_frame().to_json(orient="records")))
+        screen.print_json(screen.records(report.as_frame()))
     else:
-        _print_ingest(report)
+        screen.print_ingest(report)
+    if not report.rows:
+        raise InputError(
+            f"{', '.join(map(str, paths))}: no recording there, {len(report.ignored)} other files; the machine file "
+            f"asks for {', '.join(described.recording.files)}; give another folder or correct recording.files"
+        )
     if not report.batches:
-        raise WorkError(f"none of the {len(report.quarantined)} file(s) could be used; the reasons are above")
+        raise InputError(f"no file could be used ({len(report.quarantined)} in quarantine); the reasons are above")
 
 
 @app.command()
@@ -93,53 +83,56 @@ def train(
 ) -> None:
     """The main job: ingest → features → grid → track → promote → report."""
     settings_module.configure_environment()
-    from data.machine import load_machine
     from features.selectors import SELECTORS
     from models import FAMILIES
+    from models.grid import Plan
     from models.protocols import PROTOCOLS
+    from pipelines.request import TrainRequest, check_request
 
-    # Arguments are judged before anything is started.
-    load_machine(machine)
     settings = settings_module.load()
     chosen = (
         _names(selectors, SELECTORS, "selector"),
         _names(families, FAMILIES, "family"),
         _names(protocols, PROTOCOLS, "protocol"),
     )
+    targets = _split(channels)
+    request = TrainRequest(machine, tuple(recordings or ()), targets, Plan(*chosen), report, promote)
+    check_request(request, settings)  # before anything is started
     server = None
     if not direct:
         from pipelines.flows import start_server, train_in_flow
 
         server = start_server()
-    from models.grid import Plan
     from pipelines import training
 
-    targets = tuple(t for t in channels.split(",") if t)
-    request = training.TrainRequest(machine, tuple(recordings or ()), targets, Plan(*chosen), report, promote)
-    with _progress(as_json) as (say, done):
+    with screen.progress(as_json) as (say, done):
         if direct:
             outcome = training.train(request, settings, training.DirectCaller(done=done), say)
         else:
             outcome = train_in_flow(request, settings, say, done, server)
     if as_json:
-        _print_json(_outcome_dict(outcome))
+        screen.print_json(screen.outcome_dict(outcome))
     else:
-        _print_outcome(outcome)
+        screen.print_outcome(outcome)
 
 
 @app.command()
 def report(
     machine: Annotated[str, typer.Option("--machine", help="machine name")],
     trainings: Annotated[list[str] | None, typer.Argument(help="training ids; default: the latest per channel")] = None,
-    form: Annotated[str, typer.Option("--format", help="html or md")] = "html",
+    form: Annotated[str, typer.Option("--format", help="html or md; default: by --out, else html")] = "",
     to: Annotated[Path | None, typer.Option("--out", help="default: var/reports/MACHINE.html")] = None,
 ) -> None:
     """A comparison report from tracked trainings."""
     settings_module.configure_environment()
-    if form not in ("html", "md"):
+    if form not in ("", "html", "md"):
         raise InputError(f"--format: got {form!r}, expected html or md")
     from pipelines import tracking
     from pipelines.report import write_report
+    from pipelines.request import REPORT_ENDINGS, check_ending
+
+    if to is not None:
+        check_ending("--out", to, (f".{form}",) if form else REPORT_ENDINGS)
 
     settings = settings_module.load()
     ids = trainings
@@ -148,9 +141,9 @@ def report(
         if past.empty:
             raise InputError(f"no training of {machine!r} is tracked; call `thermodrift train` first")
         ids = past.drop_duplicates("target")["training_id"].tolist()
-    path = to or settings_module.home() / "reports" / f"{machine}.{form}"
+    path = to or settings_module.home() / "reports" / f"{machine}.{form or 'html'}"
     write_report([tracking.load_training(i, settings) for i in ids], path, settings)
-    out.print(str(path))
+    screen.line(path)
 
 
 @app.command()
@@ -164,7 +157,7 @@ def promote(
     settings_module.configure_environment()
     from pipelines.training import promote_tracked
 
-    out.print(escape(promote_tracked(training, machine, cell, force, settings_module.load()).words))
+    screen.line(promote_tracked(training, machine, cell, force, settings_module.load()).words)
 
 
 @app.command()
@@ -173,7 +166,7 @@ def rollback(model: Annotated[str, typer.Argument(help="registered model, MACHIN
     settings_module.configure_environment()
     from pipelines import registry
 
-    out.print(escape(registry.rollback(model, settings_module.load()).words))
+    screen.line(registry.rollback(model, settings_module.load()).words)
 
 
 @app.command()
@@ -185,16 +178,18 @@ def predict(
     """Predict the error of a recording; rows outside the trained region are marked."""
     settings_module.configure_environment()
     from pipelines.predict import predict_file
+    from pipelines.request import check_ending
+
+    if to is not None:
+        check_ending("--out", to, (".csv", ".parquet"))
 
     table = predict_file(model, file, settings_module.load())
     if to is None:
         table.to_csv(sys.stdout, index=False)
     elif to.suffix == ".parquet":
         table.to_parquet(to, index=False)
-    elif to.suffix == ".csv":
-        table.to_csv(to, index=False)
     else:
-        raise InputError(f"--out {to}: got the ending {to.suffix!r}, expected .csv or .parquet")
+        table.to_csv(to, index=False)
 
 
 @app.command()
@@ -209,7 +204,7 @@ def simulate(
     from data.sample_year import write_sample_year
 
     files = write_sample_year(to, seed=seed)
-    out.print(f"{to}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+    screen.line(f"{to}: {len(files)} simulated recordings of the sample machine, seed {seed}")
 
 
 @app.command()
@@ -227,8 +222,8 @@ def schedule(
     missing = [p for p in recordings if not p.exists()]
     if missing:
         raise InputError(f"--recordings {missing[0]}: no such file or folder")
-    out.print(f"retraining of {machine.stem} at '{cron}'; Ctrl-C ends it")
-    serve_schedule(machine, recordings, cron)
+    settings_module.load()
+    serve_schedule(machine, recordings, cron, say=screen.line)
 
 
 @app.command()
@@ -236,19 +231,17 @@ def status(as_json: Json = False) -> None:
     """Which version runs on which machine: registered models, aliases, scores; and what the lake holds."""
     settings_module.configure_environment()
     from data.lake import Lake
-    from pipelines import registry
+    from pipelines import registry, tracking
 
-    models = registry.status(settings_module.load())
+    settings = settings_module.load()
+    models, trainings = registry.status(settings), tracking.trainings(settings=settings)
     lake = Lake(settings_module.home() / "lake")
     held = {m: {"batches": len(lake.batch_ids(m)), "quarantined": len(lake.quarantined(m))} for m in lake.machines()}
     if as_json:
-        _print_json({"models": json.loads(models.to_json(orient="records")), "lake": held})
-        return
-    _print_frame("Registered models", models)
-    table = Table("machine", "batches", "quarantined files", title="Lake")
-    for name, n in held.items():
-        table.add_row(name, str(n["batches"]), str(n["quarantined"]))
-    out.print(table)
+        tables = {"models": screen.records(models), "trainings": screen.records(trainings)}
+        screen.print_json({**tables, "lake": held})
+    else:
+        screen.print_status(models, trainings, held)
 
 
 def main() -> None:
@@ -257,10 +250,10 @@ def main() -> None:
         code = app(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except InputError as error:
-        err.print(f"thermodrift: {escape(str(error))}", highlight=False)
+        screen.trouble(error)
         sys.exit(2)
     except WorkError as error:
-        err.print(f"thermodrift: {escape(str(error))}", highlight=False)
+        screen.trouble(error)
         sys.exit(1)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
@@ -268,116 +261,22 @@ def main() -> None:
         # typer brings its own copy of click, so a usage error is told by what it can do.
         if not hasattr(error, "format_message"):
             raise
-        err.print(f"thermodrift: {escape(error.format_message())}; see `thermodrift --help`", highlight=False)
+        context = getattr(error, "ctx", None)
+        asked = context.command_path if context is not None and context.parent is not None else "thermodrift"
+        screen.trouble(f"{error.format_message().rstrip('.')}; see `{asked} --help`")
         sys.exit(2)
 
 
-Done = Callable[[str, int, int], None]
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Done]]:
-    """One live line: what is being done, and how far the step is."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
-        current = bar.add_task("starting", total=None)
-
-        def say(text: str) -> None:
-            if not quiet and not err.is_terminal:
-                err.print(escape(text), highlight=False)
-            bar.reset(current, description=text, total=None)
-
-        def done(step: str, n: int, of: int) -> None:
-            bar.update(current, description=step, completed=n, total=of)
-
-        yield say, done
+def _split(given: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(n.strip() for n in given.split(",") if n.strip()))
 
 
 def _names(given: str, allowed: Any, kind: str) -> tuple[str, ...]:
-    names = tuple(n for n in given.split(",") if n)
+    names = _split(given)
     for n in names:
         if n not in allowed:
             raise InputError(f"unknown {kind} {n!r}: {closest(n, allowed)}")
     return names or tuple(allowed)
-
-
-def _print_json(value: Any) -> None:
-    sys.stdout.write(json.dumps(value, indent=1, default=str) + "\n")
-
-
-def _print_frame(title: str, frame: pd.DataFrame) -> None:
-    table = Table(*map(str, frame.columns), title=title)
-    for row in frame.itertuples(index=False):
-        table.add_row(*(f"{v:.3g}" if isinstance(v, float) else escape(str(v)) for v in row))
-    out.print(table)
-
-
-def _ingest_totals(report: IngestReport) -> dict[str, int]:
-    states = Counter(r.status.replace("_", " ") for r in report.batches)
-    return {
-        **{f"batches {state}": n for state, n in states.items()},
-        "findings": sum(r.findings for r in report.batches),
-        "rows read": report.rows_in,
-        "rows dropped": report.rows_dropped,
-        "files in quarantine": len(report.quarantined),
-        "files ignored": len(report.ignored),
-    }
-
-
-def _print_ingest(report: IngestReport) -> None:
-    out.print("ingest   " + ", ".join(f"{k} {v}" for k, v in _ingest_totals(report).items()), highlight=False)
-    for row in report.quarantined:
-        out.print(f"  quarantine: {escape(row.file)}: {escape(row.reason)}", highlight=False)
-
-
-def _print_outcome(outcome: TrainOutcome) -> None:
-    if outcome.stopped:
-        out.print(outcome.stopped)
-        return
-    if outcome.ingested is not None:
-        _print_ingest(outcome.ingested)
-    label = "  (simulated recordings)" if outcome.simulated else ""
-    for target, result in outcome.results.items():
-        _print_leaderboard(f"{outcome.machine} {target}: leave-batch-out{label}", result.cells)
-    for promotion in outcome.promotions.values():
-        out.print(escape(promotion.words), highlight=False)
-    out.print(f"report   {outcome.report}", highlight=False)
-    out.print("seconds  " + ", ".join(f"{k} {v:g}" for k, v in outcome.seconds.items()), highlight=False)
-
-
-def _print_leaderboard(title: str, cells: pd.DataFrame, top: int = 8) -> None:
-    """Best cell of each family, in µm."""
-    rows = cells[cells["protocol"] == "leave-batch-out"]
-    rows = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"]).sort_values("score")
-    rows = rows.drop_duplicates("family")
-    table = Table("family", "selector", "points", "S mean µm", "S std µm", "max |e| µm", "stability", title=title)
-    baseline = rows[rows["family"] == "zero"]
-    for row in [*rows.head(top).itertuples(), *baseline.itertuples()]:
-        table.add_row(
-            row.family, row.selector, str(row.n_inputs), f"{row.S_mean_um:.2f}", f"{row.S_std_um:.2f}",
-            f"{row.max_abs_um:.1f}", f"{row.tsp_stability:.2f}",
-        )  # fmt: skip
-    out.print(table)
-
-
-def _outcome_dict(outcome: TrainOutcome) -> dict[str, Any]:
-    best = {
-        t: r.cells[r.cells["protocol"] == "leave-batch-out"].nsmallest(5, "S_mean_um").to_dict(orient="records")
-        for t, r in outcome.results.items()
-    }
-    return {
-        "machine": outcome.machine,
-        "simulated": outcome.simulated,
-        "ingested": _ingest_totals(outcome.ingested) if outcome.ingested else None,
-        "trainings": outcome.training_ids,
-        "best": best,
-        "promotions": {t: p.words for t, p in outcome.promotions.items()},
-        "report": str(outcome.report) if outcome.report else None,
-        "seconds": outcome.seconds,
-        "stopped": outcome.stopped,
-    }
 
 
 if __name__ == "__main__":

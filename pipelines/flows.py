@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Sequence
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
+from zoneinfo import available_timezones
 
 from prefect import flow, task
 from prefect import settings as prefect_settings
 from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.schedules import CronSchedule
 from prefect.server.api.server import SubprocessASGIServer
+from prefect.settings import temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
+from prefect.types.entrypoint import EntrypointType
 from threadpoolctl import threadpool_limits
 
+from data.errors import InputError, WorkError
+from pipelines.request import TrainRequest
 from pipelines.settings import Settings, load
-from pipelines.training import TrainOutcome, TrainRequest, train
+from pipelines.training import TrainOutcome, train
 
 T = TypeVar("T")
 R = TypeVar("R")
+RETRY_DELAY_S = 2.0
 
 
 class PrefectCaller:
@@ -41,7 +55,8 @@ class PrefectCaller:
             cache_policy=NO_CACHE,
             persist_result=False,
             retries=retries,
-            retry_delay_seconds=2,
+            retry_delay_seconds=RETRY_DELAY_S,
+            retry_condition_fn=_can_succeed,
         )
         results: list[R] = []
         with threadpool_limits(limits=1):
@@ -50,6 +65,17 @@ class PrefectCaller:
                 if self.done:
                     self.done(step, len(results), len(items))
         return results
+
+
+def _can_succeed(task: Any, run: Any, state: Any) -> bool:
+    """Whether another try may help: what the user gave does not get better by waiting."""
+    try:
+        state.result()
+    except InputError:
+        return False
+    except Exception:
+        return True
+    return True
 
 
 def start_server() -> threading.Thread | None:
@@ -80,30 +106,115 @@ def train_in_flow(
 
     if server is not None:
         server.join()
-    # What goes wrong is told once, by the command, in one line.
-    logging.getLogger("prefect.flow_runs").setLevel(logging.CRITICAL)
-    logging.getLogger("prefect.task_runs").setLevel(logging.CRITICAL)
+    _one_line_of_trouble()
     return training()
 
 
-@flow(
-    name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=2), persist_result=False, log_prints=True
-)
+@flow(name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=2), persist_result=False)
 def retrain(machine_file: str, recordings: list[str]) -> str:
-    """Ingest what arrived since the last time and train if there is anything new; returns what was done, in words."""
+    """Ingest what arrived since the last time and train if there is anything new; returns what was done, in words.
+
+    What stops it is printed in one line, and the run counts as failed.
+    """
+    _one_line_of_trouble()
     request = TrainRequest(Path(machine_file), tuple(Path(r) for r in recordings), only_if_new=True)
-    outcome = train(request, load(), PrefectCaller(), print)
-    if outcome.stopped:
-        return outcome.stopped
-    return "; ".join(p.words for p in outcome.promotions.values())
+    try:
+        outcome = train(request, load(), PrefectCaller())
+    except (InputError, WorkError) as error:
+        print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {error}", flush=True)
+        raise
+    words = outcome.stopped or "; ".join(p.words for p in outcome.promotions.values())
+    quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
+    words += f" ({quarantined} files in quarantine)" if quarantined else ""
+    print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {words}", flush=True)
+    return words
 
 
-def serve_schedule(machine_file: Path, recordings: Sequence[Path], cron: str, limit: int | None = None) -> Any:
-    """Serve `retrain` on a cron schedule until interrupted: recordings dropped into the folder are learned."""
-    return retrain.serve(
-        name=f"retrain-{machine_file.stem}",
-        cron=cron,
-        parameters={"machine_file": str(machine_file.resolve()), "recordings": [str(r.resolve()) for r in recordings]},
-        limit=limit,
-        print_starting_message=False,
-    )
+def serve_schedule(
+    machine_file: Path, recordings: Sequence[Path], cron: str, say: Callable[[str], None] = lambda text: None
+) -> None:
+    """Serve `retrain` on a cron schedule until interrupted: recordings dropped into the folder are learned.
+
+    Runs on the server that PREFECT_API_URL names; without one a server of its own is started on 127.0.0.1 and ends
+    with the schedule, since Prefect's temporary servers schedule nothing. Its times are the local ones.
+
+    Raises:
+        InputError: `cron` is no cron expression.
+        WorkError: the server does not come up.
+    """
+    try:
+        schedule = CronSchedule(cron=cron, timezone=local_timezone())
+    except ValueError:
+        raise InputError(
+            f"--cron: got {cron!r}, expected five fields (minute hour day month weekday), such as '0 5 * * 1' for "
+            "Mondays at 5:00"
+        ) from None
+    with scheduling_server():
+        say(f"retraining of {machine_file.stem} at '{cron}' ({schedule.timezone}); Ctrl-C ends it")
+        retrain.serve(
+            name=f"retrain-{machine_file.stem}",
+            schedule=schedule,
+            parameters={
+                "machine_file": str(machine_file.resolve()),
+                "recordings": [str(r.resolve()) for r in recordings],
+            },
+            limit=1,
+            print_starting_message=False,
+            entrypoint_type=EntrypointType.MODULE_PATH,  # a file path would be one relative to where we stand
+        )
+
+
+@contextmanager
+def scheduling_server(wait_s: float = 60.0) -> Iterator[str]:
+    """The address of a server that schedules: the one that PREFECT_API_URL names, or one of our own on 127.0.0.1.
+
+    Raises:
+        WorkError: it does not answer within `wait_s`.
+    """
+    given = prefect_settings.PREFECT_API_URL.value()
+    if given:
+        yield given
+        return
+    port = SubprocessASGIServer().find_available_port()
+    command = [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port),
+               "--no-ui", "--analytics-off"]  # fmt: skip
+    address = f"http://127.0.0.1:{port}/api"
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until = time.monotonic() + wait_s
+        while not _answers(address):
+            if process.poll() is not None or time.monotonic() > until:
+                raise WorkError(
+                    f"Prefect's server did not start on 127.0.0.1:{port} within {wait_s:g} s; start one with `prefect "
+                    "server start` and name it in PREFECT_API_URL"
+                )
+            time.sleep(0.2)
+        with temporary_settings({prefect_settings.PREFECT_API_URL: address}):
+            yield address
+    finally:
+        process.terminate()
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def local_timezone() -> str:
+    """The IANA name of the local time zone, UTC where the system does not tell."""
+    named = os.environ.get("TZ", "").lstrip(":")
+    linked = Path("/etc/localtime").resolve().as_posix().partition("zoneinfo/")[2]
+    return next((z for z in (named, linked) if z in available_timezones()), "UTC")
+
+
+def _answers(address: str) -> bool:
+    try:
+        with urllib.request.urlopen(f"{address}/health", timeout=2.0) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False
+
+
+def _one_line_of_trouble() -> None:
+    """What goes wrong is told once, by the command, in one line; Prefect would log it with a traceback."""
+    for name in ("prefect.flow_runs", "prefect.task_runs"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -24,11 +24,12 @@ from data.ingest import IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
 from models import FAMILIES
-from models.grid import Crossing, FamilyResult, Plan, assemble, cross_family, prepare, refit
+from models.grid import Crossing, FamilyResult, Plan, assemble, cross_family, prepare, refit, with_target
 from models.region import region_of
 from models.result import GridResult
 from pipelines import promotion, registry, tracking
 from pipelines.report import figure_pngs, write_report
+from pipelines.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
 
 T = TypeVar("T")
@@ -60,19 +61,6 @@ class DirectCaller:
         return results
 
 
-@dataclass(frozen=True)
-class TrainRequest:
-    """What to train. `recordings` empty: what the lake holds. `targets` empty: every error channel."""
-
-    machine_file: Path
-    recordings: tuple[Path, ...] = ()
-    targets: tuple[str, ...] = ()
-    plan: Plan = field(default_factory=Plan)
-    report: Path | None = None
-    promote: bool = True
-    only_if_new: bool = False  # stop where the last training saw the same batches
-
-
 @dataclass
 class TrainOutcome:
     """What came of it, for the command line and for tests."""
@@ -93,9 +81,9 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     """Run the yearly job.
 
     Raises:
-        InputError: machine file or recordings that cannot be used, or too few batches to train on.
+        InputError: a request that cannot be served (see `check_request`), or too few batches to train on.
     """
-    machine = load_machine(request.machine_file)
+    machine, targets = check_request(request, settings)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     clock = _Clock(outcome.seconds)
     lake = Lake(home() / "lake")
@@ -105,8 +93,6 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         outcome.ingested = caller.map("ingest", work, [request.recordings], retries=RETRIES)[0]
         clock("ingest")
     batches = load_batches(lake, machine)
-    targets = request.targets or machine.names("error")
-    _check_targets(targets, machine)
     if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome
@@ -125,10 +111,10 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     track = partial(_track, outcome.results, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
     clock("track")
-    for t in targets:
-        outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
     if request.promote:
         say("promote")
+        for t in targets:
+            outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
         promote = partial(_promote, outcome, crossings, request.machine_file, settings)
         outcome.promotions = dict(zip(targets, caller.map("promote", promote, targets, retries=RETRIES), strict=True))
         clock("promote")
@@ -190,21 +176,13 @@ class _Clock:
         self.into[step], self.last = round(now - self.last, 2), now
 
 
-def _check_targets(targets: Sequence[str], machine: Machine) -> None:
-    allowed = machine.names("error")
-    for t in targets:
-        if t not in allowed:
-            raise InputError(f"machine {machine.machine}: no error channel {t!r}; allowed: {', '.join(allowed)}")
-
-
 def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch], settings: Settings) -> bool:
-    digests = {b.digest for b in batches}
     for target in targets:
         past = tracking.trainings(machine, target, settings)
         if past.empty:
             return False
         last = tracking.load_training(str(past.iloc[0]["training_id"]), settings)
-        if set(last.result.batches["digest"]) != digests:
+        if set(last.result.batches["digest"]) != {b.digest for b in with_target(batches, target)}:
             return False
     return True
 
