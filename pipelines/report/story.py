@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from data.errors import InputError
-from pipelines.promotion import Choice, pick
+from pipelines.promotion import Choice, decide, pick
 from pipelines.report.extracts import picked
 from pipelines.report.records import interval_words
 from pipelines.report.words import cell_label, count, decimals, number, p_words, plus_minus
@@ -16,6 +16,9 @@ from pipelines.settings import PromotionRule
 from pipelines.tracking import Training
 
 _CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unchanged", "": "not promoted"}
+
+
+_NESTED = re.compile(r"by the cell that the others chose: ([\d.]+) ± ([\d.]+) µm")
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,19 @@ class Verdict:
     caution: str = ""
 
 
-def promoted_cell(training: Training, rule: PromotionRule, protocol: str) -> Choice:
-    """The cell that was promoted; without a promotion the one that the rule would take."""
-    own = picked(training.result, rule, protocol)
+def promoted_cell(training: Training, rule: PromotionRule, protocol: str, nested: bool = False) -> Choice:
+    """The cell that was promoted; without a promotion the one that the rule would take.
+
+    Args:
+        nested: with the score of choosing itself, as recorded at the promotion, else computed now.
+    """
+    said = _NESTED.search(str(training.promotion.get("words", "")))
+    if nested and not said and protocol == rule.protocol:
+        own = decide(training.result, rule)
+    else:
+        own = picked(training.result, rule, protocol)
+    if said:
+        own = replace(own, nested_S_mean_um=float(said[1]), nested_S_std_um=float(said[2]))
     cell = str(training.promotion.get("cell", ""))
     if cell and cell != own.cell:
         try:
@@ -48,7 +61,7 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     digits = decimals(choice.S_std_um, choice.n_batches)
     score = (
         f"{plus_minus(choice.S_mean_um, choice.S_std_um, digits)} µm on left-out batches "
-        f"({choice.protocol}, {count(choice.n_batches, 'batch')})"
+        f"({choice.protocol}, {count(choice.n_batches, 'batch')}{_nested(choice, digits)})"
     )
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
     if outcome == "champion":
@@ -67,7 +80,7 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
         words = f"Nothing was promoted. The rule would take {model}: {score}."
     caution = ""
     if not (p.get("trusted", True) if p else choice.trusted):
-        caution = "Do not trust this model: " + _distrust(choice)
+        caution = "Do not trust this model: " + _distrust(f"{choice.words}; {p.get('words', '')}")
     return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), words, caution)
 
 
@@ -132,6 +145,13 @@ def _against(p: dict[str, Any]) -> str:
     return found[1] if found else ""
 
 
-def _distrust(choice: Choice) -> str:
-    said = [s for s in choice.words.split("; ") if s.endswith(": do not trust")]
+def _nested(choice: Choice, digits: int) -> str:
+    if not math.isfinite(choice.nested_S_mean_um):
+        return ""
+    score = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
+    return f"; {score} µm when a batch has no say in the choice of its model either"
+
+
+def _distrust(words: str) -> str:
+    said = [s for s in words.split("; ") if s.endswith(": do not trust")]
     return (said[0].removesuffix(": do not trust") if said else "the rule found nothing that beats a baseline") + "."

@@ -7,8 +7,8 @@ import re
 import pytest
 from report_training import COMPARISON, Maker, promotion, results, training
 
-from pipelines.promotion import choose
-from pipelines.report.story import verdict
+from pipelines.promotion import choose, score_of_choice
+from pipelines.report.story import promoted_cell, verdict
 from pipelines.report.words import cell_label
 from pipelines.settings import PromotionRule
 
@@ -80,6 +80,30 @@ def test_what_became_of_a_training_in_one_sentence(
         pattern.format(cell=re.escape(cell_label(choice.selector, choice.family, choice.n_tsp))), said.words
     ), said.words
     assert said.caution == ""
+
+
+def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    rule_cell = choose(result.cells, RULE)
+    nested = score_of_choice(result, RULE)["S_um"]
+    computed = promoted_cell(training(result), RULE, "leave-batch-out", nested=True)
+    assert computed.nested_S_mean_um == pytest.approx(nested.mean())
+    assert computed.nested_S_std_um == pytest.approx(nested.std())
+    recorded = promotion(rule_cell.cell, words="…; each batch by the cell that the others chose: 9.44 ± 7.31 µm; …")
+    choice = promoted_cell(training(result, recorded), RULE, "leave-batch-out", nested=True)
+    assert (choice.cell, choice.nested_S_mean_um, choice.nested_S_std_um) == (rule_cell.cell, 9.44, 7.31)
+    said = verdict("z", training(result, recorded), choice).words
+    assert re.search(
+        r"6 batches; 9\.4\d? ± 7\.31? µm when a batch has no say in the choice of its model either\)", said
+    )
+
+
+def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    reason = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean_curve (8.10 µm)"
+    recorded = promotion(choose(result.cells, RULE).cell, trusted=False, words=f"…; {reason}: do not trust")
+    said = verdict("z", training(result, recorded), choose(result.cells, RULE))
+    assert said.caution == f"Do not trust this model: {reason}."
 
 
 def test_nothing_promoted_and_nothing_to_trust_are_said(toy_batches: Maker) -> None:

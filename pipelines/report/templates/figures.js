@@ -3,7 +3,7 @@
   const root = document.documentElement;
   const plots = Array.from(document.querySelectorAll(".plot"));
   const narrow = 520;
-  const paper = { full: [680, 0], half: [332, 270], third: [680, 235] };
+  const paper = { full: [680, 0], half: [332, 270], third: [680, 275] };
   const config = {
     displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: "",
     displayModeBar: window.matchMedia("(hover: hover)").matches ? "hover" : false,
