@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,14 +13,15 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family, inner_groups
 from models.batchwise import too_few_rows
-from models.bordered import bordered_inverse, left_out
+from models.bordered import Bordered, Kernel
 
 Rows = NDArray[np.int64]
 SCALES = {"K": 10.0, "degC": 10.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}
 LINEAR_WEIGHT = 10.0  # at equal weight the RBF takes half of every slope, and keeps it at home
 _OTHER_SCALE = 10.0  # inputs without a known unit are taken for rises
 _LEAST_ROWS_PER_BATCH = 8
-_ROWS_AT_ONCE = 4096  # of a prediction: bounds the kernel's memory
+_ROWS_AT_ONCE = 128  # of a prediction: its kernel stays in a processor's cache
+_STACK_VALUES = 500_000  # of the matrices solved together: what fits a processor's cache
 
 
 class LSSVM(Family):
@@ -57,22 +58,30 @@ class LSSVM(Family):
         self.sigmas, self.gammas = [float(s) for s in sigmas], [float(g) for g in gammas]
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self._fit_alone(design, train, *self._decimated(design))
+        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
-        """Folds that leave out less than half of the rows come from one inverse per (γ, σ); others one by one.
+        """Folds that leave out one batch share one inverse per (γ, σ); the others are stacked where alike in size.
 
         Raises:
             InputError: fewer than 2 usable rows in a fold.
         """
         rows, batch = self._decimated(design)
-        shared = [f for f, fold in enumerate(folds) if _shares(fold, batch)]
+        present = np.unique(batch)
+        gaps = [present[~np.isin(present, list(fold))] for fold in folds]
+        shared = [f for f, gap in enumerate(gaps) if len(gap) == 1 and len(present) >= 4]
         out: dict[int, Self] = {}
         if len(shared) > 1:
-            out = dict(zip(shared, self._fit_shared(design, [folds[f] for f in shared], rows, batch), strict=True))
+            out |= self._fit_shared(design, rows, batch, {f: int(gaps[f][0]) for f in shared})
+        alone: dict[int, tuple[Rows, Rows]] = {}
         for f, fold in enumerate(folds):
             if f not in out:
-                out[f] = self._fit_alone(design, fold, rows, batch)
+                inside = rows[np.isin(batch, list(fold))]
+                if len(inside) < 2:
+                    raise too_few_rows(self.key, design, fold, len(inside), 2)
+                alone[f] = inside, _layout(inner_groups(design.group[inside]))
+        for stack in _stacks({f: layout.shape for f, (_, layout) in alone.items()}):
+            out |= self._fit_stack(design, {f: alone[f] for f in stack})
         return [out[f] for f in range(len(folds))]
 
     def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
@@ -122,52 +131,45 @@ class LSSVM(Family):
         rows = np.concatenate(kept) if kept else np.empty(0, np.int64)
         return rows, design.group[rows]
 
-    def _fit_alone(self, design: Design, train: Sequence[int], rows: Rows, batch: Rows) -> Self:
-        inside = np.isin(batch, np.asarray(list(train), int))
-        rows, batch = rows[inside], batch[inside]
-        if len(rows) < 2:
-            raise too_few_rows(self.key, design, train, len(rows), 2)
-        groups = inner_groups(batch)
-        none_out = np.zeros((1, 0), np.int64)
-        best = self._search(design, rows, _layout(groups), np.ones((1, groups.max() + 1), bool), none_out)
-        return self._made(design, rows, best, 0)
-
-    def _fit_shared(self, design: Design, folds: Sequence[Sequence[int]], rows: Rows, batch: Rows) -> list[Self]:
+    def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gap: dict[int, int]) -> dict[int, Self]:
+        """Fold f leaves out batch gap[f]: its inner residuals are those of pairs of batches left out."""
         present, compact = np.unique(batch, return_inverse=True)
-        member = np.array([np.isin(present, list(fold)) for fold in folds])
-        outs = _padded_rows([np.flatnonzero(~member[f][compact]) for f in range(len(folds))])
-        best = self._search(design, rows, _layout(compact), member, outs)
-        return [self._made(design, rows, best, f) for f in range(len(folds))]
+        problem = _Problem.of(design, [rows], [_layout(compact)])
+        m, left = problem.group_rows, np.searchsorted(present, list(gap.values()))
+        best = _Best.empty(len(gap), problem.n)
+        for sigma, gamma, system in problem.systems(self):
+            score = problem.score(system.pairs_left_out(m)[left], ~np.eye(len(present), dtype=bool)[left])
+            better = np.flatnonzero(score < best.score)
+            if len(better):
+                best.take(better, sigma, gamma, score[better], *system.solutions(m, left[better]))
+        folds = range(len(gap))
+        inside = [problem.known[0] & (np.arange(problem.n) // m != left[f]) for f in folds]
+        return {f: self._made(design, problem, best, i, 0, inside[i]) for i, f in enumerate(gap)}
 
-    def _search(self, design: Design, rows: Rows, groups: Rows, member: NDArray[np.bool_], outs: Rows) -> _Best:
-        u, y = design.x[rows] / _scale(design), design.y_um[rows]
-        best = _Best.empty(len(member), len(rows))
-        for sigma in self.sigmas:
-            omega = kernel(u, u, sigma, self.linear)
-            for gamma in self.gammas:
-                try:
-                    inverse, ones = bordered_inverse(omega, gamma)
-                    found = left_out(inverse, ones, y, groups, member, outs)
-                except np.linalg.LinAlgError:
-                    continue  # inputs so large that 1/γ is lost in rounding: a smaller γ still does
-                best.take(sigma, gamma, *found)
-        if not np.isfinite(best.score).all():
+    def _fit_stack(self, design: Design, alone: dict[int, tuple[Rows, Rows]]) -> dict[int, Self]:
+        problem = _Problem.of(design, [r for r, _ in alone.values()], [layout for _, layout in alone.values()])
+        best = _Best.empty(len(alone), problem.n)
+        for sigma, gamma, system in problem.systems(self):
+            score = problem.score(system.left_out(problem.group_rows))
+            better = np.flatnonzero(score < best.score)
+            if len(better):
+                alpha, bias = system.solutions(problem.group_rows)
+                best.take(better, sigma, gamma, score[better], alpha[better], bias[better])
+        return {f: self._made(design, problem, best, i, i, problem.known[i]) for i, f in enumerate(alone)}
+
+    def _made(self, design: Design, problem: _Problem, best: _Best, f: int, s: int, kept: NDArray[np.bool_]) -> Self:
+        if not np.isfinite(best.score[f]):
             raise InputError(
                 f"family lssvm: no gamma of {self.gammas} gives a solvable kernel; inputs reach "
-                f"{np.abs(u).max():.3g} times their scale, expected about 1: check their units"
+                f"{np.abs(problem.u[s]).max():.3g} times their scale, expected about 1: check their units"
             )
-        return best
-
-    def _made(self, design: Design, rows: Rows, best: _Best, f: int) -> Self:
-        kept = best.inside[f]
-        scale = _scale(design)
         fitted = {
-            "support": design.x[rows[kept]] / scale,
+            "support": problem.u[s, kept],
             "alpha": best.alpha[f, kept],
             "bias": float(best.bias[f]),
             "gamma": float(best.gamma[f]),
             "sigma": float(best.sigma[f]),
-            "scale": scale,
+            "scale": _scale(design),
             "inner_rms_um": float(best.score[f]),
         }
         return self._learned(design, fitted)
@@ -175,11 +177,70 @@ class LSSVM(Family):
 
 def kernel(u: Array, v: Array, sigma: float, linear: bool) -> Array:
     """Ω (n, m) of scaled inputs u (n, p), v (m, p); NaN rows give NaN."""
+    return _kernel(*_products(u, v), sigma, linear)
+
+
+def _products(u: Array, v: Array) -> tuple[Array, Array]:
+    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p: all that a kernel needs besides σ."""
     p = max(1, u.shape[1])
-    dot = u @ v.T
-    square = (u**2).sum(axis=1)[:, None] + (v**2).sum(axis=1) - 2.0 * dot
-    omega: Array = np.exp(np.minimum(-square / (2.0 * p * sigma**2), 0.0))
-    return omega + LINEAR_WEIGHT * dot / p if linear else omega
+    dot = u @ v.T / p
+    half = dot - (u**2).sum(axis=1)[:, None] / (2.0 * p)
+    half -= (v**2).sum(axis=1) / (2.0 * p)
+    return np.minimum(half, 0.0, out=half), dot
+
+
+def _kernel(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
+    omega: Array = half / sigma**2
+    np.exp(omega, out=omega)
+    if linear:
+        omega += LINEAR_WEIGHT * dot
+    return omega
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """S training sets, each in G groups of m rows, 0 where padded: u (S, n, p), y_um and known (S, n), n = G m."""
+
+    u: Array
+    y_um: Array
+    known: NDArray[np.bool_]
+    group_rows: int
+
+    @classmethod
+    def of(cls, design: Design, rows: Sequence[Rows], layouts: Sequence[Rows]) -> Self:
+        n_groups, m = np.max([layout.shape for layout in layouts], axis=0)
+        at = np.full((len(rows), n_groups, m), -1, np.int64)
+        for s, (r, layout) in enumerate(zip(rows, layouts, strict=True)):
+            at[s, : layout.shape[0], : layout.shape[1]] = np.where(layout >= 0, r[layout], -1)
+        at = at.reshape(len(rows), -1)
+        known = at >= 0
+        u = np.where(known[:, :, None], design.x[at] / _scale(design), 0.0)
+        return cls(u, np.where(known, design.y_um[at], 0.0), known, int(m))
+
+    @property
+    def n(self) -> int:
+        return self.known.shape[1]
+
+    def systems(self, family: LSSVM) -> Iterator[tuple[float, float, Bordered]]:
+        """Every (σ, γ) of a family, solved."""
+        known = self.known.astype(float)
+        with np.errstate(all="ignore"):  # a γ lost in rounding gives NaN, and is not chosen
+            products = [_products(u, u) for u in self.u]
+            for sigma in family.sigmas:
+                kernels = []
+                for product, k in zip(products, known, strict=True):
+                    omega = _kernel(*product, sigma, family.linear)
+                    kernels.append(Kernel(omega if k.all() else omega * k[:, None] * k))
+                for gamma in family.gammas:
+                    yield sigma, gamma, Bordered.of(kernels, known, self.y_um, gamma)
+
+    def score(self, residual: Array, member: NDArray[np.bool_] | None = None) -> Array:
+        """Mean over the groups of the RMS of residual (F, G, m); ∞ where it is not a number."""
+        count = self.known.reshape(len(self.known), -1, self.group_rows).sum(axis=2)
+        counted = (count > 0) if member is None else (count > 0) & member
+        rms = np.sqrt((residual**2).sum(axis=2) / np.maximum(count, 1))
+        score = np.where(counted, rms, 0.0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
+        return np.where(np.isfinite(score), score, np.inf)
 
 
 @dataclass
@@ -191,20 +252,15 @@ class _Best:
     gamma: Array
     alpha: Array
     bias: Array
-    inside: NDArray[np.bool_]
 
     @classmethod
-    def empty(cls, n_folds: int, n: int) -> _Best:
+    def empty(cls, n_folds: int, n: int) -> Self:
         zero = np.zeros(n_folds)
-        return cls(zero + np.inf, zero.copy(), zero.copy(), np.zeros((n_folds, n)), zero.copy(),
-                   np.ones((n_folds, n), bool))  # fmt: skip
+        return cls(zero + np.inf, zero.copy(), zero.copy(), np.zeros((n_folds, n)), zero.copy())
 
-    def take(
-        self, sigma: float, gamma: float, score: Array, alpha: Array, bias: Array, inside: NDArray[np.bool_]
-    ) -> None:
-        better = score < self.score
-        self.score[better], self.sigma[better], self.gamma[better] = score[better], sigma, gamma
-        self.alpha[better], self.bias[better], self.inside = alpha[better], bias[better], inside
+    def take(self, at: Rows, sigma: float, gamma: float, score: Array, alpha: Array, bias: Array) -> None:
+        self.score[at], self.sigma[at], self.gamma[at] = score, sigma, gamma
+        self.alpha[at], self.bias[at] = alpha, bias
 
 
 def _scale(design: Design) -> Array:
@@ -212,18 +268,20 @@ def _scale(design: Design) -> Array:
     return np.array([SCALES.get(u, _OTHER_SCALE) for u in units])
 
 
-def _shares(fold: Sequence[int], batch: Rows) -> bool:
-    """Whether a fold has batches enough to leave one out, and itself leaves out some rows but less than half."""
-    inside = np.isin(batch, list(fold))
-    return len(np.unique(batch[inside])) >= 3 and 0.5 <= inside.mean() < 1.0
+def _stacks(shapes: dict[int, tuple[int, ...]]) -> list[list[int]]:
+    """Folds of like shape together, as long as their matrices stay few."""
+    stacks: dict[tuple[int, ...], list[list[int]]] = {}
+    for f, shape in shapes.items():
+        same = stacks.setdefault(shape, [[]])
+        if same[-1] and (len(same[-1]) + 1) * (shape[0] * shape[1]) ** 2 > _STACK_VALUES:
+            same.append([])
+        same[-1].append(f)
+    return [stack for same in stacks.values() for stack in same]
 
 
 def _layout(group: Rows) -> Rows:
     """Row numbers per group (G, m), −1 behind a group's end."""
-    return _padded_rows([np.flatnonzero(group == k) for k in range(int(group.max()) + 1)])
-
-
-def _padded_rows(parts: Sequence[Rows]) -> Rows:
+    parts = [np.flatnonzero(group == k) for k in range(int(group.max()) + 1)]
     out = np.full((len(parts), max(len(p) for p in parts)), -1, np.int64)
     for i, part in enumerate(parts):
         out[i, : len(part)] = part

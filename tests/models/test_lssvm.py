@@ -6,7 +6,8 @@ from sklearn.kernel_ridge import KernelRidge
 
 from data.errors import InputError
 from features.design import Design
-from models.bordered import bordered_inverse, left_out
+from models import bordered
+from models.bordered import Bordered, Kernel
 from models.lssvm import LSSVM, kernel
 
 SIZES = (14, 9, 12, 11, 13)
@@ -60,32 +61,60 @@ def test_is_kernel_ridge_with_a_free_bias():
     np.testing.assert_allclose(np.concatenate(model.predict_design(design, range(5))), fit, atol=1e-7)
 
 
-def test_left_out_residuals_are_those_of_refits():
-    design = make_design(2)
-    u, y, batch = design.x / 10.0, design.y_um, design.group
-    omega = kernel(u, u, 0.7, True)
-    inverse, ones = bordered_inverse(omega, 30.0)
-    groups = np.full((5, max(SIZES)), -1)
+def padded(seed=2, sigma=0.7, sizes=SIZES):
+    """Five groups of unlike size in one frame of equal ones: kernel, y, known, group of every place, rows per group."""
+    design, m = make_design(seed, sizes), max(sizes)
+    u, y, known = np.zeros((5 * m, 2)), np.zeros(5 * m), np.zeros(5 * m)
     for k in range(5):
-        groups[k, : SIZES[k]] = np.flatnonzero(batch == k)
-    outs = np.full((2, 25), -1)
-    outs[0, : SIZES[3]] = np.flatnonzero(batch == 3)
-    both = np.flatnonzero((batch == 1) | (batch == 4))
-    outs[1, : len(both)] = both
-    member = np.array([[True, True, True, False, True], [True, False, True, True, False]])
-    score, alpha, bias, inside = left_out(inverse, ones, y, groups, member, outs)
-    for f in range(2):
-        train = np.flatnonzero(member[f][batch])
-        np.testing.assert_array_equal(inside[f], member[f][batch])
-        want, b = solved(omega[np.ix_(train, train)], y[train], 30.0)
-        np.testing.assert_allclose(alpha[f, train], want, atol=1e-7)
-        assert bias[f] == pytest.approx(b, abs=1e-7)
-        rms = []
-        for k in np.flatnonzero(member[f]):
-            rest, test = train[batch[train] != k], train[batch[train] == k]
-            a, b = solved(omega[np.ix_(rest, rest)], y[rest], 30.0)
-            rms.append(np.sqrt(np.mean((y[test] - omega[np.ix_(test, rest)] @ a - b) ** 2)))
-        assert score[f] == pytest.approx(np.mean(rms), rel=1e-7)
+        places = slice(k * m, k * m + sizes[k])
+        u[places], y[places], known[places] = design.x[design.rows(k)] / 10.0, design.y_um[design.rows(k)], 1.0
+    return kernel(u, u, sigma, True) * np.outer(known, known), y, known, np.repeat(np.arange(5), m), m
+
+
+def system_of(omega, y, known, gamma):
+    return Bordered.of([Kernel(omega)], known[None], y[None], gamma)
+
+
+@pytest.mark.parametrize("sizes", [SIZES, (60, 40, 50, 55, 60)])
+def test_left_out_residuals_are_those_of_refits(sizes):
+    omega, y, known, group, m = padded(sizes=sizes)
+    system = system_of(omega, y, known, 30.0)
+    one, two = system.left_out(m)[0], system.pairs_left_out(m)
+    alpha, bias = system.solutions(m, np.arange(5))
+    for f in range(5):
+        for g in range(5):
+            train = np.flatnonzero((known > 0) & (group != f) & (group != g))
+            a, b = solved(omega[np.ix_(train, train)], y[train], 30.0)
+            test = np.flatnonzero((known > 0) & (group == g))
+            got = (one[g] if f == g else two[f, g])[: len(test)]
+            np.testing.assert_allclose(got, y[test] - omega[np.ix_(test, train)] @ a - b, atol=1e-7)
+            if f == g:
+                np.testing.assert_allclose(alpha[f, train], a, atol=1e-7)
+                assert bias[f] == pytest.approx(b, abs=1e-7)
+                assert not alpha[f, np.setdiff1d(np.arange(len(y)), train)].any()
+
+
+def test_a_kernel_of_low_rank_takes_the_short_way_to_the_same_inverse(monkeypatch):
+    omega, y, known, _, m = padded(sizes=(60, 40, 50, 55, 60), sigma=3.0)
+    thin = Kernel(omega)
+    assert thin.thin is not None and thin.thin.shape[1] < 100
+    np.testing.assert_allclose(thin.thin @ thin.thin.T, omega, atol=1e-11)
+    monkeypatch.setattr(bordered, "_THIN_FROM_ROWS", 10**9)
+    full = Kernel(omega)
+    assert full.thin is None
+    np.testing.assert_allclose(thin.inverse(100.0), full.inverse(100.0), atol=1e-7)
+    short, long = (Bordered.of([k], known[None], y[None], 1e4) for k in (thin, full))
+    np.testing.assert_allclose(short.pairs_left_out(m), long.pairs_left_out(m), atol=1e-6)
+    np.testing.assert_allclose(short.solutions(m)[0] @ omega, long.solutions(m)[0] @ omega, atol=1e-7)
+
+
+def test_a_system_beyond_floating_point_is_nan_and_its_neighbours_are_not():
+    omega, y, known, _, m = padded()
+    bad = -np.eye(len(y))
+    with np.errstate(all="ignore"):
+        system = Bordered.of([Kernel(bad), Kernel(omega)], np.stack([known] * 2), np.stack([y] * 2), 30.0)
+    assert np.isnan(system.left_out(m)[0]).all()
+    np.testing.assert_array_equal(system.left_out(m)[1], system_of(omega, y, known, 30.0).left_out(m)[0])
 
 
 def brute_force(design, train, sigmas, gammas):
