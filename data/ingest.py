@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -116,7 +117,7 @@ class _Run:
         before = len(self.report.rows)
         conflicts = []
         try:
-            for batch in _checked(file, self.machine):
+            for batch in _ahead(_checked(file, self.machine)):
                 if conflict := self._store(file, batch):
                     conflicts.append(conflict)
             if len(self.report.rows) == before:
@@ -182,7 +183,19 @@ def _collect(paths: Sequence[Path], machine: Machine) -> tuple[list[Path], list[
     return list(files.values()), [f for key, f in ignored.items() if key not in files]
 
 
-def _checked(file: Path, machine: Machine) -> Iterator[Batch]:
+def _ahead(batches: Generator[Batch, None, None]) -> Generator[Batch, None, None]:
+    """The batches; a second thread reads and checks the next one while the caller stores the present one."""
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(next, batches, None)
+            while (batch := coming.result()) is not None:
+                coming = pool.submit(next, batches, None)
+                yield batch
+    finally:
+        batches.close()
+
+
+def _checked(file: Path, machine: Machine) -> Generator[Batch, None, None]:
     """The file's batches with their findings; whatever goes wrong in the file's reading is an InputError."""
     try:
         for batch in read_batches(file, machine):

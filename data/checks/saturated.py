@@ -30,6 +30,9 @@ class Saturated(Check):
                 continue
             channel, v = batch.channels[name], seen.values(name)
             ends = seen.extremes(name)
+            rails = [_rail(e, smallest_step(batch, name), channel.low, channel.high, slack=1e-5) for e in ends]
+            if all(r is None or (channel.role != "error" and abs(r) < 100.0) for r in rails):
+                continue
             for a, b in constant_runs(v, _ROWS):
                 if min(abs(v[a] - e) for e in ends) > 1e-6:
                     continue
@@ -59,11 +62,11 @@ def _jump(v: np.ndarray, row: int) -> float:
     return float(np.max(np.abs(v[row] - before))) if len(before) else 0.0
 
 
-def _rail(value: float, resolution: float, low: float | None, high: float | None) -> float | None:
+def _rail(value: float, resolution: float, low: float | None, high: float | None, slack: float = 0.0) -> float | None:
     size = abs(value)
-    if size < 5.0:
+    if size < 5.0 - slack:
         return None
-    near = max(resolution, 1e-4 * size)
+    near = max(resolution, 1e-4 * size) + slack
     decade = 10.0 ** np.floor(np.log10(size * 1.0001))
     rails = [np.sign(value) * decade * k for k in (1.0, 2.0, 2.5, 5.0, 10.0)]
     for rail in [*rails, low, high]:
