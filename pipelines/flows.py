@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
-import subprocess
-import sys
 import threading
 import time
-import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from datetime import datetime
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 from zoneinfo import available_timezones
@@ -21,7 +18,7 @@ from prefect import settings as prefect_settings
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.schedules import CronSchedule
 from prefect.server.api.server import SubprocessASGIServer
-from prefect.settings import temporary_settings
+from prefect.server.schemas.schedules import CronSchedule as ScheduleDates
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.types.entrypoint import EntrypointType
 from threadpoolctl import threadpool_limits
@@ -131,16 +128,20 @@ def retrain(machine_file: str, recordings: list[str]) -> str:
 
 
 def serve_schedule(
-    machine_file: Path, recordings: Sequence[Path], cron: str, say: Callable[[str], None] = lambda text: None
+    machine_file: Path,
+    recordings: Sequence[Path],
+    cron: str,
+    say: Callable[[str], None] = lambda text: None,
+    rounds: int | None = None,
 ) -> None:
-    """Serve `retrain` on a cron schedule until interrupted: recordings dropped into the folder are learned.
+    """Retrain on a cron schedule in local time until interrupted (or for `rounds`): recordings dropped in are learned.
 
-    Runs on the server that PREFECT_API_URL names; without one a server of its own is started on 127.0.0.1 and ends
-    with the schedule, since Prefect's temporary servers schedule nothing. Its times are the local ones.
+    Where PREFECT_API_URL names a server, a deployment is served whose runs that server schedules. Without one this
+    process waits by itself and starts Prefect's temporary server for each run, because such a server schedules
+    nothing. What goes wrong in one run is said, and the next one comes all the same.
 
     Raises:
         InputError: `cron` is no cron expression.
-        WorkError: the server does not come up.
     """
     try:
         schedule = CronSchedule(cron=cron, timezone=local_timezone())
@@ -149,54 +150,38 @@ def serve_schedule(
             f"--cron: got {cron!r}, expected five fields (minute hour day month weekday), such as '0 5 * * 1' for "
             "Mondays at 5:00"
         ) from None
-    with scheduling_server():
+    parameters = {"machine_file": str(machine_file.resolve()), "recordings": [str(r.resolve()) for r in recordings]}
+    if prefect_settings.PREFECT_API_URL.value():
         say(f"retraining of {machine_file.stem} at '{cron}' ({schedule.timezone}); Ctrl-C ends it")
         retrain.serve(
             name=f"retrain-{machine_file.stem}",
             schedule=schedule,
-            parameters={
-                "machine_file": str(machine_file.resolve()),
-                "recordings": [str(r.resolve()) for r in recordings],
-            },
+            parameters=parameters,
             limit=1,
             print_starting_message=False,
             entrypoint_type=EntrypointType.MODULE_PATH,  # a file path would be one relative to where we stand
         )
-
-
-@contextmanager
-def scheduling_server(wait_s: float = 60.0) -> Iterator[str]:
-    """The address of a server that schedules: the one that PREFECT_API_URL names, or one of our own on 127.0.0.1.
-
-    Raises:
-        WorkError: it does not answer within `wait_s`.
-    """
-    given = prefect_settings.PREFECT_API_URL.value()
-    if given:
-        yield given
         return
-    port = SubprocessASGIServer().find_available_port()
-    command = [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port),
-               "--no-ui", "--analytics-off"]  # fmt: skip
-    address = f"http://127.0.0.1:{port}/api"
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        until = time.monotonic() + wait_s
-        while not _answers(address):
-            if process.poll() is not None or time.monotonic() > until:
-                raise WorkError(
-                    f"Prefect's server did not start on 127.0.0.1:{port} within {wait_s:g} s; start one with `prefect "
-                    "server start` and name it in PREFECT_API_URL"
-                )
-            time.sleep(0.2)
-        with temporary_settings({prefect_settings.PREFECT_API_URL: address}):
-            yield address
-    finally:
-        process.terminate()
+    dates = ScheduleDates(cron=schedule.cron, timezone=schedule.timezone)
+    while rounds is None or rounds > 0:
+        (due,) = asyncio.run(dates.get_dates(1, start=datetime.now(UTC) + timedelta(seconds=1)))
+        say(f"retraining of {machine_file.stem} next at {due:%Y-%m-%d %H:%M %Z}; Ctrl-C ends it")
+        _wait_until(due)
         try:
-            process.wait(20)
-        except subprocess.TimeoutExpired:
-            process.kill()
+            retrain(**parameters)
+        except (InputError, WorkError):
+            pass  # told by the flow
+        except Exception as error:
+            print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {type(error).__name__}: {error}", flush=True)
+        finally:
+            SubprocessASGIServer().stop()
+        rounds = None if rounds is None else rounds - 1
+
+
+def _wait_until(due: datetime) -> None:
+    """In short sleeps, since a computer may be suspended or its clock set."""
+    while (left_s := (due - datetime.now(UTC)).total_seconds()) > 0:
+        time.sleep(min(left_s, 30.0))
 
 
 def local_timezone() -> str:
@@ -204,14 +189,6 @@ def local_timezone() -> str:
     named = os.environ.get("TZ", "").lstrip(":")
     linked = Path("/etc/localtime").resolve().as_posix().partition("zoneinfo/")[2]
     return next((z for z in (named, linked) if z in available_timezones()), "UTC")
-
-
-def _answers(address: str) -> bool:
-    try:
-        with urllib.request.urlopen(f"{address}/health", timeout=2.0) as answer:
-            return bool(answer.status == 200)
-    except OSError:
-        return False
 
 
 def _one_line_of_trouble() -> None:
