@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import too_few_rows
-from models.levenberg_marquardt import Nets, train
+from models.nets import Nets
 
 _STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit spread
@@ -76,7 +76,7 @@ class BP(Family):
         f = self.fitted
         nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden)
         u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
-        out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None])[0].mean(axis=0)
+        out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None]).mean(axis=0)
         return out
 
     def _decimated(self, design: Design) -> list[NDArray[np.int64]]:
@@ -101,6 +101,8 @@ class BP(Family):
         return stacks
 
     def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
+        from models.levenberg_marquardt import train  # here alone: a trained model predicts without torch
+
         n, p, starts = max(len(r) for r in rows), len(design.inputs), self.starts
         x_t, y, known = np.zeros((len(rows), p, n)), np.zeros((len(rows), n)), np.zeros((len(rows), n))
         scales = []

@@ -1,107 +1,105 @@
-"""Many small tanh nets trained at once by Levenberg–Marquardt with weight decay."""
+"""Many small tanh nets trained at once by Levenberg–Marquardt with weight decay, in torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+from torch import Tensor
+
+from models.nets import Nets
 
 Array = NDArray[np.float64]
 
 _DAMPING_START, _DAMPING_MOST = 1e-2, 1e8
 
 
-@dataclass(frozen=True)
-class Nets:
-    """S nets `c + Σ_j v_j tanh(Σ_i w_ji x_i + b_j)`: parameters (S, P), P = h (p + 2) + 1, in the order w, b, v, c."""
-
-    parameters: Array
-    n_inputs: int
-    n_hidden: int
-
-    @classmethod
-    def drawn(cls, n_nets: int, n_inputs: int, n_hidden: int, seed: int) -> Nets:
-        """Random starts that give hidden sums of about unit variance, the same for every fold of a seed."""
-        rng = np.random.default_rng(seed)
-        w = rng.normal(size=(n_nets, n_hidden, n_inputs)) / np.sqrt(n_inputs)
-        b = rng.uniform(-1.0, 1.0, size=(n_nets, n_hidden))
-        v = rng.normal(size=(n_nets, n_hidden)) / np.sqrt(n_hidden)
-        parts = [w.reshape(n_nets, -1), b, v, np.zeros((n_nets, 1))]
-        return cls(np.concatenate(parts, axis=1), n_inputs, n_hidden)
-
-    def split(self, parameters: Array) -> tuple[Array, Array, Array, Array]:
-        """w (S, h, p), b (S, h, 1), v (S, 1, h), c (S, 1)."""
-        h, p = self.n_hidden, self.n_inputs
-        w, b, v, c = np.split(parameters, [h * p, h * (p + 1), h * (p + 2)], axis=1)
-        return w.reshape(-1, h, p), b[:, :, None], v[:, None, :], c
-
-    def outputs(self, x_t: Array, parameters: Array | None = None) -> tuple[Array, Array]:
-        """Outputs (S, n) and hidden activations (S, h, n) for inputs (S or 1, p, n)."""
-        w, b, v, c = self.split(self.parameters if parameters is None else parameters)
-        hidden = np.tanh(w @ x_t + b)
-        return (v @ hidden)[:, 0] + c, hidden
-
-    def jacobian(self, x_t: Array, hidden: Array, parameters: Array) -> Array:
-        """d output / d parameter, (S, P, n)."""
-        h, p = self.n_hidden, self.n_inputs
-        s, _, n = hidden.shape
-        slope = parameters[:, h * (p + 1) : h * (p + 2), None] * (1.0 - hidden**2)
-        out = np.empty((s, h * (p + 2) + 1, n))
-        np.multiply(slope[:, :, None], x_t[:, None], out=out[:, : h * p].reshape(s, h, p, n))
-        out[:, h * p : h * (p + 1)] = slope
-        out[:, h * (p + 1) : h * (p + 2)] = hidden
-        out[:, -1] = 1.0
-        return out
-
-
 def train(
-    nets: Nets, x_t: Array, y: Array, known: Array, decay: float, iterations: int
+    nets: Nets, x_t: Array, y: Array, known: Array, decay: float, iterations: int, device: str = "cpu"
 ) -> tuple[Nets, NDArray[np.int64]]:
     """Every net's parameters after at most `iterations` damped Gauss–Newton steps, and the steps each took.
 
     Net s minimises `mean_n known·(y − ŷ)² + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known (S, n);
     known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that helps, × 10 after one that
-    does not) and stops by itself, so a net's result does not depend on its neighbours.
+    does not) and stops by itself, so a net's result does not depend on its neighbours. Float64 on any device; on
+    the processor one thread, whatever torch is set to: the matrices are small, and callers train side by side.
 
     Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
-    theta = nets.parameters.copy()
-    count = np.maximum(known.sum(axis=1), 1.0)
-    penalty = np.full(theta.shape[1], decay)
+    torch.get_num_threads()  # torch sets a thread's count at its first use there, which would undo the limit
+    with _openmp().limit(limits=1), torch.inference_mode():
+        tensors = [torch.tensor(a, dtype=torch.float64, device=device) for a in (nets.parameters, x_t, y, known)]
+        theta, steps = _trained(tensors, nets.n_hidden, decay, iterations)
+        return Nets(theta.cpu().numpy(), nets.n_inputs, nets.n_hidden), steps.cpu().numpy()
+
+
+def outputs(theta: Tensor, x_t: Tensor, n_hidden: int) -> tuple[Tensor, Tensor]:
+    """Outputs (S, n) and hidden activations (S, h, n) of nets theta (S, P) for inputs (S, p, n)."""
+    h, p = n_hidden, x_t.shape[1]
+    w, b, v, c = theta.split([h * p, h, h, 1], dim=1)
+    hidden = torch.baddbmm(b[:, :, None], w.reshape(-1, h, p), x_t).tanh_()
+    return torch.baddbmm(c[:, :, None], v[:, None], hidden)[:, 0], hidden
+
+
+def jacobian(theta: Tensor, x_t: Tensor, hidden: Tensor, out: Tensor) -> Tensor:
+    """d output / d parameter, written to out (S, P, n)."""
+    (s, h, n), p = hidden.shape, x_t.shape[1]
+    slope = out[:, h * p : h * (p + 1)]
+    torch.mul(theta[:, h * (p + 1) : h * (p + 2), None], 1.0 - hidden**2, out=slope)
+    torch.mul(slope[:, :, None], x_t[:, None], out=out[:, : h * p].view(s, h, p, n))
+    out[:, h * (p + 1) : h * (p + 2)] = hidden
+    out[:, -1] = 1.0
+    return out
+
+
+def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int) -> tuple[Tensor, Tensor]:
+    theta, x_t, y, known = tensors
+    count = known.sum(dim=1).clamp_(min=1.0)
+    penalty = torch.full_like(theta[0], decay)
     penalty[-1] = 0.0
-    damping = np.full(len(theta), _DAMPING_START)
-    steps = np.zeros(len(theta), np.int64)
-    active = np.arange(len(theta))
-    output, hidden = nets.outputs(x_t, theta)
+    damping = torch.full_like(count, _DAMPING_START)
+    steps = torch.zeros(len(theta), dtype=torch.int64, device=theta.device)
+    active = torch.arange(len(theta), device=theta.device)
+    padded = not bool(known.all())
+    output, hidden = outputs(theta, x_t, n_hidden)
     error = (y - output) * known
-    loss = (error**2).sum(axis=1) / count + theta**2 @ penalty
+    loss = (error**2).sum(dim=1) / count + theta**2 @ penalty
+    room = x_t.new_empty((*theta.shape, x_t.shape[2]))  # fresh memory each step would cost as much as the algebra
     for _ in range(iterations):
-        xa, ka, ta, na = x_t[active], known[active], theta[active], count[active, None]
-        jacobian = nets.jacobian(xa, hidden[active], ta)
-        if not ka.all():
-            jacobian *= ka[:, None]
-        gradient = (jacobian @ error[active][:, :, None])[..., 0] / na - penalty * ta
-        curvature = jacobian @ jacobian.transpose(0, 2, 1) / na[:, :, None]
-        diagonal = penalty + damping[active, None]
-        curvature[:, np.arange(ta.shape[1]), np.arange(ta.shape[1])] += diagonal
-        trial = ta + np.linalg.solve(curvature, gradient[..., None])[..., 0]
-        out_t, hidden_t = nets.outputs(xa, trial)
-        error_t = (y[active] - out_t) * ka
-        loss_t = (error_t**2).sum(axis=1) / na[:, 0] + trial**2 @ penalty
+        everything = len(active) == len(theta)
+        xa, ya, ka, na, ta, ea, ha = (
+            a if everything else a[active] for a in (x_t, y, known, count, theta, error, hidden)
+        )
+        slopes = jacobian(ta, xa, ha, room[: len(active)])
+        if padded:
+            slopes *= ka[:, None]
+        gradient = torch.bmm(slopes, ea[:, :, None])[..., 0].div_(na[:, None]) - penalty * ta
+        curvature = torch.bmm(slopes, slopes.mT).div_(na[:, None, None])
+        curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[active, None])
+        factor, failed = torch.linalg.cholesky_ex(curvature)
+        trial = ta + torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        out_t, hidden_t = outputs(trial, xa, n_hidden)
+        error_t = (ya - out_t).mul_(ka)
+        loss_t = (error_t**2).sum(dim=1) / na + trial**2 @ penalty
         fall = loss[active] - loss_t
-        better = fall > 0
+        better = (fall > 0) & (failed == 0)
         steps[active] += 1
         won = active[better]
-        theta[won], hidden[won], error[won], loss[won] = (
-            trial[better],
-            hidden_t[better],
-            error_t[better],
-            loss_t[better],
-        )
-        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), 1e-12, 10 * _DAMPING_MOST)
-        done = (better & (fall < 1e-6 * loss_t)) | (damping[active] > _DAMPING_MOST)
-        active = active[~done]
+        for kept, tried in ((theta, trial), (hidden, hidden_t), (error, error_t), (loss, loss_t)):
+            kept[won] = tried[better]
+        damped = torch.where(better, 0.1 * damping[active], 10.0 * damping[active])
+        damping[active] = damped.clamp_(1e-12, 10 * _DAMPING_MOST)
+        active = active[~((better & (fall < 1e-6 * loss_t)) | (damped > _DAMPING_MOST))]
         if not len(active):
             break
-    return Nets(theta, nets.n_inputs, nets.n_hidden), steps
+    return theta, steps
+
+
+@cache
+def _openmp() -> Any:
+    """OpenMP's thread counts. They belong to the calling thread: a limit here reaches no other thread."""
+    return ThreadpoolController().select(user_api="openmp")

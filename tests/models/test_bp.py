@@ -1,13 +1,19 @@
 """The BP net and its trainer: gradient, optimum, bounds, seeds."""
 
+import subprocess
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from threadpoolctl import threadpool_limits
 
 from data.errors import InputError
 from features.design import Design
 from models.bp import BP
-from models.levenberg_marquardt import Nets, train
+from models.levenberg_marquardt import jacobian, outputs, train
+from models.nets import Nets
 
 
 def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:
@@ -25,18 +31,26 @@ def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> 
                   offsets, 60.0)  # fmt: skip
 
 
+def slopes_of(nets, x_t):
+    theta, x = torch.from_numpy(nets.parameters), torch.from_numpy(x_t)
+    out, hidden = outputs(theta, x, nets.n_hidden)
+    np.testing.assert_allclose(out.numpy(), nets.outputs(x_t), atol=1e-12)  # what is trained is what predicts
+    return jacobian(theta, x, hidden, x.new_empty((*theta.shape, x.shape[2]))).numpy()
+
+
 def test_jacobian_is_the_difference_quotient():
     nets = Nets.drawn(4, 3, 2, seed=1)
     x_t = np.random.default_rng(0).normal(size=(4, 3, 7))
-    out, hidden = nets.outputs(x_t)
-    jacobian = nets.jacobian(x_t, hidden, nets.parameters)
-    assert jacobian.shape == (4, 2 * 5 + 1, 7) and out.shape == (4, 7)
+    got = slopes_of(nets, x_t)
+    assert got.shape == (4, 2 * 5 + 1, 7)
     for j in range(11):
-        ahead, behind = nets.parameters.copy(), nets.parameters.copy()
-        ahead[:, j] += 1e-6
-        behind[:, j] -= 1e-6
-        slope = (nets.outputs(x_t, ahead)[0] - nets.outputs(x_t, behind)[0]) / 2e-6
-        np.testing.assert_allclose(jacobian[:, j], slope, atol=1e-8)
+        step = np.where(np.arange(11) == j, 1e-6, 0.0)
+        ahead, behind = (
+            replace(nets, parameters=nets.parameters + step),
+            replace(nets, parameters=nets.parameters - step),
+        )
+        slope = (ahead.outputs(x_t) - behind.outputs(x_t)) / 2e-6
+        np.testing.assert_allclose(got[:, j], slope, atol=1e-8)
 
 
 def test_training_ends_where_the_penalised_gradient_vanishes():
@@ -46,11 +60,51 @@ def test_training_ends_where_the_penalised_gradient_vanishes():
     decay = 1e-2
     nets, steps = train(Nets.drawn(2, 2, 2, seed=0), x_t, y, known, decay, 500)
     assert (steps < 500).all()
-    out, hidden = nets.outputs(x_t)
     penalty = np.full(9, decay)
     penalty[-1] = 0.0
-    gradient = (nets.jacobian(x_t, hidden, nets.parameters) @ (y - out)[:, :, None])[..., 0] / 50
+    gradient = (slopes_of(nets, x_t) @ (y - nets.outputs(x_t))[:, :, None])[..., 0] / 50
     np.testing.assert_allclose(gradient, penalty * nets.parameters, atol=2e-3)
+
+
+def test_first_step_is_the_damped_gauss_newton_step():
+    rng = np.random.default_rng(1)
+    x_t, y, known = rng.normal(size=(3, 2, 20)), 5 * rng.normal(size=(3, 20)), np.ones((3, 20))
+    known[1, 15:] = 0.0
+    first, penalty = Nets.drawn(3, 2, 2, seed=0), np.array([0.1] * 8 + [0.0])
+    got, steps = train(first, x_t, y, known, 0.1, 1)
+    slopes, error = slopes_of(first, x_t) * known[:, None], (y - first.outputs(x_t)) * known
+    for s in range(3):
+        n = known[s].sum()
+        left = slopes[s] @ slopes[s].T / n + np.diag(penalty + 1e-2)
+        step = np.linalg.solve(left, slopes[s] @ error[s] / n - penalty * first.parameters[s])
+        np.testing.assert_allclose(got.parameters[s] - first.parameters[s], step, atol=1e-9)
+    assert steps.tolist() == [1, 1, 1]
+
+
+def test_a_trained_model_predicts_without_torch(tmp_path):
+    model = BP().fit_design(make_design(), [0, 1])
+    np.savez(tmp_path / "net.npz", **model.fitted)
+    code = (
+        "import sys, numpy as np; from models.base import family_from_plain; from features.design import Design; "
+        "fitted = dict(np.load(sys.argv[1])); plain = dict(family='bp', options={}, inputs=['t0', 't1'], target='z'); "
+        "model = family_from_plain(plain | dict(fitted=fitted)); x = np.array([[1.0, 2.0]]); "
+        "design = Design(('t0', 't1'), '', ('a',), x, x[:, 0], x[:, 0], np.array([0, 1])); "
+        "print(float(model.predict_design(design, [0])[0][0]), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "net.npz")], capture_output=True, text=True)
+    x = np.array([[1.0, 2.0]])
+    want = model.predict_design(Design(("t0", "t1"), "", ("a",), x, x[:, 0], x[:, 0], np.array([0, 1])), [0])[0][0]
+    assert done.stdout.split() == [str(float(want)), "False"], done.stderr
+
+
+def test_torch_keeps_its_thread_count():
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        BP().fit_design(make_design(), [0, 1])
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_recovers_a_net_of_its_own_shape():
