@@ -68,17 +68,21 @@ def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int
     output, hidden = outputs(theta, x_t, n_hidden)
     error = (y - output) * known
     loss = (error**2).sum(dim=1) / count + theta**2 @ penalty
-    room = x_t.new_empty((*theta.shape, x_t.shape[2]))  # fresh memory each step would cost as much as the algebra
+    # Fresh memory at each step would cost as much as the algebra.
+    room = x_t.new_empty((len(theta), theta.shape[1] + 1, x_t.shape[2]))
     for _ in range(iterations):
         everything = len(active) == len(theta)
         xa, ya, ka, na, ta, ea, ha = (
             a if everything else a[active] for a in (x_t, y, known, count, theta, error, hidden)
         )
-        slopes = jacobian(ta, xa, ha, room[: len(active)])
+        both = room[: len(active)]
+        slopes = jacobian(ta, xa, ha, both[:, :-1])
         if padded:
             slopes *= ka[:, None]
-        gradient = torch.bmm(slopes, ea[:, :, None])[..., 0].div_(na[:, None]) - penalty * ta
-        curvature = torch.bmm(slopes, slopes.mT).div_(na[:, None, None])
+        both[:, -1] = ea  # below the slopes, so that one product gives curvature and gradient
+        product = torch.bmm(both, both.mT).div_(na[:, None, None])
+        gradient = product[:, :-1, -1] - penalty * ta
+        curvature = product[:, :-1, :-1]
         curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[active, None])
         factor, failed = torch.linalg.cholesky_ex(curvature)
         trial = ta + torch.cholesky_solve(gradient[..., None], factor)[..., 0]
