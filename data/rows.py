@@ -136,10 +136,8 @@ def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float
         InputError: the driver is not in the file, or never runs for min_run_s.
     """
     pending: list[Rows] = []
-    running: list[NDArray[np.bool_]] = []
-    clock: list[Array] = []
-    before_run, started, last_on, last_time = 0, False, False, np.nan
-    longest = 0.0
+    runs = _Runs(min_run_s)
+    before_run, started, first, last_on, last_time = 0, False, 0, False, np.nan
     for rows in blocks:
         if driver not in rows.columns:
             raise InputError(
@@ -150,12 +148,9 @@ def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float
         if len(rows):
             last_on, last_time = bool(on[-1]), float(time[-1])
         pending.append(rows)
-        running.append(on > 0)
-        clock.append(time)
-        cuts, run_s = _starts(np.concatenate(running), np.concatenate(clock), min_run_s, started)
-        longest = max(longest, run_s)
-        for k, cut in enumerate(cuts):
-            done, pending = _split(pending, cut - (cuts[k - 1] if k else 0))
+        for cut in runs.starts(on > 0, time):
+            done, pending = _split(pending, cut - first)
+            first = cut
             if started:
                 whole = join(done)
                 whole.before_run, before_run = before_run, 0
@@ -163,12 +158,9 @@ def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float
             else:
                 before_run = sum(len(p) + p.ragged for p in done)
             started = True
-        if len(cuts):
-            running = [np.concatenate(running)[cuts[-1] :]]
-            clock = [np.concatenate(clock)[cuts[-1] :]]
     if not started:
         raise InputError(
-            f"{where}: {driver} never runs for {min_run_s:g} s (longest run {longest:g} s); nothing to cut;"
+            f"{where}: {driver} never runs for {min_run_s:g} s (longest run {runs.longest_s:g} s); nothing to cut;"
             " correct recording.split"
         )
     whole = join(pending)
@@ -183,15 +175,37 @@ def _filled(values: Array, before: float) -> Array:
     return np.where(last >= 0, values[np.maximum(last, 0)], before)
 
 
-def _starts(on: NDArray[np.bool_], time: Array, min_run_s: float, started: bool) -> tuple[list[int], float]:
-    """Rows where a run of at least min_run_s begins (row 0 only before anything has started), and the longest run."""
-    edges = np.diff(on.astype(np.int8), prepend=np.int8(0), append=np.int8(0))
-    begin, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
-    if len(begin) == 0:
-        return [], 0.0
-    length = time[np.minimum(end, len(time) - 1)] - time[begin]
-    cuts = [int(b) for b, run_s in zip(begin, length, strict=True) if run_s >= min_run_s and (b > 0 or not started)]
-    return cuts, float(np.nanmax(length, initial=0.0))
+class _Runs:
+    """Where runs of at least min_run_s begin, block by block; only the run under way is remembered."""
+
+    def __init__(self, min_run_s: float) -> None:
+        self.longest_s = 0.0
+        self._min_run_s = min_run_s
+        self._rows = 0  # of the blocks before
+        self._begun: tuple[int, float] | None = None  # row and time of the run under way
+        self._told = False  # the run under way has been given out
+
+    def starts(self, on: NDArray[np.bool_], time: Array) -> list[int]:
+        """Rows, counted from the first block on, of the runs that are seen to be long enough within this block."""
+        if not len(on):
+            return []
+        before = np.int8(self._begun is not None)
+        edges = np.diff(on.astype(np.int8), prepend=before, append=np.int8(0))
+        begin, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+        begun = [(self._rows + int(b), float(time[b])) for b in begin]
+        if self._begun is not None:
+            begun.insert(0, self._begun)
+        found = []
+        for k, ((row, began_s), e) in enumerate(zip(begun, end, strict=True)):
+            run_s = float(time[min(int(e), len(time) - 1)]) - began_s
+            self.longest_s = max(self.longest_s, 0.0 if np.isnan(run_s) else run_s)
+            self._told = self._told and k == 0 and self._begun is not None
+            if run_s >= self._min_run_s and not self._told:
+                found.append(row)
+                self._told = True
+        self._rows += len(on)
+        self._begun = begun[-1] if on[-1] else None
+        return found
 
 
 def _split(parts: list[Rows], n: int) -> tuple[list[Rows], list[Rows]]:

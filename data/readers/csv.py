@@ -17,7 +17,7 @@ from data.readers.base import Block, Reader, Sheet
 from data.readers.text import find_decimal, find_encoding, find_separator, split
 
 _HEAD_BYTES = 1 << 20
-_BLOCK_BYTES = 16 << 20
+_BLOCK_BYTES = 4 << 20
 
 
 class CsvSheet(Sheet):
@@ -77,7 +77,7 @@ class CsvSheet(Sheet):
                     yield piece
                 if last:
                     return
-                if len(rest) > 4 * _BLOCK_BYTES:
+                if len(rest) > 16 * _BLOCK_BYTES:
                     raise InputError(f"{self.path.name}: a line of more than 64 MB; expected CSV text; export it again")
 
     def _parse(self, lines: bytes, width: int, positions: Sequence[int], text: Collection[int]) -> Block:
