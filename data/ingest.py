@@ -19,6 +19,7 @@ from data.lake import Lake, Staged
 from data.lakefile import content_digest
 from data.machine import Machine
 from data.recording import read_batches, recording_files
+from data.units import check_canonical
 
 COMMIT_EVERY_S = 1.0
 COLUMNS = ("file", "batch_id", "status", "version", "rows_in", "rows_stored", "rows_dropped", "findings", "reason")
@@ -90,9 +91,10 @@ def ingest(
     out and its file goes to quarantine. `progress` gets one line per file.
 
     Raises:
-        InputError: a path does not exist; nothing has been read then.
+        InputError: a path does not exist, or a channel's unit cannot be kept; nothing has been read then.
         WorkError: the lake cannot be written; what was stored before stays.
     """
+    check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
     files, ignored = _collect(paths, machine)
     run = _Run(machine, lake, IngestReport(machine.machine, ignored=ignored))
     for number, file in enumerate(files, 1):

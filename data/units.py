@@ -129,10 +129,14 @@ def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> N
     """Temperatures are kept in degC and lengths of error channels in um; `roles_units` is name -> (role, unit).
 
     Raises:
-        InputError: another unit stands there, with what to write instead.
+        InputError: another unit stands there, with what to write instead, or one that nobody knows.
     """
     for name, (role, unit) in roles_units.items():
         kept = _CANONICAL.get(role)
+        if kept and quantity(unit) is None:
+            raise InputError(f"{where}: channel {name!r} ({role}) has the unknown unit {unit!r}; write unit: {kept}")
+        if kept == "degC" and quantity(unit) != "temperature":
+            raise InputError(f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r}; correct it")
         if kept and unit != kept and quantity(unit) == quantity(kept):
             raise InputError(
                 f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r};"

@@ -262,7 +262,7 @@ def main() -> None:
         if not hasattr(error, "format_message"):
             raise
         context = getattr(error, "ctx", None)
-        asked = context.command_path if context is not None and context.parent is not None else "thermodrift"
+        asked = f"thermodrift {context.info_name}" if context is not None and context.parent else "thermodrift"
         screen.trouble(f"{error.format_message().rstrip('.')}; see `{asked} --help`")
         sys.exit(2)
 

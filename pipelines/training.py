@@ -7,8 +7,9 @@ The steps are plain functions; a `Caller` decides how they run. `DirectCaller` c
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
@@ -92,14 +93,15 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         work = partial(ingest, machine=machine, lake=lake)
         outcome.ingested = caller.map("ingest", work, [request.recordings], retries=RETRIES)[0]
         clock("ingest")
-    batches = load_batches(lake, machine)
+    with _naming_quarantine(outcome.ingested):
+        batches = load_batches(lake, machine)
     if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome
     say(f"features and selectors of {len(batches)} batches")
-    crossings = dict(
-        zip(targets, caller.map("prepare", partial(_prepare, batches, request.plan), targets), strict=True)
-    )
+    with _naming_quarantine(outcome.ingested):
+        prepared = caller.map("prepare", partial(_prepare, batches, request.plan), targets)
+    crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
     jobs = [(t, f) for f in sorted(request.plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
@@ -163,6 +165,18 @@ def promote_tracked(
     text = machine_file.read_text(encoding="utf-8")
     region = region_of(batches, family.inputs)
     return registry.promote(result, choice, family, text, training_id, settings, region, batches, force=force)
+
+
+@contextmanager
+def _naming_quarantine(ingested: IngestReport | None) -> Iterator[None]:
+    """Where too little is left to train on, say what was just turned away."""
+    try:
+        yield
+    except InputError as error:
+        turned_away = ingested.quarantined if ingested else []
+        if not turned_away:
+            raise
+        raise InputError(f"{error}; {len(turned_away)} files in quarantine, first {turned_away[0].reason}") from None
 
 
 class _Clock:

@@ -1,0 +1,258 @@
+"""The command line as a user meets it: exit codes, one line of trouble, clean JSON, any working directory."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from small_year import law_um, write_machine, write_year
+
+from pipelines import cli
+
+ROOT = Path(cli.__file__).resolve().parents[1]
+NAME = "small-cli"
+
+
+@dataclass
+class Done:
+    code: int
+    out: str
+    err: str
+
+
+Call = Callable[..., Done]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """`thermodrift ARGS` in this process."""
+
+    def run(*args: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["thermodrift", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        shown = capsys.readouterr()
+        return Done(int(ended.value.code or 0), shown.out, shown.err)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def year(store: Any, store_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a machine file and recordings, promoted once without and once with a model."""
+    folder = tmp_path_factory.mktemp("cli-year")
+    machine = write_machine(folder / "small.yml", NAME)
+    write_year(folder / "in")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THERMODRIFT_HOME", str(store_home))
+        patch.setenv("COLUMNS", "200")
+        common = ["--machine", str(machine), "--channels", "z", "--direct", "--selectors", "none",
+                  "--protocols", "leave-batch-out"]  # fmt: skip
+        for families, more in (("zero", ["--recordings", str(folder / "in")]), ("zero,ridge", [])):
+            patch.setattr(sys, "argv", ["thermodrift", "train", *common, "--families", families, *more])
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            assert not ended.value.code
+        yield folder
+
+
+def lines(text: str) -> list[str]:
+    return text.strip().splitlines()
+
+
+def test_training_shows_what_came_of_it(year: Path, call: Call) -> None:
+    done = call("train", "--machine", year / "small.yml", "--channels", "z", "--direct", "--families", "zero, ridge",
+                "--selectors", "none", "--protocols", "leave-batch-out", "--report", year / "r.md")  # fmt: skip
+    assert done.code == 0
+    assert f"{NAME} z: leave-batch-out  (simulated recordings)" in done.out
+    assert all(word in done.out for word in ("ridge", "zero", "S mean µm", f"report   {year / 'r.md'}"))
+    assert "nothing new registered" in done.out
+    assert (year / "r.md").exists()
+    assert lines(done.err)[0] == "features and selectors of 6 batches"
+
+
+def test_training_as_json_is_alone_on_standard_output(year: Path, call: Call) -> None:
+    done = call("train", "--machine", year / "small.yml", "--channels", "z", "--direct", "--families", "zero,ridge",
+                "--selectors", "none", "--protocols", "leave-batch-out", "--json")  # fmt: skip
+    got = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert (done.code, done.err) == (0, "")
+    assert got["machine"] == NAME and got["simulated"] is True and got["stopped"] == ""
+    assert got["best"]["z"][0]["family"] == "ridge" and Path(got["report"]).exists()
+    assert set(got["trainings"]) == {"z"}
+
+
+def test_ingest_says_what_it_did(year: Path, call: Call) -> None:
+    done = call("ingest", year / "in", "--machine", year / "small.yml")
+    assert done.code == 0
+    assert "batches unchanged 6" in done.out and "files in quarantine 0" in done.out
+    done = call("ingest", year / "in", "--machine", year / "small.yml", "--json")
+    assert (done.code, done.err) == (0, "")
+    assert [r["status"] for r in json.loads(done.out)] == ["unchanged"] * 6
+
+
+def test_status_names_what_runs_where(year: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    done = call("status")
+    assert done.code == 0
+    assert f"  {NAME}: 6 batches, 0 files in quarantine" in done.out
+    model = next(line for line in lines(done.out) if line.startswith(f"  {NAME}-z/2 champion: none|ridge|3, "))
+    assert "over 6 batches, simulated; against version 1" in model
+    done = call("status", "--json")
+    got = json.loads(done.out)
+    assert (done.code, done.err) == (0, "")
+    assert got["lake"][NAME] == {"batches": 6, "quarantined": 0}
+    mine = [m for m in got["models"] if m["name"] == f"{NAME}-z"]
+    assert [(m["version"], m["aliases"]) for m in mine] == [(2, "champion"), (1, "")]
+    training = next(t for t in got["trainings"] if t["machine"] == NAME)
+    assert training["training_id"] and training["target"] == "z"
+
+
+def test_a_report_of_what_is_tracked(year: Path, call: Call, store_home: Path) -> None:
+    done = call("report", "--machine", NAME, "--format", "md")
+    path = store_home / "reports" / f"{NAME}.md"
+    assert (done.code, done.out.strip()) == (0, str(path))
+    assert "ridge" in path.read_text(encoding="utf-8")
+    done = call("report", "--machine", NAME, "--out", year / "two.html")
+    assert done.code == 0 and (year / "two.html").read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype")
+    done = call("report", "--machine", NAME, "--format", "md", "--out", year / "two.html")
+    assert (done.code, lines(done.err)) == (2, [f"thermodrift: --out {year / 'two.html'}: got the ending '.html', "
+                                                "expected .md"])  # fmt: skip
+
+
+def test_predict_from_another_folder(year: Path, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    table = pd.read_csv(year / "in" / "20250314.csv")
+    table.drop(columns=["x", "z"]).to_csv("run.csv", index=False)
+    done = call("predict", "--model", f"models:/{NAME}-z@champion", "run.csv")
+    assert (done.code, done.err) == (0, "")
+    got = pd.read_csv(StringIO(done.out))
+    assert np.abs(got["predicted_um"] - law_um(table)).max() < 1.5
+    for ending in (".csv", ".parquet"):
+        assert call("predict", "--model", f"models:/{NAME}-z@champion", "run.csv", "--out", f"p{ending}").code == 0
+    assert np.allclose(pd.read_parquet("p.parquet")["predicted_um"], pd.read_csv("p.csv")["predicted_um"])
+
+
+def test_promote_and_rollback(year: Path, call: Call) -> None:
+    trainings = json.loads(call("status", "--json").out)["trainings"]
+    mine = [t for t in trainings if t["machine"] == NAME]
+    ridge = next(t for t in mine if t["best"].startswith("ridge"))["training_id"]
+    done = call("promote", ridge, "--machine", year / "small.yml", "--cell", "none|zero|0", "--force")
+    assert done.code == 0 and "version 1 is champion by force" in done.out
+    back = call("rollback", f"{NAME}-z")
+    assert (back.code, lines(back.out)) == (0, [f"{NAME}-z: champion is version 2 again; version 1 was rolled back"])
+
+
+def test_describe_drafts_a_file_that_ingests(
+    year: Path, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = sorted((year / "in").glob("*.csv"))
+    done = call("describe", *files)
+    assert done.code == 0 and "# guessed" in done.out and "front:" in done.out
+    draft = tmp_path / "draft.yml"
+    done = call("describe", *files, "--out", draft)
+    assert done.code == 0 and "a draft; check every line marked 'guessed'" in done.out
+    again = call("describe", *files, "--out", draft)
+    assert (again.code, lines(again.err)) == (
+        2,
+        [f"thermodrift: {draft} exists; give another --out or remove it first"],
+    )
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
+    done = call("ingest", year / "in", "--machine", draft)
+    assert done.code == 0 and "batches new 6" in done.out
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["trian"], "No such command 'trian'"),
+        (["train", "--macine", "x"], "No such option: --macine"),
+        (["train"], "Missing option '--machine'; see `thermodrift train --help`"),
+        (["ingest", "--machine", "x.yml"], "Missing argument 'paths'"),
+        (["train", "--machine", "{yml}", "--families", "ridgge"], "unknown family 'ridgge': did you mean 'ridge'?"),
+        (["train", "--machine", "{yml}", "--selectors", "fcg"], "unknown selector 'fcg': did you mean 'fcgc'?"),
+        (["train", "--machine", "{yml}", "--protocols", "lbo"], "unknown protocol 'lbo'"),
+        (["train", "--machine", "{yml}", "--channels", "zz"], "nobody: no error channel 'zz'; did you mean 'z'"),
+        (["train", "--machine", "{yml}", "--recordings", "gone"], "recordings gone: no such file or folder"),
+        (["train", "--machine", "{yml}", "--report", "r.pdf"], "report r.pdf: got the ending '.pdf', expected .html"),
+        (["train", "--machine", "{yml}", "--protocols", "train-on-one"], "promotion judges by leave-batch-out; add it"),
+        (["report", "--machine", "m", "--format", "pdf"], "--format: got 'pdf', expected html or md"),
+        (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"], "--out p.xlsx: got the ending '.xlsx', expected"),
+        (["predict", "f.csv", "--model", "no-such-folder"], "model 'no-such-folder': no such folder; expected"),
+        (["simulate"], "got nothing to simulate; call `thermodrift simulate --sample-year"),
+        (["simulate", "--sample-year", "--seed", "-1", "--out", "y"], "seed: got -1, expected 0 or more"),
+        (["schedule", "--machine", "{yml}", "--recordings", "gone"], "--recordings gone: no such file or folder"),
+        (["describe", "gone.csv"], "gone.csv"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_one_line_and_exit_code_2(
+    args: list[str], words: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
+    machine = write_machine(tmp_path / "nobody.yml", "nobody")
+    done = call(*(a.format(yml=machine) for a in args))
+    assert (done.code, done.out) == (2, "")
+    (line,) = lines(done.err)
+    assert line.startswith("thermodrift: ") and words in line
+    assert not (tmp_path / "home" / "mlflow.db").exists()  # judged before anything was started
+
+
+def test_work_that_fails_is_one_line_and_exit_code_1(
+    year: Path, call: Call, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(store_home / "lake", tmp_path / "lake")
+    (tmp_path / "lake" / "_manifest.json").write_text("{ broken")
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path))
+    done = call("ingest", year / "in", "--machine", year / "small.yml", "--json")
+    assert (done.code, done.out) == (1, "")
+    (line,) = lines(done.err)
+    assert "_manifest.json: cannot be read" in line and "restore it from a backup" in line
+
+
+def test_nothing_there_yet_is_no_error(call: Call, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copy(store.store_file, tmp_path / "mlflow.db")  # a migrated store; the lake is empty
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path))
+    done = call("status")
+    assert done.code == 0 and "empty; `thermodrift ingest` fills it" in done.out
+
+
+def test_simulate_writes_the_labelled_year(call: Call, tmp_path: Path) -> None:
+    done = call("simulate", "--sample-year", "--out", tmp_path / "y")
+    assert done.code == 0 and "30 simulated recordings of the sample machine, seed 0" in done.out
+    assert len(list((tmp_path / "y").glob("*.csv"))) == 30
+
+
+def in_a_process(code: str, *args: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    return subprocess.run([sys.executable, "-c", code, *args], env=env, capture_output=True, text=True, check=False)
+
+
+def test_help_is_quick_because_it_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from pipelines import cli\n"
+        "try:\n"
+        "    cli.main()\n"
+        "finally:\n"
+        "    heavy = {'torch', 'mlflow', 'prefect', 'scipy', 'sklearn', 'plotly', 'matplotlib'}\n"
+        "    print('loaded', sorted(heavy & set(sys.modules)), file=sys.stderr)\n"
+    )
+    done = in_a_process(code, "--help")
+    assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
+    for command in ("describe", "ingest", "train", "report", "promote", "rollback", "predict", "schedule", "status"):
+        assert command in done.stdout
+    done = in_a_process(code, "train", "--help")
+    assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
+    assert "--direct" in done.stdout
