@@ -58,49 +58,50 @@ def jacobian(theta: Tensor, x_t: Tensor, hidden: Tensor, out: Tensor) -> Tensor:
 
 def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int) -> tuple[Tensor, Tensor]:
     theta, x_t, y, known = tensors
+    out = theta.clone()
+    steps = torch.full((len(theta),), iterations, device=theta.device)
+    place = torch.arange(len(theta), device=theta.device)
     count = known.sum(dim=1).clamp_(min=1.0)
     penalty = torch.full_like(theta[0], decay)
     penalty[-1] = 0.0
     damping = torch.full_like(count, _DAMPING_START)
-    steps = torch.zeros(len(theta), dtype=torch.int64, device=theta.device)
-    active = torch.arange(len(theta), device=theta.device)
     padded = not bool(known.all())
     output, hidden = outputs(theta, x_t, n_hidden)
-    error = (y - output) * known
-    loss = (error**2).sum(dim=1) / count + theta**2 @ penalty
+    error = (y - output).mul_(known)
+    loss = error.square().sum(dim=1) / count + theta.square() @ penalty
     # Fresh memory at each step would cost as much as the algebra.
     room = x_t.new_empty((len(theta), theta.shape[1] + 1, x_t.shape[2]))
-    for _ in range(iterations):
-        everything = len(active) == len(theta)
-        xa, ya, ka, na, ta, ea, ha = (
-            a if everything else a[active] for a in (x_t, y, known, count, theta, error, hidden)
-        )
-        both = room[: len(active)]
-        slopes = jacobian(ta, xa, ha, both[:, :-1])
+    for step in range(1, iterations + 1):
+        both = room[: len(theta)]
+        slopes = jacobian(theta, x_t, hidden, both[:, :-1])
         if padded:
-            slopes *= ka[:, None]
-        both[:, -1] = ea  # below the slopes, so that one product gives curvature and gradient
-        product = torch.bmm(both, both.mT).div_(na[:, None, None])
-        gradient = product[:, :-1, -1] - penalty * ta
+            slopes *= known[:, None]
+        both[:, -1] = error  # below the slopes, so that one product gives curvature and gradient
+        product = torch.bmm(both, both.mT).div_(count[:, None, None])
+        gradient = product[:, :-1, -1:] - (penalty * theta)[:, :, None]
         curvature = product[:, :-1, :-1]
-        curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[active, None])
+        curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[:, None])
         factor, failed = torch.linalg.cholesky_ex(curvature)
-        trial = ta + torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-        out_t, hidden_t = outputs(trial, xa, n_hidden)
-        error_t = (ya - out_t).mul_(ka)
-        loss_t = (error_t**2).sum(dim=1) / na + trial**2 @ penalty
-        fall = loss[active] - loss_t
+        trial = theta + torch.cholesky_solve(gradient, factor)[..., 0]
+        output, hidden_t = outputs(trial, x_t, n_hidden)
+        error_t = (y - output).mul_(known)
+        loss_t = error_t.square().sum(dim=1) / count + trial.square() @ penalty
+        fall = loss - loss_t
         better = (fall > 0) & (failed == 0)
-        steps[active] += 1
-        won = active[better]
-        for kept, tried in ((theta, trial), (hidden, hidden_t), (error, error_t), (loss, loss_t)):
-            kept[won] = tried[better]
-        damped = torch.where(better, 0.1 * damping[active], 10.0 * damping[active])
-        damping[active] = damped.clamp_(1e-12, 10 * _DAMPING_MOST)
-        active = active[~((better & (fall < 1e-6 * loss_t)) | (damped > _DAMPING_MOST))]
-        if not len(active):
-            break
-    return theta, steps
+        each, row = better[:, None, None], better[:, None]
+        theta, error = torch.where(row, trial, theta), torch.where(row, error_t, error)
+        hidden, loss = torch.where(each, hidden_t, hidden), torch.where(better, loss_t, loss)
+        damping = torch.where(better, 0.1 * damping, 10.0 * damping).clamp_(min=1e-12)
+        done = (better & (fall < 1e-6 * loss_t)) | (damping > _DAMPING_MOST)
+        if bool(done.any()):
+            out[place[done]], steps[place[done]] = theta[done], step
+            some = ~done
+            theta, x_t, y, known, count = (a[some] for a in (theta, x_t, y, known, count))
+            damping, hidden, error, loss, place = (a[some] for a in (damping, hidden, error, loss, place))
+            if not len(place):
+                break
+    out[place] = theta
+    return out, steps
 
 
 @cache
