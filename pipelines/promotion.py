@@ -22,7 +22,8 @@ _INTERVAL = 0.90
 
 @dataclass(frozen=True)
 class Choice:
-    """The cell that the rule picked. `trusted` is False where a baseline won or no set of points was stable."""
+    """The cell that the rule picked. `caution` says why it is not to be trusted: a baseline won, no set of points was
+    stable, or the search itself explains the score; empty where it is."""
 
     protocol: str
     selector: str
@@ -34,10 +35,14 @@ class Choice:
     S_std_um: float
     tsp_stability: float
     n_batches: int
-    trusted: bool
+    caution: str
     words: str
     nested_S_mean_um: float = float("nan")  # every batch predicted by the cell that the other batches chose
     nested_S_std_um: float = float("nan")
+
+    @property
+    def trusted(self) -> bool:
+        return not self.caution
 
     @property
     def cell(self) -> str:
@@ -103,14 +108,16 @@ def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
     is_baseline = table["family"].isin(BASELINES)
     baselines, candidates = table[is_baseline], table[~is_baseline]
     stable = candidates[candidates["tsp_stability"].fillna(0.0) >= rule.min_tsp_stability]
-    caveat = ""
+    caution = ""
     if stable.empty and not candidates.empty:
         top = candidates["tsp_stability"].max()
-        caveat = f"no set of points is stable (best {top:.2f}, asked {rule.min_tsp_stability:g}): do not trust"
+        caution = f"no set of points is stable (best {top:.2f}, asked {rule.min_tsp_stability:g})"
         stable = candidates
     floor = baselines["score_um"].min() if len(baselines) else np.inf
     if stable.empty or stable["score_um"].min() >= floor:
-        return _picked(_simplest(baselines[baselines["score_um"] <= floor]), rule, [], trusted=False, beaten=stable)
+        winner = _simplest(baselines[baselines["score_um"] <= floor])
+        other = "" if stable.empty else f" (best other: {stable['score_um'].min():.2f} µm)"
+        return _picked(winner, rule, [], f"nothing beats {winner['family']}{other}")
     best = stable.loc[stable["score_um"].idxmin()]
     limit = best["score_um"] * (1 + rule.tie_percent / 100)
     tied = stable[(stable["score_um"] <= limit) & (stable["score_um"] < floor)]
@@ -124,7 +131,7 @@ def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
     if len(baselines):
         least = baselines.loc[baselines["score_um"].idxmin()]
         notes.append(f"beats {least['family']} ({least['score_um']:.2f} µm)")
-    return _picked(picked, rule, [*notes, caveat] if caveat else notes, trusted=not caveat, beaten=None)
+    return _picked(picked, rule, notes, caution)
 
 
 def pick(cells: pd.DataFrame, rule: PromotionRule, cell: str) -> Choice:
@@ -143,7 +150,8 @@ def pick(cells: pd.DataFrame, rule: PromotionRule, cell: str) -> Choice:
         )
     row = table[labels == cell].iloc[0].copy()
     row["score_um"] = score_um(table[labels == cell], rule).iloc[0]
-    return _picked(row, rule, ["chosen by hand"], trusted=row["family"] not in BASELINES, beaten=None)
+    caution = "a baseline, no model of the temperatures" if row["family"] in BASELINES else ""
+    return _picked(row, rule, ["chosen by hand"], caution)
 
 
 def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
@@ -162,14 +170,17 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
     mean, std = float(nested["S_um"].mean()), float(nested["S_um"].std())
     words = f"{choice.words}; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
     cells = result.cells[(result.cells["protocol"] == rule.protocol) & result.cells["family"].isin(BASELINES)]
-    trusted = choice.trusted
-    if trusted and len(cells) and rule.score != "max_abs":
+    caution = choice.caution
+    if not caution and len(cells) and rule.score != "max_abs":
         floor = cells.assign(score_um=score_um(cells, rule)).nsmallest(1, "score_um").iloc[0]
         reached = mean + (std if rule.score == "S_mean + S_std" else 0.0)
         if reached >= floor["score_um"]:
-            trusted = False
+            caution = (
+                f"predicted by the cell that the other batches chose, each batch comes to {mean:.2f} ± {std:.2f} µm, "
+                f"no better than {floor['family']} ({floor['score_um']:.2f} µm)"
+            )
             words += f", no better than {floor['family']} ({floor['score_um']:.2f} µm): do not trust"
-    return replace(choice, trusted=trusted, words=words, nested_S_mean_um=mean, nested_S_std_um=std)
+    return replace(choice, caution=caution, words=words, nested_S_mean_um=mean, nested_S_std_um=std)
 
 
 def left_out(result: GridResult, protocol: str, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
@@ -262,16 +273,15 @@ def _simplest(table: pd.DataFrame) -> pd.Series:
     return table.sort_values(order, kind="stable").iloc[0]
 
 
-def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], *, trusted: bool, beaten: Any) -> Choice:
+def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], caution: str) -> Choice:
     name = _cell_words(row["family"], row["n_tsp"], row["selector"])
     if rule.score == "S_mean + S_std":
         score = f"S_mean {row['S_mean_um']:.2f} + S_std {row['S_std_um']:.2f} = {row['score_um']:.2f} µm"
     else:
         score = f"{rule.score} {row['score_um']:.2f} µm"
     words = f"{name}: {score}, {rule.protocol} over {int(row['n_batches'])} batches"
-    if beaten is not None:
-        least = "" if beaten.empty else f" (best other: {beaten['score_um'].min():.2f} µm)"
-        notes = [f"nothing beats {row['family']}{least}: do not trust"]
+    if caution:
+        notes = [*notes, f"{caution}: do not trust"]
     return Choice(
         protocol=rule.protocol,
         selector=str(row["selector"]),
@@ -283,7 +293,7 @@ def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], *, trusted: b
         S_std_um=float(row["S_std_um"]),
         tsp_stability=float(row["tsp_stability"]),
         n_batches=int(row["n_batches"]),
-        trusted=trusted,
+        caution=caution,
         words="; ".join([words, *notes]),
     )
 

@@ -35,16 +35,29 @@ Outcome = Literal["champion", "challenger", "unchanged"]
 
 @dataclass(frozen=True)
 class Promotion:
-    """What became of a training's best cell. `version` holds its model; `champion_version` runs on the machine now."""
+    """What became of a training's best cell. `version` holds its model; `champion_version` runs on the machine now.
+
+    `against` is the version that it was compared with, `obstacle` why that could not be done; `caution` and the nested
+    score are the choice's (see `promotion.Choice`).
+    """
 
     outcome: Outcome
     name: str
     version: int
     champion_version: int
     cell: str
-    trusted: bool
+    caution: str
     words: str
     comparison: Comparison | None = None
+    against: int | None = None
+    obstacle: str = ""
+    forced: bool = False
+    nested_S_mean_um: float = float("nan")
+    nested_S_std_um: float = float("nan")
+
+    @property
+    def trusted(self) -> bool:
+        return not self.caution
 
     @property
     def model_uri(self) -> str:
@@ -99,12 +112,14 @@ def promote(
                 _crown(client, name, version, champion)
                 words += f"; version {version} is champion by force"
             stays = version if champion is None or force else champion.version
-            done = Promotion("unchanged", name, int(version), int(stays), choice.cell, choice.trusted, words)
+            done = Promotion("unchanged", name, int(version), int(stays), choice.cell, choice.caution, words,
+                             nested_S_mean_um=choice.nested_S_mean_um,
+                             nested_S_std_um=choice.nested_S_std_um)  # fmt: skip
             record_promotion(client, training_id, done.as_dict())
             return done
-        comparison, why = None, "first model of this machine and channel"
+        comparison, obstacle, why = None, "", "first model of this machine and channel"
         if champion is not None:
-            comparison, why = _against(champion, result, choice, settings, batches)
+            comparison, obstacle, why = _against(champion, result, choice, settings, batches)
         replaces = champion is None or force or (comparison is not None and comparison.better)
         if force and champion is not None:
             why = f"by force; {why}"
@@ -112,6 +127,7 @@ def promote(
             "training_id": training_id, "cell": choice.cell, "n_batches": len(result.batches),
             "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.words,
             "trained_at": pd.Timestamp.now("UTC").isoformat(timespec="seconds"), "trusted": choice.trusted,
+            "caution": choice.caution,
         }  # fmt: skip
         tags = {k: _text(v) for k, v in info.items() if k != "choice"} | {
             "fingerprint": fingerprint, "machine": result.machine, "target": result.target, "reason": why,
@@ -131,7 +147,9 @@ def promote(
         client.set_model_version_tag(name, new, "outcome", outcome)  # last: what lacks it was interrupted
         stays = new if replaces or champion is None else champion.version
         words = f"{name} version {new} is {outcome}: {why}; {choice.words}"
-        done = Promotion(outcome, name, int(new), int(stays), choice.cell, choice.trusted, words, comparison)
+        against = int(champion.version) if champion is not None else None
+        done = Promotion(outcome, name, int(new), int(stays), choice.cell, choice.caution, words, comparison, against,
+                         obstacle, force, choice.nested_S_mean_um, choice.nested_S_std_um)  # fmt: skip
         record_promotion(client, training_id, done.as_dict())
         return done
 
@@ -156,7 +174,7 @@ def rollback(name: str, settings: Settings) -> Promotion:
         client.delete_model_version_tag(name, back.version, "was_champion_until")
     words = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
     return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
-                     back.tags.get("trusted") != "false", words)  # fmt: skip
+                     back.tags.get("caution", ""), words)  # fmt: skip
 
 
 def status(settings: Settings) -> pd.DataFrame:
@@ -206,13 +224,14 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
 
 def _against(
     champion: ModelVersion, result: GridResult, choice: Choice, settings: Settings, batches: Sequence[Batch]
-) -> tuple[Comparison | None, str]:
-    """The paired comparison with a champion and the reason in words; None where there is nothing to compare."""
+) -> tuple[Comparison | None, str, str]:
+    """The paired comparison with a champion, what stood in its way (None, why), and the reason in words."""
     tags = champion.tags
     try:
         then = load_training(tags.get("training_id", ""), settings).result
     except InputError as error:
-        return None, f"the champion (version {champion.version}) cannot be compared ({error}); it stays"
+        why = f"the champion (version {champion.version}) cannot be compared ({error}); it stays"
+        return None, str(error), why
     new = left_out(result, choice.protocol, choice.selector, choice.family, choice.n_tsp)
     old = left_out(then, choice.protocol, tags["selector"], tags["family"], int(tags["n_tsp"]))
     known = set(then.batches["batch_id"])
@@ -221,7 +240,7 @@ def _against(
         old = pd.concat([old, _score_unseen(champion, unseen, choice, result, settings)], ignore_index=True)
     comparison = compare_paired(new, old, settings.promotion)
     fresh = f" ({len(unseen)} of them new to the champion)" if unseen else ""
-    return comparison, f"against version {champion.version}: {comparison.words}{fresh}"
+    return comparison, "", f"against version {champion.version}: {comparison.words}{fresh}"
 
 
 def _score_unseen(

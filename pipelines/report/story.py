@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,9 +15,6 @@ from pipelines.settings import PromotionRule
 from pipelines.tracking import Training
 
 _CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unchanged", "": "not promoted"}
-
-
-_NESTED = re.compile(r"by the cell that the others chose: ([\d.]+) ± ([\d.]+) µm")
 
 
 @dataclass(frozen=True)
@@ -38,13 +34,11 @@ def promoted_cell(training: Training, rule: PromotionRule, protocol: str, nested
     Args:
         nested: with the score of choosing itself, as recorded at the promotion, else computed now.
     """
-    said = _NESTED.search(str(training.promotion.get("words", "")))
-    if nested and not said and protocol == rule.protocol:
+    mean, std = (float(training.promotion.get(f"nested_S_{n}_um", math.nan)) for n in ("mean", "std"))
+    if nested and not math.isfinite(mean) and protocol == rule.protocol:
         own = decide(training.result, rule)
     else:
-        own = picked(training.result, rule, protocol)
-    if said:
-        own = replace(own, nested_S_mean_um=float(said[1]), nested_S_std_um=float(said[2]))
+        own = replace(picked(training.result, rule, protocol), nested_S_mean_um=mean, nested_S_std_um=std)
     cell = str(training.promotion.get("cell", ""))
     if cell and cell != own.cell:
         try:
@@ -78,9 +72,8 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
         )
     else:
         words = f"Nothing was promoted. The rule would take {model}: {score}."
-    caution = ""
-    if not (p.get("trusted", True) if p else choice.trusted):
-        caution = "Do not trust this model: " + _distrust(f"{choice.words}; {p.get('words', '')}")
+    why = str(p.get("caution", "")) if p else choice.caution
+    caution = f"Do not trust this model: {why}." if why else ""
     return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), words, caution)
 
 
@@ -97,7 +90,7 @@ def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
     c = promotion.get("comparison")
     if not c:
         return []
-    old = _against(promotion)
+    old = promotion.get("against")
     return [
         ("batches in common", f"{c['n_batches']}"),
         ("mean S of the newcomer", f"{number(c['new_S_mean_um'], 2)} µm"),
@@ -111,10 +104,10 @@ def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _why_champion(p: dict[str, Any]) -> str:
     c = p.get("comparison")
-    forced = "by force" in str(p.get("words", ""))
+    forced = p.get("forced", False)
     if not c:
         return "put in place by force" if forced else "it is the first model of this machine and channel"
-    old = _against(p)
+    old = p.get("against")
     words = f"replaces version {old}" if old else "replaces the former champion"
     words += " by force" if forced and not c["better"] else ""
     if not math.isfinite(c["difference_um"]):
@@ -125,7 +118,7 @@ def _why_champion(p: dict[str, Any]) -> str:
 def _why_challenger(p: dict[str, Any]) -> str:
     c = p.get("comparison")
     if not c:
-        return "it could not be compared with the champion" + _detail(p)
+        return "it could not be compared with the champion" + (f" ({p['obstacle']})" if p.get("obstacle") else "")
     if "need at least" in str(c.get("words", "")):
         return str(c["words"]).replace(": the champion stays", "")
     return (
@@ -134,24 +127,8 @@ def _why_challenger(p: dict[str, Any]) -> str:
     )
 
 
-def _detail(p: dict[str, Any]) -> str:
-    found = re.search(r"cannot be compared \((.*?)\); it stays", str(p.get("words", "")))
-    return f" ({found[1]})" if found else ""
-
-
-def _against(p: dict[str, Any]) -> str:
-    """The version that was compared with: the words name it, the record does not."""
-    found = re.search(r"against version (\d+)", str(p.get("words", "")))
-    return found[1] if found else ""
-
-
 def _nested(choice: Choice, digits: int) -> str:
     if not math.isfinite(choice.nested_S_mean_um):
         return ""
     score = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
     return f"; {score} µm when a batch has no say in the choice of its model either"
-
-
-def _distrust(words: str) -> str:
-    said = [s for s in words.split("; ") if s.endswith(": do not trust")]
-    return (said[0].removesuffix(": do not trust") if said else "the rule found nothing that beats a baseline") + "."

@@ -54,8 +54,9 @@ def training(
 
 def promotion(cell: str, outcome: str = "champion", **changes: Any) -> dict[str, Any]:
     """What `registry.promote` records."""
-    base = {"outcome": outcome, "name": "toy-z", "version": 3, "champion_version": 3, "cell": cell, "trusted": True,
-            "words": "toy-z version 3 is champion: against version 2: S 2.90 …", "comparison": None}  # fmt: skip
+    base = {"outcome": outcome, "name": "toy-z", "version": 3, "champion_version": 3, "cell": cell, "caution": "",
+            "words": "toy-z version 3 is champion: …", "comparison": None, "against": 2, "obstacle": "",
+            "forced": False, "nested_S_mean_um": float("nan"), "nested_S_std_um": float("nan")}  # fmt: skip
     return base | changes
 
 

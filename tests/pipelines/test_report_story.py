@@ -20,7 +20,7 @@ SCORE = r"\d+\.\d+ ± \d+\.\d+ µm on left-out batches \(leave-batch-out, 6 batc
     ("changes", "pattern"),
     [
         (
-            {"version": 1, "champion_version": 1, "words": "toy-z version 1 is champion: first model"},
+            {"version": 1, "champion_version": 1, "against": None},
             rf"Version 1, {{cell}}, is champion: {SCORE}; it is the first model of this machine and channel\.",
         ),
         (
@@ -31,7 +31,7 @@ SCORE = r"\d+\.\d+ ± \d+\.\d+ µm on left-out batches \(leave-batch-out, 6 batc
         (
             {
                 "comparison": COMPARISON | {"better": False, "difference_um": -0.6, "low_um": -1.0, "high_um": -0.2},
-                "words": "by force; against version 2: …",
+                "forced": True,
             },
             rf"Version 3, {{cell}}, is champion: {SCORE}; replaces version 2 by force, 0\.60 µm worse "
             r"\(90 %: 0\.20 to 1\.00 µm\) on 28 batches\.",
@@ -59,7 +59,7 @@ SCORE = r"\d+\.\d+ ± \d+\.\d+ µm on left-out batches \(leave-batch-out, 6 batc
             {
                 "outcome": "challenger",
                 "champion_version": 2,
-                "words": "toy-z version 3: the champion (version 2) cannot be compared (gone); it stays; …",
+                "obstacle": "gone",
             },
             rf"Version 2 stays champion; .*{SCORE}; it could not be compared with the champion \(gone\)\.",
         ),
@@ -89,7 +89,7 @@ def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Make
     computed = promoted_cell(training(result), RULE, "leave-batch-out", nested=True)
     assert computed.nested_S_mean_um == pytest.approx(nested.mean())
     assert computed.nested_S_std_um == pytest.approx(nested.std())
-    recorded = promotion(rule_cell.cell, words="…; each batch by the cell that the others chose: 9.44 ± 7.31 µm; …")
+    recorded = promotion(rule_cell.cell, nested_S_mean_um=9.44, nested_S_std_um=7.31)
     choice = promoted_cell(training(result, recorded), RULE, "leave-batch-out", nested=True)
     assert (choice.cell, choice.nested_S_mean_um, choice.nested_S_std_um) == (rule_cell.cell, 9.44, 7.31)
     said = verdict("z", training(result, recorded), choice).words
@@ -101,7 +101,7 @@ def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Make
 def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     reason = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean_curve (8.10 µm)"
-    recorded = promotion(choose(result.cells, RULE).cell, trusted=False, words=f"…; {reason}: do not trust")
+    recorded = promotion(choose(result.cells, RULE).cell, caution=reason)
     said = verdict("z", training(result, recorded), choose(result.cells, RULE))
     assert said.caution == f"Do not trust this model: {reason}."
 
