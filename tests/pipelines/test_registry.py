@@ -54,6 +54,7 @@ def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
 
 def test_a_worse_one_is_challenger_with_the_reason(story, store):
     assert (story[2].outcome, story[2].version, story[2].champion_version) == ("challenger", 3, 2)
+    assert (story[2].against, story[2].obstacle, story[2].forced) == (2, "", False)
     assert "not shown to be better, the champion stays" in story[2].words
     tags = MlflowClient(store.store_uri).get_model_version("toy-story-z", "3").tags
     assert "not shown to be better" in tags["reason"]
