@@ -51,8 +51,12 @@ def look(path: Path) -> Table:
 
 def sheets_of(path: Path) -> AbstractContextManager[Sequence[Sheet]]:
     """The file's sheets, opened without knowing what to expect."""
-    if not path.is_file() or path.stat().st_size == 0:
-        raise InputError(f"{path.name}: missing or empty, expected a recording; give the path of a file with rows")
+    if path.is_dir():
+        raise InputError(f"{path.name}: is a directory, expected recordings; give its files, such as {path}/*.csv")
+    if not path.is_file():
+        raise InputError(f"{path.name}: no such file at {path}; give the path of a recording")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path.name}: the file is empty (0 bytes), expected a recording; copy it again")
     return reader_for(path).open(path, ())
 
 

@@ -122,7 +122,7 @@ def retrain(machine_file: str, recordings: list[str]) -> str:
         raise
     words = outcome.stopped or "; ".join(p.words for p in outcome.promotions.values())
     quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
-    words += f" ({quarantined} files in quarantine)" if quarantined else ""
+    words += f" (files in quarantine: {quarantined})" if quarantined else ""
     print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {words}", flush=True)
     return words
 

@@ -68,9 +68,11 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def print_ingest(report: IngestReport) -> None:
-    line("ingest   " + ", ".join(f"{k} {v}" for k, v in ingest_totals(report).items()))
+    line("ingest   " + ", ".join(f"{k}: {v}" for k, v in ingest_totals(report).items()))
     for row in report.quarantined:
-        line(f"  quarantine: {row.reason if row.reason.startswith(row.file) else f'{row.file}: {row.reason}'}")
+        folder, _, name = row.file.rpartition("/")
+        where = "" if row.reason.startswith(row.file) else f"{folder}/" if folder else ""
+        line(f"  quarantine: {where}{row.reason if name in row.reason else f'{name}: {row.reason}'}")
 
 
 def ingest_totals(report: IngestReport) -> dict[str, int]:
@@ -124,7 +126,7 @@ def print_status(models: pd.DataFrame, trainings: pd.DataFrame, lake: dict[str, 
     """Lines and not tables: names, ids and reasons are long, and a terminal is 80 wide."""
     out.print("Lake", style="bold")
     for machine, held in lake.items():
-        line(f"  {machine}: {held['batches']} batches, {held['quarantined']} files in quarantine")
+        line(f"  {machine}: {held['batches']} batches, files in quarantine: {held['quarantined']}")
     if not lake:
         line("  empty; `thermodrift ingest` fills it")
     out.print("Registered models", style="bold")

@@ -176,7 +176,7 @@ def _naming_quarantine(ingested: IngestReport | None) -> Iterator[None]:
         turned_away = ingested.quarantined if ingested else []
         if not turned_away:
             raise
-        raise InputError(f"{error}; {len(turned_away)} files in quarantine, first {turned_away[0].reason}") from None
+        raise InputError(f"{error}; files in quarantine: {len(turned_away)}, first {turned_away[0].reason}") from None
 
 
 class _Clock:

@@ -139,7 +139,7 @@ def test_nothing_to_describe_is_one_clear_line(tmp_path):
     (tmp_path / "a.csv").write_text("hello\nworld\n")
     with pytest.raises(InputError, match=r"^a.csv: no table of numbers found; expected a time column and channels"):
         draft_machine_file([tmp_path / "a.csv"])
-    with pytest.raises(InputError, match=r"gone\.csv: missing or empty"):
+    with pytest.raises(InputError, match=r"gone\.csv: no such file"):
         draft_machine_file([tmp_path / "gone.csv"])
 
 

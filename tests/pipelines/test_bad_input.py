@@ -130,9 +130,9 @@ def test_a_file_that_cannot_be_used(make: Callable[[Path], None], name: str, wor
     assert trouble(err) == "no file could be used (1 in quarantine); the reasons are above"
     assert re.search(words, place.reasons()[name]), place.reasons()[name]
     (shown,) = [line for line in out.splitlines() if line.startswith("  quarantine: ")]
-    assert place.reasons()[name] in shown
+    assert shown == f"  quarantine: {folder}/{place.reasons()[name]}"
     code, out, err = place.ingest(folder)
-    assert code == 0 and "batches new 1" in out and "files in quarantine 1" in out
+    assert code == 0 and "batches new: 1" in out and "files in quarantine: 1" in out
     assert place.lake.batch_ids(NAME) == [good.stem]
     (kept,) = place.lake.quarantined(NAME)
     assert kept.copy is not None and kept.copy.read_bytes() == (folder / name).read_bytes()
@@ -185,13 +185,13 @@ def test_two_batches_of_one_name(place: Place) -> None:
     (other,) = write_year(place.folder / "b", 1)
     recording(0).head(40).to_csv(other, index=False)
     code, out, _ = place.ingest(place.folder / "a", place.folder / "b")
-    assert code == 0 and "batches new 1" in out and "batches conflict 1" in out
+    assert code == 0 and "batches new: 1" in out and "batches conflict: 1" in out
     reason = place.reasons()[first.name]
     assert f"has other content than the batch of that id in {first}" in reason
     assert "the first one is stored, this one is left out; give one of them another name" in reason
     assert len(place.lake.versions(NAME, first.stem)) == 1
     code, out, _ = place.ingest(other)
-    assert code == 0 and "batches new version 1" in out
+    assert code == 0 and "batches new version: 1" in out
     versions = place.lake.versions(NAME, first.stem)
     assert [v.rows for v in versions] == [73, 40] and [v.current for v in versions] == [False, True]
     assert place.lake.load(NAME, first.stem, 1).n_rows == 73
@@ -278,7 +278,7 @@ def test_training_says_what_went_to_quarantine(place: Place) -> None:
     code, _, err = place.call("train", "--machine", place.machine, "--recordings", place.folder / "in", "--direct",
                                 "--families", "zero", "--selectors", "none")  # fmt: skip
     assert code == 2
-    assert "; 1 files in quarantine, first junk.csv: not a text file (binary content); expected" in trouble(err)
+    assert "; files in quarantine: 1, first junk.csv: not a text file (binary content); expected" in trouble(err)
 
 
 def test_the_recording_of_another_machine_for_a_model(
@@ -305,3 +305,14 @@ def test_describe_of_what_is_no_recording(make: Callable[[Path], None], place: P
     code, out, err = place.call("describe", path)
     assert (code, out) == (2, "")
     assert trouble(err).startswith(path.name)
+
+
+def test_describe_of_what_is_no_file(place: Place) -> None:
+    code, _, err = place.call("describe", place.folder / "gone.csv")
+    gone = place.folder / "gone.csv"
+    assert (code, trouble(err)) == (2, f"gone.csv: no such file at {gone}; give the path of a recording")
+    code, _, err = place.call("describe", place.folder)
+    assert code == 2
+    assert trouble(err) == f"{place.folder.name}: is a directory, expected recordings; give its files, such as " + (
+        f"{place.folder}/*.csv"
+    )

@@ -96,7 +96,7 @@ def test_training_as_json_is_alone_on_standard_output(year: Path, call: Call) ->
 def test_ingest_says_what_it_did(year: Path, call: Call) -> None:
     done = call("ingest", year / "in", "--machine", year / "small.yml")
     assert done.code == 0
-    assert "batches unchanged 6" in done.out and "files in quarantine 0" in done.out
+    assert "batches unchanged: 6" in done.out and "files in quarantine: 0" in done.out
     done = call("ingest", year / "in", "--machine", year / "small.yml", "--json")
     assert (done.code, done.err) == (0, "")
     assert [r["status"] for r in json.loads(done.out)] == ["unchanged"] * 6
@@ -106,7 +106,7 @@ def test_status_names_what_runs_where(year: Path, call: Call, monkeypatch: pytes
     monkeypatch.setenv("COLUMNS", "60")
     done = call("status")
     assert done.code == 0
-    assert f"  {NAME}: 6 batches, 0 files in quarantine" in done.out
+    assert f"  {NAME}: 6 batches, files in quarantine: 0" in done.out
     model = next(line for line in lines(done.out) if line.startswith(f"  {NAME}-z/2 champion: none|ridge|3, "))
     assert "over 6 batches, simulated; against version 1" in model
     done = call("status", "--json")
@@ -170,7 +170,7 @@ def test_describe_drafts_a_file_that_ingests(
     )
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
     done = call("ingest", year / "in", "--machine", draft)
-    assert done.code == 0 and "batches new 6" in done.out
+    assert done.code == 0 and "batches new: 6" in done.out
 
 
 @pytest.mark.parametrize(

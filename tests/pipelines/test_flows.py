@@ -135,7 +135,7 @@ def test_retraining_learns_once(small_retrain: ModuleType, tmp_path: Path, capfd
     assert "flow-again-z version 1 is champion" in first
     assert again == "the last training saw the same batches; nothing new to learn"
     (tmp_path / "in" / "20251015.csv").write_text("nothing")
-    assert small_retrain.retrain(str(machine), [str(tmp_path / "in")]).endswith("(1 files in quarantine)")
+    assert small_retrain.retrain(str(machine), [str(tmp_path / "in")]).endswith("(files in quarantine: 1)")
     assert f"flow-again: {again}" in capfd.readouterr().out
 
 
