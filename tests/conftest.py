@@ -44,6 +44,6 @@ def make_toy_batches(
     return batches
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def toy_batches() -> Callable[..., list[Batch]]:
     return make_toy_batches

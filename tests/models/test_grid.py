@@ -17,10 +17,8 @@ QUICK = Plan(families=("zero", "mlr", "ridge"), selectors=("none", "correlation"
 
 
 @pytest.fixture(scope="module")
-def grid():
-    from conftest import make_toy_batches
-
-    batches = make_toy_batches(6)
+def grid(toy_batches):
+    batches = toy_batches(6)
     return batches, run_grid(batches, ["z", "x"], QUICK)
 
 
