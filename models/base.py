@@ -70,7 +70,7 @@ class Family(ABC):
         return self.fit_design(design, range(design.n_batches))
 
     def predict(self, batch: Batch) -> Array:
-        """Error_um (n,) of a batch from its inputs alone, zero at its start as the training targets were."""
+        """Error_um (n,) of a batch from its inputs alone, relative to its start as the training targets were."""
         return self.predict_design(Design.build([batch], self.inputs, None), [0])[0]
 
     def n_parameters(self) -> int:

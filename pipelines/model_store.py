@@ -54,7 +54,7 @@ class StoredModel:
         return tuple(needed | dict.fromkeys(named))
 
     def predict(self, batch: Batch) -> Array:
-        """Error_um (n,) of a batch, zero at its start.
+        """Error_um (n,) of a batch, relative to its start.
 
         Raises:
             InputError: an input is not in the batch, or was nowhere recorded.

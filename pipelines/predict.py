@@ -56,7 +56,7 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     """Predicted error of every batch in a raw recording, read by the machine file that the model carries.
 
     Returns:
-        batch_id, time_s (s), predicted_um (µm, zero at the batch's start; NaN where an input is missing),
+        batch_id, time_s (s), predicted_um (µm, relative to the batch's start; NaN where an input is missing),
         outside_region (the row extrapolates), outside_of (which quantities), simulated (model or recording).
 
     Raises:

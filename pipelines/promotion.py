@@ -123,9 +123,11 @@ def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
     tied = stable[(stable["score_um"] <= limit) & (stable["score_um"] < floor)]
     picked = _simplest(tied)
     notes = []
-    if len(tied) > 1:
+    # Selectors that arrive at the same points give the same model: one of them counts.
+    models = len(tied.drop_duplicates(["family", "inputs"]))
+    if (picked["family"], picked["inputs"]) != (best["family"], best["inputs"]):
         notes.append(
-            f"the simplest of {len(tied)} within {rule.tie_percent:g} % of the best "
+            f"the simplest of {models} within {rule.tie_percent:g} % of the best "
             f"({_cell_words(best['family'], best['n_tsp'], best['selector'])}, {best['score_um']:.2f} µm)"
         )
     if len(baselines):
@@ -269,8 +271,8 @@ def sign_flip_p(difference: NDArray[np.float64]) -> float:
 
 
 def _simplest(table: pd.DataFrame) -> pd.Series:
-    order = ["n_inputs", "rank", "n_parameters", "score_um", "selector", "family", "n_tsp"]
-    return table.sort_values(order, kind="stable").iloc[0]
+    order = ["n_inputs", "rank", "n_parameters", "score_um", "selects", "selector", "family", "n_tsp"]
+    return table.assign(selects=table["selector"] != "none").sort_values(order, kind="stable").iloc[0]
 
 
 def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], caution: str) -> Choice:

@@ -199,3 +199,10 @@ def test_without_the_batch_in_question_the_choice_is_made_by_hand() -> None:
         others = s.drop(columns=batch)
         best = (others.mean(axis=1) + others.std(axis=1)).idxmin()
         assert got.loc[batch, "cell"].endswith(f"|{best}") and got.loc[batch, "S_um"] == s.loc[best, batch]
+
+
+def test_equal_points_are_one_model_and_go_by_the_plainest_name() -> None:
+    table = cells(("fcgc", "mlr", 3, 2.0, 1.0, 1.0, 10, 4), ("none", "mlr", 3, 2.0, 1.0, 1.0, 10, 4), ZERO)
+    got = choose(table, RULE)
+    assert got.cell == "none|mlr|3"
+    assert "simplest" not in got.words
