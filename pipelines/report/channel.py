@@ -16,6 +16,7 @@ from pipelines.report.extracts import (
     frequencies,
     is_baseline,
     left_out_batches,
+    paths,
     protocols_of,
     scored,
     zero_um,
@@ -131,14 +132,14 @@ def _heat(name: str, result: GridResult, cells: pd.DataFrame, digits: int) -> Pa
 
 
 def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) -> Panel | None:
-    with_inputs = cells[cells["n_tsp"] > 0]
-    best = best_per(with_inputs, "family")
+    tried = paths(cells)
+    best = best_per(tried, "family")
     if best.empty:
         return None
     at = dict(zip(best["family"], best["selector"], strict=True))
-    if choice.family in at and choice.n_tsp:
+    if ((tried["family"] == choice.family) & (tried["selector"] == choice.selector)).any():
         at[choice.family] = choice.selector  # the promoted model's own line, where another selector is as good
-    lines = with_inputs[with_inputs["selector"] == with_inputs["family"].map(at)]
+    lines = tried[tried["selector"] == tried["family"].map(at)]
     flat = best_per(cells[cells["n_tsp"] == 0], "family")
     plots = tuple(
         Plot(

@@ -67,6 +67,13 @@ def best_per(cells: pd.DataFrame, *keys: str) -> pd.DataFrame:
     return cells.drop_duplicates(list(keys)).reset_index(drop=True)
 
 
+def paths(cells: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the selectors that were tried with several numbers of points; all with inputs where none was."""
+    with_inputs = cells[cells["n_tsp"] > 0]
+    several = with_inputs.groupby(["family", "selector"])["n_tsp"].transform("nunique") > 1
+    return with_inputs[several] if several.any() else with_inputs
+
+
 def is_baseline(cells: pd.DataFrame) -> pd.Series:
     """Rows of the families that every table must hold."""
     return cells["family"].isin(BASELINES)

@@ -17,6 +17,7 @@ from pipelines.report.extracts import (
     best_per,
     is_baseline,
     left_out_batches,
+    paths,
     picked,
     protocols_of,
     scored,
@@ -65,7 +66,7 @@ def _families(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
 
 
 def _points(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
-    table = cells[cells["n_tsp"] > 0]
+    table = paths(cells)
     fig, (ax,) = _canvas(6.4, 3.6, 1, left=0.7)
     for best in best_per(table, "family").head(_MOST_LINES).to_dict("records"):
         family, selector = str(best["family"]), str(best["selector"])

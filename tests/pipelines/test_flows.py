@@ -83,7 +83,7 @@ def test_a_step_that_fails_once_is_tried_again(
     outcome = flows.train_in_flow(request_for(year, "flow-shaky"), store)
     assert len(calls) == 2
     assert outcome.promotions["z"].outcome == "champion"
-    client = MlflowClient(store.store_uri)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     assert len(client.search_model_versions("name = 'flow-shaky-z'")) == 1
 
 

@@ -27,7 +27,12 @@ def train(store, machine: str, S_um: list[float], *, batches_given: bool = False
 
 
 def aliases(store, name: str) -> dict[str, int]:
-    return {a: int(v) for a, v in MlflowClient(store.store_uri).get_registered_model(name).aliases.items()}
+    return {
+        a: int(v)
+        for a, v in MlflowClient(store.store_uri, registry_uri=store.store_uri)
+        .get_registered_model(name)
+        .aliases.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,7 @@ def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
     assert (story[1].outcome, story[1].version) == ("champion", 2)
     assert story[1].comparison is not None
     assert story[1].comparison.n_batches == 6  # the seventh is new, and the champion was never tried on it
-    client = MlflowClient(store.store_uri)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     assert client.get_model_version("toy-story-z", "2").tags["replaces"] == "1"
     assert client.get_model_version("toy-story-z", "1").tags["was_champion_until"]
 
@@ -56,7 +61,7 @@ def test_a_worse_one_is_challenger_with_the_reason(story, store):
     assert (story[2].outcome, story[2].version, story[2].champion_version) == ("challenger", 3, 2)
     assert (story[2].against, story[2].obstacle, story[2].forced) == (2, "", False)
     assert "not shown to be better, the champion stays" in story[2].words
-    tags = MlflowClient(store.store_uri).get_model_version("toy-story-z", "3").tags
+    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-story-z", "3").tags
     assert "not shown to be better" in tags["reason"]
     assert tags["simulated"] == "true"
     assert aliases(store, "toy-story-z") == {"champion": 2, "challenger": 3}
@@ -138,7 +143,7 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
     back = registry.rollback("toy-back-z", store)
     assert back.version == 1
     assert aliases(store, "toy-back-z")["champion"] == 1
-    client = MlflowClient(store.store_uri)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     assert client.get_model_version("toy-back-z", "2").tags["rolled_back"] == "true"
     assert "was_champion_until" not in client.get_model_version("toy-back-z", "1").tags
     with pytest.raises(InputError, match="champion version 1 replaced none; nothing to go back to"):
@@ -150,7 +155,9 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
 def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story, store):
     """Held against the law that the toy batches follow."""
     folder = mlflow.artifacts.download_artifacts(
-        artifact_uri=MlflowClient(store.store_uri).get_model_version("toy-story-z", "2").source,
+        artifact_uri=MlflowClient(store.store_uri, registry_uri=store.store_uri)
+        .get_model_version("toy-story-z", "2")
+        .source,
         tracking_uri=store.store_uri,
     )
     names = {p.name for p in Path(folder).rglob("*") if p.is_file()}

@@ -29,7 +29,7 @@ def logged(store) -> tuple[Settings, str, object]:
 
 
 def children(settings: Settings, training_id: str) -> dict[str, object]:
-    client = MlflowClient(settings.store_uri)
+    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
     experiment = client.get_run(training_id).info.experiment_id
     found = client.search_runs([experiment], f"tags.mlflow.parentRunId = '{training_id}'")
     return {r.info.run_name: r for r in found}
@@ -42,7 +42,7 @@ def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
     run = runs["correlation × mlr"]
     assert run.data.params["best_n_tsp"] == "2"
     assert run.info.status == "FINISHED"
-    client = MlflowClient(settings.store_uri)
+    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
     history = client.get_metric_history(run.info.run_id, "leave_batch_out/S_mean_um")
     assert {m.step: m.value for m in history} == {1: 5.0, 2: pytest.approx(6.5 / 3)}
     folds = client.get_metric_history(run.info.run_id, "leave_batch_out/fold_S_um")
@@ -52,7 +52,7 @@ def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
 
 def test_the_parent_carries_batches_figures_and_the_best(logged):
     settings, training_id, result = logged
-    run = MlflowClient(settings.store_uri).get_run(training_id)
+    run = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id)
     assert run.info.status == "FINISHED"
     assert run.data.tags["best"] == "mlr on 2 points by none"
     inputs = {i.dataset.name: i for i in run.inputs.dataset_inputs}
@@ -65,7 +65,7 @@ def test_the_parent_carries_batches_figures_and_the_best(logged):
 
 def test_simulated_is_written_on_experiment_and_every_run(logged):
     settings, training_id, _ = logged
-    client = MlflowClient(settings.store_uri)
+    client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
     run = client.get_run(training_id)
     experiment = client.get_experiment(run.info.experiment_id)
     assert experiment.name == "toy-tracked/z"

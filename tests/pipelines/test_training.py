@@ -48,7 +48,7 @@ def home(store: Any, store_home: Path) -> Any:
 def story(home: Path, store: Any, tmp_path_factory: pytest.TempPathFactory) -> Story:
     folder = tmp_path_factory.mktemp("year")
     machine, files = write_machine(folder / "small.yml", NAME), write_year(folder / "in")
-    client, said = MlflowClient(store.store_uri), []
+    client, said = MlflowClient(store.store_uri, registry_uri=store.store_uri), []
     story = Story(folder, machine, files, {"said": said}, {})
 
     def step(name: str, work: Callable[[], Any]) -> None:
@@ -144,7 +144,7 @@ def test_what_cannot_be_promoted_is_told(story: Story, store: Any, tmp_path: Pat
 
 
 def test_runs_are_tracked_with_their_batches(story: Story, store: Any) -> None:
-    client = MlflowClient(store.store_uri)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     training_id = story.steps["better"].training_ids["z"]
     run = client.get_run(training_id)
     assert {d.dataset.name for d in run.inputs.dataset_inputs} == {f.stem for f in story.files[:6]}
@@ -159,7 +159,7 @@ def test_simulated_is_said_everywhere(story: Story, store: Any) -> None:
     assert outcome.simulated
     for table in (outcome.results["z"].cells, outcome.results["z"].batches):
         assert table["simulated"].all()
-    client = MlflowClient(store.store_uri)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     assert client.get_run(outcome.training_ids["z"]).data.tags["simulated"] == "true"
     assert client.get_registered_model(MODEL).tags["simulated"] == "true"
     assert client.get_model_version(MODEL, "2").description.startswith("SIMULATED. ")
