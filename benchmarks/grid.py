@@ -10,6 +10,7 @@ Then the whole crossing of `make run` is timed once per repeat. Nothing is asser
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import tempfile
 import time
@@ -29,7 +30,8 @@ from data.batch import Batch
 from data.machine import load_machine
 from data.recording import read_batches
 from data.sample_year import write_sample_year
-from models.grid import Crossing, Plan, cross_family, prepare, run_grid
+from models.crossing import Crossing, Plan, cross_family, prepare
+from models.grid import run_grid
 from models.metrics import residual_std_um
 
 PENALTIES = np.logspace(-6, 3, 25)
@@ -104,10 +106,13 @@ def main() -> None:
                 fast.append(b)
             a, b = statistics.median(slow), statistics.median(fast)
             print(f"{family:8} {a:9.2f} {b:9.3f} {a / b:6.0f}× {s_plain:11.3f} {s_grid:10.3f}", flush=True)
-    print("\nthe crossing of `make run` (all selectors × families × protocols, x, y and z), two threads")
-    for _ in range(args.repeats):
-        seconds, cells = timed(lambda: float(sum(len(r.cells) for _, r in run_grid(batches, "xyz", Plan()).values())))
-        print(f"  {seconds:6.1f} s for {cells:.0f} cells", flush=True)
+    for workers in (1, os.cpu_count() or 1):
+        print(f"\nthe crossing of `make run` (selectors × families × protocols, x, y and z), {workers} process(es)")
+        for _ in range(args.repeats):
+            start = time.perf_counter()
+            results = run_grid(batches, "xyz", Plan(), workers=workers)
+            cells = sum(len(r.cells) for _, r in results.values())
+            print(f"  {time.perf_counter() - start:6.1f} s for {cells} cells", flush=True)
 
 
 if __name__ == "__main__":

@@ -49,7 +49,8 @@ if __name__ == "__main__":
     from data.machine import load_machine
     from data.recording import read_batches
     from data.sample_year import write_sample_year
-    from models.grid import Plan, run_grid
+    from models.crossing import Plan
+    from models.grid import run_grid
 
     models.FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -105,33 +104,35 @@ def _masked_mean(values: Array, where: NDArray[np.bool_]) -> Array:
         return np.where(ok, values, 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
 
 
-def score_rows(
+def score_table(
     batch_ids: Sequence[str], folds: Sequence[Fold], judged: Judged, columns: NDArray[np.int64], protocol: str
-) -> pd.DataFrame:
-    """A row per fold and tested batch; for train-on-one a row per fold, summed up over the batches it tests."""
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Scores and their summary for C cells, given each cell's column per fold, `columns` (C, F).
+
+    Returns:
+        R rows per cell, cell after cell: a row per fold and tested batch, or for train-on-one a row per fold, summed up
+        over the batches that it tests; and one row per cell: accuracy S_mean, robustness S_std, the other scores.
+    """
     if protocol == "train-on-one":
-        data: dict[str, Any] = {"fold": [f.name for f in folds], "batch_id": "*"}
+        fold_names, ids = [f.name for f in folds], ["*"] * len(folds)
         with np.errstate(all="ignore"):
-            for name in SCORES:
-                reduce = np.nanmax if name == "max_abs_um" else np.nanmean
-                data[name] = reduce(judged.tested[name][columns], axis=1)
-            data["S_std_um"] = np.nanstd(judged.tested["S_um"][columns], axis=1, ddof=1)
-            data["n_rows"] = np.nansum(judged.tested["n_rows"][columns], axis=1)
-        return pd.DataFrame({**data, "fit_S_um": judged.fit_S_um[columns]})
-    fold_index = np.concatenate([np.full(len(f.test), i) for i, f in enumerate(folds)])
-    batch_index = np.concatenate([f.test for f in folds])
-    picked = columns[fold_index]
-    data = {"fold": [folds[i].name for i in fold_index], "batch_id": [batch_ids[k] for k in batch_index]}
-    data |= {name: judged.tested[name][picked, batch_index] for name in [*SCORES, "n_rows"]}
-    return pd.DataFrame({**data, "fit_S_um": judged.fit_S_um[picked]})
-
-
-def summary(table: pd.DataFrame, protocol: str) -> dict[str, float]:
-    """Accuracy S_mean and robustness S_std over tested batches, and the other scores."""
-    s = table["S_um"].to_numpy()
-    spread = table["S_std_um"].mean() if protocol == "train-on-one" else (s.std(ddof=1) if len(s) > 1 else np.nan)
-    out = {"S_mean_um": float(s.mean()), "S_std_um": float(spread), "fit_S_um": float(table["fit_S_um"].mean())}
-    for name in SCORES[1:]:
-        values = table[name]
-        out[name] = float(values.max() if name == "max_abs_um" else values.mean())
-    return out | {"n_batches": len(table)}
+            # max |e| is the greatest of all, every other score a mean over the tested batches.
+            per_fold = {n: (np.nanmax if n == "max_abs_um" else np.nanmean)(judged.tested[n], axis=1) for n in SCORES}
+            per_fold["S_std_um"] = np.nanstd(judged.tested["S_um"], axis=1, ddof=1)
+            per_fold["n_rows"] = np.nansum(judged.tested["n_rows"], axis=1)
+        values = {name: column[columns] for name, column in per_fold.items()}
+        fit_S_um = judged.fit_S_um[columns]
+        spread = values["S_std_um"].mean(axis=1)
+    else:
+        fold_index = np.concatenate([np.full(len(f.test), i) for i, f in enumerate(folds)])
+        batch_index = np.concatenate([f.test for f in folds])
+        fold_names, ids = [folds[i].name for i in fold_index], [batch_ids[k] for k in batch_index]
+        picked = columns[:, fold_index]
+        values = {name: judged.tested[name][picked, batch_index] for name in [*SCORES, "n_rows"]}
+        fit_S_um = judged.fit_S_um[picked]
+        spread = values["S_um"].std(axis=1, ddof=1) if len(fold_index) > 1 else np.full(len(columns), np.nan)
+    values["fit_S_um"] = fit_S_um
+    rows = {"fold": np.tile(np.array(fold_names, object), len(columns)), "batch_id": np.tile(ids, len(columns))}
+    means = {n: (values[n].max if n == "max_abs_um" else values[n].mean)(axis=1) for n in [*SCORES[1:], "fit_S_um"]}
+    summary = {"S_mean_um": values["S_um"].mean(axis=1), "S_std_um": spread, **means, "n_batches": len(fold_names)}
+    return pd.DataFrame({**rows, **{n: v.ravel() for n, v in values.items()}}), pd.DataFrame(summary)

@@ -85,7 +85,7 @@ def train(
     settings_module.configure_environment()
     from features.selectors import SELECTORS
     from models import FAMILIES
-    from models.grid import Plan
+    from models.crossing import Plan
     from models.protocols import PROTOCOLS
     from pipelines.request import TrainRequest, check_request
 

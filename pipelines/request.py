@@ -8,7 +8,7 @@ from pathlib import Path
 
 from data.errors import InputError, closest
 from data.machine import Machine, load_machine
-from models.grid import Plan
+from models.crossing import Plan
 from pipelines.settings import Settings
 
 REPORT_ENDINGS = (".html", ".md")
@@ -25,6 +25,7 @@ class TrainRequest:
     report: Path | None = None
     promote: bool = True
     only_if_new: bool = False  # stop where the last training saw the same batches
+    workers: int = 0  # processes of the grid; 0: as many as pay
 
 
 def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, tuple[str, ...]]:

@@ -25,7 +25,8 @@ from data.ingest import IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
 from models import FAMILIES
-from models.grid import Crossing, FamilyResult, Plan, assemble, cross_family, prepare, refit, with_target
+from models.crossing import Crossing, Plan, prepare, refit, with_target
+from models.grid import Workers, assemble, jobs_of, workers_for
 from models.region import region_of
 from models.result import GridResult
 from pipelines import promotion, registry, tracking
@@ -104,8 +105,9 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs = [(t, f) for f in sorted(request.plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
-    done = dict(zip(jobs, caller.map("grid", partial(_cross, crossings), jobs), strict=True))
+    jobs = jobs_of(request.plan, targets)
+    with Workers(crossings, request.workers or workers_for(request.plan.families)) as workers:
+        done = dict(zip(jobs, caller.map("grid", workers.cross, jobs), strict=True))
     for t in targets:
         outcome.results[t] = assemble(crossings[t], [done[t, f] for f in request.plan.families])
     clock("grid")
@@ -203,10 +205,6 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
 
 def _prepare(batches: Sequence[Batch], plan: Plan, target: str) -> Crossing:
     return prepare(batches, target, plan)
-
-
-def _cross(crossings: dict[str, Crossing], job: tuple[str, str]) -> FamilyResult:
-    return cross_family(crossings[job[0]], job[1])
 
 
 def _track(results: dict[str, GridResult], settings: Settings, say: Say, target: str) -> str:

@@ -9,7 +9,8 @@ import pytest
 from data.errors import InputError
 from features.selectors import SELECTORS
 from models import FAMILIES
-from models.grid import Plan, prepare, refit, run_grid
+from models.crossing import Plan, prepare, refit
+from models.grid import run_grid
 from models.metrics import residual_std_um
 from models.result import CELL_KEYS, GridResult
 
@@ -85,11 +86,12 @@ def test_every_cell_once_and_baselines_once(grid) -> None:
     assert (lbo["family"] == "mlr").sum() == 1 + 6 + 6  # none, and 1 to 6 points of two selectors
 
 
-def test_results_do_not_depend_on_the_number_of_threads(grid) -> None:
+def test_results_do_not_depend_on_the_number_of_processes(grid) -> None:
     batches, results = grid
-    one = run_grid(batches, ["z", "x"], QUICK, threads=1)
+    two = run_grid(batches, ["z", "x"], QUICK, workers=2)
     for target in ("z", "x"):
-        pd.testing.assert_frame_equal(one[target][1].scores, results[target][1].scores)
+        pd.testing.assert_frame_equal(two[target][1].scores, results[target][1].scores)
+        pd.testing.assert_frame_equal(two[target][1].predictions, results[target][1].predictions)
 
 
 def test_a_result_survives_its_files(grid, tmp_path) -> None:

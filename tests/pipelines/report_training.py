@@ -11,7 +11,8 @@ from typing import Any
 import pandas as pd
 
 from data.batch import Batch, Finding
-from models.grid import Plan, run_grid
+from models.crossing import Plan
+from models.grid import run_grid
 from models.result import GridResult
 from pipelines.settings import NamesPart, PromotionRule, Settings
 from pipelines.tracking import Training
@@ -41,7 +42,7 @@ def results(make: Maker, k: int = 6, simulated: bool = True, findings: bool = Fa
         )
         batches[1] = batches[1].with_findings(found)
     plan = Plan(selectors=("none", "correlation", "pca_elimination"), families=FAMILIES, n_tsps=(1, 2, 4))
-    return {t: result for t, (_, result) in run_grid(batches, ["z", "x"], plan, threads=1).items()}
+    return {t: result for t, (_, result) in run_grid(batches, ["z", "x"], plan).items()}
 
 
 def training(

@@ -15,7 +15,7 @@ from mlflow import MlflowClient
 from small_year import write_machine, write_year
 
 from data.errors import InputError, WorkError
-from models.grid import Plan
+from models.crossing import Plan
 from pipelines import settings as settings_module
 from pipelines import training
 from pipelines.request import TrainRequest

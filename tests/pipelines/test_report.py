@@ -16,7 +16,8 @@ from plotly.offline import get_plotlyjs
 from report_training import HOSTILE, Maker, column, promotion, results, settings, table_after, training
 
 from data.errors import InputError
-from models.grid import Plan, run_grid
+from models.crossing import Plan
+from models.grid import run_grid
 from models.result import GridResult
 from pipelines.promotion import Choice, choose
 from pipelines.report import figure_pngs, write, write_report
@@ -253,7 +254,7 @@ def test_batches_with_other_content_count_as_new() -> None:
 
 def test_a_grid_without_leave_batch_out_still_makes_a_report(toy_batches: Maker, tmp_path: Path) -> None:
     plan = Plan(selectors=("none",), families=("mlr",), protocols=("train-on-one",))
-    ((_, result),) = run_grid(toy_batches(k=3, n=30, sensors=2), ["z"], plan, threads=1).values()
+    ((_, result),) = run_grid(toy_batches(k=3, n=30, sensors=2), ["z"], plan).values()
     text = markdown_of([training(result)], tmp_path)
     assert "z: best cell of every family, train-on-one" in text
     assert "No left-out prediction of this model was kept." in html_of([training(result)], tmp_path)

@@ -15,7 +15,7 @@ from small_year import NOISE_UM, law_um, write_machine, write_year
 
 from data.errors import InputError
 from data.lake import Lake
-from models.grid import Plan
+from models.crossing import Plan
 from pipelines import registry, tracking
 from pipelines.predict import predict_file
 from pipelines.training import DirectCaller, TrainOutcome, TrainRequest, load_batches, promote_tracked, train

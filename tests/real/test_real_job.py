@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from data.lake import Lake
-from models.grid import Plan
+from models.crossing import Plan
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

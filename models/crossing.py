@@ -1,0 +1,204 @@
+"""What a grid crosses: the plan, and for one error channel the stacked rows, the folds and every selector's choices.
+
+Folds share work: the rows are stacked once, a selector learns once per training set, and a set of inputs that
+several selectors or numbers of points arrive at is fitted once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from data.checks import usable_channels
+from data.errors import InputError
+from features.design import Design
+from features.rises import temperature_inputs
+from features.selectors import SELECTORS
+from features.stability import tsp_stability
+from models import FAMILIES
+from models.base import Family
+from models.judging import Judged, score_table
+from models.protocols import PROTOCOLS, Fold, folds_of
+from models.result import CELL_KEYS
+
+Array = NDArray[np.float64]
+Inputs = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to cross. `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all."""
+
+    selectors: tuple[str, ...] = tuple(SELECTORS)
+    families: tuple[str, ...] = tuple(FAMILIES)
+    protocols: tuple[str, ...] = tuple(PROTOCOLS)
+    n_tsps: tuple[int, ...] | None = None
+    iterative_n_tsps: tuple[int, ...] = (2, 4)
+
+    def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
+        """The numbers of points a family is tried with."""
+        wanted = self.n_tsps or tuple(range(1, n_inputs + 1))
+        if not family.closed_form:
+            wanted = (*(n for n in self.iterative_n_tsps if n in wanted), wanted[-1])
+        return tuple(dict.fromkeys(n for n in wanted if n <= n_inputs))
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """All that the families of one error channel share."""
+
+    machine: str
+    batches: tuple[Batch, ...]
+    design: Design
+    plan: Plan
+    folds: dict[str, list[Fold]]
+    chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]]  # (selector, training batches) -> n -> inputs
+    excluded: tuple[tuple[str, str], ...]
+    subsets: dict[Inputs, Design] = field(default_factory=dict)
+    stabilities: dict[tuple[str, str, int], float] = field(default_factory=dict)
+
+    @property
+    def everything(self) -> tuple[int, ...]:
+        return tuple(range(self.design.n_batches))
+
+    def subset(self, inputs: Inputs) -> Design:
+        if inputs not in self.subsets:
+            self.subsets[inputs] = self.design.subset(inputs)
+        return self.subsets[inputs]
+
+    def inputs(self, selector: str, train: tuple[int, ...], n_tsp: int) -> Inputs:
+        return self.chosen[selector, train][n_tsp] if n_tsp else ()
+
+    def stability(self, protocol: str, selector: str, n_tsp: int) -> float:
+        """How alike the folds' choices are (mean Jaccard similarity); the same for every family."""
+        key = (protocol, selector, n_tsp)
+        if key not in self.stabilities:
+            sets = [self.inputs(selector, f.train, n_tsp) for f in self.folds[protocol]]
+            self.stabilities[key] = tsp_stability(sets) if n_tsp else 1.0
+        return self.stabilities[key]
+
+    def needed(self, folds: Sequence[Fold], cells: Sequence[tuple[str, int]]) -> list[tuple[Design, list[int]]]:
+        """Every distinct set of inputs that the cells need, and the folds that need it: equal sets are fitted once."""
+        folds_of_inputs: dict[Inputs, dict[int, None]] = {}
+        for selector, n_tsp in cells:
+            for i, fold in enumerate(folds):
+                folds_of_inputs.setdefault(self.inputs(selector, fold.train, n_tsp), {})[i] = None
+        return [(self.subset(inputs), sorted(which)) for inputs, which in folds_of_inputs.items()]
+
+    def cells(self, family: type[Family]) -> list[tuple[str, int]]:
+        """(selector, n_tsp) pairs that differ for this family; baselines without inputs have one."""
+        if not family.uses_inputs:
+            return [("none", 0)]
+        p = len(self.design.inputs)
+        return [
+            (s, n)
+            for s in self.plan.selectors
+            for n in (self.plan.points(family, p) if SELECTORS[s].takes_n_tsp else (p,))
+        ]
+
+
+@dataclass(frozen=True)
+class FamilyResult:
+    """One family's share of the tables."""
+
+    scores: pd.DataFrame
+    cells: pd.DataFrame
+    predictions: dict[str, NDArray[np.float32]]
+    failures: list[tuple[str, str]]
+
+
+def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
+    """Batches that can teach or test: their error channel is not masked from end to end."""
+    return [b for b in batches if np.isfinite(b.masked(target)).sum() >= 2]
+
+
+def prepare(batches: Sequence[Batch], target: str, plan: Plan) -> Crossing:
+    """Stack the batches and let every selector choose on every training set.
+
+    Raises:
+        InputError: fewer than two batches, no usable input channel, or no usable row of the target.
+    """
+    kept = with_target(batches, target)
+    lost = [(target, f"batch {b.batch_id} is left out: no usable {target}") for b in batches if b not in kept]
+    if len(kept) < 2:
+        raise InputError(
+            f"{batches[0].machine if batches else 'training'}: got {len(kept)} batch(es) with a usable {target}, "
+            "need at least 2; ingest more recordings or overrule a check in the machine file"
+        )
+    inputs, excluded = usable_channels(kept, temperature_inputs(kept))
+    if not inputs:
+        raise InputError(f"{kept[0].machine}: no temperature channel is usable in every batch; {excluded[0][1]}")
+    design = Design.build(kept, inputs, target)
+    folds = {p: folds_of(p, kept) for p in plan.protocols}
+    chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = {}
+    n_all = range(1, len(inputs) + 1)
+
+    def choose(train: tuple[int, ...]) -> None:
+        for key in plan.selectors:
+            if (key, train) not in chosen:
+                chosen[key, train] = SELECTORS[key]().select_design(design, train, n_all)
+
+    choose(tuple(range(len(kept))))
+    for protocol, group in folds.items():
+        for fold in list(group):
+            try:
+                choose(fold.train)
+            except InputError as error:
+                # A single batch can have too few complete rows to learn from; the other folds still stand.
+                group.remove(fold)
+                lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
+    return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost))
+
+
+def cross_family(crossing: Crossing, key: str) -> FamilyResult:
+    """Fit and judge one family over all its cells, folds and protocols."""
+    family = FAMILIES[key]
+    cells = crossing.cells(family)
+    scores, summaries, failures = [], [], []
+    predictions: dict[str, NDArray[np.float32]] = {}
+    for protocol, folds in crossing.folds.items():
+        if not folds:
+            continue
+        judged = Judged.run(crossing.design, family(), folds, crossing.needed(folds, cells))
+        failures += [(f"family {key}", f"{protocol}, {text}") for text in judged.failures]
+        picked = {cell: [judged.column.get((crossing.inputs(cell[0], f.train, cell[1]), i), -1)
+                         for i, f in enumerate(folds)] for cell in cells}  # fmt: skip
+        told = [cell for cell in cells if min(picked[cell]) >= 0]
+        if not told:
+            continue
+        columns = np.array([picked[cell] for cell in told], int)
+        table, summary = score_table(crossing.design.batch_ids, folds, judged, columns, protocol)
+        names = pd.DataFrame(told, columns=["selector", "n_tsp"]).assign(protocol=protocol, family=key)[CELL_KEYS]
+        inputs = [crossing.inputs(selector, crossing.everything, n_tsp) for selector, n_tsp in told]
+        summary = summary.assign(
+            n_parameters=judged.n_parameters,
+            rank=family.rank,
+            tsp_stability=[crossing.stability(protocol, *cell) for cell in told],
+            inputs=["|".join(i) for i in inputs],
+            n_inputs=[len(i) for i in inputs],
+            simulated=any(b.simulated for b in crossing.batches),
+        )
+        repeated = names.loc[names.index.repeat(len(table) // len(told))].reset_index(drop=True)
+        scores.append(pd.concat([repeated, table], axis=1))
+        summaries.append(pd.concat([names, summary], axis=1))
+        if protocol == "leave-batch-out":
+            for (selector, n_tsp), row in zip(told, columns, strict=True):
+                predictions[f"{selector}|{key}|{n_tsp}"] = judged.left_out(crossing.design, folds, row)
+    return FamilyResult(
+        pd.concat(scores, ignore_index=True) if scores else pd.DataFrame(),
+        pd.concat(summaries, ignore_index=True) if summaries else pd.DataFrame(),
+        predictions,
+        failures,
+    )
+
+
+def refit(crossing: Crossing, selector: str, family: str, n_tsp: int) -> Family:
+    """A cell's model learned from all batches, ready to be promoted."""
+    inputs = crossing.inputs(selector, crossing.everything, n_tsp)
+    fitted: Family = FAMILIES[family]().fit_design(crossing.subset(inputs), crossing.everything)
+    return fitted
