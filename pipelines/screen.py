@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -167,7 +168,11 @@ def _print_leaderboard(title: str, cells: pd.DataFrame, protocol: str, top: int 
     rows = cells[cells["protocol"] == protocol]
     rows = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"]).sort_values("score")
     rows = rows.drop_duplicates("family")
-    table = Table("family", "selector", "points", "S mean µm", "S std µm", "max |e| µm", "stability", title=title)
+    table = Table(title=f"{title}, µm", box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
+    for name in ("family", "selector"):
+        table.add_column(name, no_wrap=True)
+    for name in ("n", "S mean", "S std", "max |e|", "stable"):
+        table.add_column(name, justify="right", no_wrap=True)
     shown = rows[(rows["family"] == "zero") | (rows["family"].isin(rows["family"].head(top)))]
     for row in _rows(shown):
         table.add_row(

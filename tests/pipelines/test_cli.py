@@ -77,7 +77,7 @@ def test_training_shows_what_came_of_it(year: Path, call: Call) -> None:
                 "--selectors", "none", "--protocols", "leave-batch-out", "--report", year / "r.md")  # fmt: skip
     assert done.code == 0
     assert f"{NAME} z: leave-batch-out  (simulated recordings)" in done.out
-    assert all(word in done.out for word in ("ridge", "zero", "S mean µm", f"report   {year / 'r.md'}"))
+    assert all(word in done.out for word in ("ridge", "zero", "S mean", f"report   {year / 'r.md'}"))
     assert "nothing new registered" in done.out
     assert (year / "r.md").exists()
     assert lines(done.err)[0] == "features and selectors of 6 batches"
