@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from data.batch import Channel, Role
-from data.errors import InputError, closest
+from data.yaml_file import load_yaml, parse_yaml
 
 
 class _Part(BaseModel):
@@ -127,53 +125,9 @@ def load_machine(path: Path | str) -> Machine:
     Raises:
         InputError: file missing, not YAML, a misspelt key (with the closest), a wrong value; one line each.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"machine file {path}: cannot be read ({error}); give the path of a .yml file") from None
-    return parse_machine(text, str(path))
+    return load_yaml(Path(path), Machine, "machine file")
 
 
 def parse_machine(text: str, where: str) -> Machine:
     """The same from text; `where` names the origin in error lines."""
-    try:
-        raw = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        at = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"machine file {where}{at}: not valid YAML ({getattr(error, 'problem', error)})") from None
-    if not isinstance(raw, dict):
-        raise InputError(
-            f"machine file {where}: expected a mapping with the keys machine and channels, got {type(raw).__name__}"
-        )
-    try:
-        return Machine.model_validate(raw)
-    except ValidationError as error:
-        raise InputError(f"machine file {where}: {_one_line(error)}") from None
-
-
-def _one_line(error: ValidationError) -> str:
-    """The first problem in words; how many more follow."""
-    problems = error.errors()
-    first = problems[0]
-    where = ".".join(str(p) for p in first["loc"])
-    if first["type"] == "extra_forbidden":
-        text = f"unknown key {where!r}; {closest(str(first['loc'][-1]), _allowed_keys(first['loc'][:-1]))}"
-    elif first["type"] == "missing":
-        text = f"key {where!r} is missing"
-    else:
-        text = f"key {where!r}: got {first['input']!r}; {first['msg']}"
-    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
-    return text + more
-
-
-def _allowed_keys(loc: Sequence[Any]) -> list[str]:
-    """Keys of the model that an error's location points into."""
-    part: Any = Machine
-    for step in loc:
-        if isinstance(part, type) and issubclass(part, BaseModel):
-            part = part.model_fields[str(step)].annotation if str(step) in part.model_fields else part
-        args = [a for a in getattr(part, "__args__", ()) if isinstance(a, type) and issubclass(a, BaseModel)]
-        part = args[0] if args else part
-    return sorted(part.model_fields) if isinstance(part, type) and issubclass(part, BaseModel) else []
+    return parse_yaml(text, Machine, f"machine file {where}")

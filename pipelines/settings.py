@@ -6,12 +6,12 @@ import os
 import string
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.errors import InputError, closest
+from data.yaml_file import load_yaml
 from models.protocols import PROTOCOLS
 from pipelines import TELEMETRY_OFF
 
@@ -128,7 +128,7 @@ def load(path: Path | str | None = None) -> Settings:
         InputError: file missing, not YAML, an unknown key (with the closest), a wrong value; one line each.
     """
     where = Path(path) if path is not None else PROJECT_ROOT / "mlflow.yml"
-    parsed = _File() if path is None and not where.exists() else _parse(where)
+    parsed = _File() if path is None and not where.exists() else load_yaml(where, _File, "settings file")
     base = home()
     store = parsed.tracking.store.format(home=base.as_posix())
     if store.startswith("sqlite:") and not Path(store.removeprefix("sqlite:///")).is_absolute():
@@ -141,39 +141,6 @@ def load(path: Path | str | None = None) -> Settings:
         artifacts = artifacts.format(home=base.as_posix())
         artifacts = artifacts if "://" in artifacts else (base / artifacts).as_uri()
     return Settings(base, store, artifacts, parsed.names, parsed.promotion)
-
-
-def _parse(where: Path) -> _File:
-    try:
-        raw = yaml.safe_load(where.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"settings file {where}: cannot be read ({error}); give the path of a .yml file") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        at = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"settings file {where}{at}: not valid YAML ({getattr(error, 'problem', error)})") from None
-    if raw is None:
-        raw = {}
-    if not isinstance(raw, dict):
-        raise InputError(f"settings file {where}: expected a mapping with the keys {', '.join(_File.model_fields)}")
-    try:
-        return _File.model_validate(raw)
-    except ValidationError as error:
-        raise InputError(f"settings file {where}: {_one_line(error)}") from None
-
-
-def _one_line(error: ValidationError) -> str:
-    problems = error.errors()
-    first = problems[0]
-    key = ".".join(str(p) for p in first["loc"])
-    if first["type"] == "extra_forbidden":
-        part: Any = _File
-        for step in first["loc"][:-1]:
-            part = part.model_fields[str(step)].annotation
-        text = f"unknown key {key!r}; {closest(str(first['loc'][-1]), part.model_fields)}"
-    else:
-        text = f"key {key!r}: got {first['input']!r}; {first['msg'].removeprefix('Value error, ')}"
-    return text + (f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else "")
 
 
 def _placeholders(value: str, allowed: set[str], needed: set[str]) -> str:

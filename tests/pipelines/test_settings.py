@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError
+from data.yaml_file import load_yaml
 from pipelines import settings
 
 
 def test_the_projects_file_says_the_same_as_the_defaults():
-    assert settings._parse(settings.PROJECT_ROOT / "mlflow.yml") == settings._File()
+    written = load_yaml(settings.PROJECT_ROOT / "mlflow.yml", settings._File, "settings file")
+    assert written == settings._File()
 
 
 def test_home_comes_from_the_environment_else_from_the_project(monkeypatch, tmp_path):
