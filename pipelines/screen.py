@@ -76,6 +76,17 @@ def print_ingest(report: IngestReport) -> None:
         line(f"  quarantine: {where}{row.reason if name in row.reason else f'{name}: {row.reason}'}")
 
 
+def print_findings(found: pd.DataFrame) -> None:
+    """What the checks found, a line per check and channel with the batches; `found` as `models.grid.finding_table`."""
+    for (check, channel), part in found.fillna({"channel": "all channels"}).groupby(["check", "channel"], sort=False):
+        ids = sorted(part["batch_id"].astype(str).unique())
+        shown = ", ".join(ids if len(ids) <= 4 else [*ids[:3], "…", ids[-1]])
+        masked = part["masks"] & (part["overruled"] == "")
+        state = "masked" if masked.all() else "partly masked" if masked.any() else "noted, not masked"
+        count = f"{len(ids)} batch{'es' if len(ids) > 1 else ''}"
+        line(f"  {str(check).replace('_', ' ')}: {channel} in {count} ({shown}), {state}")
+
+
 def ingest_totals(report: IngestReport) -> dict[str, int]:
     states = Counter(r.status.replace("_", " ") for r in report.batches)
     return {
@@ -94,6 +105,12 @@ def print_outcome(outcome: TrainOutcome) -> None:
     if outcome.stopped:
         line(outcome.stopped)
         return
+    import pandas as pd
+
+    found = [r.findings for r in outcome.results.values() if len(r.findings)]
+    if found:
+        line("findings")
+        print_findings(pd.concat(found).drop_duplicates())
     label = "  (simulated recordings)" if outcome.simulated else ""
     for target, result in outcome.results.items():
         protocol = _shown_protocol(result.cells)

@@ -19,6 +19,7 @@ import pytest
 from small_year import law_um, write_machine, write_year
 
 from pipelines import cli
+from pipelines.screen import print_findings
 
 ROOT = Path(cli.__file__).resolve().parents[1]
 NAME = "small-cli"
@@ -256,3 +257,17 @@ def test_help_is_quick_because_it_loads_nothing_heavy() -> None:
     done = in_a_process(code, "train", "--help")
     assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
     assert "--direct" in done.stdout
+
+
+def test_what_the_checks_found_is_a_line_per_check_and_channel(capsys: pytest.CaptureFixture[str]) -> None:
+    found = [("b1", "offset", "t3", True, ""), ("b2", "offset", "t3", True, ""), ("b2", "unexplained", "z", False, ""),
+             ("b3", "spike", "t1", True, "checked by hand"), ("b3", "gap", None, False, "")]  # fmt: skip
+    found += [(f"c{i}", "error_held", "z", True, "") for i in range(6)]
+    print_findings(pd.DataFrame(found, columns=["batch_id", "check", "channel", "masks", "overruled"]))
+    assert capsys.readouterr().out.splitlines() == [
+        "  offset: t3 in 2 batches (b1, b2), masked",
+        "  unexplained: z in 1 batch (b2), noted, not masked",
+        "  spike: t1 in 1 batch (b3), noted, not masked",
+        "  gap: all channels in 1 batch (b3), noted, not masked",
+        "  error held: z in 6 batches (c0, c1, c2, …, c5), masked",
+    ]
