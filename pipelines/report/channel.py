@@ -169,7 +169,8 @@ def _frequency(name: str, result: GridResult, cells: pd.DataFrame, protocol: str
     total = len({p for f in found for p in f.share})
     stable = [f"{selector_label(f.selector)} {number(f.stability, 2)} ({f.n_tsp} points)" for f in found]
     notes = [
-        f"Share of the folds that chose a point, at each selector's best n. Mean Jaccard similarity: {listed(stable)}."
+        f"Share of the folds that chose a point, at each selector's best n short of all. Mean Jaccard similarity: "
+        f"{listed(stable)}."
     ]
     if total > _MOST_POINTS_SHOWN:
         notes.append(f"The {_MOST_POINTS_SHOWN} most often chosen of {total} points.")

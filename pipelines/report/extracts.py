@@ -35,7 +35,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Frequency:
-    """How often a selector's folds chose each point, 0..1, at its best number of points."""
+    """How often a selector's folds chose each point, 0..1, at its best number of points short of all."""
 
     selector: str
     n_tsp: int
@@ -94,9 +94,14 @@ def S_by_batch(result: GridResult, cells: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def frequencies(result: GridResult, cells: pd.DataFrame, protocol: str) -> list[Frequency]:
-    """Per selector that chooses, at the number of points of its best cell: how often each point was chosen."""
+    """Per selector that chooses, at the number of points of its best cell: how often each point was chosen.
+
+    Where all points are taken there is no choice to look at, so the best cell with fewer stands for it.
+    """
     out = []
-    for row in best_per(cells[~is_baseline(cells)], "selector").to_dict("records"):
+    with_inputs = cells[(cells["n_tsp"] > 0) & ~is_baseline(cells)]
+    fewer = with_inputs[with_inputs["n_inputs"] < with_inputs["n_inputs"].max()]
+    for row in best_per(fewer if len(fewer) else with_inputs, "selector").to_dict("records"):
         s = result.subsets
         picks = s[(s["protocol"] == protocol) & (s["selector"] == row["selector"]) & (s["n_tsp"] == row["n_tsp"])]
         sets = [tuple(i for i in str(v).split("|") if i) for v in picks["inputs"]]

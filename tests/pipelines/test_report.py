@@ -21,7 +21,7 @@ from models.grid import run_grid
 from models.result import GridResult
 from pipelines.promotion import Choice, choose
 from pipelines.report import figure_pngs, write, write_report
-from pipelines.report.extracts import left_out_batches, picked
+from pipelines.report.extracts import frequencies, left_out_batches, picked, scored
 from pipelines.report.layout import Scale
 from pipelines.report.records import changed_batches
 from pipelines.report.words import between, cell_label, count, decimals, listed, number
@@ -326,3 +326,11 @@ def test_the_strips_axis_is_logarithmic_and_keeps_what_leaves_it() -> None:
     wide = Scale.over([0.5, 3.0, 1e9], cap_um=30.0)
     assert wide.high_um == pytest.approx(33.0) and wide.low_um == pytest.approx(0.5 / 1.1)
     assert Scale.over([], 1.0).ticks
+
+
+def test_the_choice_of_points_is_shown_where_there_is_a_choice(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    shown = frequencies(result, scored(result, "leave-batch-out", RULE), "leave-batch-out")
+    everything = int(result.cells["n_inputs"].max())
+    assert {f.selector for f in shown} == {"correlation", "pca_elimination"}
+    assert all(f.n_tsp < everything and sum(f.share.values()) == pytest.approx(f.n_tsp) for f in shown)
