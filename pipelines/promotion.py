@@ -177,11 +177,12 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
         floor = cells.assign(score_um=score_um(cells, rule)).nsmallest(1, "score_um").iloc[0]
         reached = mean + (std if rule.score == "S_mean + S_std" else 0.0)
         if reached >= floor["score_um"]:
+            beaten_by = f"no better than {floor['family']} ({floor['S_mean_um']:.2f} ± {floor['S_std_um']:.2f} µm)"
             caution = (
                 f"predicted by the cell that the other batches chose, each batch comes to {mean:.2f} ± {std:.2f} µm, "
-                f"no better than {floor['family']} ({floor['score_um']:.2f} µm)"
+                f"by {rule.score} {beaten_by}"
             )
-            words += f", no better than {floor['family']} ({floor['score_um']:.2f} µm): do not trust"
+            words += f", {beaten_by}: do not trust"
     return replace(choice, caution=caution, words=words, nested_S_mean_um=mean, nested_S_std_um=std)
 
 
