@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from data.errors import InputError, closest
 
 Role = Literal["temperature", "error", "driver", "ambient", "position"]
-ROLES: tuple[str, ...] = ("temperature", "error", "driver", "ambient", "position")
 
 
 @dataclass(frozen=True)
@@ -116,3 +115,10 @@ class Batch:
 
     def with_findings(self, findings: tuple[Finding, ...]) -> Batch:
         return replace(self, findings=findings)
+
+
+def finding_table(found: Iterable[tuple[str, Sequence[Finding]]]) -> pd.DataFrame:
+    """One row a finding from (batch id, findings) pairs: batch_id and the fields of `Finding`, times in s."""
+    columns = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
+    rows = [{"batch_id": batch_id, **f.as_dict()} for batch_id, findings in found for f in findings]
+    return pd.DataFrame(rows, columns=columns).astype({"start_s": float, "end_s": float, "masks": bool})

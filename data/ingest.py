@@ -12,8 +12,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from data.batch import Batch
-from data.checks import check_batch
+from data.batch import Batch, Finding
+from data.checks import check_batch, overruled
 from data.errors import InputError, WorkError
 from data.lake import Lake, Staged
 from data.lakefile import content_digest
@@ -32,6 +32,7 @@ class Ingested:
     `status`: new, unchanged, refreshed, new_version (see `data.lake`); conflict: left out because another file
     of the same ingest gave other content under this id; quarantined: the file, or what was left of it, cannot be
     used. Rows are rows of the recording: `rows_in` = `rows_stored` + `rows_dropped`; None where nobody can count.
+    `found`: what the checks of one batch found, with the machine file's overrules.
     """
 
     file: str
@@ -43,6 +44,7 @@ class Ingested:
     rows_dropped: int | None
     findings: int
     reason: str = ""
+    found: tuple[Finding, ...] = ()
 
 
 @dataclass
@@ -151,8 +153,9 @@ class _Run:
             return reason
         staged = self.lake.stage(batch, digest)
         row = Ingested(
-            str(file), batch.batch_id, "staged", None, rows_in, rows_in - dropped, dropped, len(batch.findings)
-        )
+            str(file), batch.batch_id, "staged", None, rows_in, rows_in - dropped, dropped, len(batch.findings),
+            found=overruled(batch, self.machine.overrule).findings,
+        )  # fmt: skip
         self.report.rows.append(row)
         self._waiting.append((staged, row))
         if time.monotonic() - self._committed_at > COMMIT_EVERY_S:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
-from data.batch import Batch
+from data.batch import Batch, finding_table
 from features.selectors import SELECTORS
 from models import FAMILIES
 from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
@@ -108,7 +108,7 @@ def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
         cells=cells,
         subsets=_subset_table(crossing),
         predictions=pd.DataFrame(predictions),
-        findings=finding_table(crossing.batches),
+        findings=finding_table((b.batch_id, b.findings) for b in crossing.batches),
         excluded=pd.DataFrame([*crossing.excluded, *failures], columns=["channel", "reason"]),
     )
 
@@ -132,13 +132,6 @@ def batch_table(batches: Sequence[Batch]) -> pd.DataFrame:
             for b in batches
         ]
     )
-
-
-def finding_table(batches: Sequence[Batch]) -> pd.DataFrame:
-    """One row a finding."""
-    columns = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
-    rows = [{"batch_id": b.batch_id, **f.as_dict()} for b in batches for f in b.findings]
-    return pd.DataFrame(rows, columns=columns).astype({"start_s": float, "end_s": float, "masks": bool})
 
 
 def _subset_table(crossing: Crossing) -> pd.DataFrame:

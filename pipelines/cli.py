@@ -48,22 +48,19 @@ def ingest(
     as_json: Json = False,
 ) -> None:
     """Read recordings into the lake; what cannot be used goes to quarantine with the reason."""
-    from data.checks import check_machine
+    from data.batch import finding_table
     from data.ingest import ingest as ingest_paths
     from data.lake import Lake
     from data.machine import load_machine
-    from models.grid import finding_table
 
     described = load_machine(machine)
-    lake = Lake(settings_module.home() / "lake")
     with screen.progress(as_json) as (say, _):
-        report = ingest_paths(paths, described, lake, progress=say)
+        report = ingest_paths(paths, described, Lake(settings_module.home() / "lake"), progress=say)
     if as_json:
         screen.print_json(screen.records(report.as_frame()))
     else:
         screen.print_ingest(report)
-        if report.batches:
-            screen.print_findings(finding_table(check_machine(lake.load_all(described.machine), described)))
+        screen.print_findings(finding_table((r.batch_id, r.found) for r in report.batches))
     if not report.rows:
         raise InputError(
             f"{', '.join(map(str, paths))}: no recording there, {len(report.ignored)} other files; the machine file "

@@ -77,7 +77,7 @@ def print_ingest(report: IngestReport) -> None:
 
 
 def print_findings(found: pd.DataFrame) -> None:
-    """What the checks found, a line per check and channel with the batches; `found` as `models.grid.finding_table`."""
+    """What the checks found, a line per check and channel with the batches; `found` as `data.batch.finding_table`."""
     for (check, channel), part in found.fillna({"channel": "all channels"}).groupby(["check", "channel"], sort=False):
         ids = sorted(part["batch_id"].astype(str).unique())
         shown = ", ".join(ids if len(ids) <= 4 else [*ids[:3], "…", ids[-1]])

@@ -58,7 +58,7 @@ def check_machine(batches: Sequence[Batch], machine: Machine) -> list[Batch]:
     for check in CHECKS.values():
         for k, found in check().across(known, machine).items():
             known[k] = known[k].with_findings(known[k].findings + tuple(found))
-    return [_overruled(b, machine.overrule) for b in known]
+    return [overruled(b, machine.overrule) for b in known]
 
 
 def usable_channels(
@@ -98,7 +98,8 @@ def _own(batch: Batch) -> tuple[Finding, ...]:
     return tuple(dict.fromkeys(kept))
 
 
-def _overruled(batch: Batch, rules: Sequence[Overrule]) -> Batch:
+def overruled(batch: Batch, rules: Sequence[Overrule]) -> Batch:
+    """The batch with the user's word: findings that a rule matches get its reason, `mask: true` adds one."""
     findings = list(batch.findings)
     for rule in rules:
         if not fnmatchcase(batch.batch_id, rule.batch):

@@ -75,6 +75,7 @@ def test_files_go_in_once_with_findings_and_row_counts(tmp_path: Path, lake: Lak
     ]
     assert (report.rows_in, report.rows_stored, report.rows_dropped) == (170, 145, 25)
     assert lake.load("vmc", "a1").findings == (Finding("spike", "T1", "one"),)
+    assert [r.found for r in report.rows] == 3 * [(Finding("spike", "T1", "one"),)]
     again = ingest(files, MACHINE, lake)
     assert {r.status for r in again.rows} == {"unchanged"}
     write(tmp_path / "b.csv", "b,3.5,20,1")
@@ -216,3 +217,10 @@ def test_through_the_real_readers_and_checks(tmp_path: Path) -> None:
             np.testing.assert_allclose(batch.table[mine], wanted[batch.batch_id][theirs], atol=1e-9)
     assert {r.status for r in ingest([folder], MACHINE, lake).batches} == {"unchanged"}
     assert len(lake.quarantined("vmc")) == 4
+
+
+def test_the_report_tells_what_the_user_overrules_and_the_lake_keeps_what_was_found(tmp_path: Path, lake: Lake) -> None:
+    machine = MACHINE.model_copy(update={"overrule": [Overrule(check="spike", reason="checked by hand")]})
+    (row,) = ingest([write(tmp_path / "a.csv", "a1,1.0,100,5")], machine, lake).rows
+    assert row.found == (Finding("spike", "T1", "one", overruled="checked by hand"),)
+    assert lake.load("vmc", "a1").findings == (Finding("spike", "T1", "one"),)
