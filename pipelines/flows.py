@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from data.errors import InputError, WorkError
 from pipelines.request import TrainRequest
 from pipelines.settings import Settings, load
-from pipelines.training import TrainOutcome, train
+from pipelines.training import LANES, Done, TrainOutcome, gather, train
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -36,7 +36,7 @@ RETRY_DELAY_S = 2.0
 class PrefectCaller:
     """Steps as tasks of the flow that is running."""
 
-    def __init__(self, done: Callable[[str, int, int], None] | None = None) -> None:
+    def __init__(self, done: Done | None = None) -> None:
         self.done = done
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
@@ -55,13 +55,8 @@ class PrefectCaller:
             retry_delay_seconds=RETRY_DELAY_S,
             retry_condition_fn=_can_succeed,
         )
-        results: list[R] = []
         with threadpool_limits(limits=1):
-            for future in [unit.submit(i) for i in range(len(items))]:
-                results.append(future.result())
-                if self.done:
-                    self.done(step, len(results), len(items))
-        return results
+            return gather(step, [unit.submit(i) for i in range(len(items))], self.done)
 
 
 def _can_succeed(task: Any, run: Any, state: Any) -> bool:
@@ -91,12 +86,12 @@ def train_in_flow(
     request: TrainRequest,
     settings: Settings,
     say: Callable[[str], None] = lambda text: None,
-    done: Callable[[str, int, int], None] | None = None,
+    done: Done | None = None,
     server: threading.Thread | None = None,
 ) -> TrainOutcome:
     """`pipelines.training.train` as a flow; same functions, same numbers."""
 
-    @flow(name=f"thermodrift-train-{request.machine_file.stem}", task_runner=ThreadPoolTaskRunner(max_workers=2),
+    @flow(name=f"thermodrift-train-{request.machine_file.stem}", task_runner=ThreadPoolTaskRunner(max_workers=LANES),
           persist_result=False, validate_parameters=False)  # fmt: skip
     def training() -> TrainOutcome:
         return train(request, settings, PrefectCaller(done), say)
@@ -107,7 +102,7 @@ def train_in_flow(
     return training()
 
 
-@flow(name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=2), persist_result=False)
+@flow(name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
 def retrain(machine_file: str, recordings: list[str]) -> str:
     """Ingest what arrived since the last time and train if there is anything new; returns what was done, in words.
 

@@ -6,6 +6,7 @@ The steps are plain functions; a `Caller` decides how they run. `DirectCaller` c
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +26,7 @@ from data.ingest import IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
 from models import FAMILIES
-from models.crossing import Crossing, Plan, prepare, refit, with_target
+from models.crossing import Crossing, prepare, refit, with_target
 from models.grid import Workers, assemble, jobs_of, workers_for
 from models.region import region_of
 from models.result import GridResult
@@ -36,7 +37,10 @@ from pipelines.settings import Settings, home
 
 T = TypeVar("T")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+Done = Callable[[str, int, int], None]
 Say = Callable[[str], None]
+LANES = max(2, os.cpu_count() or 1)  # steps under way at once: no fewer than `workers_for` gives processes
 RETRIES = 2  # for steps that touch a share or a store, where a second try can succeed
 
 
@@ -48,19 +52,31 @@ class Caller(Protocol):
 
 
 class DirectCaller:
-    """Steps as plain calls, two at a time."""
+    """Steps as plain calls, some at a time."""
 
-    def __init__(self, threads: int = 2, done: Callable[[str, int, int], None] | None = None) -> None:
-        self.threads, self.done = threads, done
+    def __init__(self, done: Done | None = None) -> None:
+        self.done = done
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
-        results: list[R] = []
-        with threadpool_limits(limits=1), ThreadPoolExecutor(self.threads) as pool:
-            for future in [pool.submit(work, item) for item in items]:
-                results.append(future.result())
-                if self.done:
-                    self.done(step, len(results), len(items))
-        return results
+        with threadpool_limits(limits=1), ThreadPoolExecutor(LANES) as pool:
+            return gather(step, [pool.submit(work, item) for item in items], self.done)
+
+
+class Future(Protocol[R_co]):
+    """What has been submitted, to a thread pool or to Prefect."""
+
+    def result(self) -> R_co:
+        """Waits for it; raises what it raised."""
+
+
+def gather(step: str, futures: Sequence[Future[R]], done: Done | None) -> list[R]:
+    """Results in the order of submission, telling how many of how many have come."""
+    results: list[R] = []
+    for future in futures:
+        results.append(future.result())
+        if done:
+            done(step, len(results), len(futures))
+    return results
 
 
 @dataclass
@@ -101,7 +117,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         return outcome
     say(f"features and selectors of {len(batches)} batches")
     with _naming_quarantine(outcome.ingested):
-        prepared = caller.map("prepare", partial(_prepare, batches, request.plan), targets)
+        prepared = caller.map("prepare", partial(prepare, batches, plan=request.plan), targets)
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
@@ -136,10 +152,7 @@ def load_batches(lake: Lake, machine: Machine) -> list[Batch]:
     Raises:
         InputError: the lake has no batch of the machine.
     """
-    batches = lake.load_all(machine.machine)
-    if not batches:
-        raise InputError(f"the lake has no batch of {machine.machine}; call `thermodrift ingest` or give --recordings")
-    return check_machine(batches, machine)
+    return check_machine(lake.load_all(machine.machine), machine)
 
 
 def promote_tracked(
@@ -201,10 +214,6 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
         if set(last.result.batches["digest"]) != {b.digest for b in with_target(batches, target)}:
             return False
     return True
-
-
-def _prepare(batches: Sequence[Batch], plan: Plan, target: str) -> Crossing:
-    return prepare(batches, target, plan)
 
 
 def _track(results: dict[str, GridResult], settings: Settings, say: Say, target: str) -> str:
