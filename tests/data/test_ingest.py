@@ -13,7 +13,7 @@ from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
 from data.ingest import COLUMNS, IngestReport, ingest
 from data.lake import Lake
-from data.machine import Machine, parse_machine
+from data.machine import Machine, Overrule, parse_machine
 
 MACHINE = parse_machine(
     """
