@@ -23,6 +23,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 
 from data.errors import InputError, WorkError
+from models import FAMILIES
 from models.result import GridResult
 from pipelines.promotion import choose, score_um
 from pipelines.settings import PromotionRule, Settings, load
@@ -213,7 +214,7 @@ def _log_parent(
     if rule.protocol in set(result.cells["protocol"]):
         best = choose(result.cells, rule)
         metrics |= {"best_score_um": best.score_um, "best_S_mean_um": best.S_mean_um, "best_S_std_um": best.S_std_um}
-        tags = [RunTag("best", best.name), RunTag("best_cell", best.cell), RunTag("trusted", _yes(best.trusted))]
+        tags = [RunTag("best", best.name), RunTag("best_cell", best.cell)]
     client.log_batch(
         run_id,
         metrics=[Metric(k, float(v), now, 0) for k, v in metrics.items() if np.isfinite(v)],
@@ -264,7 +265,8 @@ def _log_cell(
         for name in CELL_METRICS:
             if np.isfinite(row[name]):
                 metrics.append(Metric(f"{prefix}/{name}", float(row[name]), now, int(row["n_tsp"])))
-    params = {"selector": selector, "family": family}
+    options = FAMILIES[family]().options() if family in FAMILIES else {}
+    params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
     judged = cells[cells["protocol"] == settings.promotion.protocol]
     judged = judged.assign(score_um=score_um(judged, settings.promotion))
     judged = judged[np.isfinite(judged["score_um"])]

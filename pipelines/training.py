@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from data.ingest import IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
 from models import FAMILIES
-from models.crossing import Crossing, prepare, refit, with_target
+from models.crossing import Crossing, Plan, prepare, refit, with_target
 from models.grid import Workers, assemble, jobs_of, workers_for
 from models.region import region_of
 from models.result import GridResult
@@ -128,7 +128,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         outcome.results[t] = assemble(crossings[t], [done[t, f] for f in request.plan.families])
     clock("grid")
     say("track")
-    track = partial(_track, outcome.results, settings, say)
+    track = partial(_track, outcome.results, request.plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
     clock("track")
     if request.promote:
@@ -216,9 +216,10 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
     return True
 
 
-def _track(results: dict[str, GridResult], settings: Settings, say: Say, target: str) -> str:
+def _track(results: dict[str, GridResult], plan: Plan, settings: Settings, say: Say, target: str) -> str:
     result = results[target]
-    return tracking.log_training(result, settings, figures=figure_pngs(result), say=say)
+    params = {name: ", ".join(map(str, value)) if value else "all" for name, value in asdict(plan).items()}
+    return tracking.log_training(result, settings, figures=figure_pngs(result), params=params, say=say)
 
 
 def _promote(

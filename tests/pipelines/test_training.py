@@ -15,6 +15,7 @@ from small_year import NOISE_UM, law_um, write_machine, write_year
 
 from data.errors import InputError
 from data.lake import Lake
+from models import FAMILIES
 from models.crossing import Plan
 from pipelines import registry, tracking
 from pipelines.predict import predict_file
@@ -150,6 +151,10 @@ def test_runs_are_tracked_with_their_batches(story: Story, store: Any) -> None:
     assert {d.dataset.name for d in run.inputs.dataset_inputs} == {f.stem for f in story.files[:6]}
     children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{training_id}'")
     assert len(children) == 5  # zero, and two families under two selectors
+    assert set(run.data.params["families"].split(", ")) == {c.data.params["family"] for c in children}
+    for child in children:
+        options = FAMILIES[child.data.params["family"]]().options()
+        assert {k: child.data.params[f"option.{k}"] for k in options} == {k: str(v) for k, v in options.items()}
     loaded = tracking.load_training(training_id, store).result
     pd.testing.assert_frame_equal(loaded.scores, story.steps["better"].results["z"].scores)
 
