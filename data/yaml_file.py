@@ -40,10 +40,19 @@ def parse_yaml(text: str, model: type[M], where: str) -> M:
     if not isinstance(raw, dict):
         needed = [k for k, f in model.model_fields.items() if f.is_required()] or list(model.model_fields)
         raise InputError(f"{where}: expected a mapping with the keys {' and '.join(needed)}, got {type(raw).__name__}")
+    return parse_part(raw, model, where)
+
+
+def parse_part(raw: Any, model: type[M], where: str, key: str = "") -> M:
+    """Check what YAML already gave; `key` is where the part stands in its file ("twin").
+
+    Raises:
+        InputError: as `parse_yaml`.
+    """
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(error, model)}") from None
+        raise InputError(f"{where}: {_first_problem(error, model, key)}") from None
 
 
 class _OnceOnly(yaml.SafeLoader):
@@ -58,11 +67,11 @@ class _OnceOnly(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _first_problem(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first problem in words, and how many more follow."""
+def _first_problem(error: ValidationError, model: type[BaseModel], above: str) -> str:
+    """The first problem in words, and how many more follow; keys stand below `above`."""
     problems = error.errors()
     first = problems[0]
-    key = ".".join(str(p) for p in first["loc"])
+    key = ".".join([above] * bool(above) + [str(p) for p in first["loc"]])
     if first["type"] == "extra_forbidden":
         text = f"unknown key {key!r}; {closest(str(first['loc'][-1]), _allowed_keys(model, first['loc'][:-1]))}"
     elif first["type"] == "missing":

@@ -1,0 +1,1 @@
+"""The twin: a machine tool simulated from one file, calibrated to its recordings."""

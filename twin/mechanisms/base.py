@@ -1,0 +1,106 @@
+"""What every mechanism is.
+
+To add one: a class below `Mechanism` in a file of its group and a line in `twin/mechanisms/__init__.py`. State what it
+needs (drivers, ports, parameters) and override the one or two effects that it has. Laws are written once, forward, as
+plain numpy on arrays of any shape; their derivatives come by the complex step (Squire and Trapp 1998), so a law must
+stay analytic: no abs() or comparisons on temperatures but through `real` and `numpy.where`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.quantity import Spec
+
+if TYPE_CHECKING:
+    from twin.schema import MechanismPart, TwinPart
+
+Array = NDArray[Any]  # float64, or complex128 while a derivative is taken
+Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
+
+
+@dataclass(frozen=True)
+class View:
+    """What a law sees. All arrays broadcast together; time is the last axis.
+
+    degC: temperatures by port. rise_K: the same less the batch's first value. driver: driver channels by the law's
+    own names for them (held during each interval). time_s from the batch's start; clock_h the time of day, nan where
+    the start is not known. step_s: the spacing of the last axis where a law works along it (sensors, paths).
+    """
+
+    degC: Mapping[str, Array] = field(default_factory=dict)
+    rise_K: Mapping[str, Array] = field(default_factory=dict)
+    driver: Mapping[str, Array] = field(default_factory=dict)
+    time_s: Array = field(default_factory=lambda: np.zeros(1))
+    clock_h: Array = field(default_factory=lambda: np.full(1, np.nan))
+    step_s: float = np.nan
+
+
+class Mechanism(ABC):
+    """A piece of physics that a machine file can use and a diagnosis can propose.
+
+    parameters reach the effects as a mapping name -> value (scalar or array that broadcasts), in the units stated.
+    """
+
+    key: ClassVar[str]
+    words: ClassVar[str]  # "viscous friction of the bearings": the name an engineer would use
+    equation: ClassVar[str]  # plain text
+    source: ClassVar[str]  # author, year, equation
+    signature: ClassVar[str]  # how it shows in recordings
+    acts_at: ClassVar[tuple[Target, ...]]
+    drivers: ClassVar[Mapping[str, str]] = {}  # the law's name for a driver -> unit
+    ports: ClassVar[tuple[str, ...]] = ()  # names of the temperatures that the law needs
+    parameters: ClassVar[tuple[Spec, ...]] = ()
+    along_time: ClassVar[bool] = False  # True: the effect at a time needs the times before it (lag, slip, hysteresis)
+
+    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+        """Heat into the places of `into`, W. A law with ports is temperature-dependent."""
+        raise NotImplementedError
+
+    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+        """What the conductance of a link or exposure (drivers only), or another mechanism's heat, is multiplied by."""
+        raise NotImplementedError
+
+    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+        """Added to an error channel, in the channel's unit."""
+        raise NotImplementedError
+
+    def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
+        """What a sensor or a probe shows of what it sees, in the channel's unit; time along the last axis."""
+        raise NotImplementedError
+
+    def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
+        """Added to a surrounding's temperature."""
+        raise NotImplementedError
+
+    def start_K(self, view: View, p: Mapping[str, Array]) -> Array:
+        """Added to the start temperature of the places of `into`, by their shares."""
+        raise NotImplementedError
+
+    def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
+        """A structural mechanism's work: the twin part with its bodies, links, exposures or chain links added.
+
+        The instance itself is removed by the caller. Default: nothing to add.
+        """
+        return twin
+
+    @classmethod
+    def effects(cls) -> tuple[str, ...]:
+        """Names of the effects that this class has."""
+        every = ("heat_W", "factor", "displacement", "reading", "surrounding_K", "start_K", "expand")
+        return tuple(e for e in every if getattr(cls, e) is not getattr(Mechanism, e))
+
+    @classmethod
+    def spec(cls, name: str) -> Spec:
+        return next(s for s in cls.parameters if s.name == name)
+
+
+def real(a: Array) -> NDArray[np.float64]:
+    """The real part, for comparisons in `numpy.where` that must not see a derivative's imaginary part."""
+    return np.real(a)
