@@ -1,0 +1,93 @@
+"""What a calibration solves: unknowns with priors, and a problem that linearises itself batch by batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from data.errors import InputError
+
+Array = NDArray[np.float64]
+Scale = Literal["log", "linear", "logit"]
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One free parameter in fitting coordinates x: log of a positive value, logit of a share, a signed value itself.
+
+    `prior` and `spread` are the prior's mean and standard deviation in x, `low` and `high` its bounds there
+    (infinite where there is none); `unit` is the unit of the value, not of x.
+
+    Raises:
+        InputError: a prior that is not finite or lies outside its bounds, or a spread that is not positive.
+    """
+
+    name: str
+    unit: str
+    prior: float
+    spread: float
+    low: float = -math.inf
+    high: float = math.inf
+    scale: Scale = "log"
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.prior):
+            raise InputError(f"parameter {self.name!r}: its prior is {self.prior:g}, expected a finite number")
+        if not (math.isfinite(self.spread) and self.spread > 0):
+            raise InputError(
+                f"parameter {self.name!r}: its prior spread is {self.spread:g}, expected a finite number above 0; "
+                "give one, or make the parameter fixed"
+            )
+        if not (self.low < self.high and self.low <= self.prior <= self.high):
+            raise InputError(
+                f"parameter {self.name!r}: its value {self.value(self.prior):g} {self.unit} lies outside its bounds "
+                f"{self.value(self.low):g} … {self.value(self.high):g}; widen the bounds or correct the value"
+            )
+
+    def value(self, x: float) -> float:
+        """The parameter's value in its own unit at the fitting coordinate x."""
+        if self.scale == "log":
+            return math.exp(x) if x < 709 else math.inf
+        return float(expit(x)) if self.scale == "logit" else float(x)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One batch, whitened (divided by the noise's standard deviation), rows in time order within each channel.
+
+    `residual` (n,) measured − modelled, NaN rows removed; `jacobian` (n, p) d(modelled)/dx; `nuisance` (n, q)
+    d(modelled)/d(nuisance) for nuisances of prior N(0, 1); `channel` (n,) the index of the output channel.
+    """
+
+    batch_id: str
+    residual: Array
+    jacobian: Array
+    nuisance: Array
+    channel: NDArray[np.int64]
+
+
+class Problem(Protocol):
+    """What `fit` needs. Batches come in the same order and with the same rows every time.
+
+    `nuisance_sizes` gives q of each batch. Either method may raise `WorkError` or give numbers that are not finite
+    where the simulation fails: the step there is rejected. `linearise` may be a generator: one block lives at a time.
+    """
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]: ...
+
+    @property
+    def channels(self) -> tuple[str, ...]: ...
+
+    @property
+    def nuisance_sizes(self) -> tuple[int, ...]: ...
+
+    def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Block]: ...
+
+    def residuals(self, x: Array, nuisance: Sequence[Array]) -> Iterable[Array]: ...
