@@ -100,12 +100,16 @@ class Edge:
 
 @dataclass(frozen=True)
 class CompiledSurrounding:
-    """A surrounding: recorded `channel`, constant parameter `value`, or mean `first` reading; plus offset and laws."""
+    """A surrounding: recorded `channel`, constant parameter `value`, or mean `first` reading; plus offset and laws.
+
+    With `follow` (a parameter's number) it is value + follow (first - value).
+    """
 
     name: str
     channel: str | None = None
     value: int | None = None
     first: tuple[str, ...] = ()
+    follow: int | None = None
     offset: int | None = None
     per_batch_K: float = 0.0  # prior sd of a batch's own offset; 0: none
     effects: tuple[Law, ...] = ()

@@ -84,21 +84,27 @@ class Exposure(_Part):
 class Surrounding(_Part):
     """A temperature that the machine does not change: a recorded channel, a constant, or a batch's first readings.
 
-    `offset` (K) is added; `per_batch` (K) is the prior sd of one more offset that every batch has of its own.
+    With all of `value`, `first` and `follow` it is value + follow (first − value): ground that follows the season
+    in part. `offset` (K) is added; `per_batch` (K) is the prior sd of one more offset that every batch has of its own.
     Surroundings that the machine does warm (enclosure air, a tank) are bodies: expose to them by name.
     """
 
     channel: str | None = None
     value: Value | None = None  # degC
     first: tuple[str, ...] | None = None  # mean of these channels' first readings, held through the batch
+    follow: Value | None = None  # share, of a constant that follows the first readings in part
     offset: Value | None = None  # K
     per_batch: str | float | None = None
     words: str = ""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Surrounding:
-        if sum(x is not None for x in (self.channel, self.value, self.first)) != 1:
-            raise ValueError("a surrounding is one of channel (recorded), value (constant) or first (first readings)")
+        given = tuple(x is not None for x in (self.channel, self.value, self.first, self.follow))
+        if given != (False, True, True, True) and (sum(given) != 1 or given[3]):
+            raise ValueError(
+                "a surrounding is one of channel (recorded), value (constant) or first (first readings), "
+                "or value, first and follow together"
+            )
         return self
 
 
@@ -107,14 +113,14 @@ class MechanismPart(_Part):
 
     `at` names the places that the law's temperatures come from, by port (a list is their mean) or, for a law with one
     port, just the place.
-    `into` spreads heat over places as shares; one of them may be "rest". `on` names the links, exposures, heat
+    `into` spreads heat over places as shares; one of them may be "rest". `acts_on` names the links, exposures, heat
     mechanisms, sensors, errors or surroundings that the law changes.
     """
 
     law: str
     at: Mapping[str, Place | tuple[Place, ...]] | Place | None = None
     into: Mapping[Place, Value | Literal["rest"]] | Place | None = None
-    on: tuple[str, ...] | str | None = None
+    acts_on: tuple[str, ...] | str | None = None
     drivers: Mapping[str, str] | str | None = None
     parameters: Mapping[str, Value] = {}
     words: str = ""
