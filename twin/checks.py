@@ -55,7 +55,7 @@ def _open_chains(part: TwinPart) -> Iterator[str]:
         if abs(got - expected) > CLOSED_M:
             yield (
                 f"errors.{channel}.chain does not close: its signed lengths add up to {got:g} m, "
-                f"expected {expected:g} m, so a uniform warm-up of 1 K would give {TYPICAL_UM_PER_M_K * (got - expected):.1f} um too much; "
+                f"expected {expected:g} m, so warming all by 1 K would give {TYPICAL_UM_PER_M_K * (got - expected):.1f} um too much; "
                 "mend a length or a sign, or state uniform_length"
             )
 
