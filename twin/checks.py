@@ -52,10 +52,11 @@ def _open_chains(part: TwinPart) -> Iterator[str]:
             continue
         expected = convert(error.uniform_length, "m")
         got = sum(c.sign * convert(c.length.value, "m") for c in error.chain if c.length is not None)
+        wrong_um = TYPICAL_UM_PER_M_K * (got - expected)
         if abs(got - expected) > CLOSED_M:
             yield (
                 f"errors.{channel}.chain does not close: its signed lengths add up to {got:g} m, "
-                f"expected {expected:g} m, so warming all by 1 K would give {TYPICAL_UM_PER_M_K * (got - expected):.1f} um too much; "
+                f"expected {expected:g} m, so warming all by 1 K would give {wrong_um:.1f} um too much; "
                 "mend a length or a sign, or state uniform_length"
             )
 
