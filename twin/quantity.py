@@ -88,7 +88,8 @@ class Value(BaseModel):
 
     `spread` is the prior's standard deviation: of the logarithm for positive parameters (0.5 is about a factor 1.6),
     of the value itself, with a unit, for signed ones. A spread frees the parameter; `free: false` holds it all the
-    same. `bounds` in the parameter's unit.
+    same. `bounds` in the parameter's unit. A calibrated file keeps the prior's centre in `prior` and says how sure the
+    value is in `interval90`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -97,6 +98,8 @@ class Value(BaseModel):
     spread: str | float | None = None
     bounds: tuple[str | float, str | float] | None = None
     free: bool | None = None
+    prior: str | float | None = None
+    interval90: tuple[str | float, str | float] | None = None
     source: str = ""
 
     @model_validator(mode="before")
@@ -137,6 +140,12 @@ class Parameter:
     scale: Scale
     free: bool
     source: str = ""
+    prior: float = math.nan  # the prior's centre, in `unit`; nan: the value
+
+    @property
+    def prior_value(self) -> float:
+        """The prior's centre in `unit`."""
+        return self.prior if math.isfinite(self.prior) else self.value
 
     def to_x(self, value: Any) -> Any:
         """Fitting coordinate of a value in `unit`."""
@@ -179,6 +188,7 @@ def parameter(path: str, spec: Spec, given: Value | None, default_source: str = 
         )
     try:
         value = convert(given.value, spec.unit)
+        prior = math.nan if given.prior is None else convert(given.prior, spec.unit)
         if given.bounds is not None:
             low, high = (convert(b, spec.unit) for b in given.bounds)
     except ValueError as error:
@@ -195,7 +205,7 @@ def parameter(path: str, spec: Spec, given: Value | None, default_source: str = 
     free = given.free if given.free is not None else math.isfinite(spread)
     if free and not math.isfinite(spread):
         raise ValueError(f"{path} is free but has no prior; add 'spread', e.g. spread: {spec.spread or 0.5}")
-    return Parameter(path, spec.unit, spec.words, value, spread, low, high, spec.scale, free, given.source)
+    return Parameter(path, spec.unit, spec.words, value, spread, low, high, spec.scale, free, given.source, prior)
 
 
 def _spread(path: str, spec: Spec, given: Value, value: float) -> float:

@@ -218,7 +218,7 @@ def _conductance_alone(raw: Any) -> Any:
     """{'value': …, 'spread': …} or "14 W/K" beside the ends means the conductance."""
     if not isinstance(raw, dict) or "value" not in raw:
         return raw
-    value = {k: raw[k] for k in ("value", "spread", "bounds", "free", "source") if k in raw}
+    value = {k: raw[k] for k in Value.model_fields if k in raw}
     return {"conductance": value} | {k: v for k, v in raw.items() if k not in value}
 
 
