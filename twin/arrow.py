@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import lapack
 from scipy.optimize import lsq_linear
 
 from data.errors import WorkError
@@ -135,7 +135,7 @@ def triangle(system: Array, gram: Array) -> tuple[Array, Array]:
     if gram.diagonal()[:m].max(initial=0.0) < GRAM_LIMIT:
         root, failed = lapack.dpotrf(gram[:m, :m], lower=0, clean=1)
         if not failed:
-            return root, _solve(root, gram[:m, m], trans="T")
+            return root, _solve(root, gram[:m, m], transposed=True)
     factor = lapack.dgeqrf(np.asfortranarray(system), lwork=32 * (m + 1))[0][:m]
     return np.triu(factor[:, :m]), np.ascontiguousarray(factor[:, m])
 
@@ -153,8 +153,8 @@ def _not_finite(block: Block, unknowns: Sequence[Unknown]) -> str:
     return f"batch {block.batch_id!r}: residuals or derivatives are too large to square"
 
 
-def _solve(root: Array, right: Array, trans: str = "N") -> Array:
+def _solve(root: Array, right: Array, transposed: bool = False) -> Array:
     """``root⁻¹ right`` for an upper triangular root, which may be empty."""
     if root.size == 0 or right.size == 0:
         return np.zeros(right.shape)
-    return np.asarray(solve_triangular(root, right, trans=trans, check_finite=False))
+    return np.asarray(lapack.dtrtrs(root, right, lower=0, trans=int(transposed))[0])

@@ -18,6 +18,7 @@ from twin.least_squares import Fit
 
 Z90 = 1.6448536269514722
 SMALL = 0.2  # a weight below this share of the largest is not worded
+LISTED = 6  # a combination of more parameters names this many
 EQUAL = 0.2  # weights closer than this count as equal: a plain ratio, product, sum or difference
 
 
@@ -75,9 +76,11 @@ def undetermined(fit: Fit, unknowns: Sequence[Unknown], information_below: float
     the prior's. Eigenvectors of near-equal information mix at will, so their span is described by sparse vectors.
     """
     spread = np.array([u.spread for u in unknowns])
-    information = fit.information_data * np.outer(spread, spread)
-    values, vectors = np.linalg.eigh((information + information.T) / 2)
-    null = vectors[:, values < information_below]
+    # From the covariance, 1 / (information + 1): exact where information is small, whatever it is elsewhere.
+    values, vectors = np.linalg.eigh(fit.covariance / np.outer(spread, spread))
+    weak = values > 1 / (1 + information_below)
+    null = vectors[:, weak]
+    information = (null * np.maximum(0.0, 1 / values[weak] - 1)) @ null.T
     found = []
     for support, directions in _families(sparse_basis(null)):
         weakest = directions[:, 0] if directions.shape[1] == 1 else _weakest(directions, information)
@@ -107,7 +110,7 @@ def sparse_basis(null: Array) -> Array:
             bounds=[(None, None)] * k + [(0, None)] * (2 * p),
             method="highs",
         )
-        if solved.success:
+        if solved.success and solved.x is not None:
             v = null @ solved.x[:k]
             candidates.append(v / np.linalg.norm(v))
     chosen: list[Array] = []
@@ -159,11 +162,14 @@ def _in_words(moves: Array, weakest: Array, support: list[int], unknowns: Sequen
     fixed = np.linalg.svd(moves[support].T)[2][moves.shape[1] :]
     if len(fixed) == 1 and (scales == {"log"} or (scales == {"linear"} and len(units) == 1)):
         return f"{listed}: only {_combination(fixed[0], [names[i] for i in support], scales == {'log'})}"
-    order = sorted(support, key=lambda i: (-abs(round(weakest[i], 6)), names[i]))
+    order = sorted(support, key=lambda i: (-round(abs(float(weakest[i])), 6), names[i]))
     sign = np.sign(weakest[order[0]])
     parts = [f"{names[i]} {'up' if weakest[i] * sign > 0 else 'down'} {abs(weakest[i]):.2f}" for i in order]
-    count = "only one combination" if len(support) == 2 else "not this combination of them"
-    return f"{listed}: {count}; unseen when they move together (in prior spreads): {', '.join(parts)}"
+    if len(parts) > LISTED:
+        parts = [*parts[:LISTED], f"and {len(parts) - LISTED} more with smaller parts"]
+        listed = f"{len(support)} parameters together"
+    count = "only one combination" if len(support) == 2 else "one combination is not determined"
+    return f"{listed}: {count}; the recordings do not see the move (in prior spreads) {', '.join(parts)}"
 
 
 def _combination(weights: Array, names: list[str], log: bool) -> str:

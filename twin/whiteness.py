@@ -118,12 +118,12 @@ def _sentence(channel: str, rows: pd.DataFrame, unit: str) -> str:
     n = rows["rows"].to_numpy(float)
     rms = np.sqrt(np.sum(n * rows["rms"] ** 2) / n.sum())
     of = f"{len(rows)} batch" + ("es" if len(rows) > 1 else "")
-    p = rows["ljung_box_p"].dropna().clip(1e-300, 1.0)
+    p = np.clip(rows["ljung_box_p"].dropna().to_numpy(float), 1e-300, 1.0)
     size = f"rms {rms:.2g} {unit}".rstrip()
-    if p.empty:
+    if len(p) == 0:
         return f"{channel}: too few rows in {of} to say whether the residual is white; {size}"
     lag1 = np.sum(n * rows["lag1"].fillna(0)) / n.sum()
-    if combine_pvalues(p).pvalue > 0.01:
+    if float(combine_pvalues(p.tolist()).pvalue) > 0.01:
         return f"{channel}: the residual is white over {of} (lag-1 autocorrelation {lag1:.2f}); {size}"
     coloured = int(np.count_nonzero(p < 0.05))
     alike = np.sum(n * rows["correlated_rows"]) / n.sum()
