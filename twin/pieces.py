@@ -69,7 +69,7 @@ def cut(step: Ints, step_s: Array, regime: Ints, n_rows: Ints, every: int) -> Pi
     valid = np.arange(n_kept * every) < n_used[:, None]
     step, regime = step[:, : n_kept * every], regime[:, : n_kept * every]
     kind = regime * len(step_s) + step
-    common = _common(kind, valid, len(step_s))
+    common = _common(kind, valid)
 
     batch, first, held, kind = _rows(kind, valid, common, every)
     row_regime, row_step = kind // len(step_s), kind % len(step_s)
@@ -149,9 +149,9 @@ def cut(step: Ints, step_s: Array, regime: Ints, n_rows: Ints, every: int) -> Pi
     )
 
 
-def _common(kind: Ints, valid: NDArray[np.bool_], n_steps: int) -> NDArray[np.bool_]:
+def _common(kind: Ints, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(kinds,): frequent and lasting enough for a block with one set of weights."""
-    total = np.bincount(kind[valid], minlength=n_steps)
+    total = np.bincount(kind[valid], minlength=int(kind.max(initial=0)) + 1)
     begins = valid.copy()
     begins[:, 1:] &= (kind[:, 1:] != kind[:, :-1]) | ~valid[:, :-1]
     runs = np.bincount(kind[begins], minlength=len(total))

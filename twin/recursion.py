@@ -69,6 +69,8 @@ def advance(amplitude: Array, modes: Modes, pieces: Pieces, weights: Sequence[We
     width = n_sets * n_modes
     flat = amplitude.reshape(-1, width)
     ends = np.zeros((pieces.n_pieces + 1, width))
+    if not pieces.n_pieces:
+        return ends.reshape(-1, n_sets, n_modes)
     decays = [_decay_of_rows(b, w, n_sets) for b, w in zip(pieces.blocks, weights, strict=True)]
     for block, decay in zip(pieces.blocks, decays, strict=True):
         _end_from_zero(flat[block.rows], block, decay, ends[block.pieces])
@@ -113,9 +115,8 @@ def _starts(modes: Modes, pieces: Pieces, ends: Array, start_degC: Array, n_sets
     starts = np.empty((n_ranks, n_batches, n_sets, n_modes))
     first = modes.inverse[:, pieces.first_regime] @ start_degC[..., None]
     flat = starts.reshape(n_ranks, n_batches, -1)
-    if n_ranks:
-        starts[0] = first[..., 0].swapaxes(0, 1)
-        flat[1:] = ends.take(pieces.chain[:-1], axis=0)
+    starts[0] = first[..., 0].swapaxes(0, 1)
+    flat[1:] = ends.take(pieces.chain[:-1], axis=0)
     into = _basis_changes(modes, pieces.pairs)
     step = np.empty(flat.shape[1:])
     for k in range(1, n_ranks):

@@ -41,10 +41,6 @@ class Forcing:
     def __add__(self, other: Forcing) -> Forcing:
         return Forcing(self.terms + other.terms)
 
-    @property
-    def n_sets(self) -> int:
-        return max((n for t in self.terms for n in (len(t.directions_W), t.drive.n_sets)), default=1)
-
 
 @dataclass(frozen=True)
 class States:
@@ -148,7 +144,7 @@ class Response:
         if len(bad):
             q, b, n = bad[0].tolist()
             raise InputError(
-                f"run: set {q}, batch {b}, node {n}: the start temperature is {start[q, b, n]}, expected a finite number"
+                f"run: set {q}, batch {b}, node {n}: start temperature is {start[q, b, n]}, expected a finite number"
             )
         if any(t.drive.schedule is not self.schedule for t in forcing.terms):
             raise InputError("run: the heat was prepared for another schedule; use this response's forcing()")

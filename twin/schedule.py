@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from data.errors import InputError
 from twin.pieces import Array, Ints, Pieces, cut
 
-_STEP_DIGITS = 11  # steps that agree to so many digits are one step: differences of large times carry rounding
+_SAME_STEP = 1e-11  # of the longest: steps closer than that are one; differences of large times carry rounding
 
 
 class Schedule:
@@ -41,11 +41,9 @@ class Schedule:
         self.n_rows: Ints = rows.astype(np.intp)
         self.regime: Ints = np.where(valid, regimes, 0).astype(np.intp)
         self.n_regimes = int(self.regime.max(initial=0)) + 1
-        used = dt[valid]
-        digits = _STEP_DIGITS - int(np.ceil(np.log10(used.max()))) if used.size else 0
-        self.step_s, step = np.unique(np.round(used, digits), return_inverse=True)
+        self.step_s, step = _distinct(dt[valid])
         self._step: Ints = np.zeros(dt.shape, np.intp)
-        self._step[valid] = step.reshape(-1)
+        self._step[valid] = step
         self._pieces: dict[int, Pieces] = {}
 
     def pieces(self, every: int = 1) -> Pieces:
@@ -123,6 +121,13 @@ class Drive:
             by_time.reshape(-1, block.n_held * self.n_series).take(block.source, axis=0, mode="clip").view(float)
             for block in pieces.blocks
         ]
+
+
+def _distinct(dt_s: Array) -> tuple[Array, Ints]:
+    """The distinct steps and the number of each interval's; what differs by rounding alone is one step, their mean."""
+    values, number = np.unique(dt_s, return_inverse=True)
+    group = np.cumsum(np.diff(values, prepend=-np.inf) > _SAME_STEP * values.max(initial=0.0)) - 1
+    return np.bincount(group, weights=values) / np.bincount(group), group[number]
 
 
 def _check_steps(dt: Array, valid: NDArray[np.bool_]) -> None:
