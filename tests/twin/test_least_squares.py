@@ -330,6 +330,17 @@ def test_correlated_noise_widens_its_channel_alone():
     assert found.inflation[0] < 1.1 and found.noise_factor[0] < 1.05
 
 
+def test_a_smooth_misfit_of_one_channel_no_longer_bends_the_parameters():
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 1, 2000)
+    problem = two_channel_problem([rng.normal(size=2000) + 30 * np.sin(9 * time + k) for k in range(6)])
+    truth = np.array([0.4, -0.2])
+    as_given, weighed = fit(problem), fit(problem, reweight=True)
+    assert np.abs((as_given.x - truth) / np.sqrt(np.diag(as_given.covariance))).max() > 5
+    assert np.abs((weighed.x - truth) / np.sqrt(np.diag(weighed.covariance))).max() < 2
+    assert weighed.inflation[1] > 100 and weighed.inflation[0] < 1.1
+
+
 def test_intervals_cover_under_correlated_noise_only_with_reweighting():
     rng = np.random.default_rng(11)
     rows, repetitions = 400, 150
