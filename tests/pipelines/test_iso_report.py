@@ -35,7 +35,8 @@ def spindle_batch(simulated: bool = False) -> Batch:
     running = (time_s >= 300) & (time_s < 14700)
     z = np.where(running, (time_s - 300) / 600, 0.0)
     table = pd.DataFrame({
-        "time_s": time_s, "front": 20 + z, "<room>": 20.0, "x": -z / 4, "z": z, "spindle_rpm": 4000.0 * running, "feed": 0.0,
+        "time_s": time_s, "front": 20 + z, "<room>": 20.0, "x": -z / 4, "z": z,
+        "spindle_rpm": 4000.0 * running, "feed": 0.0,
     })  # fmt: skip
     return Batch("vmc$1", "b|1", table, CHANNELS, start=pd.Timestamp("2025-03-01 07:30"), simulated=simulated)
 
