@@ -1,0 +1,257 @@
+"""What moves the tool against the workpiece: growth, bending, the speed itself, the screw, a joint that slips.
+
+Growth and bending are structural: written out as links of the error's chain, so that they stay part of its sum. Their
+one parameter is a signed gain: lengths, lever and expansion are not told apart by recordings, and neither is the side
+that a candidate acts on. A machine file whose lengths are known states them in `errors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from data.errors import closest
+from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.quantity import Spec, Value
+from twin.schema import Body, ChainLink, ErrorChain, Link, MechanismPart, Tilt, TwinPart
+from twin.scope import several
+
+
+class ColumnBending(Mechanism):
+    """A column, head or bed that is warmer on one side bends; the error is its angle times a lever.
+
+    For the error along the column's depth the lever is half its height, for the one along it the head's reach. Each
+    error in `acts_on` has its own gain.
+    """
+
+    key = "column_bending"
+    words = "bending of a column"
+    equation = "error = gain · (θ_hot - θ_cold),  gain = ± α · height · lever / depth"
+    source = "Mayr et al. (2012), Thermal issues in machine tools, CIRP Annals 61(2); Timoshenko (1925), one material"
+    signature = "sideways error and pitch first, in step with a temperature difference; a uniform warm-up does nothing"
+    acts_at = ("error",)
+    ports = ("hot", "cold")
+    parameters = (
+        Spec("gain", "um/K", "displacement per kelvin between the sides, signed", 10.0, 15.0, -500.0, 500.0, "linear"),
+    )
+
+    def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
+        at, given = _places(name, self, part, twin), _given(name, self, part)
+        tilt = Tilt(hot=at["hot"], cold=at["cold"], gain=given["gain"], words=part.words or name)
+        return _on_errors(name, self, part, twin, tilt)
+
+
+class SpindleGrowth(Mechanism):
+    """A spindle, or any length, that grows from where it is held."""
+
+    key = "spindle_growth"
+    words = "growth of the spindle from its locating bearing"
+    equation = "error = gain · θ_spindle,  gain = ± α · length"
+    source = "Mayr et al. (2012), Thermal issues in machine tools, CIRP Annals 61(2): linear expansion"
+    signature = (
+        "Z moves fast, time constant 20-50 min, in step with the spindle's temperature and not with the housing's"
+    )
+    acts_at = ("error",)
+    ports = ("spindle",)
+    parameters = (
+        Spec(
+            "gain", "um/K", "displacement per kelvin of the spindle's rise, signed", 1.2, 2.5, -100.0, 100.0, "linear"
+        ),
+    )
+
+    def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
+        at, given = _places(name, self, part, twin), _given(name, self, part)
+        grows = ChainLink(body=at["spindle"], gain=given["gain"], words=part.words or name)
+        return _on_errors(name, self, part, twin, grows)
+
+
+class MandrelFixture(Mechanism):
+    """A test bar in the spindle, or the probe's nest on the table: a body of its own that no sensor sees.
+
+    The body takes the instance's name, so that the file may expose it to the air: ``exposures: {NAME-air: 0.5 W/K}``.
+    """
+
+    key = "mandrel_fixture"
+    words = "growth of the test bar or of the probe's fixture"
+    equation = "capacity · dT/dt = conductance · (T_seat - T),  error = gain · θ,  gain = ± α · length"
+    source = "ISO 230-3 (2020), test mandrel and fixture as part of the measuring set-up; linear expansion"
+    signature = "looks like spindle growth but lags the nose by 5-30 min; every temperature is predicted well"
+    acts_at = ("error",)
+    ports = ("seat",)
+    parameters = (
+        Spec("gain", "um/K", "displacement per kelvin of the bar's rise, signed", 2.3, 2.5, -50.0, 50.0, "linear"),
+        Spec("capacity", "J/K", "heat capacity of the bar or fixture", 2000.0, 0.7, 10.0, 1e5),
+        Spec("conductance", "W/K", "conductance from its seat", 3.0, 0.7, 0.01, 200.0),
+    )
+
+    def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
+        at, given = _places(name, self, part, twin), _given(name, self, part)
+        if name in twin.bodies:
+            raise ValueError(f"mechanisms.{name}: a body is called {name!r} already; give the mechanism another name")
+        words = part.words or self.words
+        bodies = {**twin.bodies, name: Body(capacity=given["capacity"], words=words)}
+        link = Link(between=(name, at["seat"]), conductance=given["conductance"], words=words)
+        links = {**twin.links, f"{name}-{at['seat']}": link}
+        grown = twin.model_copy(update={"bodies": bodies, "links": links})
+        return _on_errors(name, self, part, grown, ChainLink(body=name, gain=given["gain"], words=words))
+
+
+class SpeedShift(Mechanism):
+    """The shaft moves with the speed itself: the balls' centrifugal load against the preload, and a thinner shaft."""
+
+    key = "speed_shift"
+    words = "axial shift of the shaft with the speed"
+    equation = "error = shift · (n / rated)²"
+    source = "Harris and Kotzalas (2006), Rolling Bearing Analysis: centrifugal ball load, proportional to n²"
+    signature = "step within seconds of a speed change, back at the stop, while temperatures do not move"
+    acts_at = ("error",)
+    drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
+    parameters = (
+        Spec("shift", "um", "displacement at the rated speed, signed", 3.0, 5.0, -200.0, 200.0, "linear"),
+        Spec("rated", "rpm", "speed at which `shift` is stated", 6000.0, 0.01, 1.0, 2e5),
+    )
+
+    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+        return np.asarray(p["shift"] * (view.driver["speed"] / p["rated"]) ** 2)
+
+
+class ScrewElongation(Mechanism):
+    """A ball screw that positions without a linear scale: the error grows with the distance from its fixed end.
+
+    A screw stretched between two bearings first loses its tension: nothing moves until its rise has used up
+    `pretension`. Held at one end (pretension 0, fixed) it grows and shrinks with every kelvin.
+    """
+
+    key = "screw_elongation"
+    words = "elongation of a ball screw"
+    equation = "error = expansion · (θ_screw - pretension) · (position - fixed_end)"
+    source = "Slocum (1992), Precision Machine Design: thermal growth of a pretensioned lead screw"
+    signature = "proportional to the position, zero at the fixed end; absent with a linear scale"
+    acts_at = ("error",)
+    drivers: ClassVar[Mapping[str, str]] = {"position": "mm"}
+    ports = ("screw",)
+    parameters = (
+        Spec(
+            "expansion", "um/m/K", "the screw's expansion, minus where the error counts against the position",
+            11.5, 12.0, -40.0, 40.0, "linear",
+        ),
+        Spec("fixed_end", "mm", "position of the locating bearing", 0.0, 200.0, -1e4, 1e4, "linear"),
+        Spec("pretension", "K", "rise that uses up the screw's stretch", 3.0, 0.5, 0.0, 20.0),
+    )  # fmt: skip
+
+    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+        over_K = view.rise_K["screw"] - p["pretension"]
+        grows = (real(over_K) > 0) | (real(p["pretension"]) <= 0)
+        distance_m = (view.driver["position"] - p["fixed_end"]) / 1000.0
+        return np.asarray(p["expansion"] * np.where(grows, over_K, 0.0) * distance_m)
+
+
+class JointSlip(Mechanism):
+    """A joint that friction holds up to a limit and that then slips: one Maxwell-slip element."""
+
+    key = "joint_slip"
+    words = "slip in a bolted or guided joint"
+    equation = "error(t + dt) = clip(error(t) + gain · dθ, -limit, +limit)"
+    source = "Iwan (1966), J. Appl. Mech. 33(4), one elastic-slip element (stop operator)"
+    signature = "another path on cooling than on warming; a loop is left over after the temperatures return"
+    acts_at = ("error",)
+    ports = ("part",)
+    parameters = (
+        Spec("gain", "um/K", "displacement per kelvin while the joint sticks, signed", 1.0, 2.0, -50.0, 50.0, "linear"),
+        Spec("limit", "um", "displacement at which the joint slips", 3.0, 0.7, 0.0, 200.0),
+    )
+    along_time = True
+
+    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+        free, limit = np.broadcast_arrays(p["gain"] * view.rise_K["part"], p["limit"])
+        out = np.empty(free.shape, np.result_type(free, limit))
+        stuck = before = np.zeros(free.shape[:-1])
+        for k in range(free.shape[-1]):
+            stuck, before = _within(stuck + free[..., k] - before, limit[..., k]), free[..., k]
+            out[..., k] = stuck
+        return out
+
+
+def _within(a: Array, limit: Array) -> Array:
+    """Clipped to ± limit, analytic on each branch."""
+    return np.where(real(a) > real(limit), limit, np.where(real(a) < -real(limit), -limit, a))
+
+
+def _places(name: str, mechanism: Mechanism, part: MechanismPart, twin: TwinPart) -> dict[str, str]:
+    """The body or point of every port; a mechanism with one port takes a bare place.
+
+    Raises:
+        ValueError: a port missing or unknown, several places for one, or an unknown body.
+    """
+    key, at = f"mechanisms.{name}.at", part.at or {}
+    if isinstance(at, str):
+        at = {mechanism.ports[0]: at}
+    if set(at) != set(mechanism.ports):
+        raise ValueError(f"{key}: {mechanism.key} needs {', '.join(mechanism.ports)}, got {list(at)}")
+    out = {}
+    for port, place in at.items():
+        if not isinstance(place, str):
+            raise ValueError(f"{key}.{port}: got {len(place)} places, expected one; give each a mechanism of its own")
+        if place.partition("@")[0] not in twin.bodies:
+            raise ValueError(f"{key}.{port}: no body {place!r}; {closest(place, twin.bodies)}")
+        out[port] = place
+    return out
+
+
+def _given(name: str, mechanism: Mechanism, part: MechanismPart) -> dict[str, Value]:
+    """Every parameter as the file gives it, or its usual value; bare numbers get the unit that the Spec states.
+
+    Raises:
+        ValueError: a parameter that the mechanism does not have, with the closest.
+    """
+    specs = {s.name: s for s in mechanism.parameters}
+    for p in part.parameters:
+        if p not in specs:
+            raise ValueError(
+                f"mechanisms.{name}.parameters: {mechanism.key} has no parameter {p!r}; {closest(p, specs)}"
+            )
+    out = {}
+    for spec in specs.values():
+        value = part.parameters.get(spec.name) or Value(value=f"{spec.value} {spec.unit}", source=mechanism.source)
+        out[spec.name] = _with_unit(value, spec)
+    return out
+
+
+def _with_unit(value: Value, spec: Spec) -> Value:
+    """The chain's own unit may be another (mm, nm): a bare number means the mechanism's unit all the same."""
+
+    def told(v: Any) -> Any:
+        return f"{v} {spec.unit}" if v is not None and len(str(v).split()) == 1 else v
+
+    bounds = value.bounds or (spec.low, spec.high)
+    update: dict[str, Any] = {"value": told(value.value), "bounds": tuple(told(b) for b in bounds)}
+    update["prior"] = told(value.prior)
+    if spec.scale == "linear":
+        update["spread"] = told(value.spread)
+    return value.model_copy(update=update)
+
+
+def _on_errors(
+    name: str, mechanism: Mechanism, part: MechanismPart, twin: TwinPart, piece: ChainLink | Tilt
+) -> TwinPart:
+    """The twin part with one more piece in the chain of every error in `acts_on`.
+
+    Raises:
+        ValueError: no error named, or an unknown one.
+    """
+    if not part.acts_on:
+        raise ValueError(f"mechanisms.{name}.acts_on is missing; name the errors that {mechanism.key} moves")
+    errors = dict(twin.errors)
+    for channel in several(part.acts_on):
+        if channel not in errors:
+            raise ValueError(f"mechanisms.{name}.acts_on: no error {channel!r}; {closest(channel, errors)}")
+        errors[channel] = _longer(errors[channel], piece)
+    return twin.model_copy(update={"errors": errors})
+
+
+def _longer(chain: ErrorChain, piece: ChainLink | Tilt) -> ErrorChain:
+    if isinstance(piece, Tilt):
+        return chain.model_copy(update={"tilts": (*chain.tilts, piece)})
+    return chain.model_copy(update={"chain": (*chain.chain, piece)})
