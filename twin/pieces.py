@@ -37,27 +37,37 @@ class Block:
 
 
 @dataclass(frozen=True)
+class Chain:
+    """How pieces follow one another in their batches.
+
+    `by_rank` (ranks, B) is each batch's piece of a rank, `n_pieces` where it has no more; `slot` (pieces,) where a
+    piece stands in it, flattened. `changes[k]` are the batches that enter a new regime before rank k, with the number
+    of the (old, new) pair in `pairs` (…, 2); `first_regime` (B,) is the one they start in.
+    """
+
+    by_rank: Ints
+    slot: Ints
+    first_regime: Ints
+    changes: tuple[tuple[Ints, Ints] | None, ...]
+    pairs: Ints
+
+
+@dataclass(frozen=True)
 class Pieces:
     """How B batches of M intervals are cut when every `every`-th border is kept.
 
-    `chain` (ranks, B) is the piece of each batch by rank (`n_pieces` where the batch has no more), `slot` (pieces,)
-    where a piece stands in it. `span` numbers each piece's (regime, duration) in `spans`; `changes[k]` are the
-    batches that enter a new regime before rank k, with the number of the (old, new) pair in `pairs`.
-    `border` (B, M // every + 1) is the row that ends at a kept border, `n_rows + b` for the start of batch b.
+    `span` (pieces,) numbers each piece's regime and duration in `span_regime` and `span_s`. `border` (B, M // every
+    + 1) is the row that ends at a kept border, `n_rows + b` at the start of batch b; behind the end the last one.
     """
 
     every: int
     blocks: tuple[Block, ...]
     n_rows: int
     n_pieces: int
-    chain: Ints
-    slot: Ints
+    chain: Chain
     span: Ints
     span_regime: Ints
     span_s: Array
-    first_regime: Ints
-    changes: tuple[tuple[Ints, Ints] | None, ...]
-    pairs: Ints
     border: Ints
 
 
@@ -67,28 +77,25 @@ def cut(step: Ints, step_s: Array, regime: Ints, n_rows: Ints, every: int) -> Pi
     n_kept = n_intervals // every
     n_used = n_rows // every * every  # what follows the last kept border is not needed
     valid = np.arange(n_kept * every) < n_used[:, None]
-    step, regime = step[:, : n_kept * every], regime[:, : n_kept * every]
-    kind = regime * len(step_s) + step
+    kind = (regime * len(step_s) + step)[:, : n_kept * every]
     common = _common(kind, valid)
 
-    batch, first, held, kind = _rows(kind, valid, common, every)
+    first, held, kind = _rows(kind, valid, common, every)
+    batch = first // max(n_kept * every, 1)
     row_regime, row_step = kind // len(step_s), kind % len(step_s)
     lone = ~common[kind]
-    block_key = np.where(lone, -1 - row_regime, kind * (every + 1) + held)
+    key = np.where(lone, -1 - row_regime, kind * (every + 1) + held)
 
-    piece_of_row, position, length = _split(batch, block_key, int(2.0 * np.sqrt(max(n_kept, 1))))
-    head = np.flatnonzero(position == 0)  # first row of each piece, in time order
-    order = np.lexsort((np.arange(len(head)), -length, block_key[head]))  # blocks together, longest first
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-
-    sorted_rows = np.lexsort((place[piece_of_row], position, block_key))
+    # pieces in time order by their first rows; `order` puts blocks together, the longest pieces of each first
+    head, length = _split(batch, key, longest=int(2.0 * np.sqrt(max(n_kept, 1))))
+    order = np.lexsort((-length, key[head]))
     blocks: list[Block] = []
-    n_before = 0
-    for rows in np.split(sorted_rows, np.flatnonzero(np.diff(block_key[sorted_rows])) + 1) if len(sorted_rows) else ():
-        counts = np.bincount(position[rows])
-        offsets = np.cumsum(counts) - counts
-        lo = blocks[-1].rows.stop if blocks else 0
+    rows_in_order: list[Ints] = []
+    n_rows_before = 0
+    for here in _runs(key[head[order]]):
+        heads, lengths = head[order[here]], length[order[here]]
+        counts = np.searchsorted(-lengths, -np.arange(lengths[0]))  # pieces longer than a position
+        rows = np.concatenate([heads[:n] + position for position, n in enumerate(counts)])
         n_held = int(held[rows[0]])
         blocks.append(
             Block(
@@ -96,57 +103,55 @@ def cut(step: Ints, step_s: Array, regime: Ints, n_rows: Ints, every: int) -> Pi
                 n_held=n_held,
                 step=int(row_step[rows[0]]),
                 step_of_row=row_step[rows] if lone[rows[0]] else None,
-                rows=slice(lo, lo + len(rows)),
-                pieces=slice(n_before, n_before + int(counts[0])),
-                source=(batch[rows] * n_kept * every + first[rows]) // n_held,
-                spans=tuple(zip(offsets.tolist(), counts.tolist(), strict=True)),
+                rows=slice(n_rows_before, n_rows_before + len(rows)),
+                pieces=here,
+                source=first[rows] // n_held,
+                spans=tuple(zip((np.cumsum(counts) - counts).tolist(), counts.tolist(), strict=True)),
             )
         )
-        n_before += int(counts[0])
-
-    # the chain of pieces along each batch
-    piece_batch, piece_regime = batch[head], row_regime[head]
-    starts = np.flatnonzero(np.diff(piece_batch, prepend=-1))
-    rank = np.arange(len(head)) - np.repeat(starts, np.diff(np.append(starts, len(head))))
-    n_ranks = int(rank.max()) + 1 if len(rank) else 0
-    chain = np.full((n_ranks, n_batches), len(head))
-    chain[rank, piece_batch] = place
-    slot = np.empty_like(place)
-    slot[place] = rank * n_batches + piece_batch
-    first_regime = np.zeros(n_batches, int)
-    first_regime[piece_batch[rank == 0]] = piece_regime[rank == 0]
-    changed = np.flatnonzero((rank[1:] > 0) & (piece_regime[1:] != piece_regime[:-1])) + 1
-    pairs, pair = np.unique(
-        np.column_stack([piece_regime[changed - 1], piece_regime[changed]]), axis=0, return_inverse=True
-    )
-    changes: list[tuple[Ints, Ints] | None] = [None] * n_ranks
-    for k in np.unique(rank[changed]):
-        here = rank[changed] == k
-        changes[k] = piece_batch[changed[here]], pair.reshape(-1)[here]
-
-    duration = np.bincount(piece_of_row, weights=held * step_s[row_step], minlength=len(head))
-    spans, span_of = np.unique(np.column_stack([piece_regime, duration])[order], axis=0, return_inverse=True)
+        rows_in_order.append(rows)
+        n_rows_before += len(rows)
 
     # the row at each kept border: padding holds the last valid one
-    row_at = np.full((n_batches, n_kept * every + 1), -1)
-    row_at[batch[sorted_rows], (first + held)[sorted_rows]] = np.arange(len(sorted_rows))
-    row_at[:, 0] = len(sorted_rows) + np.arange(n_batches)
+    in_order = np.concatenate([*rows_in_order, np.zeros(0, np.intp)])
+    row_after = np.zeros(n_batches * n_kept * every + 1, np.intp)
+    row_after[(first + held)[in_order]] = np.arange(len(in_order))
     kept = np.minimum(np.arange(n_kept + 1) * every, n_used[:, None])
+    border = row_after[np.arange(n_batches)[:, None] * n_kept * every + kept]
+    border[kept == 0] = len(in_order) + np.nonzero(kept == 0)[0]
+
+    duration_s = np.add.reduceat(held * step_s[row_step], head) if len(head) else np.zeros(0)
+    spans, span = np.unique(np.column_stack([row_regime[head], duration_s])[order], axis=0, return_inverse=True)
     return Pieces(
         every=every,
         blocks=tuple(blocks),
-        n_rows=len(sorted_rows),
+        n_rows=len(in_order),
         n_pieces=len(head),
-        chain=chain,
-        slot=slot,
-        span=span_of.reshape(-1),
-        span_regime=spans[:, 0].astype(int),
+        chain=_chain(batch[head], row_regime[head], np.argsort(order), n_batches),
+        span=span.reshape(-1),
+        span_regime=spans[:, 0].astype(np.intp),
         span_s=spans[:, 1],
-        first_regime=first_regime,
-        changes=tuple(changes),
-        pairs=pairs,
-        border=np.take_along_axis(row_at, kept, axis=1),
+        border=border,
     )
+
+
+def _chain(batch: Ints, regime: Ints, place: Ints, n_batches: int) -> Chain:
+    """How pieces follow one another: `batch`, `regime` and place in block order (pieces,), in time order."""
+    n_of_batch = np.bincount(batch, minlength=n_batches)
+    rank = np.arange(len(batch)) - np.repeat(np.cumsum(n_of_batch) - n_of_batch, n_of_batch)
+    by_rank = np.full((n_of_batch.max(initial=0), n_batches), len(batch))
+    by_rank[rank, batch] = place
+    slot = np.empty_like(place)
+    slot[place] = rank * n_batches + batch
+    first_regime = np.zeros(n_batches, np.intp)
+    first_regime[batch[rank == 0]] = regime[rank == 0]
+    changed = np.flatnonzero((rank[1:] > 0) & (regime[1:] != regime[:-1])) + 1
+    pairs, pair = np.unique(np.column_stack([regime[changed - 1], regime[changed]]), axis=0, return_inverse=True)
+    changes: list[tuple[Ints, Ints] | None] = [None] * len(by_rank)
+    for k in np.unique(rank[changed]):
+        here = rank[changed] == k
+        changes[k] = batch[changed[here]], pair.reshape(-1)[here]
+    return Chain(by_rank, slot, first_regime, tuple(changes), pairs)
 
 
 def _common(kind: Ints, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -158,33 +163,36 @@ def _common(kind: Ints, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return (total * _COMMON >= total.sum()) & (runs * _RUN <= total)
 
 
-def _rows(kind: Ints, valid: NDArray[np.bool_], common: NDArray[np.bool_], every: int) -> tuple[Ints, Ints, Ints, Ints]:
-    """Batch, first interval, number of merged intervals and kind of each row, in time order."""
-    n_batches, n_intervals = kind.shape
-    held = valid.astype(int)
+def _rows(kind: Ints, valid: NDArray[np.bool_], common: NDArray[np.bool_], every: int) -> tuple[Ints, Ints, Ints]:
+    """First interval (batch after batch), number of merged intervals and kind of each row, in time order."""
+    held = valid.astype(np.intp)
     if every > 1:
-        groups = np.where(valid, kind, 0).reshape(n_batches, -1, every)
-        whole = (groups == groups[..., :1]).all(axis=-1) & common[groups[..., 0]]
-        whole &= valid.reshape(groups.shape).all(axis=-1)
+        groups = kind.reshape(len(kind), -1, every)
+        whole = valid.reshape(groups.shape).all(axis=-1) & (groups == groups[..., :1]).all(axis=-1)
+        whole[whole] = common[groups[whole, 0]]
         held = held.reshape(groups.shape)
         held[whole] = 0
         held[whole, 0] = every
-        held = held.reshape(n_batches, n_intervals)
-    batch, first = np.nonzero(held)
-    return batch, first, held[batch, first], kind[batch, first]
+    first = np.flatnonzero(held)
+    return first, held.reshape(-1)[first], kind.reshape(-1)[first]
 
 
-def _split(batch: Ints, key: Ints, longest: int) -> tuple[Ints, Ints, Ints]:
-    """Cut runs of rows of one batch and key into nearly equal pieces of at most `longest` rows.
+def _split(batch: Ints, key: Ints, longest: int) -> tuple[Ints, Ints]:
+    """Cut runs of rows of one batch and key into nearly equal pieces: first row and length (at most `longest`)."""
+    runs = np.array([(r.start, r.stop - r.start) for r in _runs(batch, key)], np.intp).reshape(-1, 2)
+    n_cuts = -(-runs[:, 1] // longest)
+    begin, size, n = (np.repeat(column, n_cuts) for column in (*runs.T, n_cuts))
+    part = np.arange(len(begin)) - np.repeat(np.cumsum(n_cuts) - n_cuts, n_cuts)
+    head = begin + -(-part * size // n)
+    return head, np.diff(np.append(head, len(batch)))
 
-    Returns each row's piece and position in it, and each piece's length.
-    """
-    n = len(batch)
-    begins = np.flatnonzero(np.append(n > 0, (np.diff(batch) != 0) | (np.diff(key) != 0))[: n or 0])
-    size = np.diff(np.append(begins, n))
-    n_cuts = -(-size // longest)
-    within = np.arange(n) - np.repeat(begins, size)
-    part = within * np.repeat(n_cuts, size) // np.repeat(size, size)
-    piece = np.repeat(np.cumsum(n_cuts) - n_cuts, size) + part
-    length = np.bincount(piece) if n else np.zeros(0, int)
-    return piece, np.arange(n) - np.repeat(np.cumsum(length) - length, length), length
+
+def _runs(*columns: Ints) -> list[slice]:
+    """Stretches over which every column stays the same."""
+    n = len(columns[0])
+    moved = np.zeros(n, bool)
+    for column in columns:
+        moved[1:] |= column[1:] != column[:-1]
+    moved[:1] = True
+    begins = np.flatnonzero(moved).tolist()
+    return [slice(lo, hi) for lo, hi in zip(begins, [*begins[1:], n], strict=False)]

@@ -76,7 +76,7 @@ def advance(amplitude: Array, modes: Modes, pieces: Pieces, weights: Sequence[We
         _end_from_zero(flat[block.rows], block, decay, ends[block.pieces])
     starts = _starts(modes, pieces, ends, start_degC, n_sets)
     for block, decay in zip(pieces.blocks, decays, strict=True):
-        _fill(flat[block.rows], block, decay, starts.take(pieces.slot[block.pieces], axis=0))
+        _fill(flat[block.rows], block, decay, starts.take(pieces.chain.slot[block.pieces], axis=0))
     return ends.reshape(-1, n_sets, n_modes)
 
 
@@ -107,22 +107,23 @@ def _fill(rows: Array, block: Block, decay: Array, before: Array) -> None:
 
 def _starts(modes: Modes, pieces: Pieces, ends: Array, start_degC: Array, n_sets: int) -> Array:
     """True amplitudes (ranks * B, Q * N) at the pieces' starts, in the modes of each piece's regime."""
-    n_ranks, n_batches = pieces.chain.shape
+    chain = pieces.chain
+    n_ranks, n_batches = chain.by_rank.shape
     n_modes = modes.n_nodes
     rate = np.broadcast_to(modes.rate_per_s[:, pieces.span_regime], (n_sets, len(pieces.span_s), n_modes))
     by_span = np.exp(-rate * pieces.span_s[:, None]).transpose(1, 0, 2).reshape(len(pieces.span_s), -1)
-    decay = by_span.take(np.append(pieces.span, 0)[pieces.chain], axis=0)
+    decay = by_span.take(np.append(pieces.span, 0)[chain.by_rank], axis=0)
     starts = np.empty((n_ranks, n_batches, n_sets, n_modes))
-    first = modes.inverse[:, pieces.first_regime] @ start_degC[..., None]
+    first = modes.inverse[:, chain.first_regime] @ start_degC[..., None]
     flat = starts.reshape(n_ranks, n_batches, -1)
     starts[0] = first[..., 0].swapaxes(0, 1)
-    flat[1:] = ends.take(pieces.chain[:-1], axis=0)
-    into = _basis_changes(modes, pieces.pairs)
+    flat[1:] = ends.take(chain.by_rank[:-1], axis=0)
+    into = _basis_changes(modes, chain.pairs)
     step = np.empty(flat.shape[1:])
     for k in range(1, n_ranks):
         np.multiply(flat[k - 1], decay[k - 1], out=step)
         flat[k] += step
-        change = pieces.changes[k]
+        change = chain.changes[k]
         if change is not None:
             batches, pair = change
             old = starts[k][batches]
