@@ -40,7 +40,7 @@ def weights_of(modes: Modes, block: Block, step_s: Array) -> Weights:
 def heat(block: Block, weights: Weights, modal_W: Array, series: Array, out: Array | None = None) -> Array:
     """What the sources add to each mode in each row: (rows, Q * N), into `out` if given.
 
-    `modal_W` (Q, J, N) is the sources' effect on the modes, `series` (rows, n_held * J * 2) as `Drive.rows` gives it.
+    `modal_W` (Q, J, N) is the sources' effect on the modes, `series` (rows, n_held * J * 2) as `Drive.rows` gives them.
     """
     n_sets, n_series, n_modes = modal_W.shape
     if block.step_of_row is None:

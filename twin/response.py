@@ -21,6 +21,7 @@ from twin.schedule import Drive, Schedule
 __all__ = ["Drive", "Forcing", "Response", "Schedule", "States"]
 
 _CHUNK_ELEMENTS = 30_000  # of one recursion step (pieces x sets x modes): stays in the second-level cache
+_OWN_SERIES = 12  # interval values per product for sets with own series: below it zeros are cheaper than more products
 _CHUNK_BYTES = 128 << 20  # of one chunk's states
 
 
@@ -127,8 +128,10 @@ class Response:
         matrix = _matrix(matrix, n_sets, self.modes.n_nodes)
         pieces = self.schedule.pieces(every)
         out = np.empty((n_sets, *pieces.border.shape, matrix.shape[1]))
+        store: Array | None = None  # the first chunk's states, which no later one exceeds: fresh pages cost time
         for sets in self._chunks(pieces, n_sets):
-            amplitude = self._advance(forcing, start, pieces, sets)
+            amplitude = self._advance(forcing, start, pieces, sets, store)
+            store = amplitude if store is None else store
             _read(self.modes, pieces, amplitude, start, matrix, pieces.border, sets, out)
         return out
 
@@ -169,12 +172,15 @@ class Response:
             self._cache[pieces.every] = [weights_of(self.modes, b, self.schedule.step_s) for b in pieces.blocks]
         return self._cache[pieces.every]
 
-    def _advance(self, forcing: Forcing, start_degC: Array, pieces: Pieces, sets: slice) -> Array:
-        """Modal amplitudes (rows, sets, N) of some sets at the end of every row."""
+    def _advance(
+        self, forcing: Forcing, start_degC: Array, pieces: Pieces, sets: slice, store: Array | None = None
+    ) -> Array:
+        """Modal amplitudes (rows, sets, N) of some sets at the end of every row, in the memory of `store` if given."""
         modes = self.modes.of_sets(sets)
         weights = [w.of_sets(sets) for w in self._weights(pieces)]
         n_sets, n_modes = sets.stop - sets.start, modes.n_nodes
-        amplitude = np.empty((pieces.n_rows, n_sets, n_modes))
+        shape = (pieces.n_rows, n_sets, n_modes)
+        amplitude = np.empty(shape) if store is None else store.reshape(-1)[: np.prod(shape)].reshape(shape)
         if not forcing.terms:
             amplitude[:] = 0.0
         for k, term in enumerate(forcing.terms):
@@ -197,13 +203,16 @@ def _add_heat(
     n_sets = amplitude.shape[1]
     directions = _of_sets(term.directions_W, sets)
     modal = [directions[:, b.regime] @ modes.shape[:, b.regime] for b in pieces.blocks]
-    # series shared by all sets: one matrix product for all; else one for each set
-    groups = [slice(0, n_sets)] if term.drive.n_sets == 1 else [slice(q, q + 1) for q in range(n_sets)]
-    for group in groups:
-        series = term.drive.rows(pieces.every, sets.start + group.start)
+    # series shared by all sets: one matrix product for all; own series: a few sets at once, block by block diagonal
+    own = term.drive.n_sets > 1
+    size = max(1, _OWN_SERIES // (term.drive.n_series * pieces.every)) if own else n_sets
+    for group in (slice(lo, min(lo + size, n_sets)) for lo in range(0, n_sets, size)):
+        series = term.drive.rows(pieces.every, slice(sets.start + group.start, sets.start + group.stop))
         for block, weight, modal_W, rows in zip(pieces.blocks, weights, modal, series, strict=True):
             weight, modal_W = weight.of_sets(group), _of_sets(modal_W, group)
             target = amplitude[block.rows, group]
+            if own:
+                modal_W = _each_its_own(modal_W, target.shape[1])
             n_own = max(len(modal_W), len(weight.decay))
             out = target.reshape(len(rows), -1) if first and n_own == target.shape[1] else None
             part = heat(block, weight, modal_W, rows, out).reshape(len(rows), n_own, -1)
@@ -211,6 +220,14 @@ def _add_heat(
                 target[...] = part
             elif out is None:
                 target += part
+
+
+def _each_its_own(modal_W: Array, n_sets: int) -> Array:
+    """Directions (Q, Q * J, N) on the series of Q sets side by side, from those (Q or 1, J, N) on own series."""
+    n_series, n_modes = modal_W.shape[1:]
+    wide = np.zeros((n_sets, n_sets, n_series, n_modes))
+    wide[np.arange(n_sets), np.arange(n_sets)] = modal_W
+    return wide.reshape(n_sets, -1, n_modes)
 
 
 def _read(

@@ -93,12 +93,12 @@ class Drive:
     def n_series(self) -> int:
         return self.series.shape[1]
 
-    def rows(self, every: int, q: int = 0) -> list[Array]:
-        """One matrix per block of `schedule.pieces(every)`: a row's intervals x series x (start, end), flattened."""
+    def rows(self, every: int, sets: slice) -> list[Array]:
+        """One matrix per block of `schedule.pieces(every)`: a row's intervals x sets x series x (start, end), flat."""
         if self.n_sets > 1:
-            return self._sort(every, q)
+            return self._sort(every, sets)
         if every not in self._sorted:
-            self._sorted[every] = self._sort(every, 0)
+            self._sorted[every] = self._sort(every, slice(0, 1))
         return self._sorted[every]
 
     def first_bad(self) -> str | None:
@@ -111,14 +111,15 @@ class Drive:
         value = self.series[q, j, b, m, side]
         return f"set {q}, series {j}, batch {b}, interval {m}: {('start', 'end')[side]} value is {value}"
 
-    def _sort(self, every: int, q: int) -> list[Array]:
+    def _sort(self, every: int, sets: slice) -> list[Array]:
         pieces = self.schedule.pieces(every)
         n_used = self.schedule.n_intervals // every * every
         # (start, end) travel as one complex number: a transposition of 16-byte items is four times as fast
-        pairs = self.series[q].view(np.complex128)[:, :, :n_used, 0]
+        chosen = self.series[sets]
+        pairs = chosen.reshape(len(chosen) * self.n_series, *chosen.shape[2:]).view(np.complex128)[:, :, :n_used, 0]
         by_time = np.ascontiguousarray(pairs.transpose(1, 2, 0))
         return [
-            by_time.reshape(-1, block.n_held * self.n_series).take(block.source, axis=0, mode="clip").view(float)
+            by_time.reshape(-1, block.n_held * len(pairs)).take(block.source, axis=0, mode="clip").view(float)
             for block in pieces.blocks
         ]
 

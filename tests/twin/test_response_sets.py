@@ -17,7 +17,7 @@ def test_padding_does_not_leak() -> None:
     dt, regime = np.full((4, 60), 10.0), toy.rng.integers(0, 2, (4, 60))
     series, start = toy.series(4, 60), toy.rng.normal(20, 3, (1, 4, 4))
     for b, n in enumerate(n_rows):
-        dt[b, n:], regime[b, n:], series[:, :, b, n:] = np.nan, -7, np.nan
+        dt[b, n:], regime[b, n:], series[:, :, b, n:] = np.nan, 99, np.nan
     together = toy.temperatures(Schedule(dt, regime, n_rows), series, start)
     assert np.isfinite(together).all()
     for b, n in enumerate(n_rows):
@@ -53,6 +53,7 @@ def test_every_kth_border_is_the_subsampled_run_and_any_cut_is_right(
         exact = toy.by_expm(dt[b, :n], regime[b, :n], series[0, :, b, :n], start[0, b])
         assert full[0, b, : n + 1] == pytest.approx(exact, rel=1e-11, abs=1e-10)
         assert kept[0, b, : n // every + 1] == pytest.approx(exact[::every], rel=1e-11, abs=1e-10)
+        assert (kept[0, b, n // every :] == kept[0, b, n // every]).all()
 
 
 @pytest.mark.parametrize("every", [1, 4])
@@ -114,6 +115,7 @@ def test_steps_that_differ_by_rounding_are_one_step() -> None:
     schedule = Schedule(np.diff(time_s)[None], np.zeros((1, 2880), int))
     assert schedule.step_s == pytest.approx([10.1], rel=1e-10)
     assert len(schedule.step_s) == 1
+    assert len(Schedule(np.array([[10.0, 10.000001]]), np.zeros((1, 2), int)).step_s) == 2
 
 
 # --- what cannot be used
