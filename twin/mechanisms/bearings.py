@@ -1,0 +1,123 @@
+"""Rolling bearings: friction that grows with speed, with preload, and what temperature does to both.
+
+Moments in N mm, speed n in rpm, mean diameter dm in mm: P = pi/30 * 1e-3 * n * M, rounded to 1.047e-4 as in the books.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from twin.mechanisms.analytic import power, size
+from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.quantity import Spec
+
+W_PER_RPM_NMM = 1.047e-4
+THIN_FILM = 2000.0  # nu n, mm²/s rpm: below it the viscous moment no longer depends on speed
+VISCOSITY_EXPONENT = 2.0 / 3.0
+
+COUNT = Spec("count", "1", "how many equal bearings", 2.0, 0.01, 1.0, 20.0)
+MEAN_DIAMETER = Spec("mean_diameter", "mm", "mean diameter of a bearing, (bore + outside) / 2", 77.5, 0.02, 5.0, 500.0)
+
+
+class BearingViscous(Mechanism):
+    """Shearing of the lubricant. `viscosity` is that at the working temperature; see `ViscosityFeedback`."""
+
+    key = "bearing_viscous"
+    words = "viscous friction of the bearings"
+    equation = "P = count 1.047e-4 n M0; M0 = f0 1e-7 (nu n)^(2/3) dm^3 for nu n >= 2000, else 160e-7 f0 dm^3"
+    source = (
+        "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
+    )
+    signature = "rise at the nose grows with speed as n^1.3 to n^1.7"
+    acts_at = ("node",)
+    drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
+    parameters = (
+        COUNT,
+        MEAN_DIAMETER,
+        Spec("lubrication", "1", "Palmgren's f0: 1 to 2 grease, 1.7 oil mist, 3 to 6 oil", 1.0, 0.4, 0.0, 20.0),
+        Spec("viscosity", "mm**2/s", "kinematic viscosity of the oil at work", 22.0, 0.5, 1.0, 1000.0),
+    )
+
+    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+        n = size(view.driver["speed"])
+        film = p["viscosity"] * n
+        per_f0 = np.where(real(film) < THIN_FILM, 160e-7, 1e-7 * power(film, VISCOSITY_EXPONENT))
+        moment_Nmm = p["lubrication"] * per_f0 * p["mean_diameter"] ** 3
+        return np.asarray(p["count"] * W_PER_RPM_NMM * n * moment_Nmm)
+
+
+class BearingLoad(Mechanism):
+    """Rolling and sliding under preload, independent of the lubricant."""
+
+    key = "bearing_load"
+    words = "friction of the bearings under load"
+    equation = "P = count 1.047e-4 n M1; M1 = z (F/C0)^y F dm"
+    source = (
+        "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
+    )
+    signature = "rise proportional to speed"
+    acts_at = ("node",)
+    drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
+    parameters = (
+        COUNT,
+        MEAN_DIAMETER,
+        Spec("preload", "N", "load on each bearing", 800.0, 0.5, 1.0, 1e5),
+        Spec("static_capacity", "N", "static load rating C0 of a bearing", 26e3, 0.1, 100.0, 1e7),
+        Spec("load_factor", "1", "Palmgren's z", 0.001, 0.3, 0.0, 0.01),
+        Spec("load_exponent", "1", "Palmgren's y", 0.33, 0.1, 0.1, 1.0),
+    )
+
+    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+        stress = (p["preload"] / p["static_capacity"]) ** p["load_exponent"]
+        moment_Nmm = p["load_factor"] * stress * p["preload"] * p["mean_diameter"]
+        return np.asarray(p["count"] * W_PER_RPM_NMM * size(view.driver["speed"]) * moment_Nmm)
+
+
+class ViscosityFeedback(Mechanism):
+    """The oil thins as it warms: multiplies a `bearing_viscous` heat whose viscosity holds at `reference`.
+
+    Right where nu n >= 2000; below, at a few turns a second, the moment does not depend on the viscosity.
+    """
+
+    key = "viscosity_feedback"
+    words = "lubricant that thins as it warms"
+    equation = (
+        "nu = nu_ref exp(-slope (T_oil - reference)), so heat is multiplied by exp(-2/3 slope (T_oil - reference))"
+    )
+    source = "Reynolds 1886, Phil. Trans. 177, exponential law of viscosity; Palmgren 1959 for the exponent 2/3"
+    signature = "heat peaks early, then falls; the rise in winter exceeds that in summer"
+    acts_at = ("heat",)
+    ports = ("oil",)
+    parameters = (
+        Spec("slope", "1/K", "relative fall of the viscosity per kelvin", 0.035, 0.3, 0.0, 0.1),
+        Spec("reference", "degC", "temperature at which the viscosity is stated", 40.0, 0.1, -20.0, 120.0, "linear"),
+    )
+
+    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+        return np.asarray(np.exp(-VISCOSITY_EXPONENT * p["slope"] * (view.degC["oil"] - p["reference"])))
+
+
+class PreloadFeedback(Mechanism):
+    """A shaft warmer than its housing tightens the bearing: multiplies a `bearing_load` heat.
+
+    M1 grows as F^(1 + y), so the load's heat does; a preload that is lost altogether gives no heat, never less.
+    """
+
+    key = "preload_feedback"
+    words = "preload that rises with the shaft's lead over the housing"
+    equation = "F = F0 [1 + kappa (T_shaft - T_housing)], so heat is multiplied by (F/F0)^(1 + y), and by 0 where F < 0"
+    source = "Stein and Tu 1994, J. Dyn. Syst. Meas. Control 116, thermally induced preload; Palmgren 1959 for 1 + y"
+    signature = "overshoot 10 to 40 min after a step of the speed"
+    acts_at = ("heat",)
+    ports = ("shaft", "housing")
+    parameters = (
+        Spec("kappa", "1/K", "relative rise of the preload per kelvin of the shaft's lead", 0.05, 0.6, 0.0, 0.5),
+        Spec("load_exponent", "1", "Palmgren's y, as in the load's law", 0.33, 0.1, 0.1, 1.0),
+    )
+
+    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+        preload = 1.0 + p["kappa"] * (view.degC["shaft"] - view.degC["housing"])
+        return power(np.where(real(preload) > 0, preload, 0.0), 1.0 + p["load_exponent"])

@@ -1,0 +1,93 @@
+"""Fluids that carry heat away: the thermostat's coolant in a jacket, and the cutting fluid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from twin.mechanisms.analytic import steps_s
+from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.quantity import Spec
+
+
+class JacketChiller(Mechanism):
+    """Coolant of one temperature, let through by a thermostat: on above set_point + hysteresis, off below - hysteresis.
+
+    `heat_W` scans the control temperature at the times along the last axis and holds over the interval that follows
+    each. It starts on where the first temperature exceeds the set point. A switch within an interval is only seen at
+    its end: what flowed too long or too little since the crossing, found by linear interpolation, is made up for in
+    the next interval, so the energy is right and nothing depends on what comes later. Steps well below UA's time
+    constant. `starts_on`, `switched` and `flow_W` are the same law for a solver that steps from event to event.
+    """
+
+    key = "jacket_chiller"
+    words = "cooling jacket with a thermostat"
+    equation = "P = on conductance (supply - T); on from T > set_point + hysteresis until T < set_point - hysteresis"
+    source = "Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, ch. 11: UA of a stream of constant inlet"
+    signature = "sawtooth of 3 to 15 min that aliases where samples are minutes apart"
+    acts_at = ("node",)
+    ports = ("jacket",)
+    along_time = True
+    parameters = (
+        Spec("conductance", "W/K", "UA between the jacket and the coolant", 150.0, 0.6, 0.0, 5000.0),
+        Spec("supply", "degC", "temperature of the coolant that is let in", 16.0, 3.0, -10.0, 60.0, "linear"),
+        Spec("set_point", "degC", "middle of the thermostat's band", 22.0, 2.0, -10.0, 80.0, "linear"),
+        Spec("hysteresis", "K", "half of the thermostat's band", 1.0, 0.5, 0.01, 20.0),
+    )
+
+    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+        names = [s.name for s in self.parameters]
+        jacket, step_s, *shared = np.broadcast_arrays(view.degC["jacket"], steps_s(view), *(p[n] for n in names))
+        q = dict(zip(names, shared, strict=True))
+        on = self._states(jacket, q)
+        heat = np.where(on, self.flow_W(jacket, q), 0.0)
+        before, now, held = jacket[..., :-1], jacket[..., 1:], {k: v[..., 1:] for k, v in q.items()}
+        turned = on[..., 1:].astype(int) - on[..., :-1]  # 1: came on within the interval before, -1: went off
+        crossing = np.where(turned == 0, now, held["set_point"] + turned * held["hysteresis"])
+        since = (now - crossing) / np.where(turned == 0, 1.0, now - before)  # share of that interval
+        # flow is linear in temperature: its mean since the crossing is the flow at the mean temperature
+        missed_W = turned * since * self.flow_W((crossing + now) / 2, held)
+        missed_W = missed_W * step_s[..., :-1] / step_s[..., 1:]
+        return np.asarray(heat + np.concatenate([0.0 * heat[..., :1], missed_W], axis=-1))
+
+    def starts_on(self, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+        """Whether coolant flows at the start, bool, in the shape that the arguments broadcast to."""
+        return np.asarray(real(jacket_degC) > real(p["set_point"]))
+
+    def switched(self, on: Array, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+        """The state after a temperature is reached, bool, from the state before it."""
+        beyond = real(jacket_degC - p["set_point"])
+        return np.asarray((beyond >= real(p["hysteresis"])) | (on & (beyond > -real(p["hysteresis"]))))
+
+    def flow_W(self, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+        """Heat into the jacket while the coolant flows, W."""
+        return np.asarray(p["conductance"] * (p["supply"] - jacket_degC))
+
+    def _states(self, jacket: Array, p: Mapping[str, Array]) -> Array:
+        """On or off at every time: as the last temperature outside the band said, all times at once."""
+        above, below = self.switched(np.asarray(False), jacket, p), ~self.switched(np.asarray(True), jacket, p)
+        says = above | below
+        says[..., 0] = True
+        at = np.maximum.accumulate(np.where(says, np.arange(jacket.shape[-1]), 0), axis=-1)
+        above[..., 0] |= self.starts_on(jacket[..., 0], {k: v[..., 0] for k, v in p.items()}) & ~below[..., 0]
+        return np.asarray(np.take_along_axis(above, at, axis=-1))
+
+
+class CuttingFluid(Mechanism):
+    """Fluid over table, fixture or bed while the pump runs; the heat leaves the port `tank` where that is a body."""
+
+    key = "cutting_fluid"
+    words = "cutting fluid over table and workpiece"
+    equation = "P = conductance flow (T_tank - T)"
+    source = "Newton's law of cooling; 50 to 500 W/K to the tank, tank 3 to 10 K above the room"
+    signature = "step of the rate when the flow starts or stops, the table first"
+    acts_at = ("node",)
+    drivers: ClassVar[Mapping[str, str]] = {"flow": "1"}
+    ports = ("body", "tank")
+    takes_from: ClassVar[str | None] = "tank"
+    parameters = (Spec("conductance", "W/K", "exchange with the fluid at full flow", 200.0, 0.8, 0.0, 5000.0),)
+
+    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+        return np.asarray(p["conductance"] * view.driver["flow"] * (view.degC["tank"] - view.degC["body"]))
