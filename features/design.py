@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data.batch import Batch
 from data.errors import InputError, closest
+from data.machine import Machine
 from features.rises import feature, feature_unit, zeroed_error_um
 
 Array = NDArray[np.float64]
@@ -48,6 +49,7 @@ class Design:
     `usable` marks rows fit for training. Short holes in x are the readers' and checks' business.
     `drivers` (n, d) are the first batch's driver channels as recorded (NaN where a batch lacks one), for the
     families that follow the load; empty where the design was made by hand. Units are in the same order as names.
+    `batches` and `machine` are what it was built from, for families that need more than rows (the twin).
     """
 
     inputs: tuple[str, ...]
@@ -64,9 +66,13 @@ class Design:
     driver_names: tuple[str, ...] = ()
     driver_units: tuple[str, ...] = ()
     input_units: tuple[str, ...] = ()
+    batches: tuple[Batch, ...] = field(default=(), repr=False)
+    machine: Machine | None = field(default=None, repr=False)
 
     @classmethod
-    def build(cls, batches: Sequence[Batch], inputs: Sequence[str], target: str | None) -> Design:
+    def build(
+        cls, batches: Sequence[Batch], inputs: Sequence[str], target: str | None, machine: Machine | None = None
+    ) -> Design:
         """Stack the named inputs (feature names, see features.rises) and the zeroed target of the batches.
 
         Raises:
@@ -100,7 +106,8 @@ class Design:
         return cls(tuple(inputs), target or "", tuple(b.batch_id for b in batches), x, y, time_s, offsets,
                    steps[0][0] if steps else 0.0, drivers=drivers, driver_names=driver_names,
                    driver_units=tuple(batches[0].channels[d].unit for d in driver_names),
-                   input_units=tuple(feature_unit(batches[0], i) for i in inputs) if batches else ())  # fmt: skip
+                   input_units=tuple(feature_unit(batches[0], i) for i in inputs) if batches else (),
+                   batches=tuple(batches), machine=machine)  # fmt: skip
 
     @property
     def n_batches(self) -> int:
@@ -168,7 +175,13 @@ class Design:
         x = self.x.take(np.array(columns, int), axis=1)
         return Design(tuple(inputs), self.target, self.batch_ids, x, self.y_um, self.time_s, self.offsets,
                       self.step_s, columns, self, self.drivers, self.driver_names, self.driver_units,
-                      tuple(self.input_units[c] for c in columns if c < len(self.input_units)))  # fmt: skip
+                      tuple(self.input_units[c] for c in columns if c < len(self.input_units)),
+                      self.batches, self.machine)  # fmt: skip
+
+    @property
+    def root(self) -> Design:
+        """The design that this one is a subset of, or itself."""
+        return self if self._parent is None else self._parent.root
 
     @cached_property
     def moments(self) -> Moments:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
+from data.machine import Machine
 from features.design import Design
 
 Array = NDArray[np.float64]
@@ -64,9 +65,11 @@ class Family(ABC):
         everything = range(design.n_batches)
         return np.column_stack([np.concatenate(f.predict_design(design, everything)) for f in fitted])
 
-    def fit(self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str) -> Self:
-        """A new, fitted copy from whole batches."""
-        design = Design.build(train_batches, inputs, target)
+    def fit(
+        self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str, machine: Machine | None = None
+    ) -> Self:
+        """A new, fitted copy from whole batches; families of the physics need the machine file."""
+        design = Design.build(train_batches, inputs, target, machine)
         return self.fit_design(design, range(design.n_batches))
 
     def predict(self, batch: Batch) -> Array:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from data.batch import Batch
 from data.checks import usable_channels
 from data.errors import InputError
+from data.machine import Machine
 from features.design import Design
 from features.rises import temperature_inputs
 from features.selectors import SELECTORS
@@ -117,7 +118,7 @@ def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
     return [b for b in batches if np.isfinite(b.masked(target)).sum() >= 2]
 
 
-def prepare(batches: Sequence[Batch], target: str, plan: Plan) -> Crossing:
+def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine | None = None) -> Crossing:
     """Stack the batches and let every selector choose on every training set.
 
     Raises:
@@ -133,7 +134,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan) -> Crossing:
     inputs, excluded = usable_channels(kept, temperature_inputs(kept))
     if not inputs:
         raise InputError(f"{kept[0].machine}: no temperature channel is usable in every batch; {excluded[0][1]}")
-    design = Design.build(kept, inputs, target)
+    design = Design.build(kept, inputs, target, machine)
     folds = {p: folds_of(p, kept) for p in plan.protocols}
     chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = {}
     n_all = range(1, len(inputs) + 1)

@@ -14,6 +14,7 @@ import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from data.batch import Batch, finding_table
+from data.machine import Machine
 from features.selectors import SELECTORS
 from models import FAMILIES
 from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
@@ -65,6 +66,7 @@ def run_grid(
     batches: Sequence[Batch],
     targets: Sequence[str],
     plan: Plan,
+    machine: Machine | None = None,
     *,
     workers: int = 1,
     progress: Callable[[str, int, int], None] | None = None,
@@ -74,7 +76,7 @@ def run_grid(
     `progress` is called with what was done, how many of how many.
     """
     with threadpool_limits(limits=1):
-        crossings = {t: prepare(batches, t, plan) for t in targets}
+        crossings = {t: prepare(batches, t, plan, machine) for t in targets}
         jobs = jobs_of(plan, targets)
         done: dict[tuple[str, str], FamilyResult] = {}
         with Workers(crossings, workers) as crew, ThreadPoolExecutor(workers) as pool:

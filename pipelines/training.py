@@ -117,7 +117,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         return outcome
     say(f"features and selectors of {len(batches)} batches")
     with _naming_quarantine(outcome.ingested):
-        prepared = caller.map("prepare", partial(prepare, batches, plan=request.plan), targets)
+        prepared = caller.map("prepare", partial(prepare, batches, plan=request.plan, machine=machine), targets)
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
@@ -176,7 +176,7 @@ def promote_tracked(
         batches.append(lake.load(machine.machine, batch_id, held[digest]))
     batches = check_machine(batches, machine)
     choice = promotion.decide(result, settings.promotion, cell)
-    family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target)
+    family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target, machine)
     text = machine_file.read_text(encoding="utf-8")
     region = region_of(batches, family.inputs)
     return registry.promote(result, choice, family, text, training_id, settings, region, batches, force=force)
