@@ -39,8 +39,11 @@ class EnclosureAir(Mechanism):
         values = _values(self, name, part)
         _new(name, twin)
         moved, outside = _moved(name, several(part.acts_on), twin)
+        wall = f"{name}-{outside}"
+        if wall in twin.exposures:
+            raise ValueError(f"exposures.{wall}: {self.key} adds this one; state it as mechanisms.{name}.conductance")
         exposures = {k: e.model_copy(update={"to": name}) if k in moved else e for k, e in twin.exposures.items()}
-        exposures[f"{name}-{outside}"] = Exposure(of=name, to=outside, conductance=values["conductance"])
+        exposures[wall] = Exposure(of=name, to=outside, conductance=values["conductance"])
         bodies = {**twin.bodies, name: Body(capacity=values["capacity"], words=part.words or self.words)}
         return twin.model_copy(update={"bodies": bodies, "exposures": exposures})
 

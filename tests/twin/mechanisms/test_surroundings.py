@@ -171,3 +171,12 @@ def test_a_name_that_is_taken(given: dict[str, Any]) -> None:
     for name in ("bed", "room"):
         with pytest.raises(InputError, match=f"mechanisms.{name}: a body or surrounding is called '{name}' already"):
             compile_network(machine("room", **{name: given}))
+
+
+def test_a_wall_stated_twice() -> None:
+    small = machine("room", air={"law": "enclosure_air"})
+    small.twin["exposures"]["air-room"] = "50 W/K"
+    with pytest.raises(
+        InputError, match="exposures.air-room: enclosure_air adds this one; state it as mechanisms.air.c"
+    ):
+        compile_network(small)
