@@ -19,7 +19,7 @@ class SensorSwap(Mechanism):
 
     key = "sensor_swap"
     words = "two sensors exchanged"
-    equation = "T_a shows place b, T_b shows place a"
+    equation = "T_a = T_s(place b),  T_b = T_s(place a)"
     source = "a permutation of two labels; no parameter"
     signature = "order of the time constants is wrong: the sensor near the heat is late, its partner early"
     acts_at = ("sensor",)

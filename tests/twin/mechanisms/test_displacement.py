@@ -18,7 +18,6 @@ from twin.mechanisms.displacement import (
     SpindleGrowth,
 )
 
-
 OWN_UM_PER_K = 11.5 * 0.2  # of the chain that the small machine has anyway
 
 

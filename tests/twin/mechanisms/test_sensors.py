@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from small_machine import network_with, part_with
@@ -32,7 +34,7 @@ def test_lag_of_an_uneven_course_meets_a_fine_integration():
     fine = np.linspace(0.0, 900.0, 900_001)
     seen = np.sin(UNEVEN / 80.0) * 5.0 + 20.0
     course, y, out = np.interp(fine, UNEVEN, seen), seen[0], []
-    for a, b in zip(course[:-1], course[1:], strict=True):
+    for a, b in pairwise(course):
         y += 1e-3 / 45.0 * ((a + b) / 2 - y)
         out.append(y)
     expected = np.interp(UNEVEN, fine, [seen[0], *out])

@@ -1,0 +1,178 @@
+"""Of every mechanism: its equation once more with units that pint checks, and the parameters that switch it off.
+
+An equation here sees quantities, each in the unit that its Spec (or driver) states: `q.area`, `q.speed`; temperatures
+as `q.T_port` (absolute, K) and `q.rise_port`; what a sensor sees as `q.seen` = `q.s0` + `q.slope` `q.t`. Constants of
+empirical laws carry their units too. The law itself sees bare numbers; both must agree, so a Spec that states the
+wrong unit, by dimension or by a factor, is found out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from twin.quantity import unit_registry
+
+U = unit_registry()
+K = U.kelvin
+ZERO = U.Quantity(273.15, "K")
+SIGMA = U.Quantity(5.670374419e-8, "W/m**2/K**4")
+PALMGREN = U.Quantity(1.047e-4, "W/rpm/N/mm")
+
+Formula = Callable[[SimpleNamespace], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """`off`: parameter values without effect. `values` and `ports` (degC over time in h) shape the point of the test.
+
+    Effects that a class has besides its first one stand in `more`.
+    """
+
+    formula: Formula | None
+    off: Mapping[str, float] | None
+    values: Mapping[str, float] = field(default_factory=dict)
+    ports: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    more: Mapping[str, Formula] = field(default_factory=dict)
+
+
+def _viscous(q: SimpleNamespace) -> Any:
+    film = q.viscosity * q.speed / U("mm**2/s * rpm")
+    return (
+        q.count
+        * PALMGREN
+        * q.speed
+        * 1e-7
+        * U("N*mm")
+        * q.lubrication
+        * film ** (2 / 3)
+        * (q.mean_diameter / U.mm) ** 3
+    )
+
+
+def _load(q: SimpleNamespace) -> Any:
+    moment = q.load_factor * (q.preload / q.static_capacity) ** q.load_exponent * q.preload * q.mean_diameter
+    return q.count * PALMGREN * q.speed * moment
+
+
+def _motor(q: SimpleNamespace) -> Any:
+    x = q.speed / q.rated
+    return q.idle + q.linear * x + q.quadratic * x**2
+
+
+def _wall(q: SimpleNamespace) -> Any:
+    lead = q.T_air - q.T_body
+    each_K = np.abs(lead) / K
+    laminar, turbulent = 1.42 * (each_K / (q.height / U.m)) ** 0.25, 1.31 * each_K ** (1 / 3)
+    return q.area * np.maximum(laminar, turbulent) * U("W/m**2/K") * lead
+
+
+def _blows(q: SimpleNamespace) -> Any:
+    return (q.t >= q.start) & (q.t < q.start + q.duration)
+
+
+def _chiller(q: SimpleNamespace) -> Any:
+    """The jacket cools evenly until the thermostat closes; what then flowed too long is made up for at once."""
+    closes, jacket = q.set_point - q.hysteresis, q.T_jacket
+    opened = jacket > closes
+    heat = q.conductance * (q.supply - jacket) * opened
+    at = int(np.argmin(opened))
+    since = (closes - jacket[at]) / (jacket[at - 1] - jacket[at])
+    heat[at] = heat[at] - since * q.conductance * (q.supply - (closes + jacket[at]) / 2)
+    return heat
+
+
+def _cycle(q: SimpleNamespace) -> Any:
+    def run(t: Any) -> Any:
+        turns = (t / q.period).to("dimensionless")
+        return q.period * (q.duty * np.floor(turns) + np.minimum(turns - np.floor(turns), q.duty))
+
+    step = q.t[1] - q.t[0]
+    return q.heat * q.running * (run(q.t + step) - run(q.t)) / step
+
+
+def _sun(q: SimpleNamespace) -> Any:
+    part = ((q.clock - q.rise) / (q.set - q.rise)).to("dimensionless")
+    height = np.where((part > 0) & (part < 1), np.sin(np.pi * part), 0.0)
+    return q.irradiance * q.area * q.absorptivity * height
+
+
+def _ohmic(q: SimpleNamespace) -> Any:
+    joule = q.resistance * q.current**2 * np.exp(q.coefficient * (q.T_body - q.reference))
+    return joule + q.entropic * q.current * q.T_body
+
+
+def _lag(q: SimpleNamespace) -> Any:
+    return q.seen - q.slope * q.lag * (1 - np.exp(-q.t / q.lag))
+
+
+def _skew(q: SimpleNamespace) -> Any:
+    return q.s0 + q.slope * np.clip(q.t + q.delay, q.t[0], q.t[-1])
+
+
+def _steps(q: SimpleNamespace) -> Any:
+    return ZERO + q.step * np.round(((q.seen - ZERO) / q.step).to("dimensionless"))
+
+
+def _friction(q: SimpleNamespace) -> Any:
+    return 2 * np.pi * (q.feed / q.lead) * q.moment
+
+
+CASES: Mapping[str, Case] = {
+    "bearing_viscous": Case(_viscous, {"lubrication": 0.0}),
+    "bearing_load": Case(_load, {"load_factor": 0.0}),
+    "viscosity_feedback": Case(lambda q: np.exp(-2 / 3 * q.slope * (q.T_oil - q.reference)), {"slope": 0.0}),
+    "preload_feedback": Case(
+        lambda q: (1 + q.kappa * (q.T_shaft - q.T_housing)) ** (1 + q.load_exponent), {"kappa": 0.0}
+    ),
+    "motor_loss": Case(_motor, {"idle": 0.0, "linear": 0.0, "quadratic": 0.0}),
+    "belt_loss": Case(lambda q: q.power * (q.speed / q.rated) ** q.exponent, {"power": 0.0}),
+    "nut_friction": Case(_friction, {"moment": 0.0}),
+    "guide_friction": Case(lambda q: q.friction * q.load * q.feed, {"friction": 0.0}),
+    "screw_bearing": Case(_friction, {"moment": 0.0}),
+    "rotating_convection": Case(lambda q: 1 + q.gain * (q.speed / q.rated) ** q.exponent, {"gain": 0.0}),
+    "natural_convection": Case(_wall, {"area": 0.0}),
+    "radiation": Case(lambda q: q.emissivity * SIGMA * q.area * (q.T_surrounding**4 - q.T_body**4), {"area": 0.0}),
+    "draught": Case(
+        lambda q: np.where(_blows(q), q.factor, 1.0 * U.dimensionless),
+        {"factor": 1.0, "drop": 0.0},
+        {"start": 0.52, "duration": 45.0},
+        more={"surrounding_K": lambda q: np.where(_blows(q), -q.drop, 0.0 * K)},
+    ),
+    "joint_conductance": Case(lambda q: q.ratio ** q.closed[0], {"ratio": 1.0}),
+    "jacket_chiller": Case(_chiller, {"conductance": 0.0}, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
+    "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body), {"conductance": 0.0}),
+    "enclosure_air": Case(None, None),
+    "stratification": Case(lambda q: q.gradient * q.height, {"gradient": 0.0}),
+    "floor_sink": Case(None, {"conductance": 0.0}),
+    "cabinet_heat": Case(lambda q: q.heat * q.running, {"heat": 0.0}),
+    "hydraulic_unit": Case(_cycle, {"heat": 0.0}, {"period": 11.3}),
+    "sun": Case(_sun, {"irradiance": 0.0}),
+    "cutting_heat": Case(lambda q: q.share * q.power, {"share": 0.0}),
+    "electrical_heat": Case(lambda q: q.gain * q.level, {"gain": 0.0}),
+    "ohmic_heat": Case(_ohmic, {"resistance": 0.0, "entropic": 0.0}),
+    "column_bending": Case(None, {"gain": 0.0}),
+    "spindle_growth": Case(None, {"gain": 0.0}),
+    "speed_shift": Case(lambda q: q.shift * (q.speed / q.rated) ** 2, {"shift": 0.0}),
+    "screw_elongation": Case(
+        lambda q: q.expansion * np.maximum(q.rise_screw - q.pretension, 0 * K) * (q.position - q.fixed_end),
+        {"expansion": 0.0},
+        ports={"screw": lambda t_h: 20.0 + 6.0 * t_h},
+    ),
+    "joint_slip": Case(lambda q: np.minimum(q.gain * q.rise_part, q.limit), {"limit": 0.0}, {"limit": 3.1}),
+    "mandrel_fixture": Case(None, {"gain": 0.0}),
+    "sensor_lag": Case(_lag, {"lag": 0.0}, {"lag": 900.0}),
+    "sensor_bonding": Case(lambda q: q.T_air + q.bonding * (q.seen - q.T_air), {"bonding": 1.0}),
+    "sensor_offset": Case(lambda q: q.seen + q.offset, {"offset": 0.0}),
+    "sensor_drift": Case(lambda q: q.seen + q.rate * q.t, {"rate": 0.0}),
+    "sensor_self_heat": Case(lambda q: q.seen + q.excess, {"excess": 0.0}),
+    "sensor_swap": Case(None, None),
+    "sensor_stuck": Case(lambda q: q.s0 + q.slope * np.minimum(q.t, q.start), {"start": 1e6}),
+    "sensor_quantised": Case(_steps, {"step": 0.0}, {"step": 0.13}),
+    "time_skew": Case(_skew, {"delay": 0.0}),
+    "initial_state": Case(lambda q: q.excess, {"excess": 0.0}),
+}

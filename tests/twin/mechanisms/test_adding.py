@@ -1,0 +1,47 @@
+"""The example in docs/adding_a_mechanism.md is a whole mechanism: it passes what every registered one passes."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import cases
+import pytest
+import signatures_heat
+import test_mechanisms as promises
+
+from twin.mechanisms import MECHANISMS
+
+KEY = "wiper_friction"
+
+
+@pytest.fixture
+def example(monkeypatch) -> str:
+    text = (Path(__file__).parents[3] / "docs" / "adding_a_mechanism.md").read_text(encoding="utf-8")
+    law, test = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    module = ModuleType("wipers")
+    exec(law, module.__dict__)
+    monkeypatch.setitem(sys.modules, "wipers", module)
+    monkeypatch.setitem(MECHANISMS._members, KEY, "wipers:WiperFriction")
+    monkeypatch.setitem(cases.CASES, KEY, None)  # so that it is gone afterwards
+    names = {"CASES": cases.CASES, "Case": cases.Case, "heat": signatures_heat.heat, "pytest": pytest}
+    exec(test, names)
+    monkeypatch.setitem(promises.SIGNATURES, KEY, names[KEY])
+    return text
+
+
+def test_the_example_passes(example):
+    kept = 0
+    for name, promise in vars(promises).items():
+        marks = getattr(promise, "pytestmark", [])
+        if name.startswith("test_") and any("motor_loss" in m.args[1] for m in marks):
+            promise(KEY)
+            kept += 1
+    assert kept >= 14
+
+
+def test_the_line_in_the_docs_is_how_lines_look(example):
+    assert '"wiper_friction": "twin.mechanisms.wipers:WiperFriction",' in example
+    assert MECHANISMS[KEY].key == KEY
