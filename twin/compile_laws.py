@@ -52,7 +52,7 @@ def _drivers(scope: Scope, key: str, mechanism: Mechanism, given: MechanismPart)
     wanted, drivers = list(mechanism.drivers), given.drivers or {}
     if isinstance(drivers, str):
         drivers = {wanted[0]: drivers} if len(wanted) == 1 else {}
-    if set(drivers) != set(wanted):
+    if set(drivers) - set(wanted) or set(wanted) - set(drivers) - mechanism.optional_drivers:
         raise ValueError(f"{key}.drivers: {mechanism.key} needs {', '.join(wanted) or 'none'}, got {list(drivers)}")
     for role, channel in drivers.items():
         if channel not in scope.machine.channels:
@@ -112,7 +112,10 @@ def heats(scope: Scope) -> tuple[Heat, ...]:
     heats = []
     for name, given in scope.part.mechanisms.items():
         if "heat_W" in scope.laws[name].mechanism.effects():
-            heats.append(Heat(scope.laws[name], _outlets(scope, name, given), acting(scope, "factor", name)))
+            law = scope.laws[name]
+            loses = law.ports.get(law.mechanism.takes_from or "")
+            factors = acting(scope, "factor", name)
+            heats.append(Heat(law, _outlets(scope, name, given), factors, loses.cells if loses else None))
     return tuple(heats)
 
 

@@ -50,11 +50,12 @@ class Outlet:
 
 @dataclass(frozen=True)
 class Heat:
-    """A heat source: a law, its outlets, and the laws that multiply it."""
+    """A heat source: a law, its outlets, the laws that multiply it, and the cells (N,) that lose its watts, if any."""
 
     law: Law
     outlets: tuple[Outlet, ...]
     factors: tuple[Law, ...] = ()
+    taken: Array | None = None
 
     @property
     def temperature_dependent(self) -> bool:
@@ -63,6 +64,8 @@ class Heat:
     def direction(self, values: Array) -> Array:
         """Cells' shares (..., N) of one watt, at parameter values (..., n)."""
         out = np.zeros((*values.shape[:-1], len(self.outlets[0].cells)))
+        if self.taken is not None:
+            out -= self.taken
         rest = np.ones(values.shape[:-1])
         for outlet in self.outlets:
             if outlet.share is not None:

@@ -57,7 +57,7 @@ class ParameterTable:
             ValueError: no material given, or an unknown one.
         """
         if name is None:
-            raise ValueError(f"{key}: needs the {MATERIAL[quantity].words}; give 'material' or write the value here")
+            raise ValueError(f"{key}: needs {MATERIAL[quantity].words}; give 'material' or write the value here")
         path = f"materials.{name}.{quantity}"
         if name in self.part.materials:
             return self.add(path, MATERIAL[quantity], getattr(self.part.materials[name], quantity))

@@ -52,9 +52,9 @@ def with_calibrated(text: str, lines: str) -> str:
     block = f"{indent}calibrated:\n" + "".join(f"{indent}  {line}\n" for line in lines.rstrip().splitlines())
     for key, value in twin.value:
         if key.value == "calibrated":
-            return (
-                text[: key.start_mark.index - key.start_mark.column] + block + text[value.end_mark.index :].lstrip("\n")
-            )
+            start = key.start_mark.index - key.start_mark.column
+            end = text.rfind("\n", 0, value.end_mark.index) + 1  # the mark stands behind the next key's indentation
+            return text[:start] + block + text[end:]
     first = twin.value[0][0].start_mark
     at = first.index - first.column
     return text[:at] + block + text[at:]

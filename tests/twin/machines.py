@@ -32,7 +32,9 @@ TWO_BODIES: dict[str, Any] = {
                      "parameters": {"power": {"value": "120 W", "spread": 0.4}}},
         },
         "sensors": {"t_shaft": {"at": "shaft"}, "t_head": {"at": "head"}},
-        "errors": {"z": {"chain": [{"body": "shaft", "length": "0.4 m"}, {"body": "head", "length": "0.4 m", "sign": -1}]}},
+        "errors": {
+            "z": {"chain": [{"body": "shaft", "length": "0.4 m"}, {"body": "head", "length": "0.4 m", "sign": -1}]},
+        },
     },
 }  # fmt: skip
 
@@ -50,4 +52,4 @@ def machine(raw: dict[str, Any] | None = None, **changes: Any) -> Machine:
             del at[keys[-1]]
         else:
             at[keys[-1]] = value
-    return parse_machine(yaml.safe_dump(raw), "two_bodies.yml")
+    return parse_machine(yaml.safe_dump(raw, sort_keys=False), "two_bodies.yml")

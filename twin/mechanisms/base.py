@@ -55,6 +55,8 @@ class Mechanism(ABC):
     signature: ClassVar[str]  # how it shows in recordings
     acts_at: ClassVar[tuple[Target, ...]]
     drivers: ClassVar[Mapping[str, str]] = {}  # the law's name for a driver -> unit
+    optional_drivers: ClassVar[frozenset[str]] = frozenset()  # those of `drivers` that a machine file may leave out
+    takes_from: ClassVar[str | None] = None  # the port that loses the heat which `into` gains, where it is a body
     ports: ClassVar[tuple[str, ...]] = ()  # names of the temperatures that the law needs
     parameters: ClassVar[tuple[Spec, ...]] = ()
     along_time: ClassVar[bool] = False  # True: the effect at a time needs the times before it (lag, slip, hysteresis)
