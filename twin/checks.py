@@ -37,6 +37,8 @@ def _islands(network: Network) -> Iterator[str]:
         at = np.flatnonzero(edge.direction)
         near[np.ix_(at, at)] = 1.0
     for heat in network.heats:  # radiation and natural convection are paths too
+        if heat.taken is not None:
+            near[np.ix_(np.flatnonzero(heat.direction(network.values) > 0), np.flatnonzero(heat.taken))] = 1.0
         if any(p.cells is None for p in heat.law.ports.values()):
             near[np.flatnonzero(np.sum([o.cells for o in heat.outlets], axis=0)), n] = 1.0
     _, group = connected_components(near, directed=False)
