@@ -50,7 +50,8 @@ def _instance(mechanism: Mechanism, parameters: dict[str, Any] | None) -> dict[s
     if {"heat_W", "start_K"} & set(mechanism.effects()):
         out["into"] = "first"
     if mechanism.ports:
-        out["at"] = dict(zip(mechanism.ports, BODIES, strict=False))
+        seen = BODIES[1:] if "reading" in mechanism.effects() else BODIES
+        out["at"] = dict(zip(mechanism.ports, seen, strict=False))
     if mechanism.drivers:
         out["drivers"] = {role: f"{role}_driver" for role in mechanism.drivers}
     return out

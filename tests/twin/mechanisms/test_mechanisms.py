@@ -138,7 +138,7 @@ def test_without_its_driver_it_does_nothing(key):
 @laws
 def test_an_exchange_stops_at_equal_temperatures_and_turns_with_their_difference(key):
     m = made(key)
-    if getattr(m, "takes_from", None) is None:
+    if m.takes_from is None:
         assert "heat_W" not in m.effects() or len(m.ports) < 2, "an exchange says which port the heat leaves"
         return
     point, hot, cold = Point.of(m), np.full(TIME_S.shape, 41.0), np.full(TIME_S.shape, 17.0)
@@ -155,7 +155,7 @@ def test_watts_that_enter_the_network_leave_another_place_or_are_new(key):
     m = made(key)
     for heat in network_with(m).heats:
         if heat.law.name == "tried":
-            closed = getattr(m, "takes_from", None) is not None
+            closed = m.takes_from is not None
             total = heat.direction(network_with(m).values[None]).sum()
             assert total == pytest.approx(0.0 if closed else 1.0, abs=1e-15)
 
@@ -170,7 +170,7 @@ def test_signs_hold_over_the_whole_prior(key):
             assert np.isfinite(drawn.effect(effect)).all(), effect
         if "factor" in m.effects():
             assert (drawn.effect("factor") >= 0).all()
-        if "heat_W" in m.effects() and key not in SIGNED_HEAT and getattr(m, "takes_from", None) is None:
+        if "heat_W" in m.effects() and key not in SIGNED_HEAT and m.takes_from is None:
             assert (drawn.effect("heat_W") >= 0).all()
 
 
@@ -239,7 +239,7 @@ def at_work(network: Network) -> bool:
 @laws
 def test_drivers_that_may_be_left_out(key):
     m = made(key)
-    optional = getattr(m, "optional_drivers", frozenset())
+    optional = m.optional_drivers
     assert optional <= set(m.drivers)
     if optional:
         rest = {role: f"{role}_driver" for role in m.drivers if role not in optional}
