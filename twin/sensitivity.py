@@ -1,0 +1,245 @@
+"""Forward sensitivities: how every channel changes with every parameter, start temperature and offset.
+
+The derivative of the heat balance is a heat balance with other heat: all unknowns are right-hand sides of one linear
+run with the simulation's own modes (Tomovic and Vukobratovic 1972, General Sensitivity Theory). What multiplies a
+temperature is linear within an interval, so derivatives are of second order in it, like the simulation itself.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError, WorkError
+from twin.channels import Rows, Tangents, shown
+from twin.coupling import outlets
+from twin.inputs import Inputs
+from twin.law_calls import STEP
+from twin.mixing import Mixing
+from twin.network import Network
+from twin.response import Response
+from twin.schedule import Schedule
+from twin.simulation import TOLERANCE_K, Simulation, simulation_of
+from twin.solved import Solved, rows_of, seen_matrix, solved_balance
+from twin.sources import Borders
+from twin.start import checked_start
+from twin.tangent_forcing import Unknown, UnknownsOf, few
+
+Array = NDArray[np.float64]
+
+RELATIVE = 1e-7  # to which the derivatives' own iteration converges
+ROUNDS = 60
+
+
+def sensitivities(
+    network: Network,
+    values: Array,
+    inputs: Inputs,
+    start_degC: Array | str | None = None,
+    parameters: Sequence[int] | None = None,
+    starts: bool = False,
+    offsets: Sequence[int] = (),
+    offsets_K: Array | None = None,
+    tolerance_K: float = TOLERANCE_K,
+    every: int | None = None,
+) -> tuple[Simulation, Array, Array]:
+    """A simulation at values (n,), d readings (Q, B, K, n_sensors) and d errors (Q, B, K, n_errors).
+
+    The Q unknowns are the `parameters` (numbers; default the free ones) in fitting coordinates (`Parameter.to_x`),
+    with `starts` the start temperature of every body in K, then offsets in K of the surroundings numbered `offsets`.
+    Starts and offsets are each batch's own: their derivatives hold for that batch. Start temperatures that follow from
+    first readings are taken as given. Other arguments as in `simulate`, for one parameter set.
+
+    Raises:
+        InputError: as `simulate`; WorkError: the derivatives do not converge.
+    """
+    values = np.asarray(values, float).reshape(1, -1)
+    every = inputs.every if every is None else every
+    start = checked_start(network, values, inputs, start_degC)
+    if len(start) != 1 or (offsets_K is not None and len(offsets_K) != 1):
+        raise InputError(f"machine {network.machine}: sensitivities need one set of start temperatures and offsets")
+    solved = solved_balance(network, values, inputs, start, tolerance_K, 1, offsets_K)
+    numbers = network.free.tolist() if parameters is None else list(parameters)
+    build = UnknownsOf(solved, solved.states.at(np.eye(network.n_cells)[None])[0])
+    unknowns = [build.parameter(j) for j in numbers]
+    unknowns += [build.start(cells) for cells in network.bodies.values()] if starts else []
+    unknowns += [build.offset(s) for s in offsets]
+    rows = rows_of(solved, every, 1)
+    tangents = _Tangents(solved, unknowns, build.cells_degC, every).at_rows(rows)
+    readings, errors, d_readings, d_errors = shown(rows, network, tangents)
+    for q, j in enumerate(numbers):
+        slope = float(network.parameters[j].slope(values[0, j]))
+        d_readings[q] *= slope
+        d_errors[q] *= slope
+    return simulation_of(solved, readings, errors, tolerance_K, every), d_readings, d_errors
+
+
+class _Tangents:
+    """The thermal part: derivatives of all places' temperatures, at the borders while it is solved."""
+
+    def __init__(self, solved: Solved, unknowns: Sequence[Unknown], cells_degC: Array, every: int) -> None:
+        self.solved, self.balance, self.unknowns = solved, solved.balance, unknowns
+        self.every = every
+        self.rise_K = cells_degC - cells_degC[:, :1]
+        self.thermal = [q for q, u in enumerate(unknowns) if u.thermal]
+        self.matrix = seen_matrix(self.balance.network, self.balance.values, solved.places)  # (1, n_out, N)
+        self.n_places = len(solved.places.rows)
+
+    def at_rows(self, rows: Rows) -> Tangents:
+        """Tangents at the rows of the recordings."""
+        inputs, network = self.balance.inputs, self.balance.network
+        n_rows = rows.time_s.shape[1]
+        seen = np.zeros((self.matrix.shape[1], len(self.unknowns), inputs.n_batches, n_rows))
+        if self.thermal:
+            seen[:, self.thermal] = self._coupled() if self.solved.sources else self._alone(self.every)
+        chain = seen[self.n_places :] - seen[self.n_places :, ..., :1]
+        numbers = {u.parameter: q for q, u in enumerate(self.unknowns) if u.parameter >= 0}
+        for e, error in enumerate(network.errors):
+            for row, gain in zip(error.rows, error.gains, strict=True):
+                for j in {j for j, _ in gain.powers} & set(numbers):
+                    rise = self.rise_K[:, :: self.every] @ row
+                    chain[e, numbers[j]] += gain.slope(self.balance.values, j)[0] * rise
+        air_K = np.zeros((len(self.unknowns), len(network.surroundings), inputs.n_batches, n_rows))
+        for q, u in enumerate(self.unknowns):
+            for s, ends in u.air_K.items():
+                air_K[q, s] = np.concatenate([ends[:, :1, 0], ends[..., 1]], axis=-1)[:, :: self.every]
+        return Tangents(seen[: self.n_places], chain, air_K, numbers)
+
+    def _alone(self, every: int) -> Array:
+        """Derivatives (n_out, Q, B, K) of a network whose heat does not depend on temperature."""
+        out = np.empty((self.matrix.shape[1], len(self.thermal), *self.balance.inputs.time_s[:, ::every].shape))
+        for at, forcing, start in self._groups(self.solved.response, slice(0, self.balance.inputs.valid.shape[1])):
+            out[:, at] = np.moveaxis(self.solved.response.outputs(forcing, start, self.matrix, every), -1, 0)
+        return self._with_ratio(out, every)
+
+    def _with_ratio(self, out: Array, every: int, part: slice | None = None) -> Array:
+        """Add the part of a capacity's derivative that follows the temperatures themselves."""
+        rise_K = self.rise_K if part is None else self.rise_K[:, part.start : part.stop + 1]
+        for i, q in enumerate(self.thermal):
+            ratio = self.unknowns[q].ratio
+            if ratio is not None:
+                out[:, i] -= np.moveaxis((rise_K[:, ::every] * ratio) @ self.matrix[0].T, -1, 0)
+        return out
+
+    def _groups(self, response: Response, part: slice):  # type: ignore[no-untyped-def]
+        """Unknowns with about as many pairs, together: positions, forcing in the intervals `part`, start (Q, B, N)."""
+        balance = self.balance
+        n_regimes, n_cells = balance.regimes.count, balance.network.n_cells
+        groups: dict[int, list[tuple[int, list[tuple[Array, Array]]]]] = defaultdict(list)
+        for i, q in enumerate(self.thermal):
+            pairs = few(self.unknowns[q].pairs, n_cells)
+            groups[1 << max(len(pairs) - 1, 0).bit_length()].append((i, pairs))
+        for size, members in groups.items():
+            at = [i for i, _ in members]
+            directions = np.zeros((len(at), n_regimes, size, n_cells))
+            series = np.zeros((len(at), size, *balance.inputs.dt_s[:, part].shape, 2))
+            start = np.zeros((len(at), balance.inputs.n_batches, n_cells))
+            for k, (i, pairs) in enumerate(members):
+                for p, (direction, ends) in enumerate(pairs):
+                    directions[k, :, p], series[k, p] = direction, ends[:, part]
+                given = self.unknowns[self.thermal[i]].start_K
+                start[k] = 0.0 if given is None else given
+            yield at, response.forcing(directions, series), start
+
+    def _coupled(self) -> Array:
+        """Derivatives (n_out, Q, B, K) where heat answers to temperatures: the simulation's iteration once more."""
+        coupled = self.solved.coupled
+        assert coupled is not None
+        n_intervals = self.balance.inputs.valid.shape[1]
+        heat = np.zeros((len(self.thermal), len(self.solved.sources), *self.balance.inputs.valid.shape, 2))
+        matrix = np.concatenate([self.matrix, np.stack([s.direction for s in self.solved.sources], axis=1)], axis=1)
+        seen = np.zeros((matrix.shape[1], len(self.thermal), self.balance.inputs.n_batches, n_intervals + 1))
+        now = None  # derivative of all cells at the start of a window, without the ratio's part
+        for part in coupled.windows:
+            now = self._window(part, matrix, seen, heat, now)
+        return seen[: self.matrix.shape[1], ..., :: self.every]
+
+    def _window(self, part: slice, matrix: Array, seen: Array, heat: Array, now: Array | None) -> Array | None:
+        balance, coupled = self.balance, self.solved.coupled
+        assert coupled is not None
+        n_intervals = balance.inputs.valid.shape[1]
+        whole = part == slice(0, n_intervals)
+        response = self.solved.response
+        if not whole:
+            left = np.clip(balance.inputs.n_intervals - part.start, 0, part.stop - part.start)
+            schedule = Schedule(balance.inputs.dt_s[:, part], balance.regimes.of[:, part], left)
+            response = Response(coupled.chord.modes, schedule)
+        borders = slice(part.start, part.stop + 1)
+        base = np.empty((len(matrix[0]), len(self.thermal), balance.inputs.n_batches, part.stop - part.start + 1))
+        groups = list(self._groups(response, part))
+        for at, forcing, start in groups:
+            begin = start if now is None else now[at]
+            base[:, at] = np.moveaxis(response.outputs(forcing, begin, matrix), -1, 0)
+        shift = self._with_ratio(np.zeros((self.matrix.shape[1], *base.shape[1:])), 1, part)
+        valid = np.arange(part.start, part.stop + 1) <= balance.inputs.n_intervals[:, None]
+        mixing = Mixing(valid, off=any(s.along for s in self.solved.sources))
+        into, rest = outlets(balance, self.solved.sources), np.zeros((1, balance.inputs.n_batches, matrix.shape[2]))
+        own = seen[:, ..., borders]
+        own[...] = base
+        own[: len(shift)] += shift
+        n_seen = len(shift)
+        slopes = self._slopes(part)
+        for _ in range(ROUNDS):
+            heat[:, :, :, part] = self._answer_W(part, seen, slopes, n_seen)
+            new = base + np.moveaxis(response.outputs(response.forcing(into, heat[:, :, :, part]), rest, matrix), -1, 0)
+            new[:n_seen] += shift
+            gap = np.where(valid, np.abs(new - own), 0.0).max(axis=(0, 2, 3))
+            size = np.where(valid, np.abs(new), 0.0).max(axis=(0, 2, 3))
+            if not np.isfinite(gap).all() or (gap <= RELATIVE * size).all():
+                own[...] = new
+                break
+            own[...] = mixing(own, new)
+        if not (np.isfinite(gap).all() and (gap <= 100 * RELATIVE * size).all()):
+            raise WorkError(
+                f"machine {balance.network.machine}: derivatives do not converge between "
+                f"{balance.inputs.time_s[0, part.start] / 3600:.2f} h and "
+                f"{balance.inputs.time_s[0, part.stop] / 3600:.2f} h of a batch; take smaller substeps"
+            )
+        if part.stop == n_intervals:
+            return None
+        cells = np.eye(matrix.shape[2])[None]
+        n_steps = part.stop - part.start
+        out = response.outputs(response.forcing(into, heat[:, :, :, part]), rest, cells, n_steps)[:, :, -1]
+        for at, forcing, start in groups:
+            begin = start if now is None else now[at]
+            out[at] += response.outputs(forcing, begin, cells, n_steps)[:, :, -1]
+        return np.asarray(out)
+
+    def _slopes(self, part: slice) -> list[tuple[dict[int, Array], dict[int, Array]]]:
+        """Of every source that works point by point: W/K by place and by surrounding, (1, B, 2, m)."""
+        coupled = self.solved.coupled
+        assert coupled is not None
+        sources = self.solved.sources
+        return [
+            ({}, {}) if s.along else (s.slopes(coupled.borders, part), s.surrounding_slopes(coupled.borders, part))
+            for s in sources
+        ]
+
+    def _answer_W(
+        self, part: slice, seen: Array, slopes: list[tuple[dict[int, Array], dict[int, Array]]], n_seen: int
+    ) -> Array:
+        """What the sources make of the derivatives `seen`, (Q, k, B, m, 2), the chord's part included."""
+        coupled, balance = self.solved.coupled, self.balance
+        assert coupled is not None
+        borders = Borders(seen)
+        n_batches, n_steps = balance.inputs.n_batches, part.stop - part.start
+        out = np.zeros((len(self.thermal), len(self.solved.sources), n_batches, n_steps, 2))
+        for k, (source, (by_place, by_air)) in enumerate(zip(self.solved.sources, slopes, strict=True)):
+            watts = np.zeros((len(self.thermal), n_batches, 2, n_steps))
+            if source.along:
+                ahead = Borders(coupled.borders.degC[: self.n_places] + 1j * STEP * seen[: self.n_places])
+                watts += np.imag(source.watts(ahead, part)) / STEP
+            for place, slope in by_place.items():
+                watts += slope * borders.ends(place, part)
+            for s, slope in by_air.items():
+                for i, q in enumerate(self.thermal):
+                    if s in self.unknowns[q].air_K:
+                        watts[i] += slope[0] * np.moveaxis(self.unknowns[q].air_K[s][:, part], -1, -2)
+            out[:, k] = np.moveaxis(watts, -2, -1)
+            if coupled.chord.used:
+                chord = coupled.chord.slope_W_per_K[0, balance.regimes.of[:, part], k]
+                out[:, k] += chord[..., None] * np.moveaxis(borders.ends(n_seen + k, part), -2, -1)
+        return out
