@@ -103,7 +103,8 @@ class Rows:
     def _port(self, port: Port, tangents: Tangents | None) -> Array:
         if port.cells is None:
             out = self._air[port.surrounding]
-            return out if tangents is None else out + 1j * STEP * tangents.air_K[:, port.surrounding]
+            moves = tangents is not None and tangents.air_K[:, port.surrounding].any()
+            return out + 1j * STEP * tangents.air_K[:, port.surrounding] if tangents is not None and moves else out
         k = self.places.number(port.cells)
         return self.degC[k] if tangents is None else self.degC[k] + 1j * STEP * tangents.degC[k]
 

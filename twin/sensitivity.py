@@ -30,7 +30,7 @@ from twin.tangent_forcing import Unknown, UnknownsOf, few
 
 Array = NDArray[np.float64]
 
-RELATIVE = 1e-7  # to which the derivatives' own iteration converges
+RELATIVE = 1e-6  # to which the derivatives' own iteration converges
 ROUNDS = 60
 
 
@@ -109,19 +109,20 @@ class _Tangents:
         return Tangents(seen[: self.n_places], chain, air_K, numbers)
 
     def _alone(self, every: int) -> Array:
-        """Derivatives (n_out, Q, B, K) of a network whose heat does not depend on temperature."""
+        """Derivatives (n_out, Q, B, K) without what temperature-dependent heat answers."""
+        response = self.solved.response
         out = np.empty((self.matrix.shape[1], len(self.thermal), *self.balance.inputs.time_s[:, ::every].shape))
-        for at, forcing, start in self._groups(self.solved.response, slice(0, self.balance.inputs.valid.shape[1])):
-            out[:, at] = np.moveaxis(self.solved.response.outputs(forcing, start, self.matrix, every), -1, 0)
-        return self._with_ratio(out, every)
+        for at, forcing, start in self._groups(response, slice(0, self.balance.inputs.valid.shape[1])):
+            out[:, at] = np.moveaxis(response.outputs(forcing, start, self.matrix, every), -1, 0)
+        return self._with_ratio(out, self.matrix, every)
 
-    def _with_ratio(self, out: Array, every: int, part: slice | None = None) -> Array:
+    def _with_ratio(self, out: Array, matrix: Array, every: int, part: slice | None = None) -> Array:
         """Add the part of a capacity's derivative that follows the temperatures themselves."""
         rise_K = self.rise_K if part is None else self.rise_K[:, part.start : part.stop + 1]
         for i, q in enumerate(self.thermal):
             ratio = self.unknowns[q].ratio
             if ratio is not None:
-                out[:, i] -= np.moveaxis((rise_K[:, ::every] * ratio) @ self.matrix[0].T, -1, 0)
+                out[:, i] -= np.moveaxis((rise_K[:, ::every] * ratio) @ matrix[0].T, -1, 0)
         return out
 
     def _groups(self, response: Response, part: slice):  # type: ignore[no-untyped-def]
@@ -146,46 +147,45 @@ class _Tangents:
 
     def _coupled(self) -> Array:
         """Derivatives (n_out, Q, B, K) where heat answers to temperatures: the simulation's iteration once more."""
-        coupled = self.solved.coupled
+        coupled, response, sources = self.solved.coupled, self.solved.response, self.solved.sources
         assert coupled is not None
-        n_intervals = self.balance.inputs.valid.shape[1]
-        heat = np.zeros((len(self.thermal), len(self.solved.sources), *self.balance.inputs.valid.shape, 2))
-        matrix = np.concatenate([self.matrix, np.stack([s.direction for s in self.solved.sources], axis=1)], axis=1)
-        seen = np.zeros((matrix.shape[1], len(self.thermal), self.balance.inputs.n_batches, n_intervals + 1))
+        shape = self.balance.inputs.valid.shape
+        heat = np.zeros((len(self.thermal), len(sources), *shape, 2))
+        n_places = len(coupled.borders.degC) - len(sources)
+        own = [s.direction for s in sources] if coupled.chord.used else []
+        matrix = np.concatenate([self.matrix[:, :n_places], *(d[:, None] for d in own)], axis=1)
+        seen = np.zeros((matrix.shape[1], len(self.thermal), shape[0], shape[1] + 1))
         now = None  # derivative of all cells at the start of a window, without the ratio's part
         for part in coupled.windows:
-            now = self._window(part, matrix, seen, heat, now)
-        return seen[: self.matrix.shape[1], ..., :: self.every]
+            now = self._window(part, matrix, n_places, seen, heat, now)
+        into, rest = outlets(self.balance, sources), np.zeros((1, shape[0], matrix.shape[2]))
+        answer = response.outputs(response.forcing(into, heat), rest, self.matrix, self.every)
+        return self._alone(self.every) + np.moveaxis(answer, -1, 0)
 
-    def _window(self, part: slice, matrix: Array, seen: Array, heat: Array, now: Array | None) -> Array | None:
+    def _window(
+        self, part: slice, matrix: Array, n_places: int, seen: Array, heat: Array, now: Array | None
+    ) -> Array | None:
+        """Iterate in some intervals: fills `heat` (Q, k, B, m, 2) and `seen` there; all cells (Q, B, N) at the end."""
         balance, coupled = self.balance, self.solved.coupled
         assert coupled is not None
-        n_intervals = balance.inputs.valid.shape[1]
-        whole = part == slice(0, n_intervals)
-        response = self.solved.response
-        if not whole:
-            left = np.clip(balance.inputs.n_intervals - part.start, 0, part.stop - part.start)
+        n_steps, response = part.stop - part.start, self.solved.response
+        if n_steps < balance.inputs.valid.shape[1]:
+            left = np.clip(balance.inputs.n_intervals - part.start, 0, n_steps)
             schedule = Schedule(balance.inputs.dt_s[:, part], balance.regimes.of[:, part], left)
             response = Response(coupled.chord.modes, schedule)
-        borders = slice(part.start, part.stop + 1)
-        base = np.empty((len(matrix[0]), len(self.thermal), balance.inputs.n_batches, part.stop - part.start + 1))
-        groups = list(self._groups(response, part))
+        groups = [(at, f, start if now is None else now[at]) for at, f, start in self._groups(response, part)]
+        own = seen[..., part.start : part.stop + 1]
         for at, forcing, start in groups:
-            begin = start if now is None else now[at]
-            base[:, at] = np.moveaxis(response.outputs(forcing, begin, matrix), -1, 0)
-        shift = self._with_ratio(np.zeros((self.matrix.shape[1], *base.shape[1:])), 1, part)
+            own[:, at] = np.moveaxis(response.outputs(forcing, start, matrix), -1, 0)
+        self._with_ratio(own[:n_places], matrix[:, :n_places], 1, part)
+        base = own.copy()
         valid = np.arange(part.start, part.stop + 1) <= balance.inputs.n_intervals[:, None]
         mixing = Mixing(valid, off=any(s.along for s in self.solved.sources))
         into, rest = outlets(balance, self.solved.sources), np.zeros((1, balance.inputs.n_batches, matrix.shape[2]))
-        own = seen[:, ..., borders]
-        own[...] = base
-        own[: len(shift)] += shift
-        n_seen = len(shift)
         slopes = self._slopes(part)
         for _ in range(ROUNDS):
-            heat[:, :, :, part] = self._answer_W(part, seen, slopes, n_seen)
+            heat[:, :, :, part] = self._answer_W(part, seen, slopes, n_places)
             new = base + np.moveaxis(response.outputs(response.forcing(into, heat[:, :, :, part]), rest, matrix), -1, 0)
-            new[:n_seen] += shift
             gap = np.where(valid, np.abs(new - own), 0.0).max(axis=(0, 2, 3))
             size = np.where(valid, np.abs(new), 0.0).max(axis=(0, 2, 3))
             if not np.isfinite(gap).all() or (gap <= RELATIVE * size).all():
@@ -193,19 +193,17 @@ class _Tangents:
                 break
             own[...] = mixing(own, new)
         if not (np.isfinite(gap).all() and (gap <= 100 * RELATIVE * size).all()):
+            hours = balance.inputs.time_s[0, [part.start, part.stop]] / 3600
             raise WorkError(
-                f"machine {balance.network.machine}: derivatives do not converge between "
-                f"{balance.inputs.time_s[0, part.start] / 3600:.2f} h and "
-                f"{balance.inputs.time_s[0, part.stop] / 3600:.2f} h of a batch; take smaller substeps"
+                f"machine {balance.network.machine}: derivatives do not converge between {hours[0]:.2f} h and "
+                f"{hours[1]:.2f} h of a batch; take smaller substeps"
             )
-        if part.stop == n_intervals:
+        if part.stop == balance.inputs.valid.shape[1]:
             return None
         cells = np.eye(matrix.shape[2])[None]
-        n_steps = part.stop - part.start
         out = response.outputs(response.forcing(into, heat[:, :, :, part]), rest, cells, n_steps)[:, :, -1]
         for at, forcing, start in groups:
-            begin = start if now is None else now[at]
-            out[at] += response.outputs(forcing, begin, cells, n_steps)[:, :, -1]
+            out[at] += response.outputs(forcing, start, cells, n_steps)[:, :, -1]
         return np.asarray(out)
 
     def _slopes(self, part: slice) -> list[tuple[dict[int, Array], dict[int, Array]]]:
@@ -219,7 +217,7 @@ class _Tangents:
         ]
 
     def _answer_W(
-        self, part: slice, seen: Array, slopes: list[tuple[dict[int, Array], dict[int, Array]]], n_seen: int
+        self, part: slice, seen: Array, slopes: list[tuple[dict[int, Array], dict[int, Array]]], n_places: int
     ) -> Array:
         """What the sources make of the derivatives `seen`, (Q, k, B, m, 2), the chord's part included."""
         coupled, balance = self.solved.coupled, self.balance
@@ -230,7 +228,7 @@ class _Tangents:
         for k, (source, (by_place, by_air)) in enumerate(zip(self.solved.sources, slopes, strict=True)):
             watts = np.zeros((len(self.thermal), n_batches, 2, n_steps))
             if source.along:
-                ahead = Borders(coupled.borders.degC[: self.n_places] + 1j * STEP * seen[: self.n_places])
+                ahead = Borders(coupled.borders.degC[:n_places] + 1j * STEP * seen[:n_places])
                 watts += np.imag(source.watts(ahead, part)) / STEP
             for place, slope in by_place.items():
                 watts += slope * borders.ends(place, part)
@@ -241,5 +239,5 @@ class _Tangents:
             out[:, k] = np.moveaxis(watts, -2, -1)
             if coupled.chord.used:
                 chord = coupled.chord.slope_W_per_K[0, balance.regimes.of[:, part], k]
-                out[:, k] += chord[..., None] * np.moveaxis(borders.ends(n_seen + k, part), -2, -1)
+                out[:, k] += chord[..., None] * np.moveaxis(borders.ends(n_places + k, part), -2, -1)
         return out
