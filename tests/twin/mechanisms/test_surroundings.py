@@ -177,6 +177,6 @@ def test_a_wall_stated_twice() -> None:
     small = machine("room", air={"law": "enclosure_air"})
     small.twin["exposures"]["air-room"] = "50 W/K"
     with pytest.raises(
-        InputError, match="exposures.air-room: enclosure_air adds this one; state it as mechanisms.air.c"
+        InputError, match=r"exposures\.air-room: enclosure_air adds this one; state it as mechanisms\.air"
     ):
         compile_network(small)
