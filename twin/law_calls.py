@@ -50,7 +50,9 @@ class Intervals:
 
     @cached_property
     def _time_s(self) -> Array:
-        return np.stack([self.inputs.time_s[:, :-1], self.inputs.time_s[:, 1:]], axis=1)
+        start_s, end_s = self.inputs.time_s[:, :-1], self.inputs.time_s[:, 1:]
+        # an end is just before the border: what switches there does so in the next interval
+        return np.stack([start_s, end_s - 1e-7 * self.inputs.dt_s], axis=1)
 
     @cached_property
     def _clock_h(self) -> Array:

@@ -18,6 +18,7 @@ from twin.balance import check_values
 from twin.channels import shown
 from twin.coupling import Coupled
 from twin.inputs import Inputs
+from twin.interval_means import bulge_K
 from twin.network import Network
 from twin.solved import Solved, rows_of, solved_balance
 from twin.start import checked_start, start_of
@@ -134,14 +135,22 @@ def _words(coupled: Coupled | None, tolerance_K: float) -> str:
 
 
 def _heats(solved: Solved, every: int) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Watts at the rows and joules since the start, of every heat and of exchange that varies, by name."""
+    """Watts at the rows and joules since the start, of every heat and of exchange that varies, by name.
+
+    Where a chord took part in the solution, what it delivered beyond the law's straight lines counts to the heat.
+    """
     balance = solved.balance
     inputs = balance.inputs
     series = {h.law.name: balance.driven_W(h) for h in balance.network.heats if not h.temperature_dependent}
     if solved.coupled is not None:
-        every_interval = slice(0, inputs.valid.shape[1])
-        for source in solved.sources:
+        every_interval, chord = slice(0, inputs.valid.shape[1]), solved.coupled.chord
+        if chord.used:
+            bulge = bulge_K(solved, solved.states.at(np.eye(balance.network.n_cells)[None]))
+        for k, source in enumerate(solved.sources):
             watts = np.moveaxis(source.watts(solved.coupled.borders, every_interval), -2, -1)
+            if chord.used:
+                own = np.einsum("pbmn,pn->pbm", bulge, source.direction)
+                watts = watts - (chord.slope_W_per_K[:, balance.regimes.of, k] * own)[..., None]
             series[source.name] = series.get(source.name, 0.0) + watts
     n_sets = len(balance.values)
     dt_s = np.where(inputs.valid, inputs.dt_s, 0.0)

@@ -174,7 +174,7 @@ class ExchangeSource:
 
     @property
     def name(self) -> str:
-        return self.edge.name
+        return f"{self.edge.name} beyond its mean"
 
     @cached_property
     def direction(self) -> Array:

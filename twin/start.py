@@ -10,12 +10,13 @@ from twin.air import air_of
 from twin.inputs import Inputs
 from twin.law_calls import parameters_of
 from twin.mechanisms.base import View
-from twin.network import Network
+from twin.network import Network, Reading
 
 Array = NDArray[np.float64]
 
 _HOLD = 1e6  # how much stiffer a sensor holds its place than the network pulls at it
 _LOOSE = 1e-9  # and the ambient what nothing else holds
+_LEAST_GAIN = 0.2  # of a sensor in what its place does; one that follows less tells next to nothing
 
 
 def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = False) -> Array:
@@ -45,11 +46,26 @@ def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = Fa
         known |= told
         hold = _HOLD * scale * told[:, None, None]
         system = system + hold * np.outer(reading.cells, reading.cells)
-        heat = heat + hold[..., 0] * np.where(told, value, 0.0)[:, None] * reading.cells
+        place_degC = _beneath(reading, values, first, np.where(told, value, 0.0))
+        heat = heat + hold[..., 0] * place_degC[..., None] * reading.cells
     out: Array = np.linalg.solve(np.broadcast_to(system, (*heat.shape, heat.shape[-1])), heat[..., None])[..., 0]
     if not settled:
         out = np.where(known[:, None], out, ambient[..., None])
     return out[0] if single else out
+
+
+def _beneath(reading: Reading, values: Array, air_degC: Array, shown_degC: Array) -> Array:
+    """The place's temperature (P, B) at what its sensor shows (B,), through offset and bonding, which are affine."""
+    shape = (len(values), len(shown_degC), 1)
+    low, high = np.zeros(shape), np.ones(shape)
+    for law in reading.effects:
+        if law.mechanism.along_time or any(p.cells is not None for p in law.ports.values()):
+            continue  # a lag has settled, and a swapped sensor tells nothing of this place
+        view = View(degC={role: air_degC[:, :, p.surrounding, None] for role, p in law.ports.items()})
+        low, high = (law.mechanism.reading(seen, view, parameters_of(law, values, 2)) for seen in (low, high))
+    gain = (high - low)[..., 0]
+    affine = gain > _LEAST_GAIN
+    return np.asarray(np.where(affine, (shown_degC - low[..., 0]) / np.where(affine, gain, 1.0), shown_degC))
 
 
 def excess_K(network: Network, values: Array, inputs: Inputs) -> Array | None:

@@ -15,6 +15,7 @@ from twin.law_calls import STEP, stepped
 from twin.network import Edge
 from twin.regimes import factor_series
 from twin.solved import Solved
+from twin.sources import HeatSource
 from twin.start import excess_K
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ class UnknownsOf:
     def __init__(self, solved: Solved, cells_degC: Array) -> None:
         self.solved, self.balance, self.cells_degC = solved, solved.balance, cells_degC
         self.network, self.values = solved.balance.network, solved.balance.values
-        self.bulge_K = bulge_K(solved, cells_degC)
+        self.bulge_K = bulge_K(solved, cells_degC[None])[0]
         self.shape = (*self.balance.inputs.valid.shape, 2)
 
     def parameter(self, j: int) -> Unknown:
@@ -97,7 +98,7 @@ class UnknownsOf:
         self._add(out, edge.direction, slope[..., None] * lead)
 
     def _heats(self, out: Unknown, j: int) -> None:
-        by_name = {s.name: s for s in self.solved.sources}
+        by_name = {s.name: s for s in self.solved.sources if isinstance(s, HeatSource)}
         borders = self.solved.coupled.borders if self.solved.coupled is not None else None
         every = slice(0, self.shape[1])
         for heat in self.network.heats:

@@ -1,0 +1,418 @@
+"""The simulation against closed forms, against a stiff solver, and for conserved energy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from data import sample_machine as truth
+from data.errors import InputError
+from data.machine import load_machine
+from tests.twin.drives import at, closed, drive, network, one_body
+from twin.compile import compile_network
+from twin.network import Network
+from twin.simulation import choose_substeps, simulate, start_of
+
+SIGMA = 5.670374419e-8
+SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
+
+
+@pytest.fixture(scope="module")
+def sample() -> Network:
+    return compile_network(load_machine(SAMPLE))
+
+
+# closed forms of linear networks: exact, whatever the step
+
+
+def test_one_body_answers_a_step_of_heat_and_a_moving_room() -> None:
+    net = one_body("10 W/K", mechanisms={"belt": {"law": "belt_loss", "drivers": "rpm", "into": "shaft",
+                                                  "parameters": {"power": "120 W"}}})  # fmt: skip
+    time_s = np.array([0.0, 300.0, 400.0, 2000.0, 5000.0])  # steps as they come
+    tau, drift = 500.0, 1e-3
+    out = simulate(net, net.values, drive(time_s, rpm=6000.0, room=20 + drift * time_s), at(20, net))
+    decay = np.exp(-time_s / tau)
+    expected = 20 + 12 * (1 - decay) + drift * (time_s - tau * (1 - decay))
+    np.testing.assert_allclose(out.readings[0, 0, :, 0], expected, rtol=1e-13)
+    np.testing.assert_allclose(out.errors[0, 0, :, 0], 2 * (expected - 20), atol=1e-11)
+    assert out.words == "linear: exact"
+
+
+def test_two_bodies_between_them_and_the_room() -> None:
+    net = network(mechanisms={})
+    time_s = np.linspace(0, 20000, 41)
+    out = simulate(net, net.values, drive(time_s), at([30.0, 22.0], net))
+    rates = -np.array([[13.0, -12.0], [-12.0, 20.0]]) / np.array([[5e3], [40e3]])
+    value, vector = np.linalg.eig(rates)
+    amplitude = np.linalg.solve(vector, [10.0, 2.0])
+    expected = 20 + np.einsum("ij,kj,j->ki", vector, np.exp(np.outer(time_s, value)), amplitude)
+    np.testing.assert_allclose(out.readings[0, 0], expected, rtol=1e-12)
+
+
+def test_a_bar_whose_end_is_heated_by_a_step() -> None:
+    """Carslaw and Jaeger 1959, §3.8: an insulated bar with constant flux at one end."""
+    cells = 200
+    bar = {"capacity": "20 kJ/K", "shape": "bar", "cells": cells, "conductance": "5 W/K", "material": "steel"}
+    net = closed(network(
+        bodies={"bar": bar}, links={}, exposures={"bar-room": "1 W/K"}, sensors={"t_shaft": {"at": "bar@0"}, "t_head": {"at": "bar@1"}},
+        errors={}, mechanisms={"belt": {"law": "belt_loss", "drivers": "rpm", "into": "bar@0",
+                                        "parameters": {"power": "50 W"}}},
+    ))  # fmt: skip
+    time_s = np.linspace(0, 4000, 21)
+    out = simulate(net, net.values, drive(time_s, rpm=6000.0), at(20, net))
+    span, k = 20e3 / 5.0, np.arange(1, 200)  # L²/a
+    at_end = [1 / 3, -1 / 6]  # heated, far
+    for sensor, (steady, sign) in enumerate(zip(at_end, (1.0, -1.0), strict=True)):
+        modes = np.exp(-np.outer(time_s / span, (k * np.pi) ** 2)) * sign**k / k**2
+        expected = 20 + 50 / 5.0 * (time_s / span + steady - 2 / np.pi**2 * modes.sum(axis=1))
+        np.testing.assert_allclose(out.readings[0, 0, 1:, sensor], expected[1:], atol=0.03)
+
+
+def test_a_periodic_room_is_followed_late_and_damped() -> None:
+    net = one_body("10 W/K")
+    tau, omega = 500.0, 2 * np.pi / 3000.0
+    time_s = np.arange(0, 30001.0, 5.0)
+    out = simulate(net, net.values, drive(time_s, room=20 + 2 * np.sin(omega * time_s)), at(20, net))
+    phase = np.arctan(omega * tau)
+    wave = 2 * np.cos(phase) * (np.sin(omega * time_s - phase) + np.sin(phase) * np.exp(-time_s / tau))
+    # a sine in straight lines of 5 s lacks (omega dt)²/12 of its height
+    np.testing.assert_allclose(out.readings[0, 0, :, 0], 20 + wave, atol=2 * (omega * 5) ** 2 / 8)
+
+
+# heat that depends on temperature
+
+
+def radiating(area: float = 2.0) -> Network:
+    given = {"law": "radiation", "at": {"body": "shaft", "surrounding": "room"}, "into": "shaft",
+             "parameters": {"area": f"{area} m**2", "emissivity": 0.9}}  # fmt: skip
+    return one_body(mechanisms={"walls": given})
+
+
+def test_a_body_that_only_radiates_against_a_stiff_solver() -> None:
+    net, area = radiating(), 2.0
+    time_s = np.arange(0, 7201.0, 10.0)
+
+    def rate(_: float, degC: np.ndarray) -> np.ndarray:
+        return 0.9 * SIGMA * area * (293.15**4 - (degC + 273.15) ** 4) / 5e3
+
+    exact = solve_ivp(rate, (0, 7200), [90.0], "LSODA", t_eval=time_s, rtol=1e-11, atol=1e-10).y[0]
+    gap = {}
+    for step in (4, 2, 1):
+        out = simulate(net, net.values, drive(time_s[::step]), at(90, net), tolerance_K=1e-7)
+        gap[step] = np.abs(out.readings[0, 0, :, 0] - exact[::step]).max()
+    assert gap[1] < 2e-3
+    assert gap[4] / gap[2] == pytest.approx(4, rel=0.15)  # second order in the step
+    assert gap[2] / gap[1] == pytest.approx(4, rel=0.15)
+
+
+@pytest.mark.parametrize("method", ["BDF", "LSODA"])
+def test_the_sample_machine_against_stiff_solvers(sample: Network, method: str) -> None:
+    """Grease that thins in both bearings, three speeds in turn; readings without lag and bonding."""
+    bare = replace(sample, readings=tuple(replace(r, effects=()) for r in sample.readings))
+    minutes = np.arange(0, 181.0)
+    rpm = np.repeat([6000.0, 0.0, 3000.0], 60)
+    room = 18.0 + 0.5 * minutes / 60
+    inputs = _sample_inputs(bare, 60 * minutes, rpm, room)
+    out = simulate(bare, bare.values, inputs.refined(16), at(18, bare), tolerance_K=1e-6, keep_cells=True)
+    start = np.full(14, 18.0)
+    states = [start]
+    for k, speed in enumerate((6000.0, 0.0, 3000.0)):
+        rates, by_room, by_floor = truth.network(speed)
+        capacity = np.array(list(truth.CAPACITY_J_PER_K.values()))
+
+        def rate(t: float, y: np.ndarray) -> np.ndarray:
+            heat = truth.heat_W(y[None], np.array([speed]), np.ones(1))[0]  # noqa: B023
+            return rates @ y + by_room * (18 + 0.5 * t / 3600) + by_floor * floor + heat / capacity  # noqa: B023
+
+        floor = 0.5 * (18.0 + 18.0) if (f := _floor(sample)) is None else f
+        span = (3600.0 * k, 3600.0 * (k + 1))
+        solved = solve_ivp(rate, span, states[-1], method, t_eval=[span[1]], rtol=1e-10, atol=1e-9)
+        states.append(solved.y[:, -1])
+    order = [sample.cells.index(n) for n in truth.NODES]
+    assert out.cells_degC is not None
+    np.testing.assert_allclose(out.cells_degC[0, 0, ::60][:, order], states, atol=2e-4)
+
+
+def _floor(sample: Network) -> float | None:
+    """The floor's temperature in a batch whose room starts at 18 degC."""
+    from twin.air import air_of
+
+    s = [g.name for g in sample.surroundings].index("floor")
+    inputs = _sample_inputs(sample, np.array([0.0, 60.0]), np.zeros(1), np.full(2, 18.0))
+    return float(air_of(sample, sample.values[None], inputs).ends(s)[0, 0, 0, 0])
+
+
+def _sample_inputs(net: Network, time_s: np.ndarray, rpm: np.ndarray, room: np.ndarray):  # type: ignore[no-untyped-def]
+    given = drive(time_s, rpm, room)
+    first = {r.channel: np.array([room[0]]) for r in net.readings} | {"room": room[:1]}
+    return replace(given, drivers={"spindle_rpm": given.drivers["rpm"]}, first=first)
+
+
+def test_a_thermostat_against_its_closed_form() -> None:
+    """120 W warm the body at 0.024 K/s; the coolant takes UA (T - supply) between 23 and 21 degC."""
+    net = one_body("1 W/K", mechanisms={
+        "belt": {"law": "belt_loss", "drivers": "rpm", "into": "shaft", "parameters": {"power": "120 W"}},
+        "jacket": {"law": "jacket_chiller", "at": "shaft", "into": "shaft",
+                   "parameters": {"conductance": "100 W/K", "supply": "16 degC", "set_point": "22 degC",
+                                  "hysteresis": "1 K"}},
+    })  # fmt: skip
+    net = closed(net)
+    rise_s = 2.0 / (120 / 5e3)  # from 21 to 23
+    fall_s = 50.0 * np.log((23 - 17.2) / (21 - 17.2))  # towards 16 + 120 / 100
+    gap = {}
+    for step_s in (1.0, 0.25):
+        time_s = np.arange(0, 1801.0, step_s)
+        out = simulate(net, net.values, drive(time_s, rpm=6000.0), at(21, net), keep_cells=True)
+        since = time_s % (rise_s + fall_s)
+        fallen = 17.2 + 5.8 * np.exp(-np.maximum(since - rise_s, 0) / 50.0)
+        gap[step_s] = np.abs(out.readings[0, 0, :, 0] - np.where(since < rise_s, 21 + 0.024 * since, fallen)).max()
+        assert out.windows > 1  # events follow from each other: no iteration over all of it at once
+        flows = out.heat_J["jacket"][0, 0, -1] + out.heat_J["belt"][0, 0, -1]
+        assert flows == pytest.approx(5e3 * (out.readings[0, 0, -1, 0] - 21), abs=1e-9 * out.heat_J["belt"][0, 0, -1])
+    assert gap[1.0] < 0.4  # flow holds during a step: 1 % late after 20 steps of a cycle's fall
+    assert gap[0.25] < 0.12
+
+
+def test_feedback_that_does_not_contract_is_solved_in_windows() -> None:
+    """Preload that tightens as the shaft leads the housing, near its own runaway."""
+    net = network(
+        mechanisms={
+            "load": {"law": "bearing_load", "drivers": "rpm", "into": "shaft",
+                     "parameters": {"count": 4, "preload": "1500 N"}},
+            "tighter": {"law": "preload_feedback", "at": {"shaft": "shaft", "housing": "head"}, "acts_on": "load",
+                        "parameters": {"kappa": 0.057}},
+        },
+    )  # fmt: skip
+    time_s = np.arange(0, 14401.0, 30.0)
+    inputs = drive(time_s, rpm=6000.0)
+    out = simulate(net, net.values, inputs, at(20, net), tolerance_K=1e-5)
+    p = {
+        name.rpartition(".")[2]: net.values[k]
+        for k, name in enumerate(q.name for q in net.parameters)
+        if "load." in name
+    }
+    base = (p["count"] * 1.047e-4 * 6000 * p["load_factor"] * (p["preload"] / p["static_capacity"]) ** p["load_exponent"]
+            * p["preload"] * p["mean_diameter"])  # fmt: skip
+
+    def rate(_: float, y: np.ndarray) -> list[float]:
+        heat = base * max(1 + 0.057 * (y[0] - y[1]), 0) ** 1.33
+        return [(heat + 12 * (y[1] - y[0]) + 20 - y[0]) / 5e3, (12 * (y[0] - y[1]) + 8 * (20 - y[1])) / 40e3]
+
+    exact = solve_ivp(rate, (0, 14400), [20.0, 20.0], "LSODA", t_eval=time_s, rtol=1e-10, atol=1e-9).y.T
+    rise = np.abs(exact - 20).max()
+    assert rise > 5
+    assert out.windows > 1 and f"in {out.windows} windows" in out.words
+    np.testing.assert_allclose(out.readings[0, 0], exact, atol=2e-4 * rise)
+
+
+def test_what_cannot_be_solved_is_told_in_one_line() -> None:
+    net = network(
+        mechanisms={
+            "load": {"law": "bearing_load", "drivers": "rpm", "into": "shaft",
+                     "parameters": {"count": 10, "preload": "20000 N"}},
+            "tighter": {"law": "preload_feedback", "at": {"shaft": "shaft", "housing": "head"}, "acts_on": "load",
+                        "parameters": {"kappa": 0.5}},
+        },
+    )  # fmt: skip
+    with pytest.raises(InputError) as caught:
+        simulate(net, net.values, drive(np.arange(0, 7201.0, 60.0), rpm=6000.0), at(20, net))
+    words = str(caught.value)
+    assert words.startswith("stiff beyond the step control: heat 'load', batch b0, at ")
+    assert "take smaller substeps, or check parameter mechanisms.load.count" in words
+    assert "\n" not in words
+
+
+# energy
+
+
+def test_a_closed_network_keeps_its_energy() -> None:
+    net = closed(network())
+    time_s = np.arange(0, 36001.0, 100.0)
+    rpm = np.where(np.arange(360) % 60 < 40, 5000.0, 0.0)
+    out = simulate(net, net.values, drive(time_s, rpm=rpm), at([25.0, 18.0], net), keep_cells=True)
+    _check_energy(net, out, 1e-9)
+
+
+def test_a_closed_network_keeps_its_energy_with_exchange_that_follows_temperature() -> None:
+    """Natural convection and radiation between the bodies, grease that thins, a joint that closes as it likes."""
+    net = network(
+        mechanisms={
+            "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},
+            "grease": {"law": "viscosity_feedback", "at": {"oil": ["shaft", "head"]}, "acts_on": "friction"},
+            "air": {"law": "natural_convection", "at": {"body": "shaft", "air": "head"}, "into": "shaft"},
+            "glow": {"law": "radiation", "at": {"body": "shaft", "surrounding": "head"}, "into": "shaft"},
+            "spin": {"law": "rotating_convection", "drivers": "rpm", "acts_on": "shaft-head"},
+        },
+    )
+    net = closed(net)
+    time_s = np.arange(0, 18001.0, 100.0)
+    rpm = 3000 + 2500 * np.sin(np.arange(180) ** 1.3)  # too many speeds for regimes
+    out = simulate(net, net.values, drive(time_s, rpm=rpm), at([60.0, 18.0], net), keep_cells=True)
+    assert np.abs(out.heat_W["shaft-head beyond its mean"]).max() > 10
+    _check_energy(net, out, 1e-9)
+
+
+def _check_energy(net: Network, out, relative: float) -> None:  # type: ignore[no-untyped-def]
+    assert out.cells_degC is not None
+    stored = ((out.cells_degC - out.cells_degC[:, :, :1]) @ net.capacity_J_per_K(net.values))[0, 0]
+    heats = [h for h in net.heats if h.taken is None]
+    given = sum(out.heat_J[h.law.name] for h in heats)[0, 0]
+    np.testing.assert_allclose(stored, given, atol=relative * np.abs(given).max())
+    assert given[-1] > 1e5
+
+
+# conductances that follow drivers
+
+
+def test_a_noisy_speed_is_as_exact_as_the_same_speed_in_regimes() -> None:
+    spin = {"law": "rotating_convection", "drivers": "rpm", "acts_on": "shaft-room"}
+    belt = {"law": "belt_loss", "drivers": "rpm", "into": "shaft", "parameters": {"power": "120 W"}}
+    net = network(mechanisms={"spin": spin, "belt": belt})
+    time_s = np.arange(0, 7201.0, 60.0)
+    steps = np.linspace(0, 6000, 60)
+    rpm = steps[np.random.default_rng(0).integers(0, 60, 120)]
+    few = simulate(net, net.values, drive(time_s, rpm=rpm), at(20, net))
+    assert few.words == "linear: exact"
+    many = rpm + np.linspace(0, 1e-3, 120)  # all different: no regimes
+    gap = []
+    for n in (1, 4):
+        noisy = simulate(net, net.values, drive(time_s, rpm=many).refined(n), at(20, net), tolerance_K=1e-6)
+        assert noisy.iterations > 1
+        gap.append(np.abs(noisy.readings - few.readings).max())
+    assert gap[1] < 1e-3
+    assert gap[0] / gap[1] == pytest.approx(16, rel=0.3)
+
+
+def test_a_draught_is_a_regime_of_the_clock() -> None:
+    """The exchange doubles between 1 h and 1.5 h, while the room is 4 K colder."""
+    net = one_body("10 W/K", mechanisms={
+        "gate": {"law": "draught", "acts_on": ["shaft-room", "room"],
+                 "parameters": {"start": "1 h", "duration": "30 min", "factor": 2, "drop": "4 K"}},
+    })  # fmt: skip
+    time_s = np.arange(0, 7201.0, 20.0)
+    out = simulate(net, net.values, drive(time_s), at(20, net), tolerance_K=1e-6)
+    degC = out.readings[0, 0, :, 0]
+    blown = (time_s >= 3600) & (time_s <= 5400)
+    np.testing.assert_allclose(degC[time_s <= 3600], 20, atol=1e-9)
+    np.testing.assert_allclose(degC[blown], 16 + 4 * np.exp(-(time_s[blown] - 3600) / 250.0), atol=2e-3)
+
+
+# many at once
+
+
+def test_many_sets_and_batches_are_what_they_are_one_by_one() -> None:
+    net = network(mechanisms={
+        "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},
+        "grease": {"law": "viscosity_feedback", "at": {"oil": "shaft"}, "acts_on": "friction"},
+    })  # fmt: skip
+    rng = np.random.default_rng(3)
+    values = net.values * rng.uniform(0.8, 1.2, (4, len(net.values)))
+    share = net.index("mechanisms.friction.into.shaft")
+    values[:, share] = rng.uniform(0.2, 0.9, 4)
+    time_s = np.arange(0, 3601.0, 60.0)
+    rpm = rng.choice([0.0, 3000.0, 6000.0], (3, 60))
+    inputs = drive(time_s, rpm=rpm, room=rng.uniform(15, 25, (3, 1)), n_batches=3)
+    inputs = replace(inputs, n_intervals=np.array([60, 37, 5]))
+    start = rng.uniform(15, 30, (4, 3, 2))
+    offsets = rng.normal(0, 1, (4, 3, 1))
+    out = simulate(net, values, inputs, start, tolerance_K=1e-8, offsets_K=offsets)
+    for p in range(4):
+        for b in range(3):
+            one = inputs.batch([b])
+            m = int(one.n_intervals[0])
+            cut = replace(
+                one, time_s=one.time_s[:, : m + 1], drivers={"rpm": one.drivers["rpm"][:, :m]},
+                recorded={"room": one.recorded["room"][:, : m + 1]},
+            )  # fmt: skip
+            alone = simulate(
+                net,
+                values[p],
+                cut,
+                start[p : p + 1, b : b + 1],
+                tolerance_K=1e-8,
+                offsets_K=offsets[p : p + 1, b : b + 1],
+            )
+            np.testing.assert_allclose(out.readings[p, b, : m + 1], alone.readings[0, 0], atol=1e-7)
+            np.testing.assert_allclose(out.errors[p, b, : m + 1], alone.errors[0, 0], atol=1e-6)
+            np.testing.assert_array_equal(out.valid[b], np.arange(61) <= m)
+
+
+def test_sets_are_worked_on_in_groups_of_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    net = network()
+    values = net.values * np.linspace(0.9, 1.1, 5)[:, None]
+    inputs = drive(np.arange(0, 3601.0, 60.0), rpm=4000.0)
+    whole = simulate(net, values, inputs, keep_cells=True)
+    monkeypatch.setattr("twin.simulation.CHUNK_BYTES", 1)
+    parts = simulate(net, values, inputs, keep_cells=True)
+    np.testing.assert_allclose(parts.readings, whole.readings, rtol=1e-13)
+    assert whole.cells_degC is not None and parts.cells_degC is not None
+    np.testing.assert_allclose(parts.cells_degC, whole.cells_degC, rtol=1e-13)
+    np.testing.assert_allclose(parts.heat_J["belt"], whole.heat_J["belt"], rtol=1e-13)
+
+
+def test_rows_may_be_fewer_than_intervals() -> None:
+    net = network()
+    inputs = drive(np.arange(0, 3601.0, 60.0), rpm=4000.0)
+    every = simulate(net, net.values, inputs)
+    some = simulate(net, net.values, inputs, every=6)
+    np.testing.assert_allclose(some.readings, every.readings[:, :, ::6], rtol=1e-13)
+    np.testing.assert_allclose(some.time_s, every.time_s[:, ::6])
+
+
+# start
+
+
+def test_the_start_follows_the_first_readings_and_settles_the_rest() -> None:
+    net = network(sensors__t_head=None)
+    inputs = drive(np.array([0.0, 60.0]), room=20.0, first=26.0)
+    start = start_of(net, net.values, inputs)
+    np.testing.assert_allclose(start, [[26.0, (12 * 26 + 8 * 20) / 20]], rtol=1e-5)
+    np.testing.assert_allclose(start_of(net, net.values, inputs, settled=True), [[20.0, 20.0]], atol=1e-6)
+    blind = replace(inputs, first={"t_shaft": np.array([np.nan])})
+    np.testing.assert_allclose(start_of(net, net.values, blind), [[20.0, 20.0]], atol=1e-9)
+    assert start_of(net, net.values[None], inputs).shape == (1, 1, 2)
+
+
+def test_a_law_of_the_start_is_added() -> None:
+    warm = {"law": "initial_state", "into": "head", "parameters": {"excess": "3 K"}}
+    net = network(mechanisms={"warm": warm})
+    out = simulate(net, net.values, drive(np.array([0.0, 60.0])), at(20, net))
+    np.testing.assert_allclose(out.readings[0, 0, 0], [20, 23])
+
+
+def test_bad_arrays_are_told_in_one_line() -> None:
+    net = network()
+    inputs = drive(np.array([0.0, 60.0]))
+    wrong = net.values.copy()
+    wrong[2] = np.nan
+    name = net.parameters[2].name
+    with pytest.raises(InputError, match=f"machine two_bodies: parameter {name} is nan .* in set 0, expected a finite"):
+        simulate(net, wrong, inputs)
+    with pytest.raises(InputError, match=r"start temperatures have shape \(1, 1, 3\), expected .* = \(…, 1, 2\)"):
+        simulate(net, net.values, inputs, np.zeros((1, 1, 3)))
+    with pytest.raises(InputError, match="start is 'cold', expected 'settled' or temperatures"):
+        simulate(net, net.values, inputs, "cold")
+    with pytest.raises(InputError, match=r"offsets of surroundings have shape \(1, 1, 4\), expected"):
+        simulate(net, net.values, inputs, offsets_K=np.zeros((1, 1, 4)))
+
+
+# the step
+
+
+def test_substeps_are_chosen_by_halving() -> None:
+    net = radiating(40.0)
+    coarse = drive(np.arange(0, 7201.0, 300.0))
+    chosen = choose_substeps(net, net.values, coarse, at(90, net), tolerance_K=0.01)
+    assert chosen > 1
+    fine = simulate(net, net.values, coarse.refined(64), at(90, net), tolerance_K=1e-6).readings
+    gap = np.abs(simulate(net, net.values, coarse.refined(chosen), at(90, net)).readings - fine).max()
+    half = np.abs(simulate(net, net.values, coarse.refined(chosen // 2), at(90, net)).readings - fine).max()
+    assert gap < 0.012 < half
+    linear = network()
+    assert choose_substeps(linear, linear.values, drive(np.arange(0, 7201.0, 300.0), rpm=6000.0)) == 1
+    with pytest.raises(InputError, match=r"even steps of .* s leave .* K, more than the 1e-09 K allowed; check"):
+        choose_substeps(net, net.values, coarse, at(90, net), tolerance_K=1e-9)
