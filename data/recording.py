@@ -35,6 +35,7 @@ import pandas as pd
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
+from data.own_file import own_file
 from data.readers import has_reader, reader_for
 from data.readers.base import Sheet
 from data.readers.header import Layout, NotThisTable, hints, locate
@@ -76,13 +77,23 @@ def read_batches(path: Path, machine: Machine, need_error: bool = True) -> Itera
 
     Several where a workbook has several sheets of recordings (`stem-sheet`) or where `recording.split` cuts a long
     one (`stem-01`, `stem-02`, …). A bad sheet or stretch does not hold back the good ones: its error comes last.
-    With `need_error=False` a file without error channels is good as well (to predict from it).
+    With `need_error=False` a file without error channels is good as well (to predict from it). A Parquet file that
+    thermodrift wrote is read by its own note, not by the machine file's columns (`data.own_file`).
 
     Raises:
         InputError: the file, a sheet or a stretch cannot be used; one line.
     """
     _check_file(path)
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
+    own = own_file(path)
+    if own is None:
+        yield from _file_batches(path, machine, need_error)
+        return
+    for batch in _file_batches(path, own.layout(machine), need_error):
+        yield own.marked(batch)
+
+
+def _file_batches(path: Path, machine: Machine, need_error: bool) -> Iterator[Batch]:
     with reader_for(path).open(path, hints(machine)) as sheets:
         tables: list[tuple[Sheet, Layout]] = []
         errors: list[InputError] = []

@@ -25,10 +25,27 @@ Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables
 
 @app.command()
 def describe(
-    files: Annotated[list[Path], typer.Argument(help="recordings of one machine")],
-    to: Annotated[Path | None, typer.Option("--out", help="write the draft here instead of printing it")] = None,
+    files: Annotated[list[Path] | None, typer.Argument(help="recordings of one machine")] = None,
+    to: Annotated[Path | None, typer.Option("--out", help="the draft's file, or the picture's (.svg, .png, .html)")] = None,
+    twin: Annotated[Path | None, typer.Option("--twin", help="draw this machine file's thermal network instead")] = None,
+    at: Annotated[
+        list[str] | None, typer.Option("--at", help="with --twin: a driver that the watts are shown at, NAME=VALUE")
+    ] = None,
 ) -> None:
-    """Draft a machine file from recordings; every guess is marked."""
+    """Draft a machine file from recordings, every guess marked; or draw a machine file's twin."""
+    if twin is not None:
+        if files:
+            raise InputError(f"--twin {twin}: draws a machine file and reads no recordings; leave out {files[0]}")
+        from pipelines.describe_twin import describe_twin, print_twin
+
+        print_twin(describe_twin(twin, to, at or ()))
+        if to is not None:
+            screen.line(to)
+        return
+    if not files:
+        raise InputError("describe: got nothing to describe; name recordings, or a machine file as --twin MACHINE.yml")
+    if at:
+        raise InputError(f"--at {at[0]}: belongs to a twin's picture; add --twin MACHINE.yml")
     from data.describe import draft_machine_file
 
     text = draft_machine_file(files)
@@ -120,15 +137,33 @@ def train(
 
 @app.command()
 def report(
-    machine: Annotated[str, typer.Option("--machine", help="machine name")],
-    trainings: Annotated[list[str] | None, typer.Argument(help="training ids; default: the latest per channel")] = None,
+    machine: Annotated[str, typer.Option("--machine", help="machine name; with --iso its file")],
+    subjects: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[TRAININGS]...",
+            help="training ids; default: the latest per channel. With --iso: files, folders "
+            "or batch ids in the lake; default: every batch there",
+        ),
+    ] = None,
+    iso: Annotated[
+        bool, typer.Option("--iso", help="judge recordings as thermal tests in the style of ISO 230-3")
+    ] = False,
+    sheet: Annotated[Path | None, typer.Option(help="test sheet (.yml) for --iso: position, probes, tilts …")] = None,
     form: Annotated[str, typer.Option("--format", help="html or md; default: by --out, else html")] = "",
-    to: Annotated[Path | None, typer.Option("--out", help="default: var/reports/MACHINE.html")] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", help="default: var/reports/MACHINE.html; with --iso a folder")
+    ] = None,
 ) -> None:
-    """A comparison report from tracked trainings."""
+    """A comparison report from tracked trainings; with --iso a thermal test's report from every recording."""
     settings_module.configure_environment()
     if form not in ("", "html", "md"):
         raise InputError(f"--format: got {form!r}, expected html or md")
+    if iso:
+        _thermal_tests(Path(machine), subjects or [], to, sheet, form)
+        return
+    if sheet is not None:
+        raise InputError("--sheet: a test sheet belongs to a thermal test; add --iso")
     from pipelines import tracking
     from pipelines.report import write_report
     from pipelines.request import REPORT_ENDINGS, check_ending
@@ -137,7 +172,7 @@ def report(
         check_ending("--out", to, (f".{form}",) if form else REPORT_ENDINGS)
 
     settings = settings_module.load()
-    ids = trainings
+    ids = subjects
     if not ids:
         past = tracking.trainings(machine, None, settings)
         if past.empty:
@@ -146,6 +181,20 @@ def report(
     path = to or settings_module.home() / "reports" / f"{machine}.{form or 'html'}"
     write_report([tracking.load_training(i, settings) for i in ids], path, settings)
     screen.line(path)
+
+
+def _thermal_tests(machine: Path, recordings: list[str], to: Path | None, sheet: Path | None, form: str) -> None:
+    from data.lake import Lake
+    from pipelines.thermal_tests import write_thermal_tests
+
+    if form:
+        raise InputError("--format: with --iso both forms are written; leave it out")
+    home = settings_module.home()
+    folder = to or home / "reports" / f"iso-{machine.stem}"
+    with screen.progress(False) as (say, _):
+        reports = write_thermal_tests(machine, recordings, folder, Lake(home / "lake"), sheet, say)
+    for path in reports:
+        screen.line(path)
 
 
 @app.command()
@@ -196,17 +245,47 @@ def predict(
 
 @app.command()
 def simulate(
+    plans: Annotated[list[Path] | None, typer.Argument(help="run plans: stages (.yml) or tables over time")] = None,
+    machine: Annotated[Path | None, typer.Option("--machine", help="machine file (.yml) with a twin part")] = None,
     sample_year: Annotated[bool, typer.Option("--sample-year", help="the built-in year of 30 batches")] = False,
-    to: Annotated[Path, typer.Option("--out", help="folder for the CSV files")] = Path("sample_year"),
-    seed: Annotated[int, typer.Option(help="another seed gives another year")] = 0,
+    to: Annotated[Path | None, typer.Option("--out", help="folder; default: simulated, or sample_year")] = None,
+    step: Annotated[float | None, typer.Option(help="seconds from row to row; default: the plan's step")] = None,
+    noise: Annotated[bool, typer.Option("--noise", help="add noise and resolution of sensors and probes")] = False,
+    seed: Annotated[int, typer.Option(help="of the noise, or of the sample year")] = 0,
+    begins: Annotated[str, typer.Option(help="date and time of the first row; sunlight needs it")] = "",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace recordings of the same name")] = False,
+    as_json: Json = False,
 ) -> None:
-    """Write simulated recordings, labelled so, as a measuring system would."""
-    if not sample_year:
-        raise InputError("simulate: got nothing to simulate; call `thermodrift simulate --sample-year --out FOLDER`")
-    from data.sample_year import write_sample_year
+    """Simulate run plans by a machine file's twin, or the sample year; written as recordings, labelled simulated."""
+    if sample_year:
+        if plans or machine is not None:
+            raise InputError("simulate: --sample-year has its own machine and plans; leave out --machine and PLANS")
+        from data.sample_year import write_sample_year
 
-    files = write_sample_year(to, seed=seed)
-    screen.line(f"{to}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+        folder = to or Path("sample_year")
+        files = write_sample_year(folder, seed=seed)
+        screen.line(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+        return
+    if not plans and machine is None:
+        raise InputError(
+            "simulate: got nothing to simulate; call `thermodrift simulate --sample-year --out FOLDER`, or "
+            "`thermodrift simulate PLAN --machine FILE --out FOLDER`"
+        )
+    if not plans:
+        raise InputError("simulate: got no run plan; name one or more (.yml with stages, or a table over time)")
+    if machine is None:
+        raise InputError("simulate: got a run plan and no machine; give its file by --machine")
+    from pipelines.simulating import SimulationRequest, beginning, simulate_plans
+    from pipelines.simulation_screen import outcome_dict, print_outcome
+
+    folder = to or Path("simulated")
+    request = SimulationRequest(machine, tuple(plans), folder, step, noise, seed, beginning(begins), overwrite)
+    with screen.progress(as_json) as (say, done):
+        outcome = simulate_plans(request, say, done)
+    if as_json:
+        screen.print_json(outcome_dict(outcome))
+    else:
+        print_outcome(outcome)
 
 
 @app.command()

@@ -160,6 +160,8 @@ def _periods(axes: Sequence[Axes], test: ThermalTest) -> None:
 
 
 def _legend(ax: Axes) -> None:
+    if not ax.get_legend_handles_labels()[0]:
+        return  # every channel is masked
     ax.legend(
         loc="upper left", bbox_to_anchor=(1.01, 1.02), fontsize=8, frameon=False, handlelength=1.6, borderaxespad=0
     )
