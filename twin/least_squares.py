@@ -7,15 +7,16 @@ whose nuisances are eliminated one batch at a time (`arrow`), with the noise as 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from data.errors import InputError, WorkError
+from twin.annealing import annealed, noise_left, with_noise
 from twin.descent import State, Step, descend, x_of, z_bounds
-from twin.fit_noise import Noise, estimate
+from twin.fit_noise import Noise
 from twin.fit_problem import Array, Block, Problem, Scale, Unknown
 
 __all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit"]
@@ -62,7 +63,8 @@ def fit(
 
     Converged means that the linear model expects the cost to fall by less than `tolerance` times max(1, cost per
     degree of freedom): x is within √tolerance posterior standard deviations of its optimum. With `reweight` each
-    channel's noise and its correlation are re-estimated from the best start's residuals until they settle.
+    channel's noise and its correlation are estimated on the way down from the prior's mean (`annealing`) and then from
+    the best start's residuals until they settle.
 
     Raises:
         InputError: no free parameter, or fewer usable rows than free parameters.
@@ -73,7 +75,8 @@ def fit(
         raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
     limits = max_iterations, tolerance
     with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
-        best, notes = _best_start(problem, starts, seed, *limits, progress)
+        first = _first(problem, tolerance, reweight, progress)
+        best, notes = _best_start(problem, first, starts, seed, *limits, progress)
         if reweight:
             best, settled = _with_noise(problem, best, *limits, progress)
             notes += settled
@@ -92,8 +95,19 @@ def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
     return np.clip(draws, *z_bounds(unknowns))
 
 
+def _first(problem: Problem, tolerance: float, reweight: bool, progress: Callable[[str], None] | None) -> State:
+    """The prior's mean, or what lies below it with the noise estimated on the way."""
+    z, nuisance = _starts(problem.unknowns, 1, 0)[0], [np.zeros(q) for q in problem.nuisance_sizes]
+    try:
+        state = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
+    except WorkError as error:
+        raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
+    return annealed(problem, state, tolerance, progress) if reweight else state
+
+
 def _best_start(
     problem: Problem,
+    first: State,
     starts: int,
     seed: int,
     max_iterations: int,
@@ -106,10 +120,8 @@ def _best_start(
     for number, z in enumerate(_starts(problem.unknowns, starts, seed)):
         try:
             nuisance = [np.zeros(q) for q in problem.nuisance_sizes]
-            start = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
-        except WorkError as error:
-            if number == 0:
-                raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
+            start = State.at(problem, z, nuisance, first.noise) if number else first
+        except WorkError:
             lost += 1
             continue
         ends.append(descend(problem, start, max_iterations, tolerance))
@@ -125,14 +137,12 @@ def _with_noise(
     """The optimum under noise that is re-estimated from its own residuals, and how that went in words."""
     change = np.inf
     for number in range(NOISE_ROUNDS):
-        residuals = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
-        parameters = state.arrow.effective_parameters()
-        noise = estimate(residuals, state.channels, len(problem.channels), parameters)
+        noise = noise_left(problem, state)
         change = noise.change(state.noise)
         if change < NOISE_SETTLED:
             return state, f"; noise settled in round {number}"
-        start = State.at(problem, state.z, state.nuisance, noise)
-        state = descend(problem, replace(start, history=state.history), max_iterations, tolerance)
+        start = with_noise(problem, state, noise)
+        state = descend(problem, start, len(start.history) + max_iterations, tolerance)
         if progress:
             progress(f"noise round {number + 1}: weights changed by up to {100 * change:.0f} %")
     return state, f"; noise not settled: weights still change by {100 * change:.0f} % a round"
