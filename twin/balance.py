@@ -39,7 +39,12 @@ class Balance:
 
     @cached_property
     def schedule(self) -> Schedule:
-        return Schedule(self.inputs.dt_s, self.regimes.of, self.inputs.n_intervals)
+        """Cut into pieces once for all runs on the same inputs."""
+        kept, key = self.inputs.kept, ("schedule", id(self.regimes.of))  # the regimes are kept there too
+        if key not in kept:
+            kept[key] = Schedule(self.inputs.dt_s, self.regimes.of, self.inputs.n_intervals)
+        schedule: Schedule = kept[key]
+        return schedule
 
     @cached_property
     def known(self) -> tuple[tuple[Array, Array], ...]:
@@ -95,8 +100,7 @@ class Balance:
     def _tuples(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Distinct (regime, drivers of the heats) and where each first occurs; empty where there are too many."""
         laws = [law for h in self._independent if not _timed(h) for law in (h.law, *h.factors)]
-        extra = {"": self.regimes.of.astype(float)}
-        return distinct(self.inputs, [c for law in laws for c in law.drivers.values()], extra)
+        return distinct(self.inputs, [c for law in laws for c in law.drivers.values()], self.regimes.of)
 
     def _static(self, heat: Heat) -> bool:
         """Whether a heat takes few values, so that it needs no series of its own."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ class Inputs:
     clock_h: Array
     first: Mapping[str, Array]
     every: int = 1
+    kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
 
     @cached_property
     def dt_s(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,14 +61,24 @@ def regimes_of(network: Network, values: Array, inputs: Inputs) -> Regimes:
 
 
 def distinct(
-    inputs: Inputs, channels: Sequence[str], also: Mapping[str, Array] | None = None
+    inputs: Inputs, channels: Sequence[str], also: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Distinct tuples of driver values: each interval's number (B, M), and each tuple's first interval, flattened.
 
-    `also` are further series (B, M) that tell tuples apart. Only valid intervals count; padding gets number 0.
+    `also` (B, M) are regimes that tell tuples apart. Only valid intervals count; padding gets number 0.
     """
-    at = np.flatnonzero(inputs.valid)
-    series = [v.ravel()[at] for v in ({n: inputs.drivers[n] for n in channels} | dict(also or {})).values()]
+    names = tuple(dict.fromkeys(channels))
+    key = ("distinct", names, id(also))
+    if key not in inputs.kept:
+        series = [inputs.drivers[n] for n in names] + ([] if also is None else [also.astype(float)])
+        inputs.kept[key] = (*_distinct(inputs.valid, series), also)  # keeping `also` keeps its id its own
+    number, first, _ = inputs.kept[key]
+    return number, first
+
+
+def _distinct(valid: NDArray[np.bool_], given: Sequence[Array]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    at = np.flatnonzero(valid)
+    series = [v.ravel()[at] for v in given]
     changes = np.zeros(len(at), bool)
     changes[:1] = True
     for values in series:
@@ -78,9 +88,9 @@ def distinct(
     for k, values in enumerate(series):
         tuples[:, k] = np.round(values[first] / (np.abs(values).max(initial=0.0) or 1.0), _DIGITS)
     _, where, of_run = np.unique(tuples, axis=0, return_index=True, return_inverse=True)
-    number = np.zeros(inputs.valid.size, np.int64)
+    number = np.zeros(valid.size, np.int64)
     number[at] = np.repeat(of_run.ravel(), np.diff(np.append(first, len(at))))
-    return number.reshape(inputs.valid.shape), at[first[where]]
+    return number.reshape(valid.shape), at[first[where]]
 
 
 def at_tuples(law: Law, effect: str, values: Array, inputs: Inputs, first: NDArray[np.int64]) -> Array:

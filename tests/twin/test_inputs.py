@@ -162,5 +162,5 @@ def test_a_plan_may_give_a_constant_surrounding_and_must_give_a_recorded_one(tmp
     assert str(caught.value) == (
         "run plan plan.yml: no surrounding 'room'; add surroundings: {room: 20 degC} or a column 'room'"
     )
-    with pytest.raises(InputError, match="run plan plan.yml: no driver 'rpm', which the twin needs"):
+    with pytest.raises(InputError, match=r"run plan plan\.yml: no driver 'rpm', which the twin needs"):
         inputs_of_plan(net, replace(plan, drivers={}))

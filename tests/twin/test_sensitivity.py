@@ -75,7 +75,8 @@ def everything() -> Network:
     return network(
         mechanisms=EVERYTHING,
         surroundings={
-            "room": {"channel": "room", "offset": "0.3 K"}, "floor": {"value": "17 degC", "first": ["t_head"], "follow": 0.4},
+            "room": {"channel": "room", "offset": "0.3 K"},
+            "floor": {"value": "17 degC", "first": ["t_head"], "follow": 0.4},
         },
         exposures__foot={"of": "head@0", "to": "floor", "value": "5 W/K"},
         bodies__head=bar,

@@ -56,12 +56,13 @@ def test_two_bodies_between_them_and_the_room() -> None:
 def test_a_bar_whose_end_is_heated_by_a_step() -> None:
     """Carslaw and Jaeger 1959, §3.8: an insulated bar with constant flux at one end."""
     cells = 200
+    step = {"law": "belt_loss", "drivers": "rpm", "into": "bar@0", "parameters": {"power": "50 W"}}
     bar = {"capacity": "20 kJ/K", "shape": "bar", "cells": cells, "conductance": "5 W/K", "material": "steel"}
-    net = closed(network(
-        bodies={"bar": bar}, links={}, exposures={"bar-room": "1 W/K"}, sensors={"t_shaft": {"at": "bar@0"}, "t_head": {"at": "bar@1"}},
-        errors={}, mechanisms={"belt": {"law": "belt_loss", "drivers": "rpm", "into": "bar@0",
-                                        "parameters": {"power": "50 W"}}},
-    ))  # fmt: skip
+    ends = {"t_shaft": {"at": "bar@0"}, "t_head": {"at": "bar@1"}}
+    exposures = {"bar-room": "1 W/K"}
+    net = closed(
+        network(bodies={"bar": bar}, links={}, exposures=exposures, sensors=ends, errors={}, mechanisms={"belt": step})
+    )
     time_s = np.linspace(0, 4000, 21)
     out = simulate(net, net.values, drive(time_s, rpm=6000.0), at(20, net))
     span, k = 20e3 / 5.0, np.arange(1, 200)  # L²/a
@@ -190,13 +191,10 @@ def test_feedback_that_does_not_contract_is_solved_in_windows() -> None:
     time_s = np.arange(0, 14401.0, 30.0)
     inputs = drive(time_s, rpm=6000.0)
     out = simulate(net, net.values, inputs, at(20, net), tolerance_K=1e-5)
-    p = {
-        name.rpartition(".")[2]: net.values[k]
-        for k, name in enumerate(q.name for q in net.parameters)
-        if "load." in name
-    }
-    base = (p["count"] * 1.047e-4 * 6000 * p["load_factor"] * (p["preload"] / p["static_capacity"]) ** p["load_exponent"]
-            * p["preload"] * p["mean_diameter"])  # fmt: skip
+    value = {p.name.removeprefix("mechanisms.load."): v for p, v in zip(net.parameters, net.values, strict=True)}
+    stress = (value["preload"] / value["static_capacity"]) ** value["load_exponent"]
+    moment_Nmm = value["load_factor"] * stress * value["preload"] * value["mean_diameter"]
+    base = value["count"] * 1.047e-4 * 6000 * moment_Nmm
 
     def rate(_: float, y: np.ndarray) -> list[float]:
         heat = base * max(1 + 0.057 * (y[0] - y[1]), 0) ** 1.33
