@@ -27,6 +27,7 @@ from twin.simulation import Simulation
 Array = NDArray[np.float64]
 
 KINDS = ("heat", "storage", "loss", "link")
+_BEYOND = " beyond its mean"  # what the simulation calls an edge's heat beyond its regime's constant
 COLUMNS = ("batch", "start_s", "end_s", "kind", "name", "watts")
 
 
@@ -184,7 +185,7 @@ def _integrals(
         q += joules[h.law.name][:, None] * h.direction(values[0])
     for e in network.edges:  # exchange that varies within a regime is heat on top of the regime's constant
         if _varies(network, e, joules):
-            q += joules[e.name][:, None] * e.direction
+            q += joules[e.name + _BEYOND][:, None] * e.direction
     out = 0.5 * (cells_degC[1:] + cells_degC[:-1]) * spans_s[:, None]
     for r in np.unique(regime):
         at = regime == r
@@ -212,7 +213,7 @@ def _exchange(
         if e.surrounding is not None:
             driving = driving - air_Ks[e.surrounding]
         left = g * driving
-        out.append(left - joules[e.name] if _varies(network, e, joules) else left)
+        out.append(left - joules[e.name + _BEYOND] if _varies(network, e, joules) else left)
     return out
 
 
@@ -222,7 +223,7 @@ def _varies(network: Network, edge: Edge, joules: dict[str, Array]) -> bool:
     Raises:
         InputError: it does for several edges of one name together: whose joules are whose is not known.
     """
-    if edge.name not in joules or not edge.factors or edge.name in {h.law.name for h in network.heats}:
+    if edge.name + _BEYOND not in joules or not edge.factors:
         return False
     if sum(e.name == edge.name for e in network.edges) == 1:
         return True

@@ -15,17 +15,18 @@ from twin.network import Law, Network
 
 Array = NDArray[np.float64]
 
-_STEPS, _CLOSE_K = 200, 1e-9
+_STEPS, _CLOSE_K, _SINGULAR = 200, 1e-9, 1e-13
 
 
 @dataclass(frozen=True)
 class Steady:
     """A network at rest: temperatures of the cells (N,) and surroundings (S,), degC; watts of the heats (H,);
-    conductances of the edges (E,), W/K, factor laws included."""
+    values of the factor laws (F,), and the edges' conductances (E,) with them, W/K."""
 
     degC: Array
     surrounding_degC: Array
     heat_W: Array
+    factor: Array
     edge_W_per_K: Array
 
 
@@ -49,32 +50,30 @@ def steady_state(
             raise InputError(
                 f"machine {network.machine}: no driver {name!r} in the twin; {closest(name, network.drivers)}"
             )
-    laws = [
-        _called(law, "factor", values, drivers, np.full(network.n_cells, np.mean(air)), air) for law in network.factors
-    ]
-    factor = np.array([float(f) for f in laws])
+    degC = np.full(network.n_cells, float(np.mean(air)) if len(air) else 20.0)
+    factor = np.array([float(_called(law, "factor", values, drivers, degC, air)) for law in network.factors])
     conductance = network.conductance_W_per_K(values, factor[None])[0]
+    if np.linalg.cond(conductance) > 1.0 / _SINGULAR:
+        raise InputError(
+            f"machine {network.machine}: the steady state needs a conductance from every body to a surrounding, not "
+            "only heat that depends on temperature; add an exposure"
+        )
     known = air @ network.surrounding_W_per_K(values, factor[None])[0]
     direction = np.array([h.direction(values)[0] for h in network.heats]).reshape(-1, network.n_cells)
-    degC = np.full(network.n_cells, float(np.mean(air)))
     for _ in range(_STEPS):
         watts = np.array([_watts(network, k, values, drivers, degC, air) for k in range(len(network.heats))])
-        following = (
-            np.linalg.solve(conductance, known + watts @ direction)
-            if len(watts)
-            else np.linalg.solve(conductance, known)
-        )
+        following = np.linalg.solve(conductance, known + watts @ direction)
         change = float(np.abs(following - degC).max())
+        if not np.isfinite(change):
+            break
         degC = 0.5 * degC + 0.5 * following  # half a step: friction that falls as it warms would swing
         if change < _CLOSE_K:
-            break
-    else:
-        raise InputError(
-            f"machine {network.machine}: the steady state does not settle (still {change:.2g} K after {_STEPS} steps); "
-            "look for heat that grows with temperature"
-        )
-    edges = np.array([float(network.edge_W_per_K(e, values, factor[None])[0]) for e in network.edges])
-    return Steady(degC, air, watts, edges)
+            edges = np.array([float(network.edge_W_per_K(e, values, factor[None])[0]) for e in network.edges])
+            return Steady(degC, air, watts, factor, edges)
+    raise InputError(
+        f"machine {network.machine}: the steady state does not settle (still {change:.2g} K after {_STEPS} steps); "
+        "look for heat that grows with temperature"
+    )
 
 
 def _surroundings(network: Network, given: float | Mapping[str, float]) -> Array:

@@ -26,6 +26,7 @@ from twin.mode_words import ModeView
 from twin.overview import Overview
 from twin.quantity import Parameter
 
+PICTURES = (".svg", ".png", ".html")
 MOST_BATCHES = 4
 _HOUR_S = 3600.0
 
@@ -111,7 +112,7 @@ def write_picture(path: Path | str, view: Overview) -> Path:
         InputError: another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    if path.suffix not in (".svg", ".png", ".html"):
+    if path.suffix not in PICTURES:
         raise InputError(f"picture {path}: got suffix {path.suffix!r}, expected .svg, .png or .html")
     if path.suffix == ".html":
         return write_twin_report(path, TwinData(view, ()))
@@ -184,7 +185,7 @@ def _modes(data: TwinData, pictures: bool) -> Part:
     shown = (
         (_picture(mode_shapes(data.modes, simulated), "Shapes of the slowest modes", simulated),) if pictures else ()
     )
-    return Part("modes", "Time constants and modes", (tables.modes(data.modes, simulated),), shown)
+    return Part("modes", "Time constants and modes", (tables.modes(data.modes, data.view),), shown)
 
 
 def worst(parts: Sequence[Compared], most: int) -> list[Compared]:

@@ -99,21 +99,22 @@ def _scale(size: float, unit: str) -> tuple[float, str]:
     return 1.0, _UNITS.get(unit, unit)
 
 
-def modes(views: Sequence[ModeView], simulated: bool, most: int = 10) -> Table:
+def modes(views: Sequence[ModeView], view: Overview, most: int = 10) -> Table:
     """Time constants, what moves against what, and how much of each displacement comes with that time constant."""
     channels = list(views[0].error) if views else []
+    units = {c.channel: _UNITS.get(c.unit, c.unit) for c in view.chains}
     rows = [
         Row((time_words(v.time_constant_s), v.words, *(x for c in channels for x in _brought(v, c))))
         for v in views[:most]
     ]
     columns = [Column("time constant"), Column("what moves", kind="wide")]
     for c in channels:
-        columns += [Column(c, "µm", "number", f"{c} um"), Column(c, "share", "number", f"{c} share")]
+        columns += [Column(c, units[c], "number", f"{c} unit"), Column(c, "share", "number", f"{c} share")]
     notes = (
-        "µm: what the mode brings to the displacement of the steady state, arriving as 1 − exp(−t / time constant). "
+        "What the mode brings to the displacement of the steady state, arriving as 1 − exp(−t / time constant). "
         "Share: its magnitude by the sum of all magnitudes; modes of opposite sign cancel.",
     )
-    return Table("Time constants", tuple(columns), tuple(rows), simulated, notes=notes if channels else ())
+    return Table("Time constants", tuple(columns), tuple(rows), view.simulated, notes=notes if channels else ())
 
 
 def _brought(v: ModeView, channel: str) -> tuple[str, str]:
