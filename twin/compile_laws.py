@@ -120,11 +120,19 @@ def heats(scope: Scope) -> tuple[Heat, ...]:
 
 
 def starts(scope: Scope) -> tuple[tuple[Law, Array], ...]:
-    return tuple(
-        (scope.laws[name], np.sum([o.cells for o in _outlets(scope, name, given)], axis=0))
-        for name, given in scope.part.mechanisms.items()
-        if "start_K" in scope.laws[name].mechanism.effects()
-    )
+    """Laws of the start with the cells (N,) that they lift, each by the whole amount: temperatures are not shared out."""
+    lifted = []
+    for name, given in scope.part.mechanisms.items():
+        if "start_K" in scope.laws[name].mechanism.effects():
+            key = f"mechanisms.{name}.into"
+            places = [given.into] if isinstance(given.into, str) else list(given.into or ())
+            if not places:
+                raise ValueError(f"{key} is missing; name the body that starts warmer, e.g. into: bed")
+            cells = np.zeros(len(scope.cells))
+            for place in places:
+                cells[np.flatnonzero(scope.cells.weights(place, key))] = 1.0
+            lifted.append((scope.laws[name], cells))
+    return tuple(lifted)
 
 
 def _outlets(scope: Scope, name: str, given: MechanismPart) -> tuple[Outlet, ...]:

@@ -209,3 +209,10 @@ def test_a_machine_file_without_a_twin_part_says_so() -> None:
     raw = {k: v for k, v in TWO_BODIES.items() if k != "twin"}
     with pytest.raises(InputError, match="key 'twin' is missing; add bodies, surroundings, links and sensors"):
         compile_network(parse_machine(yaml.safe_dump(raw), "x"))
+
+
+def test_a_warmer_start_lifts_every_cell_of_a_body_by_the_whole_amount() -> None:
+    bar = {"capacity": "40 kJ/K", "material": "cast_iron", "shape": "bar", "cells": 4, "conductance": "50 W/K"}
+    warm = {"law": "initial_state", "into": "head", "parameters": {"excess": "2 K"}}
+    network = compile_network(machine(bodies__head=bar, mechanisms__warm=warm))
+    np.testing.assert_array_equal(network.starts[0][1], [0, 1, 1, 1, 1])

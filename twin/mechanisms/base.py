@@ -82,7 +82,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def start_K(self, view: View, p: Mapping[str, Array]) -> Array:
-        """Added to the start temperature of the places of `into`, by their shares."""
+        """Added to the start temperature of every place of `into`, K."""
         raise NotImplementedError
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
