@@ -120,7 +120,7 @@ def heats(scope: Scope) -> tuple[Heat, ...]:
 
 
 def starts(scope: Scope) -> tuple[tuple[Law, Array], ...]:
-    """Laws of the start with the cells (N,) that they lift, each by the whole amount: temperatures are not shared out."""
+    """Laws of the start with the cells (N,) that they lift, each by all of it: temperatures are not shared."""
     lifted = []
     for name, given in scope.part.mechanisms.items():
         if "start_K" in scope.laws[name].mechanism.effects():
