@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
 STEPS_K = 0.01  # to which the time steps are right
-OVERVIEW = "overview.png"
+OVERVIEW, TWIN = "overview.png", "twin.html"
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ class Simulated:
     """One plan: as read, as simulated, as it would have been recorded, and its report where there is one."""
 
     job: Job
+    inputs: Inputs  # in the steps that were needed
     simulation: Simulation
     batch: Batch
     report: Path | None = None
@@ -67,15 +68,16 @@ class Simulated:
 
 @dataclass(frozen=True)
 class SimulationOutcome:
-    """All plans of one call and the picture that shows them together."""
+    """All plans of one call, the picture that shows them together, and the page of the twin with their heat flows."""
 
     machine: str
     plans: tuple[Simulated, ...]
     overview: Path
+    twin: Path
 
 
 def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, int, int], None]) -> SimulationOutcome:
-    """Simulate every plan and write DIR/PLAN.parquet, DIR/PLAN/ (the thermal test's report) and DIR/overview.png.
+    """Simulate every plan and write DIR/PLAN.parquet, DIR/PLAN/ (the thermal test's report), overview.png, twin.html.
 
     Everything that can be wrong with the files is looked at before the work starts. Each file appears whole or not at
     all. A machine without error channels gets no report.
@@ -84,11 +86,14 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, in
         InputError: a machine file, plan or option that cannot be used, a file that is there already, a folder that
             cannot be written, heat that is stiff beyond the step control.
     """
+    from pipelines.describe_twin import describe_twin
     from pipelines.report.simulation_figure import overview_png
+    from pipelines.report.twin_report import TwinData, write_twin_report
+    from twin.heat_flows import heat_flows
 
     network, machine, jobs = jobs_of(request)
-    picture = request.out / OVERVIEW
-    _check_folder(request.out, [*(j.file for j in jobs), picture], request.overwrite)
+    picture, page = request.out / OVERVIEW, request.out / TWIN
+    _check_folder(request.out, [*(j.file for j in jobs), picture, page], request.overwrite)
     out: list[Simulated] = []
     for job in jobs:
         say(f"{job.file.stem}: {job.plan.name}")
@@ -99,7 +104,12 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, in
         _write(job.file, encode(one.batch, content_digest(one.batch)).to_pybytes())
         out.append(one)
     _write(picture, overview_png([(s.job.file.stem, s.batch) for s in out]))
-    return SimulationOutcome(machine.machine, tuple(out), picture)
+    say("heat flows and modes")
+    told = describe_twin(request.machine_file)
+    flows = [heat_flows(one.simulation, one.inputs) for one in out]
+    data = TwinData(told.view, network.parameters, told.origin, flows=flows, modes=told.modes)
+    write_twin_report(page, data, len(flows))
+    return SimulationOutcome(machine.machine, tuple(out), picture, page)
 
 
 def jobs_of(request: SimulationRequest) -> tuple[Network, Machine, tuple[Job, ...]]:
@@ -134,9 +144,9 @@ def simulate_job(job: Job, network: Network, machine: Machine, request: Simulati
         InputError: heat that is stiff beyond the step control.
     """
     start = start_of_plan(network, job.plan)
-    finer = choose_substeps(network, network.values, job.inputs, start, STEPS_K)
-    found = simulate_network(network, network.values, job.inputs.refined(finer), start, keep_cells=True)
-    return Simulated(job, found, recorded(job, found, machine, request))
+    inputs = job.inputs.refined(choose_substeps(network, network.values, job.inputs, start, STEPS_K))
+    found = simulate_network(network, network.values, inputs, start, keep_cells=True)
+    return Simulated(job, inputs, found, recorded(job, found, machine, request))
 
 
 def recorded(job: Job, found: Simulation, machine: Machine, request: SimulationRequest) -> Batch:

@@ -65,6 +65,7 @@ def print_outcome(outcome: SimulationOutcome) -> None:
         if one.report is not None:
             screen.line(f"report    {one.report}")
     screen.line(f"overview  {outcome.overview}")
+    screen.line(f"twin      {outcome.twin}")
 
 
 def outcome_dict(outcome: SimulationOutcome) -> dict[str, Any]:
@@ -85,7 +86,8 @@ def outcome_dict(outcome: SimulationOutcome) -> dict[str, Any]:
                 "heat": screen.records(heat_table(one)),
             }
         )
-    return {"machine": outcome.machine, "simulated": True, "plans": plans, "overview": str(outcome.overview)}
+    files = {"overview": str(outcome.overview), "twin": str(outcome.twin)}
+    return {"machine": outcome.machine, "simulated": True, "plans": plans, **files}
 
 
 def _errors(table: pd.DataFrame) -> Table:

@@ -23,7 +23,6 @@ from data.recording import read_batches
 from pipelines import cli
 from pipelines.simulating import Simulated, SimulationRequest, beginning, jobs_of, simulate_job, simulate_plans
 from pipelines.simulation_screen import error_table, heat_table, hottest
-from pipelines.thermal_tests import write_thermal_tests
 from tests.twin.machines import TWO_BODIES
 
 ROOT = Path(cli.__file__).resolve().parents[1]
@@ -68,6 +67,19 @@ def small(tmp_path: Path) -> Path:
     path = tmp_path / "two.yml"
     path.write_text(yaml.safe_dump(TWO_BODIES, sort_keys=False))
     return path
+
+
+@pytest.fixture
+def plain_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages and pictures, which take seconds to draw, as empty files."""
+
+    def iso(_: Batch, folder: Path) -> Path:
+        folder.mkdir(exist_ok=True)
+        return folder / "report.html"
+
+    monkeypatch.setattr("pipelines.simulating.write_iso_report", iso)
+    monkeypatch.setattr("pipelines.report.simulation_figure.overview_png", lambda _: b"")
+    monkeypatch.setattr("pipelines.report.twin_report.write_twin_report", lambda path, *_: path.write_bytes(b""))
 
 
 def simulated(machine: Path, plan: Path, out: Path, **options: object) -> Batch:
@@ -158,9 +170,12 @@ def test_the_files_of_a_fresh_user(call: Call, tmp_path: Path) -> None:
     assert "front_bearings" in done.out and "overview  out/overview.png" in done.out
     out = tmp_path / "out"
     assert sorted(p.name for p in out.iterdir()) == [
-        "iso_spindle_test", "iso_spindle_test.parquet", "overview.png", "spectrum_day", "spectrum_day.parquet"
+        "iso_spindle_test", "iso_spindle_test.parquet", "overview.png", "spectrum_day", "spectrum_day.parquet",
+        "twin.html",
     ]  # fmt: skip
     assert "SIMULATED" in (out / "spectrum_day" / "report.html").read_text(encoding="utf-8").upper()
+    page = (out / "twin.html").read_text(encoding="utf-8")
+    assert "spectrum_day: where the watts go" in page and "Shapes of the slowest modes" in page
     assert "Rotating-spindle test" in (out / "iso_spindle_test" / "report.md").read_text(encoding="utf-8")
     plain = pd.read_parquet(out / "iso_spindle_test.parquet")
     machine = load_machine(SAMPLE)
@@ -182,6 +197,7 @@ def test_the_files_of_a_fresh_user(call: Call, tmp_path: Path) -> None:
     assert done.code == 0 and done.out.strip() == "tests/iso_spindle_test/report.html"
 
 
+@pytest.mark.usefixtures("plain_pages")
 def test_a_simulation_of_a_real_machine_stays_simulated_in_the_lake(call: Call, small: Path, tmp_path: Path) -> None:
     """The file says so, whatever the machine file claims of recordings, and however its columns are called."""
     raw = {**TWO_BODIES, "simulated": False}
@@ -235,6 +251,7 @@ def test_rows_at_the_step_that_was_asked_for(small: Path, tmp_path: Path) -> Non
     pd.testing.assert_frame_equal(coarse.table, fine.table[::6].reset_index(drop=True))
 
 
+@pytest.mark.usefixtures("plain_pages")
 def test_json_for_machines(call: Call, small: Path) -> None:
     done = call("simulate", "plan.yml", "--machine", small, "--json")
     told = json.loads(done.out)
@@ -242,13 +259,14 @@ def test_json_for_machines(call: Call, small: Path) -> None:
     assert told["plans"][0]["errors"][0]["at_1h"] is None and told["plans"][0]["hottest"]["body"] == "shaft"
 
 
+@pytest.mark.usefixtures("plain_pages")
 def test_a_machine_without_error_channels_gets_no_report(call: Call, small: Path, tmp_path: Path) -> None:
     raw = {**TWO_BODIES, "channels": {n: c for n, c in TWO_BODIES["channels"].items() if n != "z"}}
     raw["twin"] = {k: v for k, v in TWO_BODIES["twin"].items() if k != "errors"}
     small.write_text(yaml.safe_dump(raw, sort_keys=False))
     done = call("simulate", "plan.yml", "--machine", small)
     assert done.code == 0 and "report" not in done.out
-    assert sorted(p.name for p in (tmp_path / "simulated").iterdir()) == ["overview.png", "plan.parquet"]
+    assert sorted(p.name for p in (tmp_path / "simulated").iterdir()) == ["overview.png", "plan.parquet", "twin.html"]
 
 
 @pytest.mark.parametrize(
@@ -283,6 +301,7 @@ def test_bad_input_is_one_line(
     assert not (tmp_path / "simulated").exists()
 
 
+@pytest.mark.usefixtures("plain_pages")
 def test_what_is_there_is_kept(call: Call, small: Path, tmp_path: Path) -> None:
     assert call("simulate", "plan.yml", "--machine", small).code == 0
     file = tmp_path / "simulated" / "plan.parquet"
@@ -303,38 +322,3 @@ def test_a_machine_without_twin_part_or_half_a_call(call: Call, small: Path) -> 
     assert done.code == 2 and "got a run plan and no machine; give its file by --machine" in done.err
     done = call("simulate", "--machine", small)
     assert done.code == 2 and "got no run plan; name one or more" in done.err
-
-
-def test_thermal_tests_from_recordings(call: Call, small: Path, tmp_path: Path) -> None:
-    batch = simulated(small, tmp_path / "plan.yml", tmp_path / "sim", step_s=60.0)
-    folder = tmp_path / "recorded"
-    folder.mkdir()
-    for name in ("a", "b"):
-        batch.table.to_csv(folder / f"{name}.csv", index=False)
-    (tmp_path / "sheet.yml").write_text("tool_stick_out: 120 mm\naxes: {Z: z}\n")
-    done = call("report", "--iso", "--machine", small, "recorded", "--out", "tests", "--sheet", "sheet.yml")
-    assert done.code == 0, done.err
-    assert done.out.split() == ["tests/a/report.html", "tests/b/report.html"]
-    shown = (tmp_path / "tests" / "b" / "report.md").read_text(encoding="utf-8")
-    assert "120 mm" in shown and "| warm-up | Z |" in shown
-
-
-def test_thermal_tests_refuse_in_one_line(call: Call, small: Path, tmp_path: Path) -> None:
-    for args, line in {
-        (): "the lake holds no batch of two_bodies; name recordings, or call `thermodrift ingest` first",
-        ("run9",): "run9: no such file or folder, and no batch in the lake, it is empty",
-        ("home",): "home: no recording of two_bodies there; recording.files asks for *.csv",
-        ("plan.yml", "--format", "md"): "--format: with --iso both forms are written; leave it out",
-    }.items():
-        (tmp_path / "home").mkdir(exist_ok=True)
-        done = call("report", "--iso", "--machine", small, *args)
-        assert done.code == 2 and line in done.err and len(done.err.strip().splitlines()) == 1
-    done = call("report", "--machine", small, "--sheet", "sheet.yml")
-    assert done.code == 2 and "--sheet: a test sheet belongs to a thermal test; add --iso" in done.err
-
-
-def test_a_batch_that_comes_twice_is_told(small: Path, tmp_path: Path) -> None:
-    written(small, tmp_path / "plan.yml", tmp_path / "sim")
-    twice = [str(tmp_path / "sim" / "plan.parquet")] * 2
-    with pytest.raises(InputError, match="batch 'plan' comes twice in the recordings; leave one of them out"):
-        write_thermal_tests(small, twice, tmp_path / "tests", Lake(tmp_path / "lake"), None, lambda _: None)
