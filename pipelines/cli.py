@@ -26,8 +26,12 @@ Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables
 @app.command()
 def describe(
     files: Annotated[list[Path] | None, typer.Argument(help="recordings of one machine")] = None,
-    to: Annotated[Path | None, typer.Option("--out", help="the draft's file, or the picture's (.svg, .png, .html)")] = None,
-    twin: Annotated[Path | None, typer.Option("--twin", help="draw this machine file's thermal network instead")] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", help="the draft's file, or the picture's (.svg, .png, .html)")
+    ] = None,
+    twin: Annotated[
+        Path | None, typer.Option("--twin", help="draw this machine file's thermal network instead")
+    ] = None,
     at: Annotated[
         list[str] | None, typer.Option("--at", help="with --twin: a driver that the watts are shown at, NAME=VALUE")
     ] = None,
@@ -111,7 +115,7 @@ def train(
     settings = settings_module.load()
     chosen = (
         _names(selectors, SELECTORS, "selector"),
-        _names(families, FAMILIES, "family"),
+        _names(families, FAMILIES, "family") if families else (),  # none: what suits the machine
         _names(protocols, PROTOCOLS, "protocol"),
     )
     targets = _split(channels)
@@ -282,6 +286,35 @@ def simulate(
     request = SimulationRequest(machine, tuple(plans), folder, step, noise, seed, beginning(begins), overwrite)
     with screen.progress(as_json) as (say, done):
         outcome = simulate_plans(request, say, done)
+    if as_json:
+        screen.print_json(outcome_dict(outcome))
+    else:
+        print_outcome(outcome)
+
+
+@app.command()
+def calibrate(
+    machine: MachineFile,
+    to: Annotated[Path, typer.Option("--out", help="the calibrated machine file")],
+    recordings: Annotated[
+        list[Path] | None, typer.Option(help="files or folders to ingest and calibrate on; default: the lake")
+    ] = None,
+    batches: Annotated[str, typer.Option(help="batch ids, comma separated; default: all")] = "",
+    starts: Annotated[int, typer.Option(help="starts of the fit: the priors' means, then draws from them")] = 1,
+    leave_out: Annotated[
+        bool, typer.Option("--leave-out/--no-leave-out", help="predict every batch by a fit on the others")
+    ] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace --out if it exists")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fit the machine file's free parameters to recordings: values with 90 % intervals, and what they are worth."""
+    from pipelines.calibrating import CalibrationRequest, calibrate_file, outcome_dict, print_outcome
+
+    request = CalibrationRequest(
+        machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, overwrite
+    )
+    with screen.progress(as_json) as (say, done):
+        outcome = calibrate_file(request, say, done)
     if as_json:
         screen.print_json(outcome_dict(outcome))
     else:

@@ -33,6 +33,7 @@ SIDE_IN = 0.3
 NAME_PT, TEXT_PT, SMALL_PT = 10.5, 8.0, 7.4
 MOST_HEATS = 4
 _TITLE_IN, _ROW_IN, _LINE_IN, _DROP_IN, _GAP_IN, _LEAST_WIDTH_IN = 0.78, 0.17, 0.148, 0.13, 0.10, 9.6
+_WIDER_IN, _HIGHER_IN, _ASIDE_IN = 0.55, 0.36, 0.3
 _SHIFTS = (0.0, -0.5, 0.5, -1.0, 1.0)
 
 _NOWHERE = Rect(0.0, 0.0, 1.0, 1.0)
@@ -58,7 +59,7 @@ class Body:
 
     name: str
     lines: tuple[tuple[str, str], ...]  # text, colour
-    grow: float  # 0 to 1: how much larger than its text needs
+    grow: float  # 0 to 1: how much larger than the least
     badges: tuple[tuple[str, str], ...] = ()
     heats: tuple[str, ...] = ()
     stubs: tuple[Stub, ...] = ()
@@ -72,12 +73,11 @@ class Body:
     def rows(self) -> int:
         return 1 + len(self.lines) + bool(self.badges)
 
-    def at(self, x: float, y: float) -> Body:
-        """The same with its rectangle about a point."""
-        wide = max(width_in(self.name, NAME_PT, True), pills_width(self.badges), 0.75)
-        wide = max([wide, *(width_in(t, TEXT_PT) for t, _ in self.lines)])
-        size = wide + 0.24 + 0.45 * self.grow, _ROW_IN * self.rows + 0.14 + 0.24 * self.grow
-        return replace(self, rect=Rect(x, y, *size))
+    @property
+    def width_in(self) -> float:
+        """What its words need."""
+        wide = [width_in(self.name, NAME_PT, True), pills_width(self.badges), 0.75]
+        return max(wide + [width_in(t, TEXT_PT) for t, _ in self.lines])
 
 
 def arranged(view: Overview, bodies: Sequence[Body], low_in: float) -> tuple[Figure, Axes, list[Body]]:
@@ -86,14 +86,25 @@ def arranged(view: Overview, bodies: Sequence[Body], low_in: float) -> tuple[Fig
     heavy = {b.name: b.capacity_J_per_K for b in view.bodies}
     at = places([b.name for b in bodies], links, heavy, PITCH_IN)
     across, up = (max((p[i] for p in at.values()), default=0.0) for i in (0, 1))
-    width, low = max(across + PITCH_IN[0] + 2 * SIDE_IN, _LEAST_WIDTH_IN), low_in + 0.95
+    width, low = max(across + PITCH_IN[0] + 2 * SIDE_IN, _LEAST_WIDTH_IN), low_in + 1.05
     height = low + up + 0.95 + _TITLE_IN
     fig = Figure(figsize=(width, height))
     ax = fig.add_axes((0, 0, 1, 1))
     ax.set(xlim=(0, width), ylim=(0, height))
     ax.axis("off")
     left = (width - across) / 2
-    return fig, ax, [b.at(left + at[b.name][0], low + at[b.name][1]) for b in bodies]
+    # the same room for words in every box, so that a larger one always means more capacity
+    wide, rows = max(b.width_in - _WIDER_IN * b.grow for b in bodies), max(b.rows for b in bodies)
+    rects = {
+        b.name: Rect(
+            left + at[b.name][0],
+            low + at[b.name][1],
+            wide + 0.2 + _WIDER_IN * b.grow,
+            _ROW_IN * rows + 0.12 + _HIGHER_IN * b.grow,
+        )
+        for b in bodies
+    }
+    return fig, ax, [replace(b, rect=rects[b.name]) for b in bodies]
 
 
 def segments(links: Sequence[Tie], bodies: Sequence[Body], gap_in: float = 0.0) -> list[tuple[Point, Point]]:
@@ -114,6 +125,7 @@ def placed(bodies: Sequence[Body], lines: Sequence[tuple[Point, Point]]) -> list
             w, h = max(width_in(t, TEXT_PT) for t in b.heats) + 0.2, _LINE_IN * len(b.heats) + 0.1
             ends = [r.x + s * (r.w / 2 - 0.12) for s in (-1, 1, -0.4, 0.4, 0)]
             options = [Rect(x + side * w / 2, r.y + r.h / 2 + h / 2, w, h) for x in ends for side in (1, -1)]
+            options += [Rect(r.x + s * (r.w / 2 + (w + _ASIDE_IN) / 2), r.y, w + _ASIDE_IN, h) for s in (1, -1)]
             heat = best(options, lines, taken)
             taken.append(heat)
         if b.stubs:
@@ -176,12 +188,25 @@ def draw(ax: Axes, b: Body) -> None:
 
 def _heat(ax: Axes, b: Body, at: Rect) -> None:
     r = b.rect
+    if at.y < r.y + r.h / 2:
+        _heat_aside(ax, b, at, 1 if at.x > r.x else -1)
+        return
     left = abs(at.x - at.w / 2 - r.x) > abs(at.x + at.w / 2 - r.x)  # the words stand left of the arrow
     x = at.x + at.w / 2 if left else at.x - at.w / 2
     arrow(ax, (x, at.y + at.h / 2), (x, r.y + r.h / 2 + 0.01), HEAT, 1.8, zorder=5)
     for k, text in enumerate(b.heats):
         y = at.y + at.h / 2 - _LINE_IN * (k + 0.5)
         say(ax, (x - 0.11 if left else x + 0.11, y), text, TEXT_PT, HEAT, halo=2.6, ha="right" if left else "left")
+
+
+def _heat_aside(ax: Axes, b: Body, at: Rect, side: int) -> None:
+    """Heat from the right (1) or the left (-1), where lines leave no room above."""
+    border = b.rect.x + side * (b.rect.w / 2 + 0.01)
+    tail = border + side * (_ASIDE_IN + 0.04)
+    arrow(ax, (tail, b.rect.y), (border, b.rect.y), HEAT, 1.8, zorder=5)
+    for k, text in enumerate(b.heats):
+        y = at.y + at.h / 2 - 0.05 - _LINE_IN * (k + 0.5)
+        say(ax, (tail + side * 0.05, y), text, TEXT_PT, HEAT, halo=2.6, ha="left" if side > 0 else "right")
 
 
 def shortened(heats: Sequence[str]) -> tuple[str, ...]:

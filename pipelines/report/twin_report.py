@@ -69,6 +69,7 @@ class Part:
     pictures: tuple[Picture, ...] = ()
     notes: tuple[str, ...] = ()
     folded: tuple[Table, ...] = ()
+    findings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def _network(data: TwinData, pictures: bool) -> Part:
 
 def _parameters(data: TwinData) -> Part:
     free, fixed = (tables.parameters(data.parameters, data.intervals, f, data.view.simulated) for f in (True, False))
-    return Part("parameters", "Parameters", (free,), (), tuple(data.findings), (fixed,))
+    return Part("parameters", "Parameters", (free,), folded=(fixed,), findings=tuple(data.findings))
 
 
 def _fit(data: TwinData, most: int, pictures: bool) -> Part:

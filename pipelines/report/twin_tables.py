@@ -84,7 +84,12 @@ def interval_words(found: Interval | None, unit: str) -> str:
     if found is None:
         return NOTHING
     scale, shown = _scale(max(abs(found.low), abs(found.high)), unit)
-    return f"{found.low / scale:.3g} to {found.high / scale:.3g} {shown}".strip().replace("-", "−")
+    return f"{_three(found.low / scale)} to {_three(found.high / scale)} {shown}".strip().replace("-", "−")
+
+
+def _three(value: float) -> str:
+    """Three digits, without a power of ten up to a million."""
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def quantity(value: float, unit: str) -> str:
@@ -132,7 +137,7 @@ def heat(flows: HeatFlows) -> Table:
                 str(r["name"]),
                 number(r["energy_kJ"], 0),
                 number(r["mean_W"], 1),
-                percent(r["share"]),
+                percent(r["share"]).replace("-", "−"),
             )
         )
         for r in totals.to_dict("records")

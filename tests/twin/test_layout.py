@@ -1,0 +1,68 @@
+"""Places of bodies in a picture: no crossings where none are needed, no overlaps, always the same."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.layout import _crossings, flattened, places, resistance_distance
+
+RING = {("a", "b"): 5.0, ("b", "c"): 1.0, ("c", "d"): 5.0, ("d", "a"): 1.0, ("a", "e"): 2.0, ("c", "f"): 30.0}
+PITCH = (2.0, 1.5)
+
+
+def crossings(at: dict[str, tuple[float, float]], links: dict[tuple[str, str], float]) -> int:
+    names = list(at)
+    ends = np.array([(names.index(a), names.index(b)) for a, b in links])
+    xy = np.array([at[n] for n in names])[None]
+    return int(_crossings(xy[:, ends[:, 0]], xy[:, ends[:, 1]], ends)[0])
+
+
+def test_a_ring_with_tails_has_no_crossing_and_every_body_its_own_place() -> None:
+    at = places(list("abcdef"), RING, pitch=PITCH)
+    xy = np.array(list(at.values()))
+    apart = np.abs(xy[:, None] - xy[None])
+    shares_a_row = apart[..., 1] < 1e-9
+    assert crossings(at, RING) == 0
+    assert (apart[..., 0][shares_a_row & ~np.eye(6, dtype=bool)] >= PITCH[0] - 1e-9).all()
+    assert xy.min(axis=0).tolist() == [0.0, 0.0]
+
+
+def test_crossings_are_counted() -> None:
+    square = {"a": (0.0, 0.0), "b": (1.0, 1.0), "c": (1.0, 0.0), "d": (0.0, 1.0)}
+    assert crossings(square, {("a", "b"): 1.0, ("c", "d"): 1.0}) == 1
+    assert crossings(square, {("a", "c"): 1.0, ("b", "d"): 1.0}) == 0
+
+
+def test_the_same_network_in_another_order_of_links_stands_at_the_same_places() -> None:
+    again = dict(reversed(list(RING.items())))
+    one, other = places(list("abcdef"), RING), places(list("abcdef"), again)
+    for name, xy in one.items():
+        np.testing.assert_allclose(other[name], xy)
+
+
+def test_the_heavy_stands_low() -> None:
+    links = {("light", "middle"): 1.0, ("middle", "heavy"): 1.0, ("light", "x"): 1.0, ("heavy", "y"): 1.0}
+    for heavy in ("light", "heavy"):
+        at = places(["light", "middle", "heavy", "x", "y"], links, {heavy: 100.0})
+        assert at[heavy][1] <= np.mean([y for _, y in at.values()])
+
+
+def test_few_bodies_and_none() -> None:
+    assert places([], {}) == {}
+    assert places(["a"], {}) == {"a": (0.0, 0.0)}
+    two = places(["a", "b"], {("a", "b"): 1.0}, pitch=PITCH)
+    assert abs(two["a"][0] - two["b"][0]) >= 1.0
+
+
+def test_resistance_distance_of_a_chain_adds_up_and_a_strong_link_is_short() -> None:
+    ends = np.array([[0, 1], [1, 2]])
+    d = resistance_distance(3, ends, np.array([100.0, 1.0]))
+    assert d[0, 1] < d[1, 2] < d[0, 2]
+    np.testing.assert_allclose(d, d.T)
+
+
+def test_distances_that_fit_a_plane_are_met() -> None:
+    xy = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0], [0.0, 4.0]])
+    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
+    flat = flattened(distance)
+    np.testing.assert_allclose(np.linalg.norm(flat[:, None] - flat[None], axis=-1), distance, atol=1e-3)
