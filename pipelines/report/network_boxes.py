@@ -35,6 +35,7 @@ MOST_HEATS = 4
 _TITLE_IN, _ROW_IN, _LINE_IN, _DROP_IN, _GAP_IN, _LEAST_WIDTH_IN = 0.78, 0.17, 0.148, 0.13, 0.10, 9.6
 _WIDER_IN, _HIGHER_IN, _ASIDE_IN = 0.55, 0.36, 0.3
 _SHIFTS = (0.0, -0.5, 0.5, -1.0, 1.0)
+_ROUNDS = 3
 
 _NOWHERE = Rect(0.0, 0.0, 1.0, 1.0)
 
@@ -115,26 +116,34 @@ def segments(links: Sequence[Tie], bodies: Sequence[Body], gap_in: float = 0.0) 
 
 
 def placed(bodies: Sequence[Body], lines: Sequence[tuple[Point, Point]]) -> list[Body]:
-    """Heat above and stubs below every box, shifted along it to where the fewest lines run."""
-    taken = [b.rect for b in bodies]
-    out = []
-    for b in bodies:
-        r = b.rect
-        heat = below = None
-        if b.heats:
-            w, h = max(width_in(t, TEXT_PT) for t in b.heats) + 0.2, _LINE_IN * len(b.heats) + 0.1
-            ends = [r.x + s * (r.w / 2 - 0.12) for s in (-1, 1, -0.4, 0.4, 0)]
-            options = [Rect(x + side * w / 2, r.y + r.h / 2 + h / 2, w, h) for x in ends for side in (1, -1)]
-            options += [Rect(r.x + s * (r.w / 2 + (w + _ASIDE_IN) / 2), r.y, w + _ASIDE_IN, h) for s in (1, -1)]
-            heat = best(options, lines, taken)
-            taken.append(heat)
-        if b.stubs:
-            w, h = sum(s.width_in for s in b.stubs), _DROP_IN + 0.34
-            slack = max((r.w - w) / 2 + 0.08, 0.0)
-            below = best([Rect(r.x + s * slack, r.y - r.h / 2 - h / 2, w, h) for s in _SHIFTS], lines, taken)
-            taken.append(below)
-        out.append(replace(b, heat_at=heat, stubs_at=below))
-    return out
+    """Heat above (or beside) and stubs below every box, shifted to where the fewest lines and words are."""
+    boxes = [b.rect for b in bodies]
+    heat: dict[str, Rect] = {}
+    stubs: dict[str, Rect] = {}
+    for _ in range(_ROUNDS):  # again, now that the others have a place
+        for b in bodies:
+            for options, found in ((_heat_options(b), heat), (_stub_options(b), stubs)):
+                if options:
+                    found.pop(b.name, None)
+                    found[b.name] = best(options, lines, [*boxes, *heat.values(), *stubs.values()])
+    return [replace(b, heat_at=heat.get(b.name), stubs_at=stubs.get(b.name)) for b in bodies]
+
+
+def _heat_options(b: Body) -> list[Rect]:
+    if not b.heats:
+        return []
+    r, w, h = b.rect, max(width_in(t, TEXT_PT) for t in b.heats) + 0.2, _LINE_IN * len(b.heats) + 0.1
+    ends = [r.x + s * (r.w / 2 - 0.12) for s in (-1, 1, -0.4, 0.4, 0)]
+    options = [Rect(x + side * w / 2, r.y + r.h / 2 + h / 2, w, h) for x in ends for side in (1, -1)]
+    return options + [Rect(r.x + s * (r.w / 2 + (w + _ASIDE_IN) / 2), r.y, w + _ASIDE_IN, h) for s in (1, -1)]
+
+
+def _stub_options(b: Body) -> list[Rect]:
+    if not b.stubs:
+        return []
+    r, w, h = b.rect, sum(s.width_in for s in b.stubs), _DROP_IN + 0.34
+    slack = max((r.w - w) / 2 + 0.08, 0.0)
+    return [Rect(r.x + s * slack, r.y - r.h / 2 - h / 2, w, h) for s in _SHIFTS]
 
 
 def best(options: Sequence[Rect], lines: Sequence[tuple[Point, Point]], taken: Sequence[Rect]) -> Rect:

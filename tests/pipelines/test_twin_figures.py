@@ -1,8 +1,9 @@
-"""Figures and report of a twin: what they show, in which words, and that simulated data are called so."""
+"""Figures of a twin: what they show, in which words, and that simulated data are called so."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,29 +12,23 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from toy_twin import batch, flows
 
-from data.batch import Batch
 from data.errors import InputError
 from data.machine import load_machine
-from pipelines.report import twin_tables
 from pipelines.report.chain_strip import by_length
 from pipelines.report.flow_figures import heat_stack
 from pipelines.report.flow_picture import flow_picture
 from pipelines.report.network_boxes import PITCH_IN, shortened
 from pipelines.report.network_glyphs import Rect
 from pipelines.report.network_picture import network_picture, picture_bytes
-from pipelines.report.twin_data import twin_data
 from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
-from pipelines.report.twin_report import TwinData, twin_page, worst, write_picture, write_twin_report
-from tests.twin.machines import machine as two_bodies
-from twin.compared import Compared, rms_table
+from pipelines.report.twin_report import write_picture
+from twin.compared import rms_table
 from twin.compile import compile_network, expanded
-from twin.heat_flows import HeatFlows
-from twin.identifiability import Interval
 from twin.mode_words import ModeView
 from twin.network import Network
 from twin.overview import Overview, overview
-from twin.quantity import Parameter
 from twin.schema import twin_part
 from twin.steady import steady_state
 
@@ -65,27 +60,6 @@ def texts(figure: Figure) -> list[str]:
         found += [t.get_text() for t in ax.texts] + titles + [ax.get_xlabel(), ax.get_ylabel()]
         found += [t.get_text() for t in (*ax.get_xticklabels(), *ax.get_yticklabels())]
     return [t for t in found if t]
-
-
-def batch(name: str = "b$1", offset: float = 0.5, simulated: bool = False) -> Compared:
-    time_s = 300.0 * np.arange(25)
-    computed = np.stack([20 + time_s / 3600, np.full(25, 20.0), time_s / 1000])
-    recorded = computed + np.array([[offset], [-offset], [4 * offset]])
-    recorded[1, 5:8] = np.nan
-    return Compared(name, simulated, time_s, ("front", "room<1>", "z"), ("K", "K", "um"), recorded, computed)
-
-
-def flows(view: Overview) -> HeatFlows:
-    time_s = np.array([0.0, 1800.0, 3600.0, 7200.0])
-    one = np.ones(3)
-    return HeatFlows(
-        "b1", True, time_s,
-        {law: 10.0 * one for law in dict.fromkeys(h.law for h in view.heats)},
-        {b.name: (3.0 if b.name == "bed" else 0.4) * one for b in view.bodies},
-        {"room": 70.0 * one - 3.2, "floor": -5.0 * one},
-        {t.name: (-8.0 if t.name == "bed-table" else 6.0) * one for t in view.ties},
-        {b.name: np.array([0.0, 1.0, 2.0, 3.0]) for b in view.bodies},
-    )  # fmt: skip
 
 
 # the network
@@ -130,17 +104,25 @@ def test_boxes_neither_overlap_nor_leave_the_paper_and_grow_with_capacity(view: 
     assert sizes == sorted(sizes) and sizes[-1] > 1.5 * sizes[0]
 
 
-def test_words_keep_clear_of_foreign_boxes(picture: Figure) -> None:
+@pytest.mark.parametrize("scaled", [False, True])
+def test_words_keep_clear_of_boxes_and_of_each_other(view: Overview, picture: Figure, scaled: bool) -> None:
+    """Also where other conductances make another layout."""
+    if scaled:
+        ties = [
+            replace(t, conductance_W_per_K=t.conductance_W_per_K * 1.8 ** (k % 3 - 1)) for k, t in enumerate(view.ties)
+        ]
+        picture = network_picture(replace(view, ties=tuple(ties)))
     ax = picture.axes[0]
     renderer = FigureCanvasAgg(picture).get_renderer()
     boxes = [
         p.get_window_extent(renderer) for p in ax.patches if isinstance(p, FancyBboxPatch) and p.get_height() > 0.25
     ]
-    outside = [t for t in ax.texts if t.get_text().startswith(("room ", "air ", "floor ")) or " W" in t.get_text()]
-    outside = [t for t in outside if not t.get_text().endswith("W/K") and ":" not in t.get_text()]
-    assert len(outside) > 20
-    for t in outside:
-        assert not any(t.get_window_extent(renderer).overlaps(b) for b in boxes), t.get_text()
+    outside = [t for t in ax.texts if re.fullmatch(r"(room|air|floor) [\d.]+|\w+  [\d.]+ W", t.get_text())]
+    assert len(outside) == 17 + 11
+    places = [(t.get_text(), t.get_window_extent(renderer)) for t in outside]
+    for k, (text, at) in enumerate(places):
+        assert not any(at.overlaps(b) for b in boxes), text
+        assert not [other for other, there in places[:k] if at.shrunk(0.9, 0.9).overlaps(there)], text
 
 
 def test_the_picture_is_the_same_every_time(view: Overview, picture: Figure, tmp_path: Path) -> None:
@@ -242,114 +224,3 @@ def test_mode_shapes_have_a_bar_per_body() -> None:
 def test_figures_become_png_and_svg() -> None:
     for kind, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         assert picture_bytes(rms_map(rms_table([batch()]), False), kind).startswith(head)
-
-
-# tables and report
-
-
-def test_a_parameter_is_told_with_prior_interval_and_what_it_rests_on(network: Network) -> None:
-    known = Interval("bodies.shaft.capacity", "J/K", 6.4e3, 6.2e3, 6.6e3, 0.1)
-    loose = Interval("links.shaft-front.conductance", "W/K", 14.0, 6.0, 31.0, 0.95)
-    table = twin_tables.parameters(network.parameters, {i.name: i for i in (known, loose)}, True, True)
-    assert [c.title for c in table.columns][:6] == [
-        "parameter", "what it is", "value", "prior", "90 % interval", "rests on",
-    ]  # fmt: skip
-    rows = {str(r.cells[0]): r.cells[2:6] for r in table.rows}
-    assert rows["bodies.shaft.capacity"] == ("6.6 kJ/K", "6.6 kJ/K ×/÷ 1.22", "6.2 to 6.6 kJ/K", "recordings")
-    assert rows["links.shaft-front.conductance"] == ("14 W/K", "14 W/K ×/÷ 1.65", "6 to 31 W/K", "prior")
-    assert rows["sensors.bed.offset"][:2] == ("0 K", "0 ± 0.2 K")
-    assert rows["mechanisms.front_bearings.into.shaft"][1] == "0.38 to 0.62"
-    assert len(table.rows) == 60
-    plain = twin_tables.parameters(network.parameters, {}, False, True)
-    assert len(plain.rows) == 81 and "90 % interval" not in [c.title for c in plain.columns]
-
-
-def test_a_calibrated_value_keeps_the_prior_that_it_had() -> None:
-    p = Parameter("links.a-b.conductance", "W/K", "", 20.0, 0.5, 0.0, 1e9, "log", True, prior=14.0)
-    assert twin_tables.prior_words(p) == "14 W/K ×/÷ 1.65" and twin_tables.quantity(p.value, p.unit) == "20 W/K"
-    assert twin_tables.quantity(-1.1e6, "J/K") == "−1100 kJ/K" and twin_tables.quantity(0.58, "um/K") == "0.58 µm/K"
-
-
-def test_energies_add_up_in_words(view: Overview) -> None:
-    table = twin_tables.heat(flows(view))
-    assert table.simulated and table.rows[0].cells[:4] == ("put in", "front_bearings", "72", "10.0")
-    assert ("taken by", "floor", "−36", "−5.0", "−7 %") in [r.cells for r in table.rows]
-    assert not any(r.cells[0] == "through" for r in table.rows)
-
-
-def test_the_worst_batches_are_drawn() -> None:
-    parts = [batch(f"b{k}", offset) for k, offset in enumerate((0.1, 2.0, 0.3, 1.0))]
-    assert [c.batch_id for c in worst(parts, 2)] == ["b1", "b3"]
-
-
-@pytest.fixture(scope="module")
-def written(view: Overview, network: Network, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    row = {"channel": "z", "unit": "um", "batches": 3, "left_out": 1.4, "left_out_sd": 0.2, "before": 9.1, "zero": 30.0}
-    left_out = pd.DataFrame([row])
-    modes = [ModeView(27864.0, "bed against the room", {b.name: 0.5 for b in view.bodies},
-                      {b.name: 0.1 for b in view.bodies}, {"z": -1.5}, {"z": 1.0})]  # fmt: skip
-    data = TwinData(
-        view, network.parameters, "calibrated on 3 batches", {}, ("Shaft <and> front: only their ratio.",), left_out,
-        [batch("b1"), batch("b2", 0.1)], [flows(view)], modes,
-    )  # fmt: skip
-    path = tmp_path_factory.mktemp("twin") / "report.html"
-    write_twin_report(path, data, most_batches=1)
-    write_twin_report(path.with_suffix(".md"), data)
-    return path
-
-
-def test_the_page_holds_everything_it_needs(written: Path) -> None:
-    text = written.read_text(encoding="utf-8")
-    assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "default-src 'none'" in text
-    assert text.count("data:image/") == 7  # network, map, fit, residuals, stack, flows, modes
-    for part in (
-        "Network",
-        "Parameters",
-        "Simulated against recorded",
-        "Where the watts go",
-        "Time constants and modes",
-    ):
-        assert f"<h2>{part}</h2>" in text
-    assert "Shaft &lt;and&gt; front: only their ratio." in text and "calibrated on 3 batches" in text
-    assert "Drawn: the 1 of 2 batches with the greatest residual." in text and "Fixed parameters (81)" in text
-
-
-def test_simulated_is_said_on_the_page_and_in_the_pictures(written: Path) -> None:
-    text = written.read_text(encoding="utf-8")
-    assert "Twin of sample_vmc (SIMULATED)</title>" in text and '<span class="badge">SIMULATED</span></h1>' in text
-    assert 'alt="b1: where the watts go (SIMULATED)"' in text
-    assert 'alt="b1: recorded and simulated"' in text  # this recording is real
-
-
-def test_the_markdown_has_the_tables_and_no_picture(written: Path) -> None:
-    text = written.with_suffix(".md").read_text(encoding="utf-8")
-    assert text.startswith("# Twin of sample_vmc (SIMULATED)") and "data:image" not in text
-    assert "| bed |" in text and "1100 kJ/K" in text and "## Where the watts go" in text
-
-
-def test_what_is_not_given_is_left_out_and_another_ending_is_told(view: Overview, tmp_path: Path) -> None:
-    page = twin_page(TwinData(view, ()), pictures=False)
-    assert [p.title for p in page.parts] == ["Network"] and page.parts[0].pictures == ()
-    with pytest.raises(InputError, match=r"report .*x.pdf: got suffix '.pdf', expected .html or .md"):
-        write_twin_report(tmp_path / "x.pdf", TwinData(view, ()))
-
-
-def test_recordings_and_simulation_become_a_report(tmp_path: Path) -> None:
-    machine = two_bodies()
-    time_s = 60.0 * np.arange(90)
-    columns = {"t_shaft": 20.2, "t_head": 20.0, "room": 20.0, "rpm": np.where(time_s < 2400, 6000.0, 0.0), "z": 0.0}
-    batches = [
-        Batch(machine.machine, name, pd.DataFrame({"time_s": time_s} | columns), machine.batch_channels())
-        for name in ("b1", "b2")
-    ]
-    data = twin_data(machine, batches, most_flows=1)
-    assert data.view.stated.startswith("steady state, rpm = 6000") and data.origin == "as the machine file states them"
-    assert [f.batch_id for f in data.flows] == ["b1"] and [c.batch_id for c in data.compared] == ["b1", "b2"]
-    assert data.flows[0].heat_W["belt"].max() == pytest.approx(120.0) and len(data.modes) == 2
-    text = write_twin_report(tmp_path / "two.html", data, 1).read_text(encoding="utf-8")
-    assert "<h2>Simulated against recorded</h2>" in text
-
-
-def test_a_machine_without_recordings_has_network_and_modes_alone() -> None:
-    data = twin_data(two_bodies())
-    assert data.view.stated == "" and not data.compared and not data.flows and len(data.modes) == 2
