@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CROSSING, _HIDDEN, _STEEP = 6.0, 14.0, 1.0  # what a crossing, a body on a foreign link, a steep link cost, in pitches
-_SWEEPS, _TURNS = 40, 12
+_SWEEPS, _TURNS, _TRIES = 40, 12, 20
 _NEAR_IN = 0.62  # a link must pass a foreign body at this distance, in pitches of height
 _SMALL = 1e-9
 
@@ -121,8 +121,9 @@ def _slots(n: int, pitch: tuple[float, float]) -> Array:
 def _turns(flat: Array) -> list[Array]:
     """The flat positions turned by every part of half a turn; a mirrored picture costs the same."""
     out = []
-    for k in range(_TURNS):
-        c, s = math.cos(k * math.pi / _TURNS), math.sin(k * math.pi / _TURNS)
+    turns = max(2, round(_TURNS * min(1.0, 14 / len(flat)) ** 2))  # many bodies cost much: fewer beginnings
+    for k in range(turns):
+        c, s = math.cos(k * math.pi / turns), math.sin(k * math.pi / turns)
         out.append(flat @ np.array([[c, -s], [s, c]]))
     return out
 
@@ -149,10 +150,11 @@ def _search(at: Ints, slots: Array, ends: Ints, weight: Array, pitch: tuple[floa
     for _ in range(_SWEEPS):
         before = cost
         for i in range(len(at)):
-            tries = np.repeat(at[None], len(slots), axis=0)
-            for s in range(len(slots)):
-                tries[s, at == s] = at[i]
-                tries[s, i] = s
+            near = _near(i, at, slots, ends)
+            tries = np.repeat(at[None], len(near), axis=0)
+            for k, s in enumerate(near):
+                tries[k, at == s] = at[i]
+                tries[k, i] = s
             costs = _cost(slots[tries], ends, weight, pitch)
             k = int(np.argmin(costs))
             if costs[k] < cost - 1e-6:
@@ -160,6 +162,15 @@ def _search(at: Ints, slots: Array, ends: Ints, weight: Array, pitch: tuple[floa
         if cost > before - 1e-6:
             break
     return at, cost
+
+
+def _near(i: int, at: Ints, slots: Array, ends: Ints) -> Ints:
+    """The slots worth a try for body i: all of a small picture, else those nearest to what it is linked with."""
+    if len(slots) <= _TRIES:
+        return np.arange(len(slots))
+    linked = np.concatenate([ends[ends[:, 0] == i, 1], ends[ends[:, 1] == i, 0]])
+    middle = slots[at[linked if len(linked) else [i]]].mean(axis=0)
+    return np.argsort(np.linalg.norm(slots - middle, axis=1), kind="stable")[:_TRIES]
 
 
 def _cost(xy: Array, ends: Ints, weight: Array, pitch: tuple[float, float]) -> Array:
