@@ -16,8 +16,7 @@ from twin.descent import State, descend, x_of
 from twin.fit_noise import Noise, estimate
 from twin.fit_problem import Problem
 
-ROUNDS = 20
-SETTLED = 0.1  # relative change of a channel's weight below which the last rounds belong to the fit itself
+SETTLED = 0.2  # change of a channel's weight in a round: 10 % of its sd, less than residuals of a few batches tell
 
 
 def noise_left(problem: Problem, state: State) -> Noise:
@@ -32,9 +31,13 @@ def with_noise(problem: Problem, state: State, noise: Noise) -> State:
 
 
 def annealed(
-    problem: Problem, state: State, tolerance: float, progress: Callable[[str], None] | None = None
+    problem: Problem,
+    state: State,
+    max_iterations: int,
+    tolerance: float,
+    progress: Callable[[str], None] | None = None,
 ) -> State:
-    """From a state at the priors' mean towards the optimum, one step a round, with the noise that each step leaves.
+    """From a state at the priors' mean down until the noise settles, one step a round under the noise that is left.
 
     Raises:
         WorkError: not finite on the way.
@@ -42,14 +45,13 @@ def annealed(
     still = np.zeros(len(state.z))
     own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
     state = State.at(problem, state.z, own, state.noise)
-    state = with_noise(problem, state, noise_left(problem, state))
-    for number in range(ROUNDS):
-        state = descend(problem, state, len(state.history) + 1, tolerance)
+    noise = noise_left(problem, state)
+    while True:
+        steps = len(state.history)
+        state = descend(problem, with_noise(problem, state, noise), steps + 1, tolerance)
         noise = noise_left(problem, state)
         change = noise.change(state.noise)
         if progress:
-            progress(f"step {number + 1}: noise weights changed by up to {100 * change:.0f} %")
-        if change < SETTLED or state.stuck:
-            break
-        state = with_noise(problem, state, noise)
-    return state
+            progress(f"step {len(state.history)}: noise weights changed by up to {100 * change:.0f} %")
+        if change < SETTLED or state.stuck or not steps < len(state.history) < max_iterations:
+            return state

@@ -24,6 +24,7 @@ from twin.measured import EVERY_S
 from twin.network import Network
 from twin.whiteness import in_words, whiteness
 
+TOLERANCE = 1e-3  # of the fit: parameters within 3 % of a posterior standard deviation of their optimum
 RMS_COLUMNS = ("batch", "channel", "unit", "rows", "before", "after", "fitted")
 
 
@@ -86,7 +87,7 @@ def calibrate(
     leave_out: bool = False,
     processes: int = 1,
     max_iterations: int = 60,
-    tolerance: float = 1e-6,
+    tolerance: float = TOLERANCE,
     max_gap_s: float = MAX_GAP_S,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Calibration:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
+from twin.first_state import first_state
 from twin.fit_problem import Block, Unknown
 from twin.inputs import MAX_GAP_S, Inputs, inputs_of
 from twin.measured import EVERY_S, Measured, channels_of, measured
@@ -17,7 +18,6 @@ from twin.network import Network
 from twin.quantity import Parameter
 from twin.sensitivity import sensitivities
 from twin.simulation import choose_substeps, simulate
-from twin.start import start_of
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class CalibrationProblem:
     """Implements `twin.fit_problem.Problem`; residuals are whitened by the channels' noise.
 
     `start_degC` (B, N) is what the first readings say at the machine file's values, the centre of every batch's own
-    start; `inputs` already hold the substeps that the simulation needs there.
+    start; `inputs` already hold the substeps that keep the simulation's error there below the finest sensor's noise.
     """
 
     network: Network
@@ -89,8 +89,9 @@ class CalibrationProblem:
         """
         inputs = inputs_of(network, batches, max_gap_s=max_gap_s)
         values = network.values
-        start_degC = start_of(network, values[None], inputs)
-        inputs = inputs.refined(choose_substeps(network, values, inputs, start_degC))
+        start_degC = first_state(network, values, inputs)[None]
+        finest = min((r.noise for r in network.readings), default=0.03)
+        inputs = inputs.refined(choose_substeps(network, values, inputs, start_degC, max(0.01, finest)))
         return cls(
             network, inputs, tuple(measured(network, batches, every_s, channels)), start_degC[0], Nuisances.of(network)
         )
@@ -111,7 +112,7 @@ class CalibrationProblem:
     @cached_property
     def noise(self) -> Array:
         """Standard deviation (C,) of each channel's noise, in its unit."""
-        return np.array([c.noise for c in (*self.network.readings, *self.network.errors)])
+        return np.array([r.noise for r in self.network.readings] + [e.noise for e in self.network.errors])
 
     @cached_property
     def nuisance_sizes(self) -> tuple[int, ...]:
@@ -120,7 +121,9 @@ class CalibrationProblem:
     def only(self, batches: Sequence[int]) -> CalibrationProblem:
         """Some of the batches."""
         kept = tuple(self.measured[b] for b in batches)
-        return replace(self, inputs=self.inputs.batch(batches), measured=kept, start_degC=self.start_degC[batches], _last={})
+        return replace(
+            self, inputs=self.inputs.batch(batches), measured=kept, start_degC=self.start_degC[batches], _last={}
+        )
 
     def values_at(self, x: Array) -> Array:
         """All parameter values (n,) at the free ones' fitting coordinates (p,)."""
@@ -147,7 +150,9 @@ class CalibrationProblem:
     @property
     def _size(self) -> int:
         """Numbers in all blocks."""
-        return sum(len(m.row) * (len(self.unknowns) + q) for m, q in zip(self.measured, self.nuisance_sizes, strict=True))
+        return sum(
+            len(m.row) * (len(self.unknowns) + q) for m, q in zip(self.measured, self.nuisance_sizes, strict=True)
+        )
 
     def _linearised(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
         free = len(self.unknowns) + self.nuisances.shared
@@ -166,7 +171,8 @@ class CalibrationProblem:
 
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
-        simulation = simulate(self.network, values, self.inputs)
+        start = first_state(self.network, values, self.inputs)
+        simulation = simulate(self.network, values, self.inputs, start[None])
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [m.value - m.of(s) for m, s in zip(self.measured, series, strict=True)]
 

@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from data.errors import InputError, WorkError
-from twin.annealing import annealed, noise_left, with_noise
+from twin.annealing import SETTLED, annealed, noise_left, with_noise
 from twin.descent import State, Step, descend, x_of, z_bounds
 from twin.fit_noise import Noise
 from twin.fit_problem import Array, Block, Problem, Scale, Unknown
@@ -23,7 +23,7 @@ __all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit"]
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum
 MODEL_NOISE = 1e-3  # what a model's own rounding may hide of the cost: x within 0.03 posterior standard deviations
-NOISE_ROUNDS, NOISE_SETTLED = 10, 0.03
+NOISE_ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def fit(
         raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
     limits = max_iterations, tolerance
     with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
-        first = _first(problem, tolerance, reweight, progress)
+        first = _first(problem, *limits, reweight, progress)
         best, notes = _best_start(problem, first, starts, seed, *limits, progress)
         if reweight:
             best, settled = _with_noise(problem, best, *limits, progress)
@@ -95,14 +95,20 @@ def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
     return np.clip(draws, *z_bounds(unknowns))
 
 
-def _first(problem: Problem, tolerance: float, reweight: bool, progress: Callable[[str], None] | None) -> State:
+def _first(
+    problem: Problem,
+    max_iterations: int,
+    tolerance: float,
+    reweight: bool,
+    progress: Callable[[str], None] | None,
+) -> State:
     """The prior's mean, or what lies below it with the noise estimated on the way."""
     z, nuisance = _starts(problem.unknowns, 1, 0)[0], [np.zeros(q) for q in problem.nuisance_sizes]
     try:
         state = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
     except WorkError as error:
         raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
-    return annealed(problem, state, tolerance, progress) if reweight else state
+    return annealed(problem, state, max_iterations, tolerance, progress) if reweight else state
 
 
 def _best_start(
@@ -124,7 +130,7 @@ def _best_start(
         except WorkError:
             lost += 1
             continue
-        ends.append(descend(problem, start, max_iterations, tolerance))
+        ends.append(descend(problem, start, len(start.history) + max_iterations, tolerance))
         if progress:
             progress(f"start {number + 1} of {starts}: cost {ends[-1].cost:.6g} after {len(ends[-1].history)} steps")
     best = min(ends, key=lambda e: e.cost)
@@ -139,7 +145,7 @@ def _with_noise(
     for number in range(NOISE_ROUNDS):
         noise = noise_left(problem, state)
         change = noise.change(state.noise)
-        if change < NOISE_SETTLED:
+        if change < SETTLED:
             return state, f"; noise settled in round {number}"
         start = with_noise(problem, state, noise)
         state = descend(problem, start, len(start.history) + max_iterations, tolerance)
@@ -176,8 +182,7 @@ def _result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit
             f"{_percent(state.expected / state.cost)}; the derivatives do not fit the model or it is not smooth"
         )
     else:
-        costs = [s.cost for s in state.history[-2:]]
-        fall = 1 - costs[1] / costs[0] if len(costs) == 2 else state.expected / state.cost
+        fall = state.expected / state.cost  # costs of the history may stand under other noise
         words = f"stopped after {steps} steps, cost still falling by {_percent(fall)} a step"
     x = x_of(unknowns, state.z)
     low, high = z_bounds(unknowns)

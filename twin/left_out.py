@@ -67,7 +67,7 @@ def leave_batch_out(
     problem: CalibrationProblem,
     processes: int = 1,
     max_iterations: int = 60,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     reweight: bool = True,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> LeftOut:
@@ -106,7 +106,7 @@ def _rows(problem: CalibrationProblem, folds: Sequence[Fold]) -> Iterator[tuple[
     for b, (fold, m) in enumerate(zip(folds, problem.measured, strict=True)):
         one = problem.only([b])
         left_out = free_running_rms(one, fold.values)[0]
-        zero = _rms_of(m.value - problem.first_value(b), m.channel)
+        zero = _rms_of(m.value - m.at_rest, m.channel)
         for c in m.usable.tolist():
             yield (m.batch_id, problem.channels[c], problem.units[c], int((m.channel == c).sum()), left_out[c],
                    before[b][c], zero[c])  # fmt: skip
@@ -128,7 +128,9 @@ def _mapped(
     if processes < 2:
         yield from (work(problem, b) for b in items)
         return
-    with ProcessPoolExecutor(processes, get_context("spawn"), _keep, (work, problem)) as pool:
+    with ProcessPoolExecutor(
+        processes, get_context("spawn"), _keep, (work, problem.only(range(problem.inputs.n_batches)))
+    ) as pool:
         yield from pool.map(_kept, items)
 
 

@@ -46,6 +46,14 @@ class Measured:
         """Those of them that are errors."""
         return self.usable[self.is_error[self.usable]]
 
+    @cached_property
+    def at_rest(self) -> Array:
+        """What would be shown (n,) if nothing ever moved from its first value."""
+        out = np.zeros(len(self.value))
+        for c in self.usable[~self.is_error[self.usable]].tolist():
+            out[self.channel == c] = self.value[int(np.argmax(self.channel == c))]
+        return out
+
     def of(self, series: Array) -> Array:
         """The same rows (..., n) of simulated channels (..., K, C), errors less their first sample."""
         seen = series[..., self.row, self.channel]
