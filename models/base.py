@@ -34,6 +34,8 @@ class Family(ABC):
     uses_inputs: ClassVar[bool] = True  # False for baselines: every selector and n_tsp gives the same model
     closed_form: ClassVar[bool] = True  # False: iterative, so the grid takes a stated few n_tsp
     rowwise: ClassVar[bool] = True  # a prediction at a row needs that row alone (sklearn's checks apply)
+    needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
+    on_request: ClassVar[bool] = False  # True: slow, so the grid takes it only where it is named
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
 
     def __init__(self) -> None:

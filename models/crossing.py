@@ -7,7 +7,7 @@ several selectors or numbers of points arrive at is fitted once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -33,13 +33,31 @@ Inputs = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to cross. `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all."""
+    """What to cross. `families` empty: all that suit the machine and are quick enough not to wait for a request.
+
+    `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all.
+    """
 
     selectors: tuple[str, ...] = tuple(SELECTORS)
-    families: tuple[str, ...] = tuple(FAMILIES)
+    families: tuple[str, ...] = ()
     protocols: tuple[str, ...] = tuple(PROTOCOLS)
     n_tsps: tuple[int, ...] | None = None
     iterative_n_tsps: tuple[int, ...] = (2, 4)
+
+    def suited(self, machine: Machine | None) -> Plan:
+        """The plan with its families by name.
+
+        Raises:
+            InputError: a family that the plan names needs a twin part, and the machine file has none.
+        """
+        has_twin = machine is not None and machine.twin is not None
+        for key in self.families:
+            if FAMILIES[key].needs_twin and not has_twin:
+                raise InputError(
+                    f"family {key} needs the twin part of the machine file; add 'twin' to the file of "
+                    f"{machine.machine if machine else 'the machine'}, or leave the family out"
+                )
+        return replace(self, families=self.families or tuple(_usual_families(has_twin)))
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""
@@ -47,6 +65,11 @@ class Plan:
         if not family.closed_form:
             wanted = (*(n for n in self.iterative_n_tsps if n in wanted), wanted[-1])
         return tuple(dict.fromkeys(n for n in wanted if n <= n_inputs))
+
+
+def _usual_families(has_twin: bool) -> list[str]:
+    found = [(key, FAMILIES[key]) for key in FAMILIES]
+    return [key for key, family in found if not family.on_request and (has_twin or not family.needs_twin)]
 
 
 @dataclass(frozen=True)

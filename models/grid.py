@@ -75,6 +75,7 @@ def run_grid(
 
     `progress` is called with what was done, how many of how many.
     """
+    plan = plan.suited(machine)
     with threadpool_limits(limits=1):
         crossings = {t: prepare(batches, t, plan, machine) for t in targets}
         jobs = jobs_of(plan, targets)

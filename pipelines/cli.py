@@ -310,9 +310,7 @@ def calibrate(
     """Fit the machine file's free parameters to recordings: values with 90 % intervals, and what they are worth."""
     from pipelines.calibrating import CalibrationRequest, calibrate_file, outcome_dict, print_outcome
 
-    request = CalibrationRequest(
-        machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, overwrite
-    )
+    request = CalibrationRequest(machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, overwrite)
     with screen.progress(as_json) as (say, done):
         outcome = calibrate_file(request, say, done)
     if as_json:

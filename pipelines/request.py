@@ -33,7 +33,8 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
 
     Raises:
         InputError: a machine file that cannot be used, an unknown channel, recordings that do not exist, a report of
-            an unknown kind, or a promotion rule that the chosen protocols do not serve.
+            an unknown kind, a family that the machine cannot have, or a promotion rule that the chosen protocols do
+            not serve.
     """
     machine = load_machine(request.machine_file)
     targets = _targets(request.targets, machine)
@@ -48,6 +49,8 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
             f"protocols: got {', '.join(request.plan.protocols)}, but promotion judges by {rule}; add it, or train "
             "without promotion (--no-promote)"
         )
+    if request.plan.families:
+        request.plan.suited(machine)
     return machine, targets
 
 

@@ -102,6 +102,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         InputError: a request that cannot be served (see `check_request`), or too few batches to train on.
     """
     machine, targets = check_request(request, settings)
+    plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     clock = _Clock(outcome.seconds)
     lake = Lake(home() / "lake")
@@ -117,18 +118,18 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         return outcome
     say(f"features and selectors of {len(batches)} batches")
     with _naming_quarantine(outcome.ingested):
-        prepared = caller.map("prepare", partial(prepare, batches, plan=request.plan, machine=machine), targets)
+        prepared = caller.map("prepare", partial(prepare, batches, plan=plan, machine=machine), targets)
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs = jobs_of(request.plan, targets)
-    with Workers(crossings, request.workers or workers_for(request.plan.families)) as workers:
+    jobs = jobs_of(plan, targets)
+    with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
         done = dict(zip(jobs, caller.map("grid", workers.cross, jobs), strict=True))
     for t in targets:
-        outcome.results[t] = assemble(crossings[t], [done[t, f] for f in request.plan.families])
+        outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
     clock("grid")
     say("track")
-    track = partial(_track, outcome.results, request.plan, settings, say)
+    track = partial(_track, outcome.results, plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
     clock("track")
     if request.promote:

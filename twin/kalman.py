@@ -95,21 +95,20 @@ def filtered(
     solved = solved_balance(network, values[None], inputs, start_degC[None], TOLERANCE_K)
     rows = rows_of(solved, inputs.every, 1)
     nominal = simulation_of(solved, *shown(rows, network)[:2], TOLERANCE_K, inputs.every, 1)
-    used = np.isfinite(readings).any(axis=(0, 1))
+    used = np.flatnonzero(np.isfinite(readings).any(axis=(0, 1)))
     linear = _linearised(solved, rows, nominal, used, doubt)
     return _run(network, linear, nominal, readings, nominal.valid)
 
 
-def _run(
-    network: Network, linear: _Linear, nominal: Simulation, readings: Array, valid: NDArray[np.bool_]
-) -> Filtered:
+def _run(network: Network, linear: _Linear, nominal: Simulation, readings: Array, valid: NDArray[np.bool_]) -> Filtered:
     assert nominal.cells_degC is not None
-    n_batches, n_rows = valid.shape
+    n_batches, n_rows = readings.shape[:2]
     n_cells, n_heats = network.n_cells, len(network.heats)
     given = np.where(valid[..., None], readings - nominal.readings[0], np.nan)
     noise = np.array([r.noise for r in network.readings]) ** 2
-    state, cov = np.zeros(linear.first.shape[:2]), linear.first.copy()
-    states = np.empty((n_batches, n_rows, state.shape[1]))
+    cov = linear.first.copy()
+    state = np.zeros((n_batches, cov.shape[-1]))
+    states = np.empty((n_batches, n_rows, cov.shape[-1]))
     error_var = np.empty((n_batches, n_rows, len(network.errors)))
     innovation, likelihood = np.full(readings.shape, np.nan), np.zeros(n_batches)
     for k in range(n_rows):
@@ -143,7 +142,7 @@ def _run(
     )
 
 
-def _linearised(solved: Solved, rows: Rows, nominal: Simulation, used: NDArray[np.bool_], doubt: Doubt) -> _Linear:
+def _linearised(solved: Solved, rows: Rows, nominal: Simulation, used: NDArray[np.int64], doubt: Doubt) -> _Linear:
     """States: cells (N), factors on heats (H), what lagging sensors show (L), what errors remember (E)."""
     network, values = solved.balance.network, solved.balance.values[0]
     d_readings, d_errors = _slopes(solved, rows)  # (B, K, n_sensors, N), (B, K, n_errors, N)
@@ -219,22 +218,20 @@ def _slopes(solved: Solved, rows: Rows) -> tuple[Array, Array]:
     air = np.zeros((n, len(network.surroundings), *rows.time_s.shape))
     out = []
     for seen in (np.ones(shape), later):
-        tangents = Tangents(
-            places[:, :, None, None] * seen, chain[:, :, None, None] * later, air, {}
-        )
+        tangents = Tangents(places[:, :, None, None] * seen, chain[:, :, None, None] * later, air, {})
         out.append([np.moveaxis(d, 0, -1) for d in shown(rows, network, tangents)[2:]])
     return out[0][0], out[1][1]
 
 
-def _lags_s(network: Network, values: Array, used: NDArray[np.bool_]) -> dict[int, float]:
+def _lags_s(network: Network, values: Array, used: NDArray[np.int64]) -> dict[int, float]:
     """Time constant by number of the sensors in use that lag."""
     out: dict[int, float] = {}
-    for j in np.flatnonzero(used):
+    for j in used.tolist():
         for law in network.readings[j].effects:
             if law.mechanism.key == "sensor_lag" and j not in out:
                 lag_s = float(values[law.parameters["lag"]])
                 if lag_s > 0:
-                    out[int(j)] = lag_s
+                    out[j] = lag_s
             elif law.mechanism.along_time:
                 raise InputError(
                     f"machine {network.machine}: sensor {network.readings[j].channel!r} has {law.name}, "

@@ -15,7 +15,9 @@ NOTHING = "–"
 _HUGE = 10_000.0
 
 _FAMILIES = {"zero": "no model", "mean_curve": "mean curve", "thermal_exponential": "thermal exponential",
-             "pcr": "PCR 95 %", "pcr_lbo": "PCR tuned", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
+             "twin": "physics twin",
+             "twin_residual": "twin + residual", "twin_kalman": "twin with sensors", "pcr": "PCR 95 %",
+             "pcr_lbo": "PCR tuned", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
 _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc": "FCGC"}
 _SHOUTED = {"mlr", "pls", "bp"}
 

@@ -8,6 +8,7 @@ import pytest
 
 from data.batch import Batch, Channel
 from data.errors import InputError
+from data.machine import parse_machine
 from features.design import Design
 from models import FAMILIES
 from models.base import Family, family_from_plain
@@ -37,6 +38,36 @@ def make_batch(k: int) -> Batch:
     return Batch("vmc", f"K{k + 1}", table, channels)
 
 
+# Families of the physics need a machine file; its twin knows three bodies and what drives them, not the law above.
+MACHINE = parse_machine(
+    """
+machine: vmc
+recording: {step_s: 300}
+channels:
+  front: {role: temperature, unit: degC, resolution: 0.1}
+  column: {role: temperature, unit: degC, resolution: 0.1}
+  bed: {role: temperature, unit: degC, resolution: 0.1}
+  spindle: {role: driver, unit: rpm}
+  z: {role: error, unit: um, resolution: 0.1}
+twin:
+  surroundings: {hall: {first: [bed]}}
+  bodies:
+    front: {capacity: {value: 30 kJ/K, spread: 0.5}}
+    column: {capacity: {value: 150 kJ/K, spread: 0.5}}
+    bed: {capacity: {value: 400 kJ/K, spread: 0.5}}
+  links: {front-column: {value: 20 W/K, spread: 0.5}, column-bed: {value: 20 W/K, spread: 0.5}}
+  exposures: {front-hall: {value: 5 W/K, spread: 0.5}, column-hall: {value: 5 W/K, spread: 0.5}, bed-hall: 10 W/K}
+  mechanisms:
+    belt: {law: belt_loss, drivers: spindle, into: front, parameters: {power: {value: 600 W, spread: 0.5}}}
+  sensors: {front: {at: front}, column: {at: column}, bed: {at: bed}}
+  errors:
+    z:
+      chain:
+        - {body: front, gain: {value: 2 um/K, spread: 1 um/K}}
+        - {body: column, gain: {value: 2 um/K, spread: 1 um/K}}
+""",
+    "test",
+)
 BATCHES = [make_batch(k) for k in range(5)]
 _FITTED: dict[str, Family] = {}
 
@@ -48,7 +79,7 @@ def key(request) -> str:
 
 @pytest.fixture(scope="module")
 def design() -> Design:
-    return Design.build(BATCHES, INPUTS, "z")
+    return Design.build(BATCHES, INPUTS, "z", MACHINE)
 
 
 @pytest.fixture
@@ -76,7 +107,7 @@ def test_fit_gives_a_new_copy_that_predicts_every_row(key, design, fitted):
 
 
 def test_fit_and_predict_on_whole_batches_are_the_same_model(key, fitted):
-    model = FAMILIES[key]().fit(BATCHES[:4], INPUTS, "z")
+    model = FAMILIES[key]().fit(BATCHES[:4], INPUTS, "z", MACHINE)
     got = fitted.predict(BATCHES[4])
     np.testing.assert_allclose(model.predict(BATCHES[4]), got, rtol=0, atol=1e-6 * max(1.0, np.abs(got).max()))
 
@@ -94,14 +125,14 @@ def test_is_the_same_every_time(key, design, fitted):
 
 
 def test_nothing_crosses_a_border_between_batches(key, design, fitted):
-    alone = fitted.predict_design(Design.build([BATCHES[4]], INPUTS, "z"), [0])[0]
+    alone = fitted.predict_design(Design.build([BATCHES[4]], INPUTS, "z", MACHINE), [0])[0]
     for neighbours in ([4, 0], [0, 4]):
-        both = Design.build([BATCHES[k] for k in neighbours], INPUTS, "z")
+        both = Design.build([BATCHES[k] for k in neighbours], INPUTS, "z", MACHINE)
         np.testing.assert_allclose(fitted.predict_design(both, [neighbours.index(4)])[0], alone, rtol=0, atol=1e-9)
 
 
 def test_a_prediction_never_sees_the_recorded_error(key, design, fitted):
-    blind = Design.build(BATCHES, INPUTS, None)
+    blind = Design.build(BATCHES, INPUTS, None, MACHINE)
     np.testing.assert_array_equal(fitted.predict_design(blind, [4])[0], fitted.predict_design(design, [4])[0])
 
 
@@ -133,7 +164,7 @@ def test_one_batch_is_enough(key, design):
 
 
 def test_left_out_batches_do_not_touch_the_fit(key, design, fitted):
-    other = Design.build([*BATCHES[:4], make_batch(99)], INPUTS, "z")
+    other = Design.build([*BATCHES[:4], make_batch(99)], INPUTS, "z", MACHINE)
     model = FAMILIES[key]().fit_design(other, [0, 1, 2, 3])
     got, want = model.predict_design(other, [0])[0], fitted.predict_design(design, [0])[0]
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * max(1.0, np.abs(want).max()))
@@ -159,5 +190,5 @@ def test_no_usable_row_is_told_in_one_line(key):
     table = BATCHES[0].table.assign(z=np.nan)
     dead = Batch("vmc", "K9", table, BATCHES[0].channels)
     with pytest.raises(InputError) as error:
-        FAMILIES[key]().fit([dead], INPUTS, "z")
+        FAMILIES[key]().fit([dead], INPUTS, "z", MACHINE)
     assert "\n" not in str(error.value) and "K9" in str(error.value) and key.split("_")[0] in str(error.value)
