@@ -110,6 +110,17 @@ def test_a_table_without_header(tmp_path, rows, spelling):
     assert np.array_equal(batch.values("z")[known], np.array([r[1] for r in rows])[known])
 
 
+@pytest.mark.parametrize("header", [(), ("t", "front", "z"), ("Time (sec)", " Temperature 1", " z")])
+def test_columns_by_position_whatever_the_header_says(tmp_path, header):
+    path = tmp_path / "run.txt"
+    write_csv(path, header, [(3.0 * i, 20.0 + i, -1.0 * i) for i in range(20)], encoding="utf-8-sig")
+    machine = machine_for(0, 1, 2)
+    batch = only(path, machine)
+    assert batch.repairs["rows_in"] == 20 and batch.repairs.get("preamble_rows", 0) == bool(header)
+    assert batch.values("front")[0] == 20.0 and batch.values("z")[0] == 0.0
+    assert (batch.values("front")[-1], batch.values("z")[-1]) == (36.5, -16.5)  # at 50 s: rows 15 to 18
+
+
 @SAFE
 @given(rows=tables)
 def test_xlsx_and_parquet_give_what_csv_gives(tmp_path, rows):
