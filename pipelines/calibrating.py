@@ -201,7 +201,7 @@ def error_table(c: Calibration) -> Table:
     for channel, part in c.rms.groupby("channel", sort=False):
         row = [str(channel), str(part["unit"].iloc[0]), str(len(part)), _spread(part["before"]), _spread(part["after"])]
         if left is not None:
-            row += [_spread(shown[str(channel)][k]) for k in ("left_out", "zero")]
+            row += [_spread(shown[str(channel)]["left_out"]), f"{shown[str(channel)]['zero'].mean():.2f}"]
         table.add_row(*row)
     return table
 
