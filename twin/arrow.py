@@ -29,8 +29,11 @@ class Corner:
     target: Array  # (q,)
 
     def step(self, dz: Array, share: float = 1.0) -> Array:
-        """The nuisances' step (q,) that goes with a parameter step dz (p,)."""
-        return share * _solve(self.corner, self.target - self.coupling @ dz)
+        """The nuisances' step (q,): all that a parameter step dz (p,) asks of them, and `share` of their own.
+
+        Held back from what dz asks, dz would not lead downhill: it is the step of the cost at their optimum.
+        """
+        return _solve(self.corner, share * self.target - self.coupling @ dz)
 
 
 @dataclass(frozen=True)
@@ -79,14 +82,13 @@ class Arrow:
         return np.clip(bounded.x, low, high)
 
     def gain(self, dz: Array, share: float = 1.0) -> float:
-        """By how much the linearised cost falls with dz (p,) and `share` of the nuisances' step."""
+        """By how much the linearised cost falls with dz (p,) and `share` of the nuisances' own step."""
         before = self.target @ self.target
         rest = self.target - self.root @ dz
         after = rest @ rest
         for c in self.corners:
-            aim = c.target - c.coupling @ dz
             before += c.target @ c.target
-            after += (1 - share) ** 2 * (aim @ aim)
+            after += (1 - share) ** 2 * (c.target @ c.target)
         return float(before - after)
 
 
