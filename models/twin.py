@@ -30,7 +30,8 @@ class Twin(Family):
     error channels of a machine share one calibration), one row in `every_s`. A prediction knows the drivers and the
     surroundings alone: it starts where the network would settle with the surroundings' first values, plus the mean
     deviation of the training batches' starts from that (`start` "usual"; "settled": without it), and runs free.
-    `fitted`: the machine as JSON, parameters and their values, start_K by cell and its covariance over batches.
+    `fitted`: the machine as JSON, the channels that drive it, parameters and their values, start_K by cell and its
+    covariance over batches.
     A training batch that cannot be simulated is left out; a hole in a driver of a batch to predict is bridged.
     """
 
@@ -105,8 +106,11 @@ class Twin(Family):
         return np.asarray(self.fitted["values"], float)
 
     def _plain(self, machine: str, c: Calibrated) -> Plain:
-        names = [p.name for p in network_of(machine).parameters]
-        return {"machine": machine, "parameters": names, "values": c.values, "start_K": c.start_K,
+        network = network_of(machine)
+        driven_by = [*network.drivers, *(s.channel for s in network.surroundings if s.channel)]
+        driven_by += [name for s in network.surroundings for name in s.first]
+        return {"machine": machine, "driven_by": list(dict.fromkeys(driven_by)),
+                "parameters": [p.name for p in network.parameters], "values": c.values, "start_K": c.start_K,
                 "start_cov_K2": c.start_cov_K2, "words": c.words}  # fmt: skip
 
     def _usual_K(self) -> Array:

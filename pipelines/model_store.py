@@ -42,9 +42,10 @@ class StoredModel:
         return bool(self.info.get("simulated", False))
 
     def channels(self) -> tuple[str, ...]:
-        """The channels that a recording must have: those of the inputs, and a driver that `fitted` names."""
-        drivers = self.machine.names("driver")
-        named = [v for v in self.family.fitted.values() if isinstance(v, str) and v in drivers]
+        """The channels that a recording must have: those of the inputs, and what drives it as `fitted` names it."""
+        drivers = self.machine.names("driver", "ambient", "temperature")
+        words = (w for v in self.family.fitted.values() for w in (v if isinstance(v, list) else [v]))
+        named = [w for w in words if isinstance(w, str) and w in drivers]
         needed: dict[str, None] = {}
         for name in self.family.inputs:
             channel, _, kind = name.partition("@")

@@ -45,7 +45,7 @@ def family_style(key: str) -> tuple[str, str]:
     """Colour and marker of a family, the same on every page."""
     keys = list(FAMILIES)
     i = keys.index(key) if key in keys else len(keys)
-    return _PALETTE[i % len(_PALETTE)], _SYMBOLS[i % len(_SYMBOLS)]
+    return _PALETTE[i % len(_PALETTE)], _SYMBOLS[(i + i // len(_PALETTE)) % len(_SYMBOLS)]
 
 
 def plain(text: str) -> str:
