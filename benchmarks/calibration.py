@@ -28,15 +28,15 @@ from data.machine import Machine, load_machine
 from data.recording import read_batches
 from data.sample_year import PROBE_NOISE_UM, PROBE_STEP_UM, TEMPERATURE_STEP_K, write_sample_year
 from twin.calibration import TOLERANCE, calibrate
-from twin.calibration_problem import CalibrationProblem
+from twin.calibration.first_state import first_state
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import fit
+from twin.calibration.left_out import leave_batch_out
+from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.first_state import first_state
-from twin.identifiability import intervals90
-from twin.inputs import inputs_of
-from twin.least_squares import fit
-from twin.left_out import leave_batch_out
 from twin.network import Network
 from twin.simulation import simulate
+from twin.simulation.inputs import inputs_of
 
 MACHINE = Path(__file__).parents[1] / "machines" / "sample_vmc.yml"
 

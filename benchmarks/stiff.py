@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from data import sample_machine as sample
-from twin.inputs import Inputs
+from twin.simulation.inputs import Inputs
 
 Array = NDArray[np.float64]
 

@@ -34,8 +34,8 @@ from models import FAMILIES
 from models.base import Family
 from models.metrics import batch_scores
 from models.protocols import Fold, leave_batch_out, leave_season_out
+from twin.calibration.rewrite import Update, with_values
 from twin.compile import compile_network
-from twin.rewrite import Update, with_values
 
 MACHINE_FILE = Path(__file__).parent.parent / "machines" / "sample_vmc.yml"
 SENSORS = {4: ("front", "motor", "column_front", "bed"), 10: ()}  # a control's few, and all

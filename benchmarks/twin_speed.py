@@ -30,15 +30,15 @@ from benchmarks.stiff import Plain
 from data import sample_machine as sample
 from data.machine import load_machine
 from data.sample_year import plan_year
-from twin.balance import balance_of
 from twin.compile import compile_network
-from twin.coupling import plain_modes
-from twin.inputs import Inputs
 from twin.network import Network
-from twin.response import Response
 from twin.schema import twin_part
-from twin.sensitivity import sensitivities
 from twin.simulation import simulate
+from twin.simulation.balance import balance_of
+from twin.simulation.coupling import plain_modes
+from twin.simulation.inputs import Inputs
+from twin.simulation.response import Response
+from twin.simulation.sensitivity import sensitivities
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from data.batch import Batch
 from data.errors import InputError
 from models.base import Array
 from models.twin_folds import SUBSTEPS_K
-from twin.inputs import Inputs, inputs_of
 from twin.network import Network
 from twin.simulation import choose_substeps, simulate
-from twin.start import start_of
+from twin.simulation.inputs import Inputs, inputs_of
+from twin.simulation.start import start_of
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from data.lake import Lake
 from data.machine import Machine, load_machine
 from pipelines import screen
 from pipelines.settings import home
-from twin.calibrated_file import Origin, calibrated_text, check_target, check_writable, write_file
 from twin.calibration import Calibration, calibrate
+from twin.calibration.calibrated_file import Origin, calibrated_text, check_target, check_writable, write_file
+from twin.calibration.identifiability import Interval, readable_names
 from twin.compile import compile_network
-from twin.identifiability import Interval, readable_names
 
 Say = Callable[[str], None]
 SHOWN = 8  # directions that the recordings do not determine; --json tells all

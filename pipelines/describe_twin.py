@@ -18,12 +18,12 @@ from pipelines.report.layout import Table
 from pipelines.report.network_picture import counted
 from pipelines.report.twin_report import PICTURES, TwinData, write_picture, write_twin_report
 from twin.compile import compile_network, expanded
-from twin.mode_words import ModeView, machine_modes, mode_views
 from twin.network import Network
-from twin.overview import Overview, overview
 from twin.quantity import convert
 from twin.schema import twin_part
-from twin.steady import Steady, steady_state
+from twin.simulation.steady import Steady, steady_state
+from twin.views.mode_words import ModeView, machine_modes, mode_views
+from twin.views.overview import Overview, overview
 
 AIR_DEGC = 20.0
 

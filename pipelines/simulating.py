@@ -18,11 +18,11 @@ from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine, load_machine
 from pipelines.report.iso230_3 import _write_bytes, write_iso_report
 from twin.compile import compile_network
-from twin.inputs import Inputs, inputs_of_plan, start_of_plan
 from twin.network import Network
 from twin.run_plan import RunPlan, load_run_plan
 from twin.simulation import Simulation, choose_substeps
 from twin.simulation import simulate as simulate_network
+from twin.simulation.inputs import Inputs, inputs_of_plan, start_of_plan
 
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
@@ -89,7 +89,7 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, in
     from pipelines.describe_twin import describe_twin
     from pipelines.report.simulation_figure import overview_png
     from pipelines.report.twin_report import TwinData, write_twin_report
-    from twin.heat_flows import heat_flows
+    from twin.views.heat_flows import heat_flows
 
     network, machine, jobs = jobs_of(request)
     picture, page = request.out / OVERVIEW, request.out / TWIN

@@ -13,7 +13,7 @@ from data.batch import Batch
 from pipelines import screen
 from pipelines.report.words import number
 from pipelines.simulating import Simulated, SimulationOutcome
-from twin.iso_kind import clock
+from twin.iso230_3.kind import clock
 
 HOURS = (1.0, 2.0, 6.0)
 _UNITS = {"um": "µm", "um/m": "µm/m"}

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from data.errors import InputError
 from data.machine import Machine
-from twin.checks import problems
-from twin.compile_channels import error, reading, surrounding
-from twin.compile_edges import exposure, inside, link
-from twin.compile_laws import acting_on, heats, law_of, mechanism_of, starts
+from twin.compiling.channels import error, reading, surrounding
+from twin.compiling.checks import problems
+from twin.compiling.edges import exposure, inside, link
+from twin.compiling.laws import acting_on, heats, law_of, mechanism_of, starts
+from twin.compiling.scope import Scope, number
 from twin.network import Network
 from twin.schema import TwinPart, twin_part
-from twin.scope import Scope, number
 
 
 def compile_network(machine: Machine, where: str = "", part: TwinPart | None = None) -> Network:

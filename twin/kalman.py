@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from data.errors import InputError
-from twin.channels import Rows, Tangents, shown
-from twin.inputs import Inputs
 from twin.network import Network
 from twin.simulation import TOLERANCE_K, Simulation, simulation_of
-from twin.solved import Solved, rows_of, solved_balance
-from twin.start import start_of
+from twin.simulation.channels import Rows, Tangents, shown
+from twin.simulation.inputs import Inputs
+from twin.simulation.solved import Solved, rows_of, solved_balance
+from twin.simulation.start import start_of
 
 Array = NDArray[np.float64]
 

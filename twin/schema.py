@@ -234,7 +234,7 @@ def _with_ends(key: Any, given: Any, ends: tuple[str, ...]) -> Any:
 
 
 def twin_part(machine: Machine, where: str = "") -> TwinPart:
-    """The machine file's twin part, checked for form; `twin.checks` and `twin.network` check its sense.
+    """The machine file's twin part, checked for form; `twin.compiling.checks` and `twin.network` check its sense.
 
     Raises:
         InputError: no twin part, an unknown key (with the closest), a wrong value; one line with file and key.

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from pipelines.report.network_glyphs import CHAINS, SOFT, say, width_in
 from pipelines.report.words import INK, number
-from twin.overview import ChainView
+from twin.views.overview import ChainView
 
 _ROW_IN, _BAR_IN, _HEAD_IN, _LEFT_IN, _RIGHT_IN = 0.50, 0.21, 0.42, 0.85, 0.35
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipelines.report.twin_figures import _WIDTH_IN, SOFT, _calm, _head
 from pipelines.report.words import INK, number
-from twin.heat_flows import HeatFlows
+from twin.views.heat_flows import HeatFlows
 
 Array = NDArray[np.float64]
 

@@ -27,8 +27,8 @@ from pipelines.report.network_boxes import (
 from pipelines.report.network_glyphs import LINK, SOFT, arrow, ground, say, width_in
 from pipelines.report.network_picture import grown
 from pipelines.report.words import INK, number
-from twin.heat_flows import HeatFlows
-from twin.overview import BodyView, Overview, Tie
+from twin.views.heat_flows import HeatFlows
+from twin.views.overview import BodyView, Overview, Tie
 
 WARMTH = LinearSegmentedColormap.from_list("warmth", ["#8ec3e6", "#f4f7fa", "#fbd9bd", "#f0a266", "#e27a35"])
 _LEGEND_IN, _LEAST_W = 0.72, 0.5

@@ -19,7 +19,7 @@ from pipelines.report.layout import Column, Row, Table
 from pipelines.report.words import listed, number
 from pipelines.report.write import _environment, _write
 from twin.iso230_3 import ProbePair, ThermalTest, thermal_test
-from twin.iso_kind import clock
+from twin.iso230_3.kind import clock
 
 NOT_STATED = "not stated"
 STYLE = "in the style of ISO 230-3"

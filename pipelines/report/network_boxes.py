@@ -25,8 +25,8 @@ from pipelines.report.network_glyphs import (
     width_in,
 )
 from pipelines.report.words import INK, ORANGE
-from twin.layout import places
-from twin.overview import Overview, Tie
+from twin.views.layout import places
+from twin.views.overview import Overview, Tie
 
 PITCH_IN = (2.3, 1.72)
 SIDE_IN = 0.3

@@ -31,7 +31,7 @@ from pipelines.report.network_boxes import (
 )
 from pipelines.report.network_glyphs import CHAINS, HEAT, LINK, SOFT, arrow, ground, say, width_in
 from pipelines.report.words import INK, count, number
-from twin.overview import BodyView, HeatView, Overview, Tie
+from twin.views.overview import BodyView, HeatView, Overview, Tie
 
 _LEGEND_IN = 0.78
 

@@ -9,16 +9,16 @@ from data.errors import InputError
 from data.machine import Machine
 from pipelines.report.twin_report import MOST_BATCHES, TwinData
 from twin.calibration import Calibration
-from twin.compared import compared
 from twin.compile import compile_network, expanded
-from twin.heat_flows import heat_flows
-from twin.inputs import Inputs, inputs_of
-from twin.mode_words import machine_modes, mode_views
 from twin.network import Network
-from twin.overview import overview
 from twin.schema import twin_part
 from twin.simulation import choose_substeps, simulate
-from twin.steady import Steady, steady_state
+from twin.simulation.inputs import Inputs, inputs_of
+from twin.simulation.steady import Steady, steady_state
+from twin.views.compared import compared
+from twin.views.heat_flows import heat_flows
+from twin.views.mode_words import machine_modes, mode_views
+from twin.views.overview import overview
 
 AIR_DEGC = 20.0
 

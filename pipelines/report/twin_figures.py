@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipelines.report.words import BLUE, INK, ORANGE, number
-from twin.compared import Compared
-from twin.mode_words import ModeView, time_words
+from twin.views.compared import Compared
+from twin.views.mode_words import ModeView, time_words
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of ev
     """Batch × channel with its numbers; the colour counts within the channels of one unit.
 
     Args:
-        rms: batch, channel, unit, rms, as `twin.compared.rms_table` gives it.
+        rms: batch, channel, unit, rms, as `twin.views.compared.rms_table` gives it.
     """
     batches, channels = list(dict.fromkeys(rms["batch"])), list(dict.fromkeys(rms["channel"]))
     unit = rms.drop_duplicates("channel").set_index("channel")["unit"]

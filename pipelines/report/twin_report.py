@@ -19,12 +19,12 @@ from pipelines.report.layout import Table
 from pipelines.report.network_picture import counted, network_picture, picture_bytes
 from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
 from pipelines.report.write import FORMATS, _environment, _write
-from twin.compared import Compared, rms_table
-from twin.heat_flows import HeatFlows
-from twin.identifiability import Interval
-from twin.mode_words import ModeView
-from twin.overview import Overview
+from twin.calibration.identifiability import Interval
 from twin.quantity import Parameter
+from twin.views.compared import Compared, rms_table
+from twin.views.heat_flows import HeatFlows
+from twin.views.mode_words import ModeView
+from twin.views.overview import Overview
 
 PICTURES = (".svg", ".png", ".html")
 MOST_BATCHES = 4

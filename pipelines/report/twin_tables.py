@@ -10,11 +10,11 @@ import pandas as pd
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.network_picture import capacity_words
 from pipelines.report.words import NOTHING, number, percent
-from twin.heat_flows import HeatFlows
-from twin.identifiability import Interval
-from twin.mode_words import ModeView, time_words
-from twin.overview import Overview
+from twin.calibration.identifiability import Interval
 from twin.quantity import Parameter
+from twin.views.heat_flows import HeatFlows
+from twin.views.mode_words import ModeView, time_words
+from twin.views.overview import Overview
 
 _UNITS = {"1": "", "um": "µm", "um/K": "µm/K", "um/m/K": "µm/m/K", "degC": "°C", "m**2": "m²", "mm**2/s": "mm²/s",
           "W/m**2/K": "W/m²/K"}  # fmt: skip

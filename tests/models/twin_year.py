@@ -9,9 +9,9 @@ from data.batch import Batch
 from data.machine import Machine
 from tests.twin.machines import machine
 from twin.compile import compile_network
-from twin.inputs import Inputs
 from twin.network import Network
 from twin.simulation import simulate
+from twin.simulation.inputs import Inputs
 
 STEP_S, ROWS = 300.0, 61
 NOISE_K, NOISE_UM = 0.03, 0.3

@@ -24,13 +24,13 @@ from pipelines.report.network_glyphs import Rect
 from pipelines.report.network_picture import network_picture, picture_bytes
 from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
 from pipelines.report.twin_report import write_picture
-from twin.compared import rms_table
 from twin.compile import compile_network, expanded
-from twin.mode_words import ModeView
 from twin.network import Network
-from twin.overview import Overview, overview
 from twin.schema import twin_part
-from twin.steady import steady_state
+from twin.simulation.steady import steady_state
+from twin.views.compared import rms_table
+from twin.views.mode_words import ModeView
+from twin.views.overview import Overview, overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

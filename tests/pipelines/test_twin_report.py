@@ -17,14 +17,14 @@ from pipelines.report import twin_tables
 from pipelines.report.twin_data import twin_data
 from pipelines.report.twin_report import TwinData, twin_page, worst, write_twin_report
 from tests.twin.machines import machine as two_bodies
+from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, expanded
-from twin.identifiability import Interval
-from twin.mode_words import ModeView
 from twin.network import Network
-from twin.overview import Overview, overview
 from twin.quantity import Parameter
 from twin.schema import twin_part
-from twin.steady import steady_state
+from twin.simulation.steady import steady_state
+from twin.views.mode_words import ModeView
+from twin.views.overview import Overview, overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.compared import Compared
-from twin.heat_flows import HeatFlows
-from twin.overview import Overview
+from twin.views.compared import Compared
+from twin.views.heat_flows import HeatFlows
+from twin.views.overview import Overview
 
 
 def batch(name: str = "b$1", offset: float = 0.5, simulated: bool = False) -> Compared:

@@ -16,11 +16,11 @@ from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches
 from twin.calibration import calibrate
+from twin.calibration.first_state import first_state
 from twin.compile import compile_network
-from twin.first_state import first_state
-from twin.inputs import inputs_of
 from twin.network import Network
 from twin.simulation import simulate
+from twin.simulation.inputs import inputs_of
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data" / "lathe_gv1203"

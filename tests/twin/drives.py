@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from tests.twin.machines import machine
 from twin.compile import compile_network
-from twin.inputs import Inputs
 from twin.network import Network
+from twin.simulation.inputs import Inputs
 
 Array = NDArray[np.float64]
 

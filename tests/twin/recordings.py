@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from data.batch import Batch
 from data.machine import Machine
 from twin.compile import compile_network
-from twin.inputs import inputs_of
 from twin.network import Network
 from twin.quantity import values_of
 from twin.simulation import simulate
+from twin.simulation.inputs import inputs_of
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twin.arrow import assemble
-from twin.fit_problem import Block, Unknown
+from twin.calibration.arrow import assemble
+from twin.calibration.fit_problem import Block, Unknown
 
 UNKNOWNS = tuple(Unknown(f"p{k}", "1", 0.0, 1.0) for k in range(3))
 FREE = np.full(3, np.inf)

@@ -8,9 +8,9 @@ import pytest
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine, parse_machine
-from twin.calibrated_file import Origin, calibrated_text, check_writable, write_file
+from twin.calibration.calibrated_file import Origin, calibrated_text, check_writable, write_file
+from twin.calibration.identifiability import Interval
 from twin.compile import compile_network
-from twin.identifiability import Interval
 from twin.network import Network
 from twin.schema import twin_part
 

@@ -13,14 +13,14 @@ from data.machine import Machine
 from tests.twin.machines import machine
 from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration import Calibration, calibrate
-from twin.calibration_problem import CalibrationProblem
+from twin.calibration.first_state import first_state
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import fit
+from twin.calibration.left_out import leave_batch_out
+from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.first_state import first_state
-from twin.identifiability import intervals90
-from twin.inputs import inputs_of
-from twin.least_squares import fit
-from twin.left_out import leave_batch_out
 from twin.simulation import simulate
+from twin.simulation.inputs import inputs_of
 
 HEAD = {"capacity": "40 kJ/K", "material": "cast_iron"}  # fixed: else heat, capacities, conductances only scale
 

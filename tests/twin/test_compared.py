@@ -9,9 +9,9 @@ import pytest
 from data.batch import Batch, Channel
 from data.errors import InputError
 from tests.twin.drives import network
-from twin.compared import RMS_COLUMNS, compared, rms_table
-from twin.inputs import inputs_of
 from twin.simulation import Simulation, simulate
+from twin.simulation.inputs import inputs_of
+from twin.views.compared import RMS_COLUMNS, compared, rms_table
 
 CHANNELS = {
     "t_shaft": Channel("t_shaft", "temperature", "degC", 0.1),

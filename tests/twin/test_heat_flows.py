@@ -10,9 +10,9 @@ import pytest
 
 from data.errors import InputError
 from tests.twin.drives import at, closed, drive, network
-from twin.heat_flows import COLUMNS, HeatFlows, heat_flows
 from twin.network import Network
 from twin.simulation import simulate
+from twin.views.heat_flows import COLUMNS, HeatFlows, heat_flows
 
 TIME_S = np.arange(0, 14401.0, 300.0)
 STOPS = np.where(np.arange(48) % 16 < 10, 5000.0, 0.0)

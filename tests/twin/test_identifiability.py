@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from toy_problems import ToyProblem, linear
 
-from twin.identifiability import (
+from twin.calibration.identifiability import (
     correlation,
     intervals90,
     prior_shrinkage,
@@ -12,7 +12,7 @@ from twin.identifiability import (
     sparse_basis,
     undetermined,
 )
-from twin.least_squares import Fit, Unknown, fit
+from twin.calibration.least_squares import Fit, Unknown, fit
 
 CONDUCTANCE = "links.shaft-housing.conductance"
 CAPACITY = "nodes.shaft.capacity"

@@ -13,9 +13,9 @@ from data.batch import Batch, Finding
 from data.errors import InputError
 from tests.twin.drives import network
 from tests.twin.machines import machine
-from twin.inputs import inputs_of, inputs_of_plan, start_of_plan
 from twin.run_plan import load_run_plan
 from twin.simulation import simulate
+from twin.simulation.inputs import inputs_of, inputs_of_plan, start_of_plan
 
 
 def batch(n: int = 6, step_s: float = 60.0, batch_id: str = "b1", **columns: Any) -> Batch:

@@ -9,10 +9,10 @@ from scipy.linalg import expm
 from data.errors import InputError
 from tests.twin.machines import machine
 from twin.compile import compile_network
-from twin.inputs import Inputs
 from twin.kalman import Doubt, filtered
 from twin.network import Network
 from twin.simulation import simulate
+from twin.simulation.inputs import Inputs
 
 DT_S, ROWS = 60.0, 121
 LAG_S = 90.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.layout import _crossings, flattened, places, resistance_distance
+from twin.views.layout import _crossings, flattened, places, resistance_distance
 
 RING = {("a", "b"): 5.0, ("b", "c"): 1.0, ("c", "d"): 5.0, ("d", "a"): 1.0, ("a", "e"): 2.0, ("c", "f"): 30.0}
 PITCH = (2.0, 1.5)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from toy_problems import ToyProblem, decay, linear, unknowns
 
-import twin.arrow
+import twin.calibration.arrow
 from data.errors import InputError, WorkError
-from twin.identifiability import intervals90
-from twin.least_squares import Unknown, fit
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import Unknown, fit
 
 
 def linear_problem(seed: int = 0, rows: tuple[int, ...] = (40, 25, 3)) -> ToyProblem:
@@ -39,7 +39,7 @@ def dense_solution(problem: ToyProblem) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("gram_limit", [1e9, 0.0], ids=["cholesky", "householder"])
 def test_linear_gaussian_equals_the_dense_closed_form(gram_limit, monkeypatch):
-    monkeypatch.setattr(twin.arrow, "GRAM_LIMIT", gram_limit)
+    monkeypatch.setattr(twin.calibration.arrow, "GRAM_LIMIT", gram_limit)
     problem = linear_problem()
     solution, covariance = dense_solution(problem)
     found = fit(problem)

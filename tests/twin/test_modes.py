@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from twin.modes import first_order_hold, modes_of
+from twin.simulation.modes import first_order_hold, modes_of
 
 
 def chain(n_nodes: int, conductance_W_per_K: float, to_room_W_per_K: float = 0.0) -> np.ndarray:

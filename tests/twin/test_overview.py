@@ -10,9 +10,9 @@ import pytest
 from data.machine import load_machine
 from tests.twin.machines import machine
 from twin.compile import compile_network, expanded
-from twin.overview import Overview, overview
 from twin.schema import twin_part
-from twin.steady import steady_state
+from twin.simulation.steady import steady_state
+from twin.views.overview import Overview, overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from toy_network import Toy, held, linear, one_schedule
 
-from twin.modes import modes_of
-from twin.response import Forcing, Response, Schedule
+from twin.simulation.modes import modes_of
+from twin.simulation.response import Forcing, Response, Schedule
 
 # --- closed forms
 

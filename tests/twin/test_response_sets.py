@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from toy_network import Toy, one_schedule
 
 from data.errors import InputError
-from twin import response as response_module
-from twin.response import Response, Schedule
+from twin.simulation import response as response_module
+from twin.simulation.response import Response, Schedule
 
 
 def test_padding_does_not_leak() -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from data.errors import InputError
 from data.machine import parse_machine
+from twin.calibration.rewrite import Update, with_calibrated, with_values
 from twin.compile import compile_network
-from twin.rewrite import Update, with_calibrated, with_values
 
 TEXT = (Path(__file__).parents[2] / "machines" / "sample_vmc.yml").read_text()
 

@@ -12,10 +12,10 @@ from data.machine import load_machine
 from tests.twin.drives import at, drive, network, one_body
 from tests.twin.test_simulation import _sample_inputs
 from twin.compile import compile_network
-from twin.inputs import Inputs
 from twin.network import Network
-from twin.sensitivity import sensitivities
 from twin.simulation import simulate
+from twin.simulation.inputs import Inputs
+from twin.simulation.sensitivity import sensitivities
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

@@ -140,7 +140,7 @@ def test_the_sample_machine_against_stiff_solvers(sample: Network, method: str) 
 
 def _floor(sample: Network) -> float | None:
     """The floor's temperature in a batch whose room starts at 18 degC."""
-    from twin.air import air_of
+    from twin.simulation.air import air_of
 
     s = [g.name for g in sample.surroundings].index("floor")
     inputs = _sample_inputs(sample, np.array([0.0, 60.0]), np.zeros(1), np.full(2, 18.0))
@@ -344,7 +344,7 @@ def test_sets_are_worked_on_in_groups_of_bounded_memory(monkeypatch: pytest.Monk
     values = net.values * np.linspace(0.9, 1.1, 5)[:, None]
     inputs = drive(np.arange(0, 3601.0, 60.0), rpm=4000.0)
     whole = simulate(net, values, inputs, keep_cells=True)
-    monkeypatch.setattr("twin.simulation.CHUNK_BYTES", 1)
+    monkeypatch.setattr("twin.simulation.run.CHUNK_BYTES", 1)
     parts = simulate(net, values, inputs, keep_cells=True)
     np.testing.assert_allclose(parts.readings, whole.readings, rtol=1e-13)
     assert whole.cells_degC is not None and parts.cells_degC is not None

@@ -3,7 +3,15 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from twin.whiteness import COLUMNS, correlated_rows, in_words, lagged_sums, ljung_box_p, runs_test, whiteness
+from twin.calibration.whiteness import (
+    COLUMNS,
+    correlated_rows,
+    in_words,
+    lagged_sums,
+    ljung_box_p,
+    runs_test,
+    whiteness,
+)
 
 
 def ar1(rng: np.random.Generator, rows: int, memory: float) -> np.ndarray:

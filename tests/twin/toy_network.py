@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from twin.modes import modes_of
-from twin.response import Response, Schedule
+from twin.simulation.modes import modes_of
+from twin.simulation.response import Response, Schedule
 
 
 class Toy:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.least_squares import Block, Unknown
+from twin.calibration.least_squares import Block, Unknown
 
 Array = NDArray[np.float64]
 Model = Callable[[Array, int], tuple[Array, Array]]  # (x, batch) -> modelled (n,), derivative (n, p)

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from data.errors import closest
+from twin.compiling.scope import several
 from twin.mechanisms.base import Array, Mechanism, View, real
 from twin.quantity import Spec, Value
 from twin.schema import Body, ChainLink, ErrorChain, Link, MechanismPart, Tilt, TwinPart
-from twin.scope import several
 
 
 class ColumnBending(Mechanism):

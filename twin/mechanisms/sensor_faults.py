@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import closest
+from twin.compiling.scope import several
 from twin.mechanisms.base import Array, Mechanism, View, real
 from twin.quantity import Spec
 from twin.schema import MechanismPart, TwinPart
-from twin.scope import several
 
 
 class SensorSwap(Mechanism):

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from data.errors import closest
+from twin.compiling.scope import several
 from twin.mechanisms.base import Array, Mechanism, View
 from twin.quantity import Spec, Value
 from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart
-from twin.scope import several
 
 
 class EnclosureAir(Mechanism):

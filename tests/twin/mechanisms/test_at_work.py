@@ -9,11 +9,11 @@ from small_machine import BODIES, machine_with
 
 from data.machine import Machine
 from twin.compile import compile_network
-from twin.inputs import Inputs
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
 from twin.network import Network
 from twin.simulation import Simulation, simulate
+from twin.simulation.inputs import Inputs
 
 N_INTERVALS, STEP_S = 120, 60.0
 OPEN = ("enclosure_air", "floor_sink", "initial_state")  # these exchange with a surrounding, or start elsewhere

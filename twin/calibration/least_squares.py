@@ -1,0 +1,213 @@
+"""MAP least squares over batches: parameters with priors, nuisances per batch, convergence told honestly.
+
+Minimises ``Σ |r_b|² + Σ ((x − prior) / spread)² + Σ nuisance²`` from one or several starts (`descent`), on batches
+whose nuisances are eliminated one batch at a time (`arrow`), with the noise as given or re-estimated (`fit_noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from data.errors import InputError, WorkError
+from twin.calibration.annealing import SETTLED, annealed, noise_left, with_noise
+from twin.calibration.descent import State, Step, descend, x_of, z_bounds
+from twin.calibration.fit_noise import Noise
+from twin.calibration.fit_problem import Array, Block, Problem, Scale, Unknown
+
+__all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit"]
+
+SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum
+MODEL_NOISE = 1e-3  # what a model's own rounding may hide of the cost: x within 0.03 posterior standard deviations
+NOISE_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The optimum and what is known about it; p parameters, B batches, c channels.
+
+    `covariance` (p, p) of x: the inverse of the data's information plus the prior's, nuisances marginalised;
+    `information_data` (p, p) without the prior. `dof`: rows less the parameters and nuisances that the data determine.
+    `noise_factor` and `inflation` (c,) divide the information as `Noise` says; ones without re-estimation.
+    """
+
+    x: Array
+    nuisance: list[Array]
+    covariance: Array
+    information_data: Array
+    cost: float
+    history: tuple[Step, ...]
+    converged: bool
+    words: str
+    at_bound: tuple[str, ...]
+    dof: float
+    rows: int
+    noise_factor: Array
+    inflation: Array
+
+
+def fit(
+    problem: Problem,
+    starts: int = 1,
+    seed: int = 0,
+    max_iterations: int = 60,
+    tolerance: float = 1e-6,
+    progress: Callable[[str], None] | None = None,
+    reweight: bool = False,
+) -> Fit:
+    """The MAP estimate, best of `starts`: the prior's mean, then draws from the prior by `seed`.
+
+    Converged means that the linear model expects the cost to fall by less than `tolerance` times max(1, cost per
+    degree of freedom): x is within √tolerance posterior standard deviations of its optimum. With `reweight` each
+    channel's noise and its correlation are estimated on the way down from the prior's mean (`annealing`) and then from
+    the best start's residuals until they settle.
+
+    Raises:
+        InputError: no free parameter, or fewer usable rows than free parameters.
+        WorkError: the model is not finite at the prior's mean.
+    """
+    unknowns = problem.unknowns
+    if not unknowns:
+        raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
+    limits = max_iterations, tolerance
+    with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
+        first = _first(problem, *limits, reweight, progress)
+        best, notes = _best_start(problem, first, starts, seed, *limits, progress)
+        if reweight:
+            best, settled = _with_noise(problem, best, *limits, progress)
+            notes += settled
+        return _result(problem, best, tolerance, notes)
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    return ThreadpoolController()  # it looks through every loaded library: once is enough
+
+
+def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
+    """Where to start, in z (starts, p): the prior's mean, then draws from the prior, put within the bounds."""
+    draws = np.random.default_rng(seed).standard_normal((max(1, starts), len(unknowns)))
+    draws[0] = 0.0
+    return np.clip(draws, *z_bounds(unknowns))
+
+
+def _first(
+    problem: Problem,
+    max_iterations: int,
+    tolerance: float,
+    reweight: bool,
+    progress: Callable[[str], None] | None,
+) -> State:
+    """The prior's mean, or what lies below it with the noise estimated on the way."""
+    z, nuisance = _starts(problem.unknowns, 1, 0)[0], [np.zeros(q) for q in problem.nuisance_sizes]
+    try:
+        state = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
+    except WorkError as error:
+        raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
+    return annealed(problem, state, max_iterations, tolerance, progress) if reweight else state
+
+
+def _best_start(
+    problem: Problem,
+    first: State,
+    starts: int,
+    seed: int,
+    max_iterations: int,
+    tolerance: float,
+    progress: Callable[[str], None] | None,
+) -> tuple[State, str]:
+    """The lowest end of all starts, and what the others did in words."""
+    ends: list[State] = []
+    lost = 0
+    for number, z in enumerate(_starts(problem.unknowns, starts, seed)):
+        try:
+            nuisance = [np.zeros(q) for q in problem.nuisance_sizes]
+            start = State.at(problem, z, nuisance, first.noise) if number else first
+        except WorkError:
+            lost += 1
+            continue
+        ends.append(descend(problem, start, len(start.history) + max_iterations, tolerance))
+        if progress:
+            progress(f"start {number + 1} of {starts}: cost {ends[-1].cost:.6g} after {len(ends[-1].history)} steps")
+    best = min(ends, key=lambda e: e.cost)
+    return best, _starts_in_words(best, ends, starts, lost)
+
+
+def _with_noise(
+    problem: Problem, state: State, max_iterations: int, tolerance: float, progress: Callable[[str], None] | None
+) -> tuple[State, str]:
+    """The optimum under noise that is re-estimated from its own residuals, and how that went in words."""
+    change = np.inf
+    for number in range(NOISE_ROUNDS):
+        noise = noise_left(problem, state)
+        change = noise.change(state.noise)
+        if change < SETTLED:
+            return state, f"; noise settled in round {number}"
+        start = with_noise(problem, state, noise)
+        state = descend(problem, start, len(start.history) + max_iterations, tolerance)
+        if progress:
+            progress(f"noise round {number + 1}: weights changed by up to {100 * change:.0f} %")
+    return state, f"; noise not settled: weights still change by {100 * change:.0f} % a round"
+
+
+def _starts_in_words(best: State, ends: Sequence[State], starts: int, lost: int) -> str:
+    """How many starts reached the best one's optimum, and whether another place fits as well."""
+    if starts < 2:
+        return ""
+    root = best.arrow.root
+    alike = [e for e in ends if e.cost <= best.cost * (1 + SAME_COST)]
+    near = max(1.0, 4 * SAME_COST * best.cost)
+    same = [e for e in alike if float(np.sum((root @ (e.z - best.z)) ** 2)) <= near]
+    words = f"; {len(same)} of {starts} starts reached this optimum (cost within {100 * SAME_COST:g} %)"
+    elsewhere = len(alike) - len(same)
+    if elsewhere:
+        words += f"; {elsewhere} ended elsewhere at the same cost, so the recordings do not tell these apart"
+    return words + (f"; {lost} could not be simulated" if lost else "")
+
+
+def _result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
+    unknowns, steps = problem.unknowns, len(state.history)
+    by_noise = state.stuck and state.small(MODEL_NOISE)
+    converged = by_noise or state.small(tolerance)
+    if converged:
+        words = f"converged after {steps} step{'' if steps == 1 else 's'}"
+        words += " as far as the model is smooth" if by_noise else ""
+    elif state.stuck:
+        words = (
+            f"stopped after {steps} steps: no step lowers the cost, though the linear model expects "
+            f"{_percent(state.expected / state.cost)}; the derivatives do not fit the model or it is not smooth"
+        )
+    else:
+        fall = state.expected / state.cost  # costs of the history may stand under other noise
+        words = f"stopped after {steps} steps, cost still falling by {_percent(fall)} a step"
+    x = x_of(unknowns, state.z)
+    low, high = z_bounds(unknowns)
+    touching = (state.z <= low + 1e-9) | (state.z >= high - 1e-9)
+    at_bound = tuple(u.name for u, touches in zip(unknowns, touching, strict=True) if touches)
+    if at_bound:
+        notes += f"; at its bound: {', '.join(at_bound)}"
+    spread = np.array([u.spread for u in unknowns])
+    scale = np.outer(spread, spread)
+    return Fit(
+        x=x,
+        nuisance=state.nuisance,
+        covariance=state.arrow.covariance * scale,
+        information_data=state.arrow.information / scale,
+        cost=state.cost,
+        history=tuple(state.history),
+        converged=converged,
+        words=words + notes,
+        at_bound=at_bound,
+        dof=state.rows - state.arrow.effective_parameters(),
+        rows=state.rows,
+        noise_factor=state.noise.factor,
+        inflation=state.noise.inflation,
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

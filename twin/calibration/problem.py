@@ -1,0 +1,233 @@
+"""A network and its recordings as a least-squares problem: free parameters shared, start and offsets per batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from twin.calibration.first_state import first_state
+from twin.calibration.fit_problem import Block, Unknown
+from twin.calibration.measured import EVERY_S, Measured, channels_of, measured
+from twin.network import Network
+from twin.quantity import Parameter
+from twin.simulation import choose_substeps, simulate
+from twin.simulation.inputs import MAX_GAP_S, Inputs, inputs_of
+from twin.simulation.sensitivity import sensitivities
+
+Array = NDArray[np.float64]
+
+# An error is shown less its first sample, whose noise shifts the whole batch; half as much again, since a display
+# that rounds or a machine that moves within the first sample makes it worse than the others.
+FIRST_SAMPLE = 1.5
+MOST_NUMBERS = 20_000_000  # derivatives held at once (160 MB): batches beyond it are linearised one after the other
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """What each batch has of its own, all of prior N(0, 1): start of every body, first samples, surroundings' offsets.
+
+    `start_K` (bodies, N) cells' deviation per unit, `surroundings` their numbers with `offset_K` per unit.
+    """
+
+    start_K: Array
+    surroundings: NDArray[np.int64]
+    offset_K: Array
+
+    @classmethod
+    def of(cls, network: Network) -> Nuisances:
+        start_K = np.zeros((len(network.bodies), network.n_cells))
+        for k, cells in enumerate(network.bodies.values()):
+            start_K[k, cells] = network.start_spread_K
+        spread = np.array([s.per_batch_K for s in network.surroundings])
+        at = np.flatnonzero(spread > 0)
+        return cls(start_K if network.start_spread_K > 0 else start_K[:0], at, spread[at])
+
+    @property
+    def size(self) -> Array:
+        """K per unit of each that a batch's errors and sensors share."""
+        return np.concatenate([self.start_K.max(axis=1), self.offset_K])
+
+    @property
+    def shared(self) -> int:
+        """How many come before a batch's error offsets, which are as many as its usable error channels."""
+        return len(self.start_K) + len(self.surroundings)
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """Implements `twin.calibration.fit_problem.Problem`; residuals are whitened by the channels' noise.
+
+    `start_degC` (B, N) is what the first readings say at the machine file's values, the centre of every batch's own
+    start; `inputs` already hold the substeps that keep the simulation's error there below the finest sensor's noise.
+    """
+
+    network: Network
+    inputs: Inputs
+    measured: tuple[Measured, ...]
+    start_degC: Array
+    nuisances: Nuisances
+    _last: dict[bytes, list[Block]] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def of(
+        cls,
+        network: Network,
+        batches: Sequence[Batch],
+        every_s: float = EVERY_S,
+        channels: Sequence[str] | None = None,
+        max_gap_s: float = MAX_GAP_S,
+    ) -> CalibrationProblem:
+        """The problem that the recordings pose.
+
+        Raises:
+            InputError: batches that cannot be simulated (`inputs_of`) or measured (`measured`), or too few rows.
+        """
+        inputs = inputs_of(network, batches, max_gap_s=max_gap_s)
+        values = network.values
+        start_degC = first_state(network, values, inputs)[None]
+        finest = min((r.noise for r in network.readings), default=0.03)
+        inputs = inputs.refined(choose_substeps(network, values, inputs, start_degC, max(0.01, finest)))
+        return cls(
+            network, inputs, tuple(measured(network, batches, every_s, channels)), start_degC[0], Nuisances.of(network)
+        )
+
+    @cached_property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return tuple(unknown(self.network.parameters[k]) for k in self.network.free)
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        return channels_of(self.network)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """Of a difference in each channel: K for sensors."""
+        return (*("K" for _ in self.network.readings), *(e.unit for e in self.network.errors))
+
+    @cached_property
+    def noise(self) -> Array:
+        """Standard deviation (C,) of each channel's noise, in its unit."""
+        return np.array([r.noise for r in self.network.readings] + [e.noise for e in self.network.errors])
+
+    @cached_property
+    def nuisance_sizes(self) -> tuple[int, ...]:
+        return tuple(self.nuisances.shared + len(m.usable_errors) for m in self.measured)
+
+    def only(self, batches: Sequence[int]) -> CalibrationProblem:
+        """Some of the batches."""
+        kept = tuple(self.measured[b] for b in batches)
+        return replace(
+            self, inputs=self.inputs.batch(batches), measured=kept, start_degC=self.start_degC[batches], _last={}
+        )
+
+    def values_at(self, x: Array) -> Array:
+        """All parameter values (n,) at the free ones' fitting coordinates (p,)."""
+        values = self.network.values.copy()
+        for k, v in zip(self.network.free, x, strict=True):
+            values[k] = self.network.parameters[k].from_x(v)
+        return values
+
+    def linearise(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
+        """One block per batch; batches are linearised together as far as `MOST_NUMBERS` allows.
+
+        The last point's blocks are kept, since a new noise asks for them again, where they are small.
+        """
+        key = np.concatenate([x, *nuisance]).tobytes()
+        if key not in self._last:
+            self._last.clear()
+            blocks = self._linearised(x, nuisance)
+            if self._size > MOST_NUMBERS:
+                yield from blocks
+                return
+            self._last[key] = list(blocks)
+        yield from self._last[key]
+
+    @property
+    def _size(self) -> int:
+        """Numbers in all blocks."""
+        return sum(
+            len(m.row) * (len(self.unknowns) + q) for m, q in zip(self.measured, self.nuisance_sizes, strict=True)
+        )
+
+    def _linearised(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
+        free = len(self.unknowns) + self.nuisances.shared
+        per_batch = free * len(self.channels) * (self.inputs.time_s.shape[1] - 1) // self.inputs.every
+        together = max(1, MOST_NUMBERS // max(1, per_batch))
+        for first in range(0, len(self.measured), together):
+            part = list(range(first, min(first + together, len(self.measured))))
+            yield from self.only(part)._blocks(x, [nuisance[b] for b in part])
+
+    def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
+        """(measured − simulated) / noise of every batch, (n_b,) each."""
+        start, offset = self._own(nuisance)
+        simulation = simulate(self.network, self.values_at(x), self.inputs, start, offsets_K=offset)
+        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
+
+    def free_running_errors(self, values: Array) -> list[Array]:
+        """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
+        start = first_state(self.network, values, self.inputs)
+        simulation = simulate(self.network, values, self.inputs, start[None])
+        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        return [m.value - m.of(s) for m, s in zip(self.measured, series, strict=True)]
+
+    def residual_series(self, x: Array, nuisance: Sequence[Array]) -> dict[str, dict[str, Array]]:
+        """Measured − simulated by batch and channel in the channel's unit, NaN where nothing was measured."""
+        out: dict[str, dict[str, Array]] = {}
+        for m, residual in zip(self.measured, self.residuals(x, nuisance), strict=True):
+            out[m.batch_id] = {}
+            for c in m.usable.tolist():
+                at = m.channel == c
+                rows = np.full(int((m.row[at][-1] - m.row[at][0]) // m.stride) + 1, np.nan)
+                rows[(m.row[at] - m.row[at][0]) // m.stride] = residual[at] * self.noise[c]
+                out[m.batch_id][self.channels[c]] = rows
+        return out
+
+    def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
+        start, offset = self._own(nuisance)
+        simulation, *slopes = sensitivities(
+            self.network, self.values_at(x), self.inputs, start, starts=len(self.nuisances.start_K) > 0,
+            offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
+        )  # fmt: skip
+        series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
+        slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
+        free = len(self.unknowns)
+        for b, m in enumerate(self.measured):
+            whitened = (m.of(slope[:, b]) / self.noise[m.channel]).T
+            own = [whitened[:, free:] * self.nuisances.size, self._first_samples(m)]
+            yield Block(
+                m.batch_id, self._residual(m, series[b], nuisance[b]), whitened[:, :free], np.hstack(own), m.channel
+            )
+
+    def _own(self, nuisance: Sequence[Array]) -> tuple[Array, Array | None]:
+        """Start temperatures (1, B, N) and surroundings' offsets (1, B, S) that the batches' nuisances make."""
+        bodies = len(self.nuisances.start_K)
+        shared = np.array([v[: self.nuisances.shared] for v in nuisance]).reshape(len(nuisance), -1)
+        start = self.start_degC + shared[:, :bodies] @ self.nuisances.start_K
+        if not len(self.nuisances.surroundings):
+            return start[None], None
+        offset = np.zeros((len(nuisance), len(self.network.surroundings)))
+        offset[:, self.nuisances.surroundings] = shared[:, bodies:] * self.nuisances.offset_K
+        return start[None], offset[None]
+
+    def _residual(self, m: Measured, series: Array, nuisance: Array) -> Array:
+        """(n_b,) of one batch whose channels were simulated as (K, C)."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            plain = (m.value - m.of(series)) / self.noise[m.channel]
+        return plain - self._first_samples(m) @ nuisance[self.nuisances.shared :]
+
+    def _first_samples(self, m: Measured) -> Array:
+        """What the errors' first samples do to the whitened rows, (n_b, usable error channels)."""
+        return FIRST_SAMPLE * (m.channel[:, None] == m.usable_errors)
+
+
+def unknown(p: Parameter) -> Unknown:
+    """A free parameter in its fitting coordinate: the prior's centre, not the value, is where it starts."""
+    with np.errstate(divide="ignore"):
+        low, high = (float(p.to_x(v)) if np.isfinite(v) else v for v in (p.low, p.high))
+    return Unknown(p.name, p.unit, float(p.to_x(p.prior_value)), p.spread, low, high, p.scale)

@@ -1,0 +1,168 @@
+"""From temperatures to what the channels show: sensors' effects, displacement chains and laws, the probe.
+
+Every law is passed in order with its tangents, if there are any: derivatives by Q unknowns, by the complex step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.mechanisms.base import View
+from twin.network import Law, Network, Port
+from twin.simulation.air import Air
+from twin.simulation.inputs import Inputs
+from twin.simulation.law_calls import STEP, parameters_of, stepped
+from twin.simulation.sources import Places
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Derivatives by Q unknowns at the rows of the recordings, beside one parameter set.
+
+    degC (n, Q, B, K) of the places, chain (n_errors, Q, B, K) of the chains and tilts, air_K (Q, S, B, K) of the
+    surroundings; `parameters` numbers Q's unknown by the parameter's number.
+    """
+
+    degC: Array
+    chain: Array
+    air_K: Array
+    parameters: Mapping[int, int]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What laws see at the rows of the recordings: places (n, P, B, K) degC, surroundings, drivers, time.
+
+    chain (n_errors, P, B, K) are the sums of chains and tilts less their first value, in the channels' units.
+    """
+
+    inputs: Inputs
+    every: int
+    values: Array  # (P, n)
+    degC: Array
+    chain: Array
+    air: Air
+    places: Places
+
+    def law(self, law: Law, effect: str, seen: Array | None, tangents: Tangents | None, d_seen: Array | None) -> Any:
+        """A law's effect (P, B, K) on what it sees, and, with tangents, its derivative (Q, B, K), else None."""
+        out = self._call(law, effect, seen, self.values, None)
+        shape = (len(self.values), *self.time_s.shape)
+        out = np.broadcast_to(out, shape)
+        if tangents is None:
+            return out, None
+        n_unknowns = tangents.degC.shape[1]
+        d_out = np.zeros((n_unknowns, *self.time_s.shape))
+        if d_seen is not None or law.ports:
+            ahead = None if seen is None else seen + 1j * STEP * (d_seen if d_seen is not None else 0.0)
+            d_out += np.broadcast_to(self._call(law, effect, ahead, self.values, tangents), d_out.shape).imag / STEP
+        for j in set(law.parameters.values()) & set(tangents.parameters):
+            moved = self._call(law, effect, seen, stepped(self.values, j), None)
+            d_out[tangents.parameters[j]] += np.broadcast_to(moved, shape)[0].imag / STEP
+        return out, d_out
+
+    @cached_property
+    def time_s(self) -> Array:
+        return self.inputs.time_s[:, :: self.every]
+
+    @cached_property
+    def _clock_h(self) -> Array:
+        if np.isnan(self.inputs.clock_h).all():
+            return np.full(self.time_s.shape, np.nan)
+        return np.asarray((self.inputs.clock_h[:, None] + self.time_s / 3600.0) % 24.0)
+
+    @cached_property
+    def _drivers(self) -> dict[str, Array]:
+        """By channel, in the interval that ends at each row; at the first row in the first interval."""
+        before = np.maximum(np.arange(self.time_s.shape[1]) * self.every - 1, 0)
+        return {channel: series[:, before] for channel, series in self.inputs.drivers.items()}
+
+    @cached_property
+    def _air(self) -> list[Array]:
+        return [self.air.borders(s, self.every) for s in range(self.air.steady_degC.shape[1])]
+
+    def _call(self, law: Law, effect: str, seen: Array | None, values: Array, tangents: Tangents | None) -> Array:
+        degC, rise_K = {}, {}
+        for role, port in law.ports.items():
+            degC[role] = self._port(port, tangents)
+            rise_K[role] = degC[role] - degC[role][..., :1]
+        driver = {role: self._drivers[c] for role, c in law.drivers.items()}
+        view = View(degC, rise_K, driver, self.time_s, self._clock_h, self._step_s)
+        p = parameters_of(law, values, 2)
+        method = getattr(law.mechanism, effect)
+        return np.asarray(method(view, p) if seen is None else method(seen, view, p))
+
+    def _port(self, port: Port, tangents: Tangents | None) -> Array:
+        if port.cells is None:
+            out = self._air[port.surrounding]
+            moves = tangents is not None and tangents.air_K[:, port.surrounding].any()
+            return out + 1j * STEP * tangents.air_K[:, port.surrounding] if tangents is not None and moves else out
+        k = self.places.number(port.cells)
+        return self.degC[k] if tangents is None else self.degC[k] + 1j * STEP * tangents.degC[k]
+
+    @cached_property
+    def _step_s(self) -> float:
+        """The rows' spacing, nan where it varies."""
+        steps = np.diff(self.time_s, axis=1)
+        even = steps.size and np.ptp(steps) < 1e-6 * steps.max()
+        return float(steps[0, 0]) if even else float("nan")
+
+
+def watch(network: Network, places: Places) -> None:
+    """Add the places that sensors and errors look at."""
+    laws = [law for r in network.readings for law in r.effects]
+    laws += [law for e in network.errors for law in (*e.effects, *e.readings)]
+    for r in network.readings:
+        places.number(r.cells)
+    for law in laws:
+        for port in law.ports.values():
+            if port.cells is not None:
+                places.number(port.cells)
+
+
+def shown(rows: Rows, network: Network, tangents: Tangents | None = None) -> tuple[Array, Array, Array, Array]:
+    """Readings (P, B, K, n_sensors) and errors (P, B, K, n_errors), and their tangents (Q, B, K, …) or empty arrays."""
+    readings = [_reading(rows, r.cells, r.effects, tangents) for r in network.readings]
+    errors = [_error(rows, network, k, tangents) for k in range(len(network.errors))]
+    n_unknowns = 0 if tangents is None else tangents.degC.shape[1]
+    none = np.zeros((n_unknowns, *rows.time_s.shape))
+    shape = (len(rows.values), *rows.time_s.shape)
+    first, second = (_stacked([seen for seen, _ in group], shape) for group in (readings, errors))
+    third, fourth = (
+        _stacked([none if slope is None else slope for _, slope in group], none.shape) for group in (readings, errors)
+    )
+    return first, second, third, fourth
+
+
+def _stacked(arrays: Sequence[Array], shape: tuple[int, ...]) -> Array:
+    return np.stack(arrays, axis=-1) if arrays else np.zeros((*shape, 0))
+
+
+def _reading(rows: Rows, cells: Array, effects: Sequence[Law], tangents: Tangents | None) -> tuple[Array, Array | None]:
+    k = rows.places.number(cells)
+    seen = rows.degC[k]
+    d_seen = None if tangents is None else tangents.degC[k]
+    for law in effects:
+        seen, d_seen = rows.law(law, "reading", seen, tangents, d_seen)
+    return seen, d_seen
+
+
+def _error(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Array, Array | None]:
+    """Chain and tilts, then the laws that displace, then what the probe makes of the sum."""
+    given = network.errors[k]
+    seen, d_seen = rows.chain[k], None if tangents is None else tangents.chain[k]
+    for law in given.effects:
+        moved, d_moved = rows.law(law, "displacement", None, tangents, None)
+        seen = seen + moved
+        d_seen = None if d_seen is None or d_moved is None else d_seen + d_moved
+    for law in given.readings:
+        seen, d_seen = rows.law(law, "reading", seen, tangents, d_seen)
+    return seen, d_seen

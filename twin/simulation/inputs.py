@@ -1,0 +1,261 @@
+"""What drives a simulation: driver channels that hold, surroundings that move linearly, on one time grid per batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.batch import Batch
+from data.errors import InputError, closest
+from twin.run_plan.table import fill_short_gaps
+from twin.simulation.law_calls import Intervals
+
+if TYPE_CHECKING:
+    from twin.network import Network
+    from twin.run_plan import RunPlan
+
+Array = NDArray[np.float64]
+
+MAX_GAP_S = 900.0
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """B batches side by side, M intervals of the longest; shorter ones are padded by holding their last values.
+
+    time_s (B, M + 1) borders from each batch's start; n_intervals (B,) the valid ones; drivers by channel (B, M), held
+    in each interval; recorded surroundings by channel (B, M + 1) at the borders, linear between (a plan may also give
+    one by the surrounding's own name); clock_h (B,) time of day at the start, nan if unknown; first: by channel the
+    first readings (B,), nan where there is none; every: how many intervals lie between two rows of the recording, so
+    that borders ``::every`` are its rows.
+    """
+
+    batch_ids: tuple[str, ...]
+    time_s: Array
+    n_intervals: NDArray[np.int64]
+    drivers: Mapping[str, Array]
+    recorded: Mapping[str, Array]
+    clock_h: Array
+    first: Mapping[str, Array]
+    every: int = 1
+    kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
+
+    @cached_property
+    def dt_s(self) -> Array:
+        """Interval lengths (B, M)."""
+        return np.diff(self.time_s, axis=1)
+
+    @cached_property
+    def intervals(self) -> Intervals:
+        """What laws see of them."""
+        return Intervals(self)
+
+    @property
+    def n_batches(self) -> int:
+        return len(self.batch_ids)
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which intervals are no padding, (B, M)."""
+        return np.asarray(np.arange(self.time_s.shape[1] - 1) < self.n_intervals[:, None])
+
+    @property
+    def valid_rows(self) -> NDArray[np.bool_]:
+        """Which rows of the recordings are no padding, (B, K)."""
+        rows = np.arange((self.time_s.shape[1] - 1) // self.every + 1)
+        return np.asarray(rows * self.every <= self.n_intervals[:, None])
+
+    def refined(self, factor: int) -> Inputs:
+        """Every interval cut into equal parts: drivers held, surroundings linear; the recording's rows stay."""
+        if factor == 1:
+            return self
+        return replace(
+            self,
+            time_s=_between(self.time_s, factor),
+            n_intervals=self.n_intervals * factor,
+            drivers={n: np.repeat(v, factor, axis=1) for n, v in self.drivers.items()},
+            recorded={n: _between(v, factor) for n, v in self.recorded.items()},
+            every=self.every * factor,
+        )
+
+    def batch(self, numbers: Sequence[int] | slice) -> Inputs:
+        """Some of the batches."""
+        at = np.arange(self.n_batches)[numbers]
+        return replace(
+            self,
+            batch_ids=tuple(self.batch_ids[i] for i in at),
+            time_s=self.time_s[at],
+            n_intervals=self.n_intervals[at],
+            drivers={n: v[at] for n, v in self.drivers.items()},
+            recorded={n: v[at] for n, v in self.recorded.items()},
+            clock_h=self.clock_h[at],
+            first={n: v[at] for n, v in self.first.items()},
+        )
+
+
+def inputs_of(network: Network, batches: Sequence[Batch], substeps: int = 1, max_gap_s: float = MAX_GAP_S) -> Inputs:
+    """The inputs that a network needs from recordings, masked stretches filled up to `max_gap_s`.
+
+    A driver holds its last value; a surrounding's temperature is interpolated. `substeps` cuts each recorded interval
+    into equal parts.
+
+    Raises:
+        InputError: no batches, a batch with fewer than two rows or without the needed channels, a longer gap.
+    """
+    if not batches:
+        raise InputError(f"machine {network.machine}: no batches to simulate; name at least one")
+    surroundings = [s.channel for s in network.surroundings if s.channel]
+    for batch in batches:
+        _check_channels(network, batch, [*network.drivers, *surroundings])
+    drivers = {n: [_filled(b, n, max_gap_s, hold=True)[:-1] for b in batches] for n in network.drivers}
+    recorded = {n: [_filled(b, n, max_gap_s, hold=False) for b in batches] for n in dict.fromkeys(surroundings)}
+    starts = [*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)]
+    first = {n: np.array([_first(b, n, max_gap_s) for b in batches]) for n in dict.fromkeys(starts)}
+    for s in network.surroundings:
+        if s.first:
+            _check_first(s.name, s.first, first, batches)
+    n_intervals = np.array([b.n_rows - 1 for b in batches])
+    longest = int(n_intervals.max())
+    inputs = Inputs(
+        batch_ids=tuple(b.batch_id for b in batches),
+        time_s=np.stack([b.step_s * np.arange(longest + 1) for b in batches]),
+        n_intervals=n_intervals,
+        drivers={n: _padded(v, longest) for n, v in drivers.items()},
+        recorded={n: _padded(v, longest + 1) for n, v in recorded.items()},
+        clock_h=np.array([_clock_h(b) for b in batches]),
+        first=first,
+    )
+    return inputs.refined(substeps)
+
+
+def inputs_of_plan(network: Network, plan: RunPlan, clock_h: float = math.nan) -> Inputs:
+    """The inputs that a network needs from a run plan: one batch of the plan's name.
+
+    A surrounding is taken from the plan under its own name or its channel's; one that the network knows as a constant
+    may be given by name too. Sensors start as the bodies that they sit on.
+
+    Raises:
+        InputError: the plan lacks a recorded surrounding or a driver that the network needs.
+    """
+    where = f"run plan {plan.source or plan.name}"
+    for name in network.drivers:
+        if name not in plan.drivers:
+            raise InputError(f"{where}: no driver {name!r}, which the twin needs; {closest(name, plan.drivers)}")
+    recorded = {}
+    for s in network.surroundings:
+        if s.name in plan.surroundings:
+            recorded[s.channel or s.name] = plan.surroundings[s.name][None]
+        elif s.channel and s.channel in plan.surroundings:
+            recorded[s.channel] = plan.surroundings[s.channel][None]
+        elif s.channel:
+            raise InputError(
+                f"{where}: no surrounding {s.name!r}; add surroundings: {{{s.name}: 20 degC}} or a column {s.channel!r}"
+            )
+    cells = start_of_plan(network, plan)[0, 0]
+    channels = {c for s in network.surroundings for c in s.first}
+    first = {c: np.full(1, plan.settled_degC) for c in channels}
+    first |= {r.channel: np.array([r.cells @ cells]) for r in network.readings}
+    return Inputs(
+        batch_ids=(plan.name,),
+        time_s=plan.time_s[None],
+        n_intervals=np.array([len(plan.time_s) - 1]),
+        drivers={n: plan.drivers[n][None] for n in network.drivers},
+        recorded=recorded,
+        clock_h=np.array([clock_h]),
+        first=first,
+    )
+
+
+def start_of_plan(network: Network, plan: RunPlan) -> Array:
+    """Start temperatures of all cells (1, 1, N), degC, as the plan gives them by body."""
+    start = np.full((1, 1, network.n_cells), plan.settled_degC)
+    for body, cells in network.bodies.items():
+        start[..., cells] = plan.start_degC(body)
+    return start
+
+
+def _between(values: Array, factor: int) -> Array:
+    """Borders (B, M + 1) with each interval cut into equal parts, (B, M factor + 1), linear between."""
+    share = np.arange(factor) / factor
+    inner = values[:, :-1, None] * (1 - share) + values[:, 1:, None] * share
+    return np.concatenate([inner.reshape(len(values), -1), values[:, -1:]], axis=1)
+
+
+def _padded(rows: Sequence[Array], length: int) -> Array:
+    return np.stack([np.pad(v, (0, length - len(v)), mode="edge") for v in rows])
+
+
+def _check_channels(network: Network, batch: Batch, needed: Sequence[str]) -> None:
+    if batch.n_rows < 2:
+        raise InputError(f"batch {batch.batch_id}: has {batch.n_rows} rows, a simulation needs 2 or more; leave it out")
+    missing = [n for n in dict.fromkeys(needed) if n not in batch.table.columns]
+    if missing and len(missing) == len(set(needed)):
+        raise InputError(
+            f"batch {batch.batch_id}: has none of the channels that the twin of {network.machine} needs "
+            f"({', '.join(missing)}); check that it is a recording of this machine, or leave it out"
+        )
+    if missing:
+        raise InputError(
+            f"batch {batch.batch_id}: no channel {missing[0]!r}, which the twin of {network.machine} needs; "
+            "record it, or leave the batch out"
+        )
+
+
+def _filled(batch: Batch, channel: str, max_gap_s: float, hold: bool) -> Array:
+    """A channel without gaps (n,).
+
+    Raises:
+        InputError: a gap longer than `max_gap_s`, the first such: batch, channel, from when to when.
+    """
+    values = batch.masked(channel)
+    if np.isnan(values).all():
+        raise InputError(f"batch {batch.batch_id}: channel {channel!r} has no value at all; leave the batch out")
+    for start_s, end_s in _gaps(np.isnan(values), batch.time_s):
+        if end_s - start_s > max_gap_s * (1 + 1e-9):
+            raise InputError(
+                f"batch {batch.batch_id}: channel {channel!r} has no value from {start_s:g} s to {end_s:g} s, longer "
+                f"than the {max_gap_s:g} s that may be bridged; cut the batch there, overrule the mask, or widen "
+                "max_gap_s"
+            )
+    return fill_short_gaps(values, batch.time_s, math.inf, hold, "")
+
+
+def _gaps(bad: NDArray[np.bool_], time_s: Array) -> Iterator[tuple[float, float]]:
+    """Each gap's first empty row and the next value, s."""
+    edges = np.flatnonzero(np.diff(np.r_[False, bad, False].astype(int)))
+    for first, behind in zip(edges[::2], edges[1::2], strict=True):
+        yield float(time_s[first]), float(time_s[min(behind, len(time_s) - 1)])
+
+
+def _first(batch: Batch, channel: str, max_gap_s: float) -> float:
+    """The first reading, nan where there is none within `max_gap_s` of the start."""
+    if channel not in batch.table.columns:
+        return math.nan
+    values = batch.masked(channel)
+    good = np.flatnonzero(~np.isnan(values) & (batch.time_s <= max_gap_s))
+    return float(values[good[0]]) if len(good) else math.nan
+
+
+def _check_first(
+    surrounding: str, channels: Sequence[str], first: Mapping[str, Array], batches: Sequence[Batch]
+) -> None:
+    missing = np.isnan(np.stack([first[c] for c in channels])).all(axis=0)
+    if missing.any():
+        raise InputError(
+            f"batch {batches[int(missing.argmax())].batch_id}: surrounding {surrounding!r} needs a first reading of "
+            f"{' or '.join(channels)}, and there is none; leave the batch out, or give the surrounding a value"
+        )
+
+
+def _clock_h(batch: Batch) -> float:
+    """Time of day at the start."""
+    if batch.start is None:
+        return math.nan
+    midnight = batch.start.normalize()
+    return float((batch.start - midnight).total_seconds() / 3600.0)

@@ -1,0 +1,243 @@
+"""Simulation: temperatures of all cells, what the sensors show, and the displacement at the tool.
+
+The linear part is exact (modes of every regime, drivers held, surroundings linear between rows); heat that depends on
+temperature is linear within an interval and found by iteration, of second order in the interval (`twin.substeps`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from twin.network import Network
+from twin.simulation.balance import check_values
+from twin.simulation.channels import shown
+from twin.simulation.coupling import Coupled
+from twin.simulation.inputs import Inputs
+from twin.simulation.interval_means import bulge_K
+from twin.simulation.solved import Solved, rows_of, solved_balance
+from twin.simulation.start import checked_start, start_of
+
+__all__ = ["Simulation", "choose_substeps", "simulate", "start_of"]
+
+Array = NDArray[np.float64]
+
+TOLERANCE_K = 1e-3
+CHUNK_BYTES = 256 << 20  # of the series that one group of parameter sets works on
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """P parameter sets on B batches at the K rows of the recordings; behind a batch's end the last values are held.
+
+    readings (P, B, K, n_sensors) degC and errors (P, B, K, n_errors) in the network's order and units, errors from
+    the first row; time_s and valid (B, K). If cells were kept: cells_degC (P, B, K, N), air_degC (P, B, K, S), and by
+    heat heat_W (P, B, K), what flows at a row (before it, where a driver jumps), and heat_J since the start.
+    """
+
+    network: Network
+    batch_ids: tuple[str, ...]
+    time_s: Array
+    valid: NDArray[np.bool_]
+    readings: Array
+    errors: Array
+    iterations: int = 0
+    windows: int = 1
+    words: str = ""
+    cells_degC: Array | None = None
+    air_degC: Array | None = None
+    heat_W: Mapping[str, Array] = field(default_factory=dict)
+    heat_J: Mapping[str, Array] = field(default_factory=dict)
+
+
+def simulate(
+    network: Network,
+    values: Array,
+    inputs: Inputs,
+    start_degC: Array | str | None = None,
+    tolerance_K: float = TOLERANCE_K,
+    keep_cells: bool = False,
+    every: int | None = None,
+    offsets_K: Array | None = None,
+) -> Simulation:
+    """Simulate B batches at P parameter sets, values (P, n) or (n,), in one array pass.
+
+    `start_degC` (P or 1, B, N), "settled" (the steady state with the surroundings) or None (`start_of`); `every` how
+    many intervals lie between two rows of the result, default the recording's rows; `offsets_K` (P or 1, B, S) adds to
+    each batch's surroundings. `tolerance_K` is the iteration's; time steps are the inputs'.
+
+    Raises:
+        InputError: arrays of a wrong shape or not finite; heat that is stiff beyond the step control.
+    """
+    values = np.atleast_2d(np.asarray(values, float))
+    check_values(network, values)
+    every = inputs.every if every is None else every
+    start = checked_start(network, values, inputs, start_degC)
+    values, start, offsets_K = _sets(network, values, start, offsets_K)
+    parts = []
+    for part in _chunks(network, len(values), inputs):
+        own = start if len(start) == 1 else start[part]
+        offset = offsets_K if offsets_K is None or len(offsets_K) == 1 else offsets_K[part]
+        solved = solved_balance(network, values[part], inputs, own, tolerance_K, every, offset)
+        parts.append(_simulated(solved, tolerance_K, keep_cells, every))
+    return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _simulated(solved: Solved, tolerance_K: float, keep_cells: bool, every: int) -> Simulation:
+    states_every = every if solved.coupled is None else 1
+    network = solved.balance.network
+    readings, errors, _, _ = shown(rows_of(solved, every, states_every), network)
+    return simulation_of(solved, readings, errors, tolerance_K, every, states_every if keep_cells else None)
+
+
+def simulation_of(
+    solved: Solved, readings: Array, errors: Array, tolerance_K: float, every: int, cells_every: int | None = None
+) -> Simulation:
+    """The result of a solved group; with cells if `cells_every` says how far its states stand apart."""
+    balance, coupled = solved.balance, solved.coupled
+    inputs, network = balance.inputs, balance.network
+    rows = np.arange(inputs.time_s.shape[1])[::every]
+    kept: dict[str, Any] = {}
+    if cells_every is not None:
+        shape = (len(balance.values), inputs.n_batches, len(rows))
+        air = [np.broadcast_to(balance.air.borders(s, every), shape) for s in range(len(network.surroundings))]
+        heat_W, heat_J = _heats(solved, every)
+        kept = {
+            "cells_degC": solved.states.at(np.eye(network.n_cells)[None], every // cells_every),
+            "air_degC": np.stack(air, axis=-1) if air else np.zeros((*shape, 0)),
+            "heat_W": heat_W,
+            "heat_J": heat_J,
+        }
+    return Simulation(
+        network,
+        inputs.batch_ids,
+        inputs.time_s[:, ::every],
+        rows <= inputs.n_intervals[:, None],
+        readings,
+        errors,
+        0 if coupled is None else coupled.rounds,
+        1 if coupled is None else len(coupled.windows),
+        _words(coupled, tolerance_K),
+        **kept,
+    )
+
+
+def _words(coupled: Coupled | None, tolerance_K: float) -> str:
+    if coupled is None:
+        return "linear: exact"
+    windows = f" in {len(coupled.windows)} windows" if len(coupled.windows) > 1 else ""
+    return f"converged to {tolerance_K / 10:g} K after {coupled.rounds} rounds{windows}"
+
+
+def _heats(solved: Solved, every: int) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Watts at the rows and joules since the start, of every heat and of exchange that varies, by name.
+
+    Where a chord took part in the solution, what it delivered beyond the law's straight lines counts to the heat.
+    """
+    balance = solved.balance
+    inputs = balance.inputs
+    series = {h.law.name: balance.driven_W(h) for h in balance.network.heats if not h.temperature_dependent}
+    if solved.coupled is not None:
+        every_interval, chord = slice(0, inputs.valid.shape[1]), solved.coupled.chord
+        if chord.used:
+            bulge = bulge_K(solved, solved.states.at(np.eye(balance.network.n_cells)[None]))
+        for k, source in enumerate(solved.sources):
+            watts = np.moveaxis(source.watts(solved.coupled.borders, every_interval), -2, -1)
+            if chord.used:
+                own = np.einsum("pbmn,pn->pbm", bulge, source.direction)
+                watts = watts - (chord.slope_W_per_K[:, balance.regimes.of, k] * own)[..., None]
+            series[source.name] = series.get(source.name, 0.0) + watts
+    n_sets = len(balance.values)
+    dt_s = np.where(inputs.valid, inputs.dt_s, 0.0)
+    watts_at, joules_at = {}, {}
+    for name, ends in series.items():
+        ends = np.broadcast_to(ends, (n_sets, *ends.shape[1:]))
+        at = np.concatenate([ends[:, :, :1, 0], ends[..., 1]], axis=-1)
+        total = np.cumsum(ends.mean(axis=-1) * dt_s, axis=-1)
+        watts_at[name] = at[..., ::every]
+        joules_at[name] = np.concatenate([np.zeros_like(total[..., :1]), total], axis=-1)[..., ::every]
+    return watts_at, joules_at
+
+
+def choose_substeps(
+    network: Network,
+    values: Array,
+    inputs: Inputs,
+    start_degC: Array | str | None = None,
+    tolerance_K: float = 0.01,
+    offsets_K: Array | None = None,
+) -> int:
+    """Into how many parts each interval must be cut (1, 2, 4, … 32) for places and chains to be right to tolerance_K.
+
+    Compares each step with half of it (Richardson's estimate for second order, a third of their difference; for laws
+    along time, of first order, all of it). A linear network needs none.
+
+    Raises:
+        InputError: 32 do not suffice; names the batch and the remedy.
+    """
+    values = np.atleast_2d(np.asarray(values, float))
+    start = checked_start(network, values, inputs, start_degC)
+    values, start, offsets_K = _sets(network, values, start, offsets_K)
+
+    def cells(n: int) -> tuple[Solved, Array]:
+        finer = inputs.refined(n)
+        solved = solved_balance(network, values, finer, start, tolerance_K / 10, 1, offsets_K)
+        return solved, solved.states.at(np.eye(network.n_cells)[None], n)
+
+    solved, coarse = cells(1)
+    if solved.coupled is None:
+        return 1
+    share = 1.0 if any(s.along for s in solved.sources) else 1.0 / 3.0
+    valid = (np.arange(coarse.shape[2]) <= inputs.n_intervals[:, None])[..., None]
+    for n in (2, 4, 8, 16, 32, 64):
+        fine = cells(n)[1]
+        gap = share * np.where(valid, np.abs(fine - coarse), 0.0).max(axis=(0, 2, 3))
+        if gap.max() <= tolerance_K:
+            return n // 2
+        coarse = fine
+    worst = int(np.argmax(gap))
+    raise InputError(
+        f"machine {network.machine}: batch {inputs.batch_ids[worst]}: even steps of "
+        f"{inputs.dt_s[worst, 0] / 64:.3g} s leave {gap[worst]:.2g} K, more than the {tolerance_K:g} K allowed; "
+        "check the parameters of heat that depends on temperature, or allow more"
+    )
+
+
+def _sets(network: Network, values: Array, start: Array, offsets_K: Array | None) -> tuple[Array, Array, Array | None]:
+    """All with as many sets as the largest; starts and offsets shared by all stay one."""
+    counts = {"parameter values": len(values), "start temperatures": len(start)}
+    if offsets_K is not None:
+        counts["offsets of surroundings"] = len(offsets_K)
+    n_sets = max(counts.values())
+    for name, n in counts.items():
+        if n not in (1, n_sets):
+            raise InputError(f"machine {network.machine}: {name} come in {n} sets, expected 1 or {n_sets}")
+    return np.repeat(values, n_sets, axis=0) if len(values) < n_sets else values, start, offsets_K
+
+
+def _chunks(network: Network, n_sets: int, inputs: Inputs) -> Iterator[slice]:
+    n_dependent = sum(h.temperature_dependent for h in network.heats) + sum(bool(e.factors) for e in network.edges)
+    per_set = 8 * inputs.valid.size * (network.n_cells + 8 + 16 * n_dependent)
+    size = max(int(CHUNK_BYTES // per_set), 1)
+    return (slice(lo, min(lo + size, n_sets)) for lo in range(0, n_sets, size))
+
+
+def _joined(parts: Sequence[Simulation]) -> Simulation:
+    """The simulations of several groups of parameter sets as one."""
+
+    def cat(name: str) -> Array | None:
+        each = [getattr(p, name) for p in parts]
+        return None if each[0] is None else np.concatenate(each)
+
+    worst = max(parts, key=lambda p: p.iterations)
+    joined = {name: cat(name) for name in ("readings", "errors", "cells_degC", "air_degC")}
+    by_heat = {
+        name: {k: np.concatenate([getattr(p, name)[k] for p in parts]) for k in getattr(parts[0], name)}
+        for name in ("heat_W", "heat_J")
+    }
+    return replace(worst, **joined, **by_heat)  # type: ignore[arg-type]

@@ -1,0 +1,123 @@
+"""Start temperatures: bodies with sensors from the first readings, the rest from the network's steady state."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError
+from twin.mechanisms.base import View
+from twin.network import Network, Reading
+from twin.simulation.air import air_of
+from twin.simulation.inputs import Inputs
+from twin.simulation.law_calls import parameters_of
+
+Array = NDArray[np.float64]
+
+_HOLD = 1e6  # how much stiffer a sensor holds its place than the network pulls at it
+_LOOSE = 1e-9  # and the ambient what nothing else holds
+_LEAST_GAIN = 0.2  # of a sensor in what its place does; one that follows less tells next to nothing
+
+
+def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = False) -> Array:
+    """Start temperatures (P, B, N), degC, at parameter values (P, n); (B, N) at values (n,).
+
+    Cells with a sensor start at its first reading, the rest where the network at rest (every driver 0, no heat)
+    settles with those and the surroundings held. Without any first reading, or `settled`, there is only the second
+    part; a batch without first readings starts all at the ambient's first temperature.
+    """
+    single, values = values.ndim == 1, np.atleast_2d(values)
+    at_rest = np.ones((len(values), len(network.factors)))
+    for k, law in enumerate(network.factors):
+        view = View(driver={role: np.zeros(1) for role in law.drivers})
+        factor = np.asarray(law.mechanism.factor(view, parameters_of(law, values, 1)))
+        at_rest[:, k] = np.broadcast_to(factor, (len(values), 1))[:, 0]
+    conductance = network.conductance_W_per_K(values, at_rest)[:, None]
+    first = _first_air(network, values, inputs)
+    ambient = first[:, :, _ambient(network)] if first.shape[2] else np.full(first.shape[:2], 20.0)
+    heat = np.einsum("psn,pbs->pbn", network.surrounding_W_per_K(values, at_rest), first)
+    scale = np.trace(conductance, axis1=-2, axis2=-1)[..., None, None] / network.n_cells
+    system = conductance + _LOOSE * scale * np.eye(network.n_cells)
+    heat = heat + _LOOSE * scale[..., 0] * ambient[..., None]
+    known = np.zeros(inputs.n_batches, bool)
+    for reading in network.readings if not settled else ():
+        value = inputs.first.get(reading.channel, np.full(inputs.n_batches, np.nan))
+        told = np.isfinite(value)
+        known |= told
+        hold = _HOLD * scale * told[:, None, None]
+        system = system + hold * np.outer(reading.cells, reading.cells)
+        place_degC = _beneath(reading, values, first, np.where(told, value, 0.0))
+        heat = heat + hold[..., 0] * place_degC[..., None] * reading.cells
+    out: Array = np.linalg.solve(np.broadcast_to(system, (*heat.shape, heat.shape[-1])), heat[..., None])[..., 0]
+    if not settled:
+        out = np.where(known[:, None], out, ambient[..., None])
+    return out[0] if single else out
+
+
+def _beneath(reading: Reading, values: Array, air_degC: Array, shown_degC: Array) -> Array:
+    """The place's temperature (P, B) at what its sensor shows (B,), through offset and bonding, which are affine."""
+    shape = (len(values), len(shown_degC), 1)
+    low, high = np.zeros(shape), np.ones(shape)
+    for law in reading.effects:
+        if law.mechanism.along_time or any(p.cells is not None for p in law.ports.values()):
+            continue  # a lag has settled, and a swapped sensor tells nothing of this place
+        view = View(degC={role: air_degC[:, :, p.surrounding, None] for role, p in law.ports.items()})
+        low, high = (law.mechanism.reading(seen, view, parameters_of(law, values, 2)) for seen in (low, high))
+    gain = (high - low)[..., 0]
+    affine = gain > _LEAST_GAIN
+    return np.asarray(np.where(affine, (shown_degC - low[..., 0]) / np.where(affine, gain, 1.0), shown_degC))
+
+
+def excess_K(network: Network, values: Array, inputs: Inputs) -> Array | None:
+    """What the laws of the start add, (P, B, N); None where there are none."""
+    if not network.starts:
+        return None
+    out = np.zeros((len(values), inputs.n_batches, network.n_cells), values.dtype)
+    for law, cells in network.starts:
+        view = View(
+            driver={role: inputs.drivers[c][:, :1] for role, c in law.drivers.items()},
+            clock_h=inputs.clock_h[:, None],
+        )
+        added = law.mechanism.start_K(view, parameters_of(law, values, 2))
+        out += np.broadcast_to(added, (len(values), inputs.n_batches, 1)) * cells
+    return out
+
+
+def checked_start(network: Network, values: Array, inputs: Inputs, start: Array | str | None) -> Array:
+    """Start temperatures (P or 1, B, N) as given, "settled", or by default those of `start_of`; laws not yet added.
+
+    Raises:
+        InputError: another word, another shape, or a temperature that is not finite.
+    """
+    if start is None or (isinstance(start, str) and start == "settled"):
+        return start_of(network, values, inputs, settled=start is not None)
+    if isinstance(start, str):
+        raise InputError(f"machine {network.machine}: start is {start!r}, expected 'settled' or temperatures")
+    given = np.asarray(start, float)
+    given = given[None] if given.ndim == 2 else given
+    if given.ndim != 3 or given.shape[1] not in (1, inputs.n_batches) or given.shape[2] != network.n_cells:
+        raise InputError(
+            f"machine {network.machine}: start temperatures have shape {given.shape}, expected (sets, batches, cells) "
+            f"= (…, {inputs.n_batches}, {network.n_cells})"
+        )
+    bad = np.argwhere(~np.isfinite(given))
+    if len(bad):
+        raise InputError(
+            f"machine {network.machine}: start temperature of {network.cells[bad[0][2]]} is not finite in batch "
+            f"{inputs.batch_ids[bad[0][1]]}; give a temperature in degC"
+        )
+    return np.broadcast_to(given, (len(given), inputs.n_batches, network.n_cells))
+
+
+def _first_air(network: Network, values: Array, inputs: Inputs) -> Array:
+    """Every surrounding at the start, (P, B, S)."""
+    air = air_of(network, values, inputs)
+    firsts = [air.ends(s, slice(0, 1))[..., 0, 0] for s in range(len(network.surroundings))]
+    shape = (len(values), inputs.n_batches)
+    out = [np.broadcast_to(f, shape) for f in firsts]
+    return np.stack(out, axis=-1) if out else np.zeros((*shape, 0))
+
+
+def _ambient(network: Network) -> int:
+    recorded = [s for s, given in enumerate(network.surroundings) if given.channel]
+    return recorded[0] if recorded else 0

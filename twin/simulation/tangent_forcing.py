@@ -1,0 +1,177 @@
+"""What every unknown does to the heat balance: the right-hand sides of the forward sensitivities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.network import Edge
+from twin.simulation.air import effect_K, follows, recorded_degC
+from twin.simulation.balance import Balance
+from twin.simulation.interval_means import bulge_K
+from twin.simulation.law_calls import STEP, stepped
+from twin.simulation.regimes import factor_series
+from twin.simulation.solved import Solved
+from twin.simulation.sources import HeatSource
+from twin.simulation.start import excess_K
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Unknown:
+    """One right-hand side: heat as pairs of a direction (R, N) and a series (B, M, 2), and what stands beside it.
+
+    A capacity's derivative is the sum of what the heat makes and of ``-ratio (T - T(0))``: so the heat follows the
+    temperatures, which are smooth, and not their rates, which jump. `start_K` (B, N), `air_K` by surrounding
+    (B, M, 2).
+    """
+
+    parameter: int = -1
+    pairs: list[tuple[Array, Array]] = field(default_factory=list)
+    ratio: Array | None = None  # (N,) dC/C per cell
+    start_K: Array | None = None
+    air_K: dict[int, Array] = field(default_factory=dict)
+
+    @property
+    def thermal(self) -> bool:
+        return bool(self.pairs or self.air_K) or self.ratio is not None or self.start_K is not None
+
+
+class UnknownsOf:
+    """Builds the unknowns of one solved parameter set; `cells_degC` (B, M + 1, N) at all borders.
+
+    A series of temperatures is a straight line whose mean over the interval is right, not one through the borders:
+    that makes the derivatives of a linear network accurate to the fourth order in the interval.
+    """
+
+    def __init__(self, solved: Solved, cells_degC: Array) -> None:
+        self.solved, self.balance, self.cells_degC = solved, solved.balance, cells_degC
+        self.network, self.values = solved.balance.network, solved.balance.values
+        self.bulge_K = bulge_K(solved, cells_degC[None])[0]
+        self.shape = (*self.balance.inputs.valid.shape, 2)
+
+    def parameter(self, j: int) -> Unknown:
+        """By a parameter's value, in its own unit."""
+        out = Unknown(parameter=j)
+        self._capacities(out, j)
+        for edge in self.network.edges:
+            self._edge(out, edge, j)
+        self._heats(out, j)
+        self._surroundings(out, j)
+        if any(j in law.parameters.values() for law, _ in self.network.starts):
+            excess = excess_K(self.network, stepped(self.values, j), self.balance.inputs)
+            out.start_K = None if excess is None else np.imag(excess[0]) / STEP
+        return out
+
+    def start(self, cells: NDArray[np.int64]) -> Unknown:
+        """By the start temperature of a body, each batch its own."""
+        start_K = np.zeros((self.shape[0], self.network.n_cells))
+        start_K[:, cells] = 1.0
+        return Unknown(start_K=start_K)
+
+    def offset(self, s: int) -> Unknown:
+        """By an offset of a surrounding, each batch its own."""
+        out = Unknown()
+        self._warmer(out, s, np.ones(self.shape))
+        return out
+
+    def _capacities(self, out: Unknown, j: int) -> None:
+        slopes = np.array([c.slope(self.values, j)[0] for c in self.network.capacities])
+        if not slopes.any():
+            return
+        out.ratio = slopes / self.balance.capacity_J_per_K[0]
+        conductance = self.balance.conductance_W_per_K[0]
+        for i in np.flatnonzero(slopes):
+            rise = self._series(np.eye(self.network.n_cells)[i]) - self.cells_degC[:, :1, i, None]
+            out.pairs.append((conductance[:, i] * out.ratio[i], rise))
+
+    def _edge(self, out: Unknown, edge: Edge, j: int) -> None:
+        slope = edge_slope(self.balance, edge, j)
+        if slope is None:
+            return
+        own = self._series(edge.direction)
+        lead = -own if edge.surrounding is None else self.balance.air.ends(edge.surrounding)[0] - own
+        self._add(out, edge.direction, slope[..., None] * lead)
+
+    def _heats(self, out: Unknown, j: int) -> None:
+        by_name = {s.name: s for s in self.solved.sources if isinstance(s, HeatSource)}
+        borders = self.solved.coupled.borders if self.solved.coupled is not None else None
+        every = slice(0, self.shape[1])
+        for heat in self.network.heats:
+            in_law = any(j in law.parameters.values() for law in (heat.law, *heat.factors))
+            in_share = heat.direction_slope(j)
+            for values in [stepped(self.values, j)] * in_law + [self.values] * bool(in_share.any()):
+                if heat.temperature_dependent and borders is not None:
+                    watts = np.moveaxis(by_name[heat.law.name].watts(borders, every, values), -2, -1)[0]
+                else:
+                    watts = self.balance.driven_W(heat, values)[0]
+                if np.iscomplexobj(values):
+                    self._add(out, heat.direction(self.values)[0], np.imag(watts) / STEP)
+                else:
+                    self._add(out, in_share, watts)
+
+    def _surroundings(self, out: Unknown, j: int) -> None:
+        inputs = self.balance.inputs
+        for s, given in enumerate(self.network.surroundings):
+            warmer = np.zeros(self.shape)
+            constant = recorded_degC(given, inputs) is None
+            if follows(given, inputs) and given.value is not None and given.follow is not None:
+                if given.value == j:
+                    warmer += 1.0 - self.values[0, given.follow]
+                if given.follow == j:
+                    warmer += self.balance.air.recorded_degC[s] - self.values[0, given.value]
+            elif constant and given.value == j:
+                warmer += 1.0
+            if given.offset == j:
+                warmer += 1.0
+            for law in given.effects:
+                if j in law.parameters.values():
+                    moved = effect_K(law, stepped(self.values, j), inputs, self.balance.air)
+                    warmer += np.imag(moved[0]) / STEP
+            if warmer.any():
+                self._warmer(out, s, warmer)
+
+    def _warmer(self, out: Unknown, s: int, warmer: Array) -> None:
+        """A surrounding that is warmer by a series (B, M, 2): what regimes' constant conductances let in."""
+        out.air_K[s] = warmer
+        out.pairs.append((self.balance.into_W_per_K[0, :, s], warmer))
+
+    def _series(self, place: Array) -> Array:
+        """Temperature of a place at both ends of every interval (B, M, 2), shifted so that its mean is right."""
+        borders = self.cells_degC @ place
+        return np.stack([borders[:, :-1], borders[:, 1:]], axis=-1) + (self.bulge_K @ place)[..., None]
+
+    def _add(self, out: Unknown, direction: Array, series: Array) -> None:
+        out.pairs.append((np.repeat(direction[None], self.balance.regimes.count, axis=0), series))
+
+
+def edge_slope(balance: Balance, edge: Edge, j: int) -> Array | None:
+    """Derivative (B, M) of an edge's conductance in every interval by parameter j's value; None where there is none."""
+    laws = [balance.network.factors[k] for k in edge.factors]
+    in_law = any(j in law.parameters.values() for law in laws)
+    if not in_law and j not in {k for k, _ in edge.conductance.powers}:
+        return None
+    values = stepped(balance.values, j)
+    out = np.asarray(edge.conductance(values))[0] * np.ones(balance.inputs.valid.shape)
+    for k, law in zip(edge.factors, laws, strict=True):
+        if k in balance.regimes.varying or j in law.parameters.values():
+            out = out * factor_series(law, values, balance.inputs)[0]
+        else:
+            out = out * balance.regimes.factor[0, balance.regimes.of, k]
+    return np.asarray(np.imag(out) / STEP)
+
+
+def few(pairs: Sequence[tuple[Array, Array]], n_cells: int) -> list[tuple[Array, Array]]:
+    """The same heat in at most as many pairs as there are cells."""
+    if len(pairs) <= n_cells:
+        return list(pairs)
+    n_regimes = len(pairs[0][0])
+    if any((d != d[0]).any() for d, _ in pairs):
+        return list(pairs)
+    directions = np.array([d[0] for d, _ in pairs])
+    total = np.einsum("jn,jbme->nbme", directions, np.array([s for _, s in pairs]))
+    return [(np.repeat(unit[None], n_regimes, axis=0), total[i]) for i, unit in enumerate(np.eye(n_cells))]

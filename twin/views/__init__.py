@@ -1,0 +1,1 @@
+"""What a twin shows: heat flows, modes in words, the network's overview and places."""
