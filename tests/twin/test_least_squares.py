@@ -243,6 +243,17 @@ def test_a_model_with_noise_of_its_own_converges_as_far_as_it_is_smooth():
     assert re.match(r"converged after \d+ steps? as far as the model is smooth", found.words)
 
 
+def test_derivatives_a_little_off_are_told_in_standard_deviations():
+    def model(x, b):  # coarser than its derivative says: no step lowers the cost though 0.01 to 0.1 is expected
+        rows = np.array([10 * np.exp(x[0]), 3 * x[0]])
+        return np.round(rows / 0.4) * 0.4, np.array([[10 * np.exp(x[0])], [3.0]])
+
+    found = fit(ToyProblem((Unknown("p0", "K", 0.0, 1.0, scale="linear"),), [np.array([7.0, 0.1])], model))
+    assert found.converged
+    told = re.search(r"as far as the derivatives are exact, to (0\.\d+) posterior standard deviations", found.words)
+    assert told and 0.03 < float(told[1]) < 0.32
+
+
 def test_a_bound_that_rounding_misses_is_still_told():
     given = tuple(Unknown(f"p{i}", "K", 0.1 * i, 0.3, -0.07 * i - 0.1, 0.37 + 0.11 * i, "linear") for i in range(8))
     found = fit(ToyProblem(given, [np.tile([50.0, -50.0], 4)], linear([np.eye(8)])))

@@ -22,7 +22,9 @@ from twin.calibration.fit_problem import Array, Block, Problem, Scale, Unknown
 __all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit"]
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum
-MODEL_NOISE = 1e-3  # what a model's own rounding may hide of the cost: x within 0.03 posterior standard deviations
+# What a model's rounding and its derivatives may hide of the cost, where no step lowers it any more. An undamped step
+# that promises g is sqrt(g) posterior standard deviations long: x is known to a third of one, all parameters together.
+MODEL_NOISE = 0.1
 NOISE_ROUNDS = 10
 
 
@@ -175,7 +177,12 @@ def _result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit
     converged = by_noise or state.small(tolerance)
     if converged:
         words = f"converged after {steps} step{'' if steps == 1 else 's'}"
-        words += " as far as the model is smooth" if by_noise else ""
+        if by_noise and not state.small(MODEL_NOISE / 100):
+            words += (
+                f" as far as the derivatives are exact, to {np.sqrt(state.expected):.2g} posterior standard deviations"
+            )
+        elif by_noise:
+            words += " as far as the model is smooth"
     elif state.stuck:
         words = (
             f"stopped after {steps} steps: no step lowers the cost, though the linear model expects "
