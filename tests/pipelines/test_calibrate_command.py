@@ -95,13 +95,13 @@ def test_a_fit_that_fails_leaves_the_file_untouched(
     monkeypatch: pytest.MonkeyPatch,  # type: ignore[no-untyped-def]
 ) -> None:
     (folder / "new.yml").write_text("what stood there", encoding="utf-8")
-    from twin import calibration
+    from twin.calibration import estimate
 
     def impatient(*args, **kwargs):  # type: ignore[no-untyped-def]
         return real(args[0], *args[1:3], 1, 1e-15, *args[5:])
 
-    real = calibration.fit
-    monkeypatch.setattr(calibration, "fit", impatient)
+    real = estimate.fit
+    monkeypatch.setattr(estimate, "fit", impatient)
     done = call("--recordings", folder / "in", "--overwrite", "--no-leave-out")
     assert done.code == 1
     assert "calibration of two_bodies: stopped after" in done.err and done.err.count("Traceback") == 0
