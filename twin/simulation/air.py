@@ -48,24 +48,18 @@ def air_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | N
     Raises:
         InputError: offsets of another shape.
     """
-    shape = inputs.valid.shape
-    recorded = np.zeros((len(network.surroundings), *shape, 2))
+    recorded, moving = _recorded(network, inputs)
     steady = np.zeros((len(values), len(network.surroundings)))
     follow = np.ones_like(steady)
-    moving = []
     for s, given in enumerate(network.surroundings):
-        borders = recorded_degC(given, inputs)
-        if borders is not None:
-            recorded[s, ..., 0], recorded[s, ..., 1] = borders[:, :-1], borders[:, 1:]
-            moving.append(s)
-        if borders is None and given.value is not None:
+        if s not in moving and given.value is not None:
             steady[:, s] += values[:, given.value]
         if follows(given, inputs) and given.value is not None:
             follow[:, s] = values[:, given.follow]
             steady[:, s] += (1.0 - follow[:, s]) * values[:, given.value]
         if given.offset is not None:
             steady[:, s] += values[:, given.offset]
-    out = Air(recorded, np.array(moving, int), follow, steady, None)
+    out = Air(recorded, moving, follow, steady, None)
     return replace(out, extra_K=_extra(network, values, inputs, out, offsets_K))
 
 
@@ -79,6 +73,21 @@ def recorded_degC(given: CompiledSurrounding, inputs: Inputs) -> Array | None:
         first = np.nanmean(np.stack([inputs.first[c] for c in given.first]), axis=0)
         return np.repeat(first[:, None], inputs.time_s.shape[1], axis=1)
     return None
+
+
+def _recorded(network: Network, inputs: Inputs) -> tuple[Array, NDArray[np.int64]]:
+    """What is recorded of all surroundings, and the numbers of those; the same for all parameters, so kept."""
+    key = ("surroundings", tuple((s.name, s.channel, s.first) for s in network.surroundings))
+    if key not in inputs.kept:
+        borders = {s: recorded_degC(given, inputs) for s, given in enumerate(network.surroundings)}
+        moving = np.array([s for s, b in borders.items() if b is not None], int)
+        recorded = np.zeros((len(borders), *inputs.valid.shape, 2))
+        for s, b in borders.items():
+            if b is not None:
+                recorded[s, ..., 0], recorded[s, ..., 1] = b[:, :-1], b[:, 1:]
+        inputs.kept[key] = recorded, moving
+    kept: tuple[Array, NDArray[np.int64]] = inputs.kept[key]
+    return kept
 
 
 def follows(given: CompiledSurrounding, inputs: Inputs) -> bool:

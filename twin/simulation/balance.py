@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from twin.simulation.inputs import Inputs
 from twin.simulation.law_calls import along_time, heat_W, parameters_of, reads_time
 from twin.simulation.regimes import MOST, Regimes, at_tuples, distinct, regimes_of
 from twin.simulation.response import Forcing, Response
-from twin.simulation.schedule import Schedule
+from twin.simulation.schedule import Drive, Schedule
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 class Balance:
     """``C dT/dt = -K T + q`` of P parameter sets on B batches; what depends on temperature is not in q.
 
-    capacity (P, N), conductance (P, R, N, N) and into (P, R, S, N), the heat per kelvin of each surrounding.
+    capacity (P, N), conductance (P, R, N, N) and into (P, R, S, N), the heat per kelvin of each surrounding. Regimes
+    tell the drivers of heats apart too, so that held_W (P, R, N) holds within one; `alike` (R,) has one number for all
+    of the same conductances, from 0. Driven heats that follow the clock or take too many values are `timed`.
     """
 
     network: Network
@@ -36,6 +38,9 @@ class Balance:
     conductance_W_per_K: Array
     into_W_per_K: Array
     air: Air
+    held_W: Array
+    alike: NDArray[np.int64]
+    timed: tuple[Heat, ...]
 
     @cached_property
     def schedule(self) -> Schedule:
@@ -50,29 +55,35 @@ class Balance:
     def known(self) -> tuple[tuple[Array, Array], ...]:
         """Directions (P or 1, R, J, N) and series (P or 1, J, B, M, 2) of surroundings and driven heats."""
         moving = self.air.moving
-        steady_W = np.einsum("prsn,ps->prn", self.into_W_per_K, self.air.steady_degC)
-        slots, watts = self._driven()
-        watts += steady_W[:, :, None]  # slots that a regime lacks are never 1
-        terms = [(watts, slots[None])]
-        if len(moving):
-            into = self.into_W_per_K[:, :, moving] * self.air.follow[:, None, moving, None]
-            terms.append((into, self.air.recorded_degC[None, moving]))
+        steady_W = self.held_W + np.einsum("prsn,ps->prn", self.into_W_per_K, self.air.steady_degC)
+        into = self.into_W_per_K[:, :, moving] * self.air.follow[:, None, moving, None]
+        terms = [(np.concatenate([steady_W[:, :, None], into], axis=2), self._recorded.series)]
         if self.air.extra_K is not None:
             terms.append((self.into_W_per_K, self.air.extra_K))
-        timed = [h for h in self._independent if not self._static(h)]
-        if timed:
-            series = np.stack([self.driven_W(h) for h in timed], axis=1)
-            terms.append((self.directions(timed), series))
+        if self.timed:
+            series = np.stack([self.driven_W(h) for h in self.timed], axis=1)
+            terms.append((self.directions(self.timed), series))
         return tuple(terms)
 
     def forcing(self, response: Response) -> Forcing:
         """The known heat for a response on this balance's schedule."""
-        out = Forcing()
-        for directions, series in self.known:
+        (directions, _), *others = self.known
+        out = response.forcing(directions, self._recorded)
+        for directions, series in others:
             out = out + response.forcing(directions, series)
         return out
 
-    def directions(self, heats: list[Heat]) -> Array:
+    @cached_property
+    def _recorded(self) -> Drive:
+        """A series of ones, for what holds, and the recorded surroundings; sorted once for all runs."""
+        kept, key = self.inputs.kept, ("recorded", id(self.schedule), id(self.air.recorded_degC))
+        if key not in kept:
+            moving = self.air.recorded_degC[self.air.moving]
+            kept[key] = self.schedule.drive(np.concatenate([np.ones((1, *moving.shape[1:])), moving])[None])
+        drive: Drive = kept[key]
+        return drive
+
+    def directions(self, heats: Sequence[Heat]) -> Array:
         """Where heats go, (P, R, J, N), the same in every regime."""
         rows = np.stack([h.direction(self.values) for h in heats], axis=1)
         return np.repeat(rows[:, None], self.regimes.count, axis=1)
@@ -92,43 +103,6 @@ class Balance:
             return np.broadcast_to(np.broadcast_to(out, shape)[..., None], (*shape, 2))
         return np.moveaxis(np.broadcast_to(out, (shape[0], shape[1], 2, shape[2])), 2, 3)
 
-    @cached_property
-    def _independent(self) -> list[Heat]:
-        return [h for h in self.network.heats if not h.temperature_dependent]
-
-    @cached_property
-    def _tuples(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Distinct (regime, drivers of the heats) and where each first occurs; empty where there are too many."""
-        laws = [law for h in self._independent if not _timed(h) for law in (h.law, *h.factors)]
-        return distinct(self.inputs, [c for law in laws for c in law.drivers.values()], self.regimes.of)
-
-    def _static(self, heat: Heat) -> bool:
-        """Whether a heat takes few values, so that it needs no series of its own."""
-        return not _timed(heat) and len(self._tuples[1]) <= MOST
-
-    def _driven(self) -> tuple[Array, Array]:
-        """Heats of few values: indicator series (J, B, M, 2), of which one is 1 at a time, and watts (P, R, J, N).
-
-        Within a regime each tuple of drivers has a slot; mostly a regime has one tuple, and J is 1.
-        """
-        number, first = self._tuples
-        heats = [h for h in self._independent if self._static(h)]
-        if len(first) > MOST:
-            number, first = np.zeros_like(number), first[:1]
-        regime = self.regimes.of.ravel()[first]
-        order = np.argsort(regime, kind="stable")
-        slot = np.empty_like(regime)
-        slot[order] = np.arange(len(first)) - np.searchsorted(regime[order], regime[order])
-        n_slots = int(slot.max(initial=0)) + 1
-        watts = np.zeros((len(self.values), self.regimes.count, n_slots, self.network.n_cells))
-        for heat in heats:
-            at = heat_W(heat, lambda law, effect: at_tuples(law, effect, self.values, self.inputs, first))
-            watts[:, regime, slot] += at[..., None] * heat.direction(self.values)[:, None]
-        if n_slots == 1:
-            return np.ones((1, *self.inputs.valid.shape, 2)), watts
-        chosen = slot[number][None] == np.arange(n_slots)[:, None, None]
-        return np.repeat(chosen[..., None].astype(float), 2, axis=-1), watts
-
 
 def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | None = None) -> Balance:
     """The heat balance at parameter values (P, n); `offsets_K` (P or 1, B, S) of each batch's surroundings.
@@ -137,7 +111,7 @@ def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array
         InputError: parameter values of another length, or that are not finite.
     """
     check_values(network, values)
-    regimes = regimes_of(network, values, inputs)
+    regimes, held_W, alike, timed = _finer(network, values, inputs, regimes_of(network, values, inputs))
     spread = np.repeat(values[:, None], regimes.count, axis=1)
     return Balance(
         network,
@@ -148,7 +122,30 @@ def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array
         network.conductance_W_per_K(spread, regimes.factor),
         network.surrounding_W_per_K(spread, regimes.factor),
         air_of(network, values, inputs, offsets_K),
+        held_W,
+        alike,
+        timed,
     )
+
+
+def _finer(
+    network: Network, values: Array, inputs: Inputs, regimes: Regimes
+) -> tuple[Regimes, Array, NDArray[np.int64], tuple[Heat, ...]]:
+    """Regimes in which driven heats hold as well; their watts, the given regime of each, and the heats left over."""
+    driven = [h for h in network.heats if not h.temperature_dependent]
+    held = [h for h in driven if not _timed(h)]
+    number, first = distinct(
+        inputs, [c for h in held for law in (h.law, *h.factors) for c in law.drivers.values()], regimes.of
+    )
+    if len(first) > MOST:
+        held, number, first = [], *distinct(inputs, (), regimes.of)
+    alike = regimes.of.ravel()[first]
+    watts = np.zeros((len(values), len(first), network.n_cells))
+    for heat in held:
+        at = heat_W(heat, lambda law, effect: at_tuples(law, effect, values, inputs, first))
+        watts += at[..., None] * heat.direction(values)[:, None]
+    timed = tuple(h for h in driven if all(h is not other for other in held))
+    return replace(regimes, of=number, factor=regimes.factor[:, alike]), watts, alike, timed
 
 
 def check_values(network: Network, values: Array) -> None:

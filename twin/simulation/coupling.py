@@ -55,7 +55,9 @@ class Coupled:
 
 
 def plain_modes(balance: Balance) -> Modes:
-    return modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K)
+    """The network's own modes; regimes of the same conductances share them."""
+    first = np.unique(balance.alike, return_index=True)[1]
+    return modes_of(balance.capacity_J_per_K, balance.conductance_W_per_K[:, first]).of_regimes(balance.alike)
 
 
 def solve(balance: Balance, sources: Sequence[Source], rows: Array, start_degC: Array, tolerance_K: float) -> Coupled:

@@ -54,6 +54,10 @@ class Modes:
             return self
         return Modes(self.rate_per_s[sets], self.shape[sets], self.inverse[sets])
 
+    def of_regimes(self, numbers: NDArray[np.int64]) -> Modes:
+        """The modes of some regimes, which may repeat."""
+        return Modes(self.rate_per_s[:, numbers], self.shape[:, numbers], self.inverse[:, numbers])
+
 
 def modes_of(capacity_J_per_K: Array, conductance_W_per_K: Array) -> Modes:
     """Modes from heat capacities (P, N) and symmetric, positive semidefinite conductance matrices (P, R, N, N).
