@@ -5,7 +5,7 @@ Every law is passed in order with its tangents, if there are any: derivatives by
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -130,27 +130,25 @@ def watch(network: Network, places: Places) -> None:
 
 def shown(rows: Rows, network: Network, tangents: Tangents | None = None) -> tuple[Array, Array, Array, Array]:
     """Readings (P, B, K, n_sensors) and errors (P, B, K, n_errors), and their tangents (Q, B, K, …) or empty arrays."""
-    readings = [_reading(rows, r.cells, r.effects, tangents) for r in network.readings]
-    errors = [_error(rows, network, k, tangents) for k in range(len(network.errors))]
     n_unknowns = 0 if tangents is None else tangents.degC.shape[1]
-    none = np.zeros((n_unknowns, *rows.time_s.shape))
-    shape = (len(rows.values), *rows.time_s.shape)
-    first, second = (_stacked([seen for seen, _ in group], shape) for group in (readings, errors))
-    third, fourth = (
-        _stacked([none if slope is None else slope for _, slope in group], none.shape) for group in (readings, errors)
-    )
-    return first, second, third, fourth
+    out = []
+    for group, work in ((network.readings, _reading), (network.errors, _error)):
+        seen = np.empty((len(group), len(rows.values), *rows.time_s.shape))
+        d_seen = np.empty((len(group), n_unknowns, *rows.time_s.shape))
+        for k in range(len(group)):
+            seen[k], slope = work(rows, network, k, tangents)
+            if slope is not None:
+                d_seen[k] = slope
+        out.append((np.moveaxis(seen, 0, -1), np.moveaxis(d_seen, 0, -1)))
+    (readings, d_readings), (errors, d_errors) = out
+    return readings, errors, d_readings, d_errors
 
 
-def _stacked(arrays: Sequence[Array], shape: tuple[int, ...]) -> Array:
-    return np.stack(arrays, axis=-1) if arrays else np.zeros((*shape, 0))
-
-
-def _reading(rows: Rows, cells: Array, effects: Sequence[Law], tangents: Tangents | None) -> tuple[Array, Array | None]:
-    k = rows.places.number(cells)
-    seen = rows.degC[k]
-    d_seen = None if tangents is None else tangents.degC[k]
-    for law in effects:
+def _reading(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Array, Array | None]:
+    given = network.readings[k]
+    place = rows.places.number(given.cells)
+    seen, d_seen = rows.degC[place], None if tangents is None else tangents.degC[place]
+    for law in given.effects:
         seen, d_seen = rows.law(law, "reading", seen, tangents, d_seen)
     return seen, d_seen
 

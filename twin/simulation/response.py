@@ -64,10 +64,10 @@ class States:
         """
         matrix = _matrix(matrix, self.n_sets, self.modes.n_nodes)
         border = self.pieces.border[:, ::every]
-        out = np.empty((self.n_sets, *border.shape, matrix.shape[1]))
+        out = np.empty((matrix.shape[1], self.n_sets, *border.shape))
         for sets, amplitude in self.chunks:
             _read(self.modes, self.pieces, amplitude, self.start_degC, matrix, border, sets, out)
-        return out
+        return np.moveaxis(out, 0, -1)
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,13 @@ class Response:
         n_sets, start = self._sets(forcing, start_degC)
         matrix = _matrix(matrix, n_sets, self.modes.n_nodes)
         pieces = self.schedule.pieces(every)
-        out = np.empty((n_sets, *pieces.border.shape, matrix.shape[1]))
+        out = np.empty((matrix.shape[1], n_sets, *pieces.border.shape))
         store: Array | None = None  # the first chunk's states, which no later one exceeds: fresh pages cost time
         for sets in self._chunks(pieces, n_sets):
             amplitude = self._advance(forcing, start, pieces, sets, store)
             store = amplitude if store is None else store
             _read(self.modes, pieces, amplitude, start, matrix, pieces.border, sets, out)
-        return out
+        return np.moveaxis(out, 0, -1)
 
     def _sets(self, forcing: Forcing, start_degC: Array) -> tuple[int, Array]:
         start = np.asarray(start_degC, float)
@@ -234,17 +234,18 @@ def _read(
     modes: Modes, pieces: Pieces, amplitude: Array, start_degC: Array, matrix: Array, border: Ints, sets: slice,
     out: Array,
 ) -> None:  # fmt: skip
-    """Write the outputs of some sets at the rows `border` into out (Q, B, borders, n_out)."""
+    """Write the outputs of some sets at the rows `border` into out (n_out, Q, B, borders): time last, as laws read."""
     chosen, few = _of_sets(matrix, sets), modes.of_sets(sets)
-    of_modes = np.ascontiguousarray((chosen[:, None] @ few.shape).swapaxes(-1, -2))  # (Q or 1, R, N, n_out)
-    start = _of_sets(start_degC, sets) @ chosen.swapaxes(-1, -2)  # (Q or 1, B, n_out)
-    lines = np.empty((pieces.n_rows + len(border), out.shape[-1]))
+    of_modes = chosen[:, None] @ few.shape  # (Q or 1, R, n_out, N)
+    start = chosen @ _of_sets(start_degC, sets).swapaxes(-1, -2)  # (Q or 1, n_out, B)
+    lines = np.empty((len(out), pieces.n_rows + len(border)))
     for i in range(amplitude.shape[1]):
         reading = of_modes[min(i, len(of_modes) - 1)]
         for block in pieces.blocks:
-            np.matmul(amplitude[block.rows, i], reading[block.regime], out=lines[block.rows])
-        lines[pieces.n_rows :] = start[min(i, len(start) - 1)]
-        lines.take(border.reshape(-1), axis=0, out=out[sets.start + i].reshape(-1, out.shape[-1]), mode="clip")
+            np.matmul(reading[block.regime], amplitude[block.rows, i].T, out=lines[:, block.rows])
+        lines[:, pieces.n_rows :] = start[min(i, len(start) - 1)]
+        for line, into in zip(lines, out[:, sets.start + i], strict=True):
+            line.take(border, out=into, mode="clip")
 
 
 def _of_sets(array: Array, sets: slice) -> Array:
