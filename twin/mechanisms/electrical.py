@@ -1,4 +1,4 @@
-"""Electrical heat: a heater by its setting, a conductor or a cell by its current."""
+"""Electrical heat: a heater by its setting, alone or on a shared supply; a conductor or a cell by its current."""
 
 from __future__ import annotations
 
@@ -26,6 +26,28 @@ class ElectricalHeat(Mechanism):
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["gain"] * view.driver["level"])
+
+
+class SupplySag(Mechanism):
+    """Loads on one supply: while another draws current the voltage falls, and this one heats less.
+
+    `acts_on` names the heat that is lessened; the other load's heat, if it suffers too, has a sag of its own.
+    """
+
+    key = "supply_sag"
+    words = "voltage drop of a shared supply"
+    equation = "P = P0 (1 - sag other / rated)"
+    source = "Ohm 1827: inner resistance of a source, linear in the other load's current"
+    signature = "a heater warms its place less while another one is on, in step with that one's setting"
+    acts_at = ("heat",)
+    drivers: ClassVar[Mapping[str, str]] = {"other": "1"}
+    parameters = (
+        Spec("sag", "1", "share of the heat that is lost at the other's rated level", 0.2, 0.8, 0.0, 1.0, "logit"),
+        Spec("rated", "1", "level of the other, in its channel's unit, at which `sag` is stated", 1.0, 0.01, 1e-6, 1e6),
+    )
+
+    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+        return np.asarray(1.0 - p["sag"] * view.driver["other"] / p["rated"])
 
 
 class OhmicHeat(Mechanism):

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from twin.quantity import unit_registry
 
@@ -118,6 +119,24 @@ def _steps(q: SimpleNamespace) -> Any:
     return ZERO + q.step * np.round(((q.seen - ZERO) / q.step).to("dimensionless"))
 
 
+def _through(q: SimpleNamespace, drawn: Any, points: list[Any]) -> Any:
+    """The natural cubic spline through evenly spaced points, in the first one's unit."""
+    spline = CubicSpline(np.arange(len(points)), [p.m_as(points[0].u) for p in points], bc_type="natural")
+    return spline((drawn / q.capacity * (len(points) - 1)).m_as("")) * points[0].u
+
+
+def _voltage_loss(q: SimpleNamespace) -> Any:
+    middle = q.t + (q.t[1] - q.t[0]) / 2
+    u = _through(q, q.start - q.current * middle, [getattr(q, f"u{k}") for k in range(8)])
+    return q.current * (q.voltage - u)
+
+
+def _charge_strain(q: SimpleNamespace) -> Any:
+    drawn = q.start - q.current * q.t
+    f = _through(q, drawn, [0 * q.f1, *(getattr(q, f"f{k}") for k in range(1, 9))])
+    return f + q.rise_body * _through(q, drawn, [getattr(q, f"g{k}") for k in range(5)])
+
+
 def _friction(q: SimpleNamespace) -> Any:
     return 2 * np.pi * (q.feed / q.lead) * q.moment
 
@@ -154,7 +173,14 @@ CASES: Mapping[str, Case] = {
     "sun": Case(_sun, {"irradiance": 0.0}),
     "cutting_heat": Case(lambda q: q.share * q.power, {"share": 0.0}),
     "electrical_heat": Case(lambda q: q.gain * q.level, {"gain": 0.0}),
+    "supply_sag": Case(lambda q: 1 - q.sag * q.other / q.rated, {"sag": 0.0}),
     "ohmic_heat": Case(_ohmic, {"resistance": 0.0, "entropic": 0.0}),
+    "voltage_loss_heat": Case(_voltage_loss, {f"u{k}": 3.4 for k in range(8)}, {"capacity": 30.0, "start": 28.0}),
+    "charge_strain": Case(
+        _charge_strain,
+        {**{f"f{k}": 0.0 for k in range(1, 9)}, **{f"g{k}": 0.0 for k in range(5)}},
+        {"capacity": 30.0, "start": 28.0},
+    ),
     "column_bending": Case(None, {"gain": 0.0}),
     "spindle_growth": Case(None, {"gain": 0.0}),
     "speed_shift": Case(lambda q: q.shift * (q.speed / q.rated) ** 2, {"shift": 0.0}),

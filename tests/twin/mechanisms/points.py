@@ -16,7 +16,7 @@ from twin.quantity import Spec
 TIME_S = np.arange(13) * 600.0
 STARTS_AT_H = 8.5
 SEEN_DEGC, SLOPE_K_PER_S = 21.3, 1.1e-3
-DRIVER = {"rpm": 3700.0, "mm/min": 5200.0, "mm": 430.0, "1": 0.6, "W": 900.0, "A": 12.0}
+DRIVER = {"rpm": 3700.0, "mm/min": 5200.0, "mm": 430.0, "1": 0.6, "W": 900.0, "A": 12.0, "V": 3.4}
 PORTS_DEGC = (34.0, 22.0)
 
 

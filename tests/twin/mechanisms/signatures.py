@@ -60,6 +60,18 @@ def joint_slip(m: Mechanism) -> None:
     assert um[25] != pytest.approx(um[-26])  # another path on cooling
 
 
+def charge_strain(m: Mechanism) -> None:
+    shape = usual(m, **{f"f{k}": 300.0 * np.sin(0.4 * k) for k in range(1, 9)})
+
+    def strain(current_A: float, rise_K: float = 0.0) -> Array:
+        time_s = np.linspace(0.0, 3600.0 * 2.9 / current_A, 200)
+        rise = {"body": np.full(200, rise_K)}
+        return m.displacement(View(driver={"current": np.full(200, -current_A)}, rise_K=rise, time_s=time_s), shape)
+
+    assert strain(3.0) == pytest.approx(strain(12.0)) and np.ptp(strain(3.0)) > 200.0  # at every rate the same course
+    assert strain(3.0, rise_K=5.0) - strain(3.0) == pytest.approx(50.0)
+
+
 def mandrel_fixture(m: Mechanism) -> None:
     network = network_with(m)
     bar, nose = network.cells.index("tried"), network.cells.index("first")
@@ -128,6 +140,7 @@ SIGNATURES: Mapping[str, Callable[[Mechanism], None]] = {
     **HEAT,
     **{f.__name__: f for f in (
         column_bending, spindle_growth, speed_shift, screw_elongation, joint_slip, mandrel_fixture, sensor_lag,
+        charge_strain,
         sensor_bonding, sensor_drift, sensor_swap, sensor_stuck, sensor_quantised, time_skew, initial_state,
     )},
     "sensor_offset": adds_the_same(-0.3, offset=-0.3),

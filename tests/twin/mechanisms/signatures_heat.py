@@ -197,11 +197,37 @@ def ohmic_heat(m: Mechanism) -> None:
     assert twice == pytest.approx(0.02 * 20**2 + 1e-4 * 20 * 298.15)
 
 
+def supply_sag(m: Mechanism) -> None:
+    assert factor(m, other=[0.0, 0.5, 1.0]) == pytest.approx([1.0, 0.9, 0.8])
+
+
+def voltage_loss_heat(m: Mechanism) -> None:
+    def loss_W(current_A: float) -> Array:
+        """Over the same charge, on a cell whose voltage falls by 20 mohm."""
+        time_s = np.linspace(0.0, 3600.0 * 2.9 / current_A, 200)
+        drawn = current_A * time_s / 3600.0
+        neutral_V = np.interp(drawn, np.linspace(0.0, 3.0, 8), [float(usual(m)[f"u{k}"]) for k in range(8)])
+        driver = {"current": np.full(200, -current_A), "voltage": neutral_V - 0.02 * current_A}
+        return m.heat_W(View(driver=driver, time_s=time_s), usual(m))
+
+    slow, fast = loss_W(3.0), loss_W(12.0)
+    assert fast.mean() == pytest.approx(0.02 * 12.0**2, rel=0.1) and fast.mean() > 10 * slow.mean()
+    bent = {k: m.heat_W(_discharge(), usual(m, **{k: 4.0})) - m.heat_W(_discharge(), usual(m)) for k in ("u6", "u1")}
+    assert np.abs(bent["u6"]).argmax() > 150 > 50 > np.abs(bent["u1"]).argmax()  # at its own charge
+
+
+def _discharge() -> View:
+    return View(
+        driver={"current": np.full(200, -3.0), "voltage": np.full(200, 3.5)}, time_s=np.linspace(0.0, 3500.0, 200)
+    )
+
+
 HEAT: Mapping[str, Callable[[Mechanism], None]] = {
     **{f.__name__: f for f in (
         bearing_viscous, bearing_load, viscosity_feedback, preload_feedback, motor_loss, belt_loss, rotating_convection,
         natural_convection, radiation, draught, joint_conductance, jacket_chiller, cutting_fluid, enclosure_air,
         stratification, floor_sink, cabinet_heat, hydraulic_unit, sun, cutting_heat, electrical_heat, ohmic_heat,
+        supply_sag, voltage_loss_heat,
     )},
     "nut_friction": feed_friction(1000 * 2 * np.pi * 0.5 / 60),
     "screw_bearing": feed_friction(1000 * 2 * np.pi * 0.3 / 60),
