@@ -379,3 +379,20 @@ def test_a_converged_fit_linearises_once_per_step():
     problem = decay_problem()
     found = fit(problem)
     assert problem.linearised == len(found.history) + 1
+
+
+def test_a_smooth_misfit_at_the_priors_does_not_pass_for_noise():
+    times = np.linspace(0.0, 3.0, 120)
+
+    def model(x, b):  # 30 exp(x0) (1 - exp(-t / exp(x1))), whitened by 0.1
+        warm = np.exp(-times / np.exp(x[1]))
+        rows = 300 * np.exp(x[0]) * (1 - warm)
+        return rows, np.column_stack([rows, -300 * np.exp(x[0]) * warm * times / np.exp(x[1])])
+
+    truth = np.array([0.9, -1.0])  # about two prior standard deviations away
+    wave = 3 * np.sin(4 * times)  # and the model is not quite right
+    measured = model(truth, 0)[0] + wave + np.random.default_rng(3).normal(size=len(times))
+    given = tuple(Unknown(f"p{i}", "K", 0.0, 0.45, scale="linear") for i in range(2))
+    found = fit(ToyProblem(given, [measured], model), reweight=True)
+    assert found.converged
+    np.testing.assert_allclose(found.x, truth, atol=0.02)

@@ -135,5 +135,5 @@ def _try(problem: Problem, state: State, dz: Array, share: float) -> tuple[State
         if not np.isfinite(cost) or ratio < 1e-3:
             return None, 0.0
         return State.at(problem, z, nuisance, state.noise), ratio
-    except WorkError:
+    except (WorkError, InputError):  # the simulation refuses values that no machine has: too far a step
         return None, 0.0

@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from data.errors import InputError, WorkError
-from twin.calibration.annealing import SETTLED, annealed, noise_left, with_noise
+from twin.calibration.annealing import SETTLED, annealed, likelier, misfits, noise_left, with_noise
 from twin.calibration.descent import State, Step, descend, x_of, z_bounds
 from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array, Block, Problem, Scale, Unknown
@@ -110,7 +110,15 @@ def _first(
         state = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
     except WorkError as error:
         raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
-    return annealed(problem, state, max_iterations, tolerance, progress) if reweight else state
+    if not reweight:
+        return state
+    down = annealed(problem, state, max_iterations, tolerance, progress)
+    if len(down.history) >= max_iterations or not misfits(noise_left(problem, down)):
+        return down
+    # From above, a misfit can pass for noise and hold the fit where it stands: once more, every row counting in full.
+    full = annealed(problem, down, len(down.history) + max_iterations, tolerance, progress, correlated=False)
+    full = annealed(problem, full, len(full.history) + max_iterations, tolerance, progress)
+    return likelier(problem, down, full)
 
 
 def _best_start(
