@@ -28,7 +28,6 @@ from data.machine import Machine, load_machine
 from data.recording import read_batches
 from data.sample_year import PROBE_NOISE_UM, PROBE_STEP_UM, TEMPERATURE_STEP_K, write_sample_year
 from twin.calibration import TOLERANCE, calibrate
-from twin.calibration.first_state import first_state
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import fit
 from twin.calibration.left_out import leave_batch_out
@@ -37,6 +36,7 @@ from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
+from twin.simulation.start import start_of
 
 MACHINE = Path(__file__).parents[1] / "machines" / "sample_vmc.yml"
 
@@ -74,7 +74,7 @@ def own_recordings(network: Network, batches: list[Batch], values: NDArray[np.fl
     """The batches with what the network itself shows at parameter values (n,), rounded as the sample year is."""
     rng = np.random.default_rng(seed)
     inputs = inputs_of(network, batches, substeps=8)
-    start = first_state(network, network.values, inputs)
+    start = start_of(network, network.values, inputs)
     for cells in network.bodies.values():
         start[:, cells] += network.start_spread_K * rng.standard_normal((len(batches), 1))
     shown = simulate(network, values, inputs, start[None])

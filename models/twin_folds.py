@@ -21,7 +21,6 @@ from data.machine import Machine
 from models.base import Array
 from twin.calibration.arrow import Arrow, assemble
 from twin.calibration.descent import State, descend, x_of, z_bounds
-from twin.calibration.first_state import first_state
 from twin.calibration.fit_noise import Noise, estimate
 from twin.calibration.fit_problem import Block
 from twin.calibration.measured import measured
@@ -33,8 +32,8 @@ from twin.simulation.inputs import inputs_of
 from twin.simulation.start import start_of
 
 SUBSTEPS_K = 0.03  # what the time step may cost; a third of a common sensor's last digit
-FAR = 4.0  # squared way, in posterior standard deviations, beyond which derivatives are taken anew
-CLOSE = 1e-5  # expected gain in cost per degree of freedom below which a fit has arrived
+FAR = 16.0  # squared way, in posterior standard deviations, beyond which derivatives are taken anew
+CLOSE = 1e-4  # expected gain in cost per degree of freedom below which a fit has arrived
 SETTLED = 3e-3  # relative change of the channels' weights
 ROUNDS = 60
 _SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -70,8 +69,9 @@ class _InParts(CalibrationProblem):
 
 @dataclass(frozen=True)
 class _Point:
-    """A fit on its way: where it is, the derivatives that it uses and where these were taken."""
+    """A fit on its way: its batches (by their number in the problem), where it is, derivatives and where from."""
 
+    at: list[int]
     z: Array
     nuisance: list[Array]
     blocks: list[Block]
@@ -106,7 +106,7 @@ class Calibrations:
     def problem(self) -> CalibrationProblem:
         kept = [self.batches[k] for k in self.used]
         inputs = inputs_of(self.network, kept)
-        start = first_state(self.network, self.network.values, inputs)
+        start = start_of(self.network, self.network.values, inputs)
         inputs = inputs.refined(choose_substeps(self.network, self.network.values, inputs, start[None], SUBSTEPS_K))
         seen = tuple(measured(self.network, kept, self._options[0], self._options[1] or None))
         return _InParts(self.network, inputs, seen, start, Nuisances.of(self.network))
@@ -154,9 +154,12 @@ class Calibrations:
         at = [self.used[k] for k in key if k in self.used]
         problem = self.problem.only(at)
         if begin is None:
-            point = _from_file(problem)
+            point = _from_file(problem, at)
         else:
-            point = replace(begin, nuisance=[begin.nuisance[i] for i in at], blocks=[begin.blocks[i] for i in at])
+            own = [begin.at.index(i) for i in at]
+            point = _Point(
+                at, begin.z, [begin.nuisance[k] for k in own], [begin.blocks[k] for k in own], begin.taken_at
+            )
         point, noise, rounds, words = _arrived(problem, point)
         values = problem.values_at(x_of(problem.unknowns, point.z))
         own = _own_starts_K(problem, values, point.nuisance)
@@ -181,10 +184,10 @@ def _refused(network: Network, batches: Sequence[Batch], every_s: float, channel
     return out
 
 
-def _from_file(problem: CalibrationProblem) -> _Point:
+def _from_file(problem: CalibrationProblem, at: list[int]) -> _Point:
     """The machine file's values and starts as the first readings tell them."""
     z, nuisance = np.zeros(len(problem.unknowns)), [np.zeros(q) for q in problem.nuisance_sizes]
-    return _Point(z, nuisance, _linearised(problem, z, nuisance), z)
+    return _Point(at, z, nuisance, _linearised(problem, z, nuisance), z)
 
 
 def _linearised(problem: CalibrationProblem, z: Array, nuisance: list[Array]) -> list[Block]:

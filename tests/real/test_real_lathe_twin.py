@@ -16,11 +16,11 @@ from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches
 from twin.calibration import calibrate
-from twin.calibration.first_state import first_state
 from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
+from twin.simulation.start import start_of
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data" / "lathe_gv1203"
@@ -115,7 +115,7 @@ def _mean(rms_K: Mapping[str, float]) -> float:
 def _rms_K(network: Network, values: NDArray[np.float64], batches: Sequence[Batch]) -> dict[str, float]:
     """Mean over batches of each sensor's rms, from drivers, room and first readings alone."""
     inputs = inputs_of(network, batches)
-    shown = simulate(network, values, inputs, first_state(network, values, inputs)[None]).readings[0]
+    shown = simulate(network, values, inputs, start_of(network, values, inputs)[None]).readings[0]
     return {
         r.channel: _over([b.masked(r.channel) - shown[i, : b.n_rows, k] for i, b in enumerate(batches)])
         for k, r in enumerate(network.readings)

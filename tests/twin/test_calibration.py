@@ -13,7 +13,6 @@ from data.machine import Machine
 from tests.twin.machines import machine
 from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration import Calibration, calibrate
-from twin.calibration.first_state import first_state
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import fit
 from twin.calibration.left_out import leave_batch_out
@@ -21,6 +20,7 @@ from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
+from twin.simulation.start import start_of
 
 HEAD = {"capacity": "40 kJ/K", "material": "cast_iron"}  # fixed: else heat, capacities, conductances only scale
 
@@ -189,7 +189,7 @@ def test_starts_from_first_readings_undo_what_the_sensors_add() -> None:
     own = machine(bodies__head=HEAD, surroundings__room=room, sensors__t_shaft=shaft)
     network = compile_network(own)
     inputs = inputs_of(network, recorded(own, empty_batches(own, 2), seed=1, noise=0.0, start_K=3.0))
-    shown = simulate(network, network.values, inputs, first_state(network, network.values, inputs)[None])
+    shown = simulate(network, network.values, inputs, start_of(network, network.values, inputs)[None])
     for c, channel in enumerate(("t_shaft", "t_head")):
         np.testing.assert_allclose(shown.readings[0, :, 0, c], inputs.first[channel], atol=0.01)
 

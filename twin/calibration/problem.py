@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
-from twin.calibration.first_state import first_state
 from twin.calibration.fit_problem import Block, Unknown
 from twin.calibration.measured import EVERY_S, Measured, channels_of, measured
 from twin.network import Network
@@ -18,6 +17,7 @@ from twin.quantity import Parameter
 from twin.simulation import choose_substeps, simulate
 from twin.simulation.inputs import MAX_GAP_S, Inputs, inputs_of
 from twin.simulation.sensitivity import sensitivities
+from twin.simulation.start import start_of
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class CalibrationProblem:
         """
         inputs = inputs_of(network, batches, max_gap_s=max_gap_s)
         values = network.values
-        start_degC = first_state(network, values, inputs)[None]
+        start_degC = start_of(network, values, inputs)[None]
         finest = min((r.noise for r in network.readings), default=0.03)
         inputs = inputs.refined(choose_substeps(network, values, inputs, start_degC, max(0.01, finest)))
         return cls(
@@ -171,7 +171,7 @@ class CalibrationProblem:
 
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
-        start = first_state(self.network, values, self.inputs)
+        start = start_of(self.network, values, self.inputs)
         simulation = simulate(self.network, values, self.inputs, start[None])
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [m.value - m.of(s) for m, s in zip(self.measured, series, strict=True)]

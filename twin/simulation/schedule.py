@@ -42,8 +42,8 @@ class Schedule:
         self.regime: Ints = np.where(valid, regimes, 0).astype(np.intp)
         self.n_regimes = int(self.regime.max(initial=0)) + 1
         self.step_s, step = _distinct(dt[valid])
-        self._step: Ints = np.zeros(dt.shape, np.intp)
-        self._step[valid] = step
+        self.step: Ints = np.zeros(dt.shape, np.intp)
+        self.step[valid] = step
         self._pieces: dict[int, Pieces] = {}
 
     def pieces(self, every: int = 1) -> Pieces:
@@ -57,7 +57,7 @@ class Schedule:
                 raise InputError(
                     f"schedule: every is {every}, expected a whole number of intervals from 1 to {self.n_intervals}"
                 )
-            self._pieces[every] = cut(self._step, self.step_s, self.regime, self.n_rows, int(every))
+            self._pieces[every] = cut(self.step, self.step_s, self.regime, self.n_rows, int(every))
         return self._pieces[every]
 
     def drive(self, series: Array) -> Drive:

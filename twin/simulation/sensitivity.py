@@ -19,13 +19,12 @@ from twin.simulation.channels import Rows, Tangents, shown
 from twin.simulation.coupling import outlets
 from twin.simulation.inputs import Inputs
 from twin.simulation.law_calls import STEP
-from twin.simulation.mixing import Mixing
 from twin.simulation.response import Response
 from twin.simulation.run import TOLERANCE_K, Simulation, simulation_of
-from twin.simulation.schedule import Schedule
 from twin.simulation.solved import Solved, rows_of, seen_matrix, solved_balance
-from twin.simulation.sources import Borders
+from twin.simulation.sources import Borders, Source
 from twin.simulation.start import checked_start
+from twin.simulation.tangent_answer import Answer
 from twin.simulation.tangent_forcing import Unknown, UnknownsOf, few
 
 Array = NDArray[np.float64]
@@ -94,7 +93,7 @@ class _Tangents:
         n_rows = rows.time_s.shape[1]
         seen = np.zeros((self.matrix.shape[1], len(self.unknowns), inputs.n_batches, n_rows))
         if self.thermal:
-            seen[:, self.thermal] = self._coupled() if self.solved.sources else self._alone(self.every)
+            seen[:, self.thermal] = self._coupled() if self.solved.sources else self._linear()
         chain = seen[self.n_places :] - seen[self.n_places :, ..., :1]
         numbers = {u.parameter: q for q, u in enumerate(self.unknowns) if u.parameter >= 0}
         for e, error in enumerate(network.errors):
@@ -108,25 +107,24 @@ class _Tangents:
                 air_K[q, s] = np.concatenate([ends[:, :1, 0], ends[..., 1]], axis=-1)[:, :: self.every]
         return Tangents(seen[: self.n_places], chain, air_K, numbers)
 
-    def _alone(self, every: int) -> Array:
-        """Derivatives (n_out, Q, B, K) without what temperature-dependent heat answers."""
+    def _alone(self, matrix: Array, every: int) -> Array:
+        """Derivatives (n_out, Q, B, K) without what temperature-dependent heat answers; a capacity's without ratio."""
         response = self.solved.response
-        out = np.empty((self.matrix.shape[1], len(self.thermal), *self.balance.inputs.time_s[:, ::every].shape))
-        for at, forcing, start in self._groups(response, slice(0, self.balance.inputs.valid.shape[1])):
-            out[:, at] = np.moveaxis(response.outputs(forcing, start, self.matrix, every), -1, 0)
-        return self._with_ratio(out, self.matrix, every)
+        out = np.empty((matrix.shape[1], len(self.thermal), *self.balance.inputs.time_s[:, ::every].shape))
+        for at, forcing, start in self._groups(response):
+            out[:, at] = np.moveaxis(response.outputs(forcing, start, matrix, every), -1, 0)
+        return out
 
-    def _with_ratio(self, out: Array, matrix: Array, every: int, part: slice | None = None) -> Array:
+    def _with_ratio(self, out: Array, matrix: Array, every: int) -> Array:
         """Add the part of a capacity's derivative that follows the temperatures themselves."""
-        rise_K = self.rise_K if part is None else self.rise_K[:, part.start : part.stop + 1]
         for i, q in enumerate(self.thermal):
             ratio = self.unknowns[q].ratio
             if ratio is not None:
-                out[:, i] -= np.moveaxis((rise_K[:, ::every] * ratio) @ matrix[0].T, -1, 0)
+                out[:, i] -= np.moveaxis((self.rise_K[:, ::every] * ratio) @ matrix[0].T, -1, 0)
         return out
 
-    def _groups(self, response: Response, part: slice):  # type: ignore[no-untyped-def]
-        """Unknowns with about as many pairs, together: positions, forcing in the intervals `part`, start (Q, B, N)."""
+    def _groups(self, response: Response):  # type: ignore[no-untyped-def]
+        """Unknowns with about as many pairs, together: positions, forcing, start (Q, B, N)."""
         balance = self.balance
         n_regimes, n_cells = balance.regimes.count, balance.network.n_cells
         groups: dict[int, list[tuple[int, list[tuple[Array, Array]]]]] = defaultdict(list)
@@ -136,108 +134,96 @@ class _Tangents:
         for size, members in groups.items():
             at = [i for i, _ in members]
             directions = np.zeros((len(at), n_regimes, size, n_cells))
-            series = np.zeros((len(at), size, *balance.inputs.dt_s[:, part].shape, 2))
+            series = np.zeros((len(at), size, *balance.inputs.dt_s.shape, 2))
             start = np.zeros((len(at), balance.inputs.n_batches, n_cells))
             for k, (i, pairs) in enumerate(members):
                 for p, (direction, ends) in enumerate(pairs):
-                    directions[k, :, p], series[k, p] = direction, ends[:, part]
+                    directions[k, :, p], series[k, p] = direction, ends
                 given = self.unknowns[self.thermal[i]].start_K
                 start[k] = 0.0 if given is None else given
             yield at, response.forcing(directions, series), start
 
+    def _linear(self) -> Array:
+        """Derivatives (n_out, Q, B, K) of a network whose heat does not answer."""
+        return self._with_ratio(self._alone(self.matrix, self.every), self.matrix, self.every)
+
     def _coupled(self) -> Array:
-        """Derivatives (n_out, Q, B, K) where heat answers to temperatures: the simulation's iteration once more."""
-        coupled, response, sources = self.solved.coupled, self.solved.response, self.solved.sources
+        """Derivatives (n_out, Q, B, K) where heat answers to temperatures."""
+        response, sources = self.solved.response, self.solved.sources
+        into, rest = outlets(self.balance, sources), np.zeros((1, self.balance.inputs.n_batches, self.matrix.shape[2]))
+        heat = response.forcing(into, np.ascontiguousarray(self._answer_W().transpose(4, 3, 2, 0, 1)))
+        answer = response.outputs(heat, rest, self.matrix, self.every)
+        return self._linear() + np.moveaxis(answer, -1, 0)
+
+    def _answer_W(self) -> Array:
+        """What the sources make of all derivatives, (M, 2, B, k, Q), the chord's part included.
+
+        Sources along time need the whole past: they are repeated, window by window, until nothing moves.
+        """
+        coupled, sources, balance = self.solved.coupled, self.solved.sources, self.balance
         assert coupled is not None
-        shape = self.balance.inputs.valid.shape
-        heat = np.zeros((len(self.thermal), len(sources), *shape, 2))
+        n_batches, n_intervals = balance.inputs.valid.shape
         n_places = len(coupled.borders.degC) - len(sources)
         own = [s.direction for s in sources] if coupled.chord.used else []
         matrix = np.concatenate([self.matrix[:, :n_places], *(d[:, None] for d in own)], axis=1)
-        seen = np.zeros((matrix.shape[1], len(self.thermal), shape[0], shape[1] + 1))
-        now = None  # derivative of all cells at the start of a window, without the ratio's part
+        alone = self._alone(matrix, 1)
+        self._with_ratio(alone[:n_places], matrix[:, :n_places], 1)
+        alone = np.ascontiguousarray(alone.transpose(3, 2, 0, 1))  # time first
+        slope = np.zeros((n_batches, n_intervals, 2, len(sources), matrix.shape[1]))
+        heat = np.zeros((n_intervals, 2, n_batches, len(sources), len(self.thermal)))
+        for k, source in enumerate(sources):
+            self._slopes(k, source, slope, heat)
+        if coupled.chord.used:
+            k = np.arange(len(sources))
+            slope[..., k, n_places + k] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
+        answer, now = Answer(self.solved, matrix[0], slope), np.zeros((n_batches, matrix.shape[2], len(self.thermal)))
+        along = [k for k, source in enumerate(sources) if source.along]
+        if not along:
+            return answer.heat_W(slice(0, n_intervals), alone, heat, now)[0]
+        seen = alone.copy()
         for part in coupled.windows:
-            now = self._window(part, matrix, n_places, seen, heat, now)
-        into, rest = outlets(self.balance, sources), np.zeros((1, shape[0], matrix.shape[2]))
-        answer = response.outputs(response.forcing(into, heat), rest, self.matrix, self.every)
-        return self._alone(self.every) + np.moveaxis(answer, -1, 0)
+            now = self._window(part, answer, along, alone, seen, heat, now)
+        return heat
+
+    def _slopes(self, k: int, source: Source, slope: Array, heat: Array) -> None:
+        """Fill in a point-by-point source's W/K at its places, and its heat by derivatives of surroundings."""
+        coupled, every = self.solved.coupled, slice(0, self.balance.inputs.valid.shape[1])
+        assert coupled is not None
+        if source.along:
+            return
+        for place, watts in source.slopes(coupled.borders, every).items():
+            slope[:, :, :, k, place] = np.moveaxis(watts[0], 1, 2)
+        for s, watts in source.surrounding_slopes(coupled.borders, every).items():
+            for i, q in enumerate(self.thermal):
+                if s in self.unknowns[q].air_K:
+                    by_air = np.moveaxis(watts[0], 1, 2) * self.unknowns[q].air_K[s]
+                    heat[..., k, i] += np.moveaxis(by_air, 0, -1)
 
     def _window(
-        self, part: slice, matrix: Array, n_places: int, seen: Array, heat: Array, now: Array | None
-    ) -> Array | None:
-        """Iterate in some intervals: fills `heat` (Q, k, B, m, 2) and `seen` there; all cells (Q, B, N) at the end."""
+        self, part: slice, answer: Answer, along: list[int], alone: Array, seen: Array, heat: Array, now: Array
+    ) -> Array:
+        """Repeat sources along time in some intervals: fills `heat` and `seen` there; all cells' y at the end."""
         balance, coupled = self.balance, self.solved.coupled
         assert coupled is not None
-        n_steps, response = part.stop - part.start, self.solved.response
-        if n_steps < balance.inputs.valid.shape[1]:
-            left = np.clip(balance.inputs.n_intervals - part.start, 0, n_steps)
-            schedule = Schedule(balance.inputs.dt_s[:, part], balance.regimes.of[:, part], left)
-            response = Response(coupled.chord.modes, schedule)
-        groups = [(at, f, start if now is None else now[at]) for at, f, start in self._groups(response, part)]
-        own = seen[..., part.start : part.stop + 1]
-        for at, forcing, start in groups:
-            own[:, at] = np.moveaxis(response.outputs(forcing, start, matrix), -1, 0)
-        self._with_ratio(own[:n_places], matrix[:, :n_places], 1, part)
-        base = own.copy()
-        valid = np.arange(part.start, part.stop + 1) <= balance.inputs.n_intervals[:, None]
-        mixing = Mixing(valid, off=any(s.along for s in self.solved.sources))
-        into, rest = outlets(balance, self.solved.sources), np.zeros((1, balance.inputs.n_batches, matrix.shape[2]))
-        slopes = self._slopes(part)
+        n_places = len(coupled.borders.degC) - len(self.solved.sources)
+        borders, given = slice(part.start, part.stop + 1), heat[part].copy()
+        valid = (np.arange(part.start, part.stop + 1)[:, None] <= balance.inputs.n_intervals)[..., None, None]
         for _ in range(ROUNDS):
-            heat[:, :, :, part] = self._answer_W(part, seen, slopes, n_places)
-            new = base + np.moveaxis(response.outputs(response.forcing(into, heat[:, :, :, part]), rest, matrix), -1, 0)
-            gap = np.where(valid, np.abs(new - own), 0.0).max(axis=(0, 2, 3))
-            size = np.where(valid, np.abs(new), 0.0).max(axis=(0, 2, 3))
+            ahead = Borders(coupled.borders.degC[:n_places] + 1j * STEP * seen[:, :, :n_places].transpose(2, 3, 1, 0))
+            for k in along:
+                watts = np.imag(self.solved.sources[k].watts(ahead, part)) / STEP
+                given[:, :, :, k] = watts.transpose(3, 2, 1, 0)
+            heat[part], y, then = answer.heat_W(part, alone[borders], given, now)
+            new = alone[borders] + y
+            gap = np.where(valid, np.abs(new - seen[borders]), 0.0).max(axis=(0, 1, 2))
+            size = np.where(valid, np.abs(new), 0.0).max(axis=(0, 1, 2))
+            seen[borders] = new
             if not np.isfinite(gap).all() or (gap <= RELATIVE * size).all():
-                own[...] = new
                 break
-            own[...] = mixing(own, new)
         if not (np.isfinite(gap).all() and (gap <= 100 * RELATIVE * size).all()):
             hours = balance.inputs.time_s[0, [part.start, part.stop]] / 3600
             raise WorkError(
                 f"machine {balance.network.machine}: derivatives do not converge between {hours[0]:.2f} h and "
                 f"{hours[1]:.2f} h of a batch; take smaller substeps"
             )
-        if part.stop == balance.inputs.valid.shape[1]:
-            return None
-        cells = np.eye(matrix.shape[2])[None]
-        out = response.outputs(response.forcing(into, heat[:, :, :, part]), rest, cells, n_steps)[:, :, -1]
-        for at, forcing, start in groups:
-            out[at] += response.outputs(forcing, start, cells, n_steps)[:, :, -1]
-        return np.asarray(out)
-
-    def _slopes(self, part: slice) -> list[tuple[dict[int, Array], dict[int, Array]]]:
-        """Of every source that works point by point: W/K by place and by surrounding, (1, B, 2, m)."""
-        coupled = self.solved.coupled
-        assert coupled is not None
-        sources = self.solved.sources
-        return [
-            ({}, {}) if s.along else (s.slopes(coupled.borders, part), s.surrounding_slopes(coupled.borders, part))
-            for s in sources
-        ]
-
-    def _answer_W(
-        self, part: slice, seen: Array, slopes: list[tuple[dict[int, Array], dict[int, Array]]], n_places: int
-    ) -> Array:
-        """What the sources make of the derivatives `seen`, (Q, k, B, m, 2), the chord's part included."""
-        coupled, balance = self.solved.coupled, self.balance
-        assert coupled is not None
-        borders = Borders(seen)
-        n_batches, n_steps = balance.inputs.n_batches, part.stop - part.start
-        out = np.zeros((len(self.thermal), len(self.solved.sources), n_batches, n_steps, 2))
-        for k, (source, (by_place, by_air)) in enumerate(zip(self.solved.sources, slopes, strict=True)):
-            watts = np.zeros((len(self.thermal), n_batches, 2, n_steps))
-            if source.along:
-                ahead = Borders(coupled.borders.degC[:n_places] + 1j * STEP * seen[:n_places])
-                watts += np.imag(source.watts(ahead, part)) / STEP
-            for place, slope in by_place.items():
-                watts += slope * borders.ends(place, part)
-            for s, slope in by_air.items():
-                for i, q in enumerate(self.thermal):
-                    if s in self.unknowns[q].air_K:
-                        watts[i] += slope[0] * np.moveaxis(self.unknowns[q].air_K[s][:, part], -1, -2)
-            out[:, k] = np.moveaxis(watts, -2, -1)
-            if coupled.chord.used:
-                chord = coupled.chord.slope_W_per_K[0, balance.regimes.of[:, part], k]
-                out[:, k] += chord[..., None] * np.moveaxis(borders.ends(n_places + k, part), -2, -1)
-        return out
+        return then
