@@ -20,6 +20,9 @@ lint: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks/grid.py
 	$(BIN)/python benchmarks/ingest.py
+	$(BIN)/python -m benchmarks.twin
+	$(BIN)/python -m benchmarks.calibration
+	$(BIN)/python -m benchmarks.twin_families
 
 clean:
 	rm -rf .venv var .mypy_cache .ruff_cache .hypothesis *.egg-info
