@@ -174,8 +174,8 @@ class _Tangents:
         for k, source in enumerate(sources):
             self._slopes(k, source, slope, heat)
         if coupled.chord.used:
-            k = np.arange(len(sources))
-            slope[..., k, n_places + k] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
+            each = np.arange(len(sources))
+            slope[..., each, n_places + each] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
         answer, now = Answer(self.solved, matrix[0], slope), np.zeros((n_batches, matrix.shape[2], len(self.thermal)))
         along = [k for k, source in enumerate(sources) if source.along]
         if not along:
