@@ -39,6 +39,7 @@ class CalibrationRequest:
     batch_ids: tuple[str, ...] = ()
     starts: int = 1
     leave_out: bool = True
+    report: bool = True
     overwrite: bool = False
     seed: int = 0
 
@@ -50,6 +51,7 @@ class CalibrationOutcome:
     calibration: Calibration
     out: Path
     when: str
+    report: Path | None = None
 
 
 def calibrate_file(request: CalibrationRequest, say: Say, done: screen.Done) -> CalibrationOutcome:
@@ -82,7 +84,15 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: screen.Done) -> 
     where = f"machine file {request.out}"
     new = calibrated_text(text, network, found.values, found.intervals90, origin, where)
     write_file(request.out, new, request.machine_file, request.overwrite)
-    return CalibrationOutcome(found, request.out, when)
+    if not request.report:
+        return CalibrationOutcome(found, request.out, when)
+    from pipelines.report.twin_data import twin_data
+    from pipelines.report.twin_report import write_twin_report
+
+    say("pictures")
+    page = request.out.with_suffix(".html")
+    write_twin_report(page, twin_data(machine, batches, found))
+    return CalibrationOutcome(found, request.out, when, page)
 
 
 def _batches(request: CalibrationRequest, machine: Machine, say: Say) -> list[Batch]:
@@ -131,6 +141,7 @@ def outcome_dict(outcome: CalibrationOutcome) -> dict[str, Any]:
         "simulated": c.simulated,
         "out": str(outcome.out),
         "when": outcome.when,
+        "report": str(outcome.report) if outcome.report else None,
         "batches": list(c.batches),
         "fit": {"words": c.fit.words, "converged": c.fit.converged, "cost": c.fit.cost, "rows": c.fit.rows,
                 "dof": c.fit.dof, "at_bound": list(c.fit.at_bound)},
@@ -172,6 +183,8 @@ def print_outcome(outcome: CalibrationOutcome) -> None:
         screen.line(f"  {sentence}")
     screen.line("seconds  " + ", ".join(f"{k} {v:.1f}" for k, v in c.seconds.items() if v >= 0.05))
     screen.line(f"{outcome.out}: calibrated machine file")
+    if outcome.report:
+        screen.line(f"{outcome.report}: pictures")
 
 
 def parameter_table(c: Calibration) -> Table:

@@ -304,13 +304,16 @@ def calibrate(
     leave_out: Annotated[
         bool, typer.Option("--leave-out/--no-leave-out", help="predict every batch by a fit on the others")
     ] = True,
+    report: Annotated[bool, typer.Option(help="pictures of the fit beside --out, as .html")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace --out if it exists")] = False,
     as_json: Json = False,
 ) -> None:
     """Fit the machine file's free parameters to recordings: values with 90 % intervals, and what they are worth."""
     from pipelines.calibrating import CalibrationRequest, calibrate_file, outcome_dict, print_outcome
 
-    request = CalibrationRequest(machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, overwrite)
+    request = CalibrationRequest(
+        machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, report, overwrite
+    )
     with screen.progress(as_json) as (say, done):
         outcome = calibrate_file(request, say, done)
     if as_json:

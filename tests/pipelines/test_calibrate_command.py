@@ -74,13 +74,15 @@ def test_recordings_become_a_calibrated_file(folder: Path, call) -> None:  # typ
     assert power.value == pytest.approx(156.0, rel=0.05) and power.prior_value == 120.0
     assert part.calibrated is not None and part.calibrated.batches == ("b00", "b01", "b02")
     assert set(part.calibrated.left_out_rms) == {"t_shaft_K", "t_head_K", "z_um"}
+    page = (folder / "new.html").read_text(encoding="utf-8")
+    assert "new.html: pictures" in done.out and "SIMULATED" in page.upper() and "Simulated against recorded" in page
     again = call()  # what stands there is not overwritten unasked
     assert again.code == 2 and "new.yml: exists; give another file" in again.err
 
 
 def test_json_is_clean_and_the_lake_is_the_default(folder: Path, call) -> None:  # type: ignore[no-untyped-def]
-    assert call("--recordings", folder / "in", "--no-leave-out").code == 0
-    done = call("--batches", "b00,b02", "--no-leave-out", "--overwrite", "--json")
+    assert call("--recordings", folder / "in", "--no-leave-out", "--no-report").code == 0
+    done = call("--batches", "b00,b02", "--no-leave-out", "--no-report", "--overwrite", "--json")
     assert done.code == 0, done.err
     told = json.loads(done.out)
     assert told["batches"] == ["b00", "b02"] and told["simulated"] and told["left_out"] is None
@@ -102,7 +104,7 @@ def test_a_fit_that_fails_leaves_the_file_untouched(
 
     real = estimate.fit
     monkeypatch.setattr(estimate, "fit", impatient)
-    done = call("--recordings", folder / "in", "--overwrite", "--no-leave-out")
+    done = call("--recordings", folder / "in", "--overwrite", "--no-leave-out", "--no-report")
     assert done.code == 1
     assert "calibration of two_bodies: stopped after" in done.err and done.err.count("Traceback") == 0
     assert (folder / "new.yml").read_text(encoding="utf-8") == "what stood there"
@@ -117,6 +119,6 @@ def test_bad_input_is_one_line_and_exit_code_2(folder: Path, call) -> None:  # t
     for args, words in cases:
         done = call(*args)
         assert done.code == 2 and words in done.err and len(done.err.strip().splitlines()) == 1, (args, done.err)
-    call("--recordings", folder / "in", "--no-leave-out")
+    call("--recordings", folder / "in", "--no-leave-out", "--no-report")
     done = call("--batches", "b0", "--overwrite")
     assert done.code == 2 and "--batches: no batch 'b0' of two_bodies; did you mean" in done.err
