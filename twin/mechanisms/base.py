@@ -61,6 +61,10 @@ class Mechanism(ABC):
     parameters: ClassVar[tuple[Spec, ...]] = ()
     along_time: ClassVar[bool] = False  # True: the effect at a time needs the times before it (lag, slip, hysteresis)
 
+    linear_reading: ClassVar[bool] = (
+        False  # True: `reading` is a linear map of what is seen and the ports, plus a constant
+    )
+
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         """Heat into the places of `into`, W. A law with ports is temperature-dependent."""
         raise NotImplementedError

@@ -27,6 +27,7 @@ class SensorLag(Mechanism):
     acts_at = ("sensor",)
     parameters = (Spec("lag", "s", "time constant of the sensor in its place", 40.0, 0.7, 0.0, 3600.0),)
     along_time = True
+    linear_reading = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         seen, lag = _along_time(seen, p["lag"])
@@ -47,6 +48,7 @@ class SensorBonding(Mechanism):
     acts_at = ("sensor",)
     ports = ("air",)
     parameters = (Spec("bonding", "1", "share of the surface in what the sensor shows", 0.95, 0.7, 0.0, 1.0, "logit"),)
+    linear_reading = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         air = view.degC["air"]
@@ -65,6 +67,7 @@ class SensorOffset(Mechanism):
     parameters = (
         Spec("offset", "K", "reading at equilibrium less the true temperature", 0.0, 0.5, -10.0, 10.0, "linear"),
     )
+    linear_reading = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["offset"])
@@ -82,6 +85,7 @@ class SensorDrift(Mechanism):
     parameters = (
         Spec("rate", "K/h", "change of the sensor's error per hour of a run", 0.0, 0.02, -5.0, 5.0, "linear"),
     )
+    linear_reading = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["rate"] * view.time_s / 3600.0)
@@ -97,6 +101,7 @@ class SensorSelfHeat(Mechanism):
     signature = "one sensor too warm by the same amount at equilibrium; no effect on rises"
     acts_at = ("sensor",)
     parameters = (Spec("excess", "K", "rise of the sensor above its place by its own current", 0.1, 0.8, 0.0, 5.0),)
+    linear_reading = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["excess"])

@@ -21,6 +21,7 @@ from twin.simulation.law_calls import STEP, parameters_of, stepped
 from twin.simulation.sources import Places
 
 Array = NDArray[Any]
+Seen = tuple[Array | None, Mapping[str, Array]]  # what a law makes something of, and its ports' temperatures
 
 
 @dataclass(frozen=True)
@@ -54,20 +55,34 @@ class Rows:
 
     def law(self, law: Law, effect: str, seen: Array | None, tangents: Tangents | None, d_seen: Array | None) -> Any:
         """A law's effect (P, B, K) on what it sees, and, with tangents, its derivative (Q, B, K), else None."""
-        out = self._call(law, effect, seen, self.values, None)
+        degC = {role: self._port(port) for role, port in law.ports.items()}
         shape = (len(self.values), *self.time_s.shape)
-        out = np.broadcast_to(out, shape)
+        out = np.broadcast_to(self._call(law, effect, seen, degC, self.values), shape)
         if tangents is None:
             return out, None
-        n_unknowns = tangents.degC.shape[1]
-        d_out = np.zeros((n_unknowns, *self.time_s.shape))
-        if d_seen is not None or law.ports:
-            ahead = None if seen is None else seen + 1j * STEP * (d_seen if d_seen is not None else 0.0)
-            d_out += np.broadcast_to(self._call(law, effect, ahead, self.values, tangents), d_out.shape).imag / STEP
+        d_out = np.zeros((tangents.degC.shape[1], *self.time_s.shape))
+        self._pass_on(law, effect, (seen, degC), (d_seen, self._tangents_of(law, tangents)), d_out)
         for j in set(law.parameters.values()) & set(tangents.parameters):
-            moved = self._call(law, effect, seen, stepped(self.values, j), None)
+            moved = self._call(law, effect, seen, degC, stepped(self.values, j))
             d_out[tangents.parameters[j]] += np.broadcast_to(moved, shape)[0].imag / STEP
         return out, d_out
+
+    def _pass_on(self, law: Law, effect: str, at: Seen, moved: Seen, d_out: Array) -> None:
+        """Write what a law makes of the derivatives of what it sees, for the unknowns that move any of it."""
+        (seen, degC), (d_seen, d_degC) = at, moved
+        moving = [d for d in (d_seen, *d_degC.values()) if d is not None]
+        which = np.flatnonzero(sum((d.any(axis=(1, 2)) for d in moving), np.zeros(len(d_out), bool)))
+        if not len(which):
+            return
+        steps = {role: d[which] for role, d in d_degC.items()}
+        if d_seen is not None and law.mechanism.linear_reading:
+            nothing = np.zeros((1, *self.time_s.shape))
+            rest = self._call(law, effect, nothing, dict.fromkeys(steps, nothing), self.values)
+            d_out[which] = self._call(law, effect, d_seen[which], steps, self.values) - rest
+            return
+        ahead = seen if seen is None or d_seen is None else seen + 1j * STEP * d_seen[which]
+        degC = {role: degC[role] + 1j * STEP * d for role, d in steps.items()}
+        d_out[which] = self._call(law, effect, ahead, degC, self.values).imag / STEP
 
     @cached_property
     def time_s(self) -> Array:
@@ -89,24 +104,25 @@ class Rows:
     def _air(self) -> list[Array]:
         return [self.air.borders(s, self.every) for s in range(self.air.steady_degC.shape[1])]
 
-    def _call(self, law: Law, effect: str, seen: Array | None, values: Array, tangents: Tangents | None) -> Array:
-        degC, rise_K = {}, {}
-        for role, port in law.ports.items():
-            degC[role] = self._port(port, tangents)
-            rise_K[role] = degC[role] - degC[role][..., :1]
+    def _call(self, law: Law, effect: str, seen: Array | None, degC: Mapping[str, Array], values: Array) -> Array:
+        rise_K = {role: t - t[..., :1] for role, t in degC.items()}
         driver = {role: self._drivers[c] for role, c in law.drivers.items()}
         view = View(degC, rise_K, driver, self.time_s, self._clock_h, self._step_s)
         p = parameters_of(law, values, 2)
         method = getattr(law.mechanism, effect)
         return np.asarray(method(view, p) if seen is None else method(seen, view, p))
 
-    def _port(self, port: Port, tangents: Tangents | None) -> Array:
-        if port.cells is None:
-            out = self._air[port.surrounding]
-            moves = tangents is not None and tangents.air_K[:, port.surrounding].any()
-            return out + 1j * STEP * tangents.air_K[:, port.surrounding] if tangents is not None and moves else out
-        k = self.places.number(port.cells)
-        return self.degC[k] if tangents is None else self.degC[k] + 1j * STEP * tangents.degC[k]
+    def _port(self, port: Port) -> Array:
+        return self._air[port.surrounding] if port.cells is None else self.degC[self.places.number(port.cells)]
+
+    def _tangents_of(self, law: Law, tangents: Tangents) -> dict[str, Array]:
+        """Derivatives (Q, B, K) of a law's ports."""
+        return {
+            role: tangents.air_K[:, port.surrounding]
+            if port.cells is None
+            else tangents.degC[self.places.number(port.cells)]
+            for role, port in law.ports.items()
+        }
 
     @cached_property
     def _step_s(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.network import Edge
-from twin.simulation.air import effect_K, follows, recorded_degC
+from twin.simulation.air import effect_K, follows
 from twin.simulation.balance import Balance
 from twin.simulation.interval_means import bulge_K
 from twin.simulation.law_calls import STEP, stepped
@@ -53,12 +54,17 @@ class UnknownsOf:
         self.network, self.values = solved.balance.network, solved.balance.values
         self.bulge_K = bulge_K(solved, cells_degC[None])[0]
         self.shape = (*self.balance.inputs.valid.shape, 2)
+        self.edges = defaultdict(list)  # that a parameter changes, by its number
+        for edge in self.network.edges:
+            laws = [self.network.factors[k] for k in edge.factors]
+            for j in {k for k, _ in edge.conductance.powers}.union(*(law.parameters.values() for law in laws)):
+                self.edges[j].append(edge)
 
     def parameter(self, j: int) -> Unknown:
         """By a parameter's value, in its own unit."""
         out = Unknown(parameter=j)
         self._capacities(out, j)
-        for edge in self.network.edges:
+        for edge in self.edges[j]:
             self._edge(out, edge, j)
         self._heats(out, j)
         self._surroundings(out, j)
@@ -91,8 +97,6 @@ class UnknownsOf:
 
     def _edge(self, out: Unknown, edge: Edge, j: int) -> None:
         slope = edge_slope(self.balance, edge, j)
-        if slope is None:
-            return
         own = self._series(edge.direction)
         lead = -own if edge.surrounding is None else self.balance.air.ends(edge.surrounding)[0] - own
         self._add(out, edge.direction, slope[..., None] * lead)
@@ -118,7 +122,7 @@ class UnknownsOf:
         inputs = self.balance.inputs
         for s, given in enumerate(self.network.surroundings):
             warmer = np.zeros(self.shape)
-            constant = recorded_degC(given, inputs) is None
+            constant = s not in self.balance.air.moving
             if follows(given, inputs) and given.value is not None and given.follow is not None:
                 if given.value == j:
                     warmer += 1.0 - self.values[0, given.follow]
@@ -149,12 +153,9 @@ class UnknownsOf:
         out.pairs.append((np.repeat(direction[None], self.balance.regimes.count, axis=0), series))
 
 
-def edge_slope(balance: Balance, edge: Edge, j: int) -> Array | None:
-    """Derivative (B, M) of an edge's conductance in every interval by parameter j's value; None where there is none."""
+def edge_slope(balance: Balance, edge: Edge, j: int) -> Array:
+    """Derivative (B, M) of an edge's conductance in every interval by parameter j's value."""
     laws = [balance.network.factors[k] for k in edge.factors]
-    in_law = any(j in law.parameters.values() for law in laws)
-    if not in_law and j not in {k for k, _ in edge.conductance.powers}:
-        return None
     values = stepped(balance.values, j)
     out = np.asarray(edge.conductance(values))[0] * np.ones(balance.inputs.valid.shape)
     for k, law in zip(edge.factors, laws, strict=True):
