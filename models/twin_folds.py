@@ -37,6 +37,7 @@ CLOSE = 1e-4  # expected gain in cost per degree of freedom below which a fit ha
 SETTLED = 3e-3  # relative change of the channels' weights
 ROUNDS = 60
 _SHARES = (1.0, 0.5, 0.2, 0.05)
+_PATIENCE = 6  # rounds in which the noise follows the residuals at once
 _ROUNDING = 1e-3  # of a cost, from the iterations within a simulation
 _TOGETHER = 4
 
@@ -156,10 +157,9 @@ class Calibrations:
         if begin is None:
             point = _from_file(problem, at)
         else:
-            own = [begin.at.index(i) for i in at]
-            point = _Point(
-                at, begin.z, [begin.nuisance[k] for k in own], [begin.blocks[k] for k in own], begin.taken_at
-            )
+            place = [begin.at.index(i) for i in at]
+            nuisance, blocks = [begin.nuisance[k] for k in place], [begin.blocks[k] for k in place]
+            point = _Point(at, begin.z, nuisance, blocks, begin.taken_at)
         point, noise, rounds, words = _arrived(problem, point)
         values = problem.values_at(x_of(problem.unknowns, point.z))
         own = _own_starts_K(problem, values, point.nuisance)
@@ -203,6 +203,7 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
     noise, determined = Noise.as_given(len(problem.channels)), float(len(point.z))
     for number in range(1, ROUNDS + 1):
         before, noise = noise, estimate(residuals, channels, len(problem.channels), determined)
+        noise = _towards(before, noise, min(1.0, _PATIENCE / number))
         blocks = [replace(b, residual=r) for b, r in zip(point.blocks, residuals, strict=True)]
         arrow = assemble(blocks, point.nuisance, point.z, problem.unknowns, noise.weight)
         determined = arrow.effective_parameters()
@@ -227,6 +228,12 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         z, nuisance, residuals = moved
         point = replace(point, z=z, nuisance=nuisance)
     return replace(point, blocks=blocks), noise, ROUNDS, f"still moving after {ROUNDS} rounds"
+
+
+def _towards(before: Noise, after: Noise, share: float) -> Noise:
+    """Some of the way: how many rows count as one is no smooth function of the residuals; fits could go in circles."""
+    factor = before.factor ** (1 - share) * after.factor**share
+    return Noise(factor, before.inflation ** (1 - share) * after.inflation**share)
 
 
 def _step(
