@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from data.errors import InputError, WorkError
 from twin.network import Network
 from twin.simulation.channels import Rows, Tangents, shown
-from twin.simulation.coupling import outlets
 from twin.simulation.inputs import Inputs
 from twin.simulation.law_calls import STEP
 from twin.simulation.response import Response
@@ -149,72 +148,71 @@ class _Tangents:
 
     def _coupled(self) -> Array:
         """Derivatives (n_out, Q, B, K) where heat answers to temperatures."""
-        response, sources = self.solved.response, self.solved.sources
-        into, rest = outlets(self.balance, sources), np.zeros((1, self.balance.inputs.n_batches, self.matrix.shape[2]))
-        heat = response.forcing(into, np.ascontiguousarray(self._answer_W().transpose(4, 3, 2, 0, 1)))
-        answer = response.outputs(heat, rest, self.matrix, self.every)
-        return self._linear() + np.moveaxis(answer, -1, 0)
-
-    def _answer_W(self) -> Array:
-        """What the sources make of all derivatives, (M, 2, B, k, Q), the chord's part included.
-
-        Sources along time need the whole past: they are repeated, window by window, until nothing moves.
-        """
         coupled, sources, balance = self.solved.coupled, self.solved.sources, self.balance
         assert coupled is not None
         n_batches, n_intervals = balance.inputs.valid.shape
-        n_places = len(coupled.borders.degC) - len(sources)
-        own = [s.direction for s in sources] if coupled.chord.used else []
-        matrix = np.concatenate([self.matrix[:, :n_places], *(d[:, None] for d in own)], axis=1)
-        alone = self._alone(matrix, 1)
-        self._with_ratio(alone[:n_places], matrix[:, :n_places], 1)
-        alone = np.ascontiguousarray(alone.transpose(3, 2, 0, 1))  # time first
-        slope = np.zeros((n_batches, n_intervals, 2, len(sources), matrix.shape[1]))
-        heat = np.zeros((n_intervals, 2, n_batches, len(sources), len(self.thermal)))
+        n_places, n_sources = len(coupled.borders.degC) - len(sources), len(sources)
+        own = np.stack([s.direction for s in sources], axis=1)
+        matrix = np.concatenate([own, self.matrix], axis=1)  # what sources look at comes first
+        n_seen = n_sources + n_places
+        alone = self._alone(matrix if self.every == 1 else matrix[:, :n_seen], 1)
+        self._with_ratio(alone[n_sources:], self.matrix[:, : len(alone) - n_sources], 1)
+        slope = np.zeros((n_batches, n_intervals, 2, n_sources, n_seen))
+        given = np.zeros((n_intervals, 2, n_batches, n_sources, len(self.thermal)))
         for k, source in enumerate(sources):
-            self._slopes(k, source, slope, heat)
-        if coupled.chord.used:
-            each = np.arange(len(sources))
-            slope[..., each, n_places + each] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
-        answer, now = Answer(self.solved, matrix[0], slope), np.zeros((n_batches, matrix.shape[2], len(self.thermal)))
-        along = [k for k, source in enumerate(sources) if source.along]
-        if not along:
-            return answer.heat_W(slice(0, n_intervals), alone, heat, now)[0]
-        seen = alone.copy()
-        for part in coupled.windows:
-            now = self._window(part, answer, along, alone, seen, heat, now)
-        return heat
+            self._slopes(source, slope[:, :, :, k, n_sources:], given[..., k, :])
+        each = np.arange(n_sources)
+        slope[..., each, each] += coupled.chord.slope_W_per_K[0, balance.regimes.of][:, :, None]
+        answer = Answer(self.solved, matrix[0], slope)
+        y = self._answered(answer, np.ascontiguousarray(alone[:n_seen].transpose(3, 2, 0, 1)), given)
+        shown = alone[n_sources:] if self.every == 1 else self._linear()
+        return shown + y[:, :, n_sources:].transpose(2, 3, 1, 0)
 
-    def _slopes(self, k: int, source: Source, slope: Array, heat: Array) -> None:
+    def _answered(self, answer: Answer, alone: Array, given: Array) -> Array:
+        """What the sources make of derivatives at the places `alone` (M + 1, B, n, Q), at all outputs and rows.
+
+        Sources along time need the whole past: they are repeated, window by window, until nothing moves.
+        """
+        coupled, (n_batches, n_intervals) = self.solved.coupled, self.balance.inputs.valid.shape
+        assert coupled is not None
+        now = np.zeros((n_batches, answer.matrix.shape[1], len(self.thermal)))
+        if not any(source.along for source in self.solved.sources):
+            return answer.run(slice(0, n_intervals), alone, given, now, self.every)[0]
+        seen, out = alone.copy(), np.empty((n_intervals + 1, n_batches, len(answer.matrix), len(self.thermal)))
+        for part in coupled.windows:
+            now = self._window(part, answer, alone, seen, given[part], now, out)
+        return out[:: self.every]
+
+    def _slopes(self, source: Source, slope: Array, given: Array) -> None:
         """Fill in a point-by-point source's W/K at its places, and its heat by derivatives of surroundings."""
         coupled, every = self.solved.coupled, slice(0, self.balance.inputs.valid.shape[1])
         assert coupled is not None
         if source.along:
             return
         for place, watts in source.slopes(coupled.borders, every).items():
-            slope[:, :, :, k, place] = np.moveaxis(watts[0], 1, 2)
+            slope[..., place] = np.moveaxis(watts[0], 1, 2)
         for s, watts in source.surrounding_slopes(coupled.borders, every).items():
             for i, q in enumerate(self.thermal):
                 if s in self.unknowns[q].air_K:
                     by_air = np.moveaxis(watts[0], 1, 2) * self.unknowns[q].air_K[s]
-                    heat[..., k, i] += np.moveaxis(by_air, 0, -1)
+                    given[..., i] += np.moveaxis(by_air, 0, -1)
 
     def _window(
-        self, part: slice, answer: Answer, along: list[int], alone: Array, seen: Array, heat: Array, now: Array
+        self, part: slice, answer: Answer, alone: Array, seen: Array, given: Array, now: Array, out: Array
     ) -> Array:
-        """Repeat sources along time in some intervals: fills `heat` and `seen` there; all cells' y at the end."""
-        balance, coupled = self.balance, self.solved.coupled
+        """Repeat sources along time in some intervals: fills `seen` and `out` there; all cells' y at the end."""
+        balance, coupled, sources = self.balance, self.solved.coupled, self.solved.sources
         assert coupled is not None
-        n_places = len(coupled.borders.degC) - len(self.solved.sources)
-        borders, given = slice(part.start, part.stop + 1), heat[part].copy()
-        valid = (np.arange(part.start, part.stop + 1)[:, None] <= balance.inputs.n_intervals)[..., None, None]
+        borders, places = slice(part.start, part.stop + 1), slice(len(sources), alone.shape[2])
+        degC = coupled.borders.degC[: alone.shape[2] - len(sources)]
+        valid = (np.arange(borders.start, borders.stop)[:, None] <= balance.inputs.n_intervals)[..., None, None]
         for _ in range(ROUNDS):
-            ahead = Borders(coupled.borders.degC[:n_places] + 1j * STEP * seen[:, :, :n_places].transpose(2, 3, 1, 0))
-            for k in along:
-                watts = np.imag(self.solved.sources[k].watts(ahead, part)) / STEP
-                given[:, :, :, k] = watts.transpose(3, 2, 1, 0)
-            heat[part], y, then = answer.heat_W(part, alone[borders], given, now)
-            new = alone[borders] + y
+            ahead = Borders(degC + 1j * STEP * seen[:, :, places].transpose(2, 3, 1, 0))
+            for k, source in enumerate(sources):
+                if source.along:
+                    given[:, :, :, k] = np.imag(source.watts(ahead, part)).transpose(3, 2, 1, 0) / STEP
+            out[borders], then = answer.run(part, alone[borders], given, now)
+            new = alone[borders] + out[borders, :, : alone.shape[2]]
             gap = np.where(valid, np.abs(new - seen[borders]), 0.0).max(axis=(0, 1, 2))
             size = np.where(valid, np.abs(new), 0.0).max(axis=(0, 1, 2))
             seen[borders] = new

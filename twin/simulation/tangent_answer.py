@@ -17,10 +17,9 @@ Array = NDArray[np.float64]
 
 
 class Answer:
-    """Heat ``w = slope (seen + y) + given`` of k sources, y being what it makes of the temperatures seen.
+    """y of a linear network to heat ``w = slope (seen + y) + given`` of k sources, at outputs `matrix` (n_out, N).
 
-    `matrix` (n, N) are the places that the sources look at and `slope` (B, M, 2, k, n) their W/K at both ends of every
-    interval.
+    The sources look at the first n outputs, with `slope` (B, M, 2, k, n), W/K, at both ends of every interval.
     """
 
     def __init__(self, solved: Solved, matrix: Array, slope: Array) -> None:
@@ -36,22 +35,24 @@ class Answer:
         self.keeps = (shape * decay[:, None]) @ modes.inverse[0, regime]  # (pairs, N, N)
         self.of_start = shape @ (start_s[..., None] * modal)  # (pairs, N, k)
         self.of_end = shape @ (end_s[..., None] * modal)
-        loop = slope[:, :, 1] @ (matrix @ self.of_end)[self.number]
+        loop = slope[:, :, 1] @ (matrix[: slope.shape[-1]] @ self.of_end)[self.number]
         self.solution = np.linalg.inv(np.eye(loop.shape[-1]) - loop)  # (B, M, k, k)
 
-    def heat_W(self, part: slice, seen: Array, given: Array, now: Array) -> tuple[Array, Array, Array]:
-        """From y of all cells at the start of some intervals, `now` (B, N, Q): heat, y of the places, y at the end.
+    def run(self, part: slice, seen: Array, given: Array, now: Array, every: int = 1) -> tuple[Array, Array]:
+        """Outputs and, at the end, all cells of y from its cells `now` (B, N, Q) at the start of some intervals.
 
-        Time goes first: seen (m + 1, B, n, Q), given and heat (m, 2, B, k, Q), y (m + 1, B, n, Q).
+        Time goes first: seen (m + 1, B, n, Q), given (m, 2, B, k, Q), outputs (m // every + 1, B, n_out, Q).
         """
-        heat, y = np.empty_like(given), np.empty_like(seen)
-        y[0] = self.matrix @ now
+        n_seen, shown = seen.shape[2], self.matrix @ now
+        out = np.empty(((part.stop - part.start) // every + 1, *shown.shape))
+        out[0] = shown
         for i, m in enumerate(range(part.start, part.stop)):
             number = self.number[:, m]
-            heat[i, 0] = self.slope[:, m, 0] @ (seen[i] + y[i]) + given[i, 0]
-            ahead = self.keeps[number] @ now + self.of_start[number] @ heat[i, 0]
-            known = self.slope[:, m, 1] @ (seen[i + 1] + self.matrix @ ahead) + given[i, 1]
-            heat[i, 1] = self.solution[:, m] @ known
-            now = ahead + self.of_end[number] @ heat[i, 1]
-            y[i + 1] = self.matrix @ now
-        return heat, y, now
+            start_W = self.slope[:, m, 0] @ (seen[i] + shown[:, :n_seen]) + given[i, 0]
+            ahead = self.keeps[number] @ now + self.of_start[number] @ start_W
+            known_W = self.slope[:, m, 1] @ (seen[i + 1] + self.matrix[:n_seen] @ ahead) + given[i, 1]
+            now = ahead + self.of_end[number] @ (self.solution[:, m] @ known_W)
+            shown = self.matrix @ now
+            if (i + 1) % every == 0:
+                out[(i + 1) // every] = shown
+        return out, now
