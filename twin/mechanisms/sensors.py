@@ -132,13 +132,18 @@ def _weights(step_s: Array, lag_s: Array) -> tuple[Array, Array, Array]:
 
 def _filtered(seen: Array, kept: Array, before: Array, now: Array) -> Array:
     """The recursion where the weights hold for all time; one call for every lag among the parameter sets."""
+    if kept.size == 1:
+        return _of_one_lag(seen, kept.item(), before.item(), now.item())
     out = np.empty(seen.shape, np.result_type(seen, kept))
     for at in np.ndindex(kept.shape[:-1]):
         rows = tuple(slice(None) if n == 1 else i for i, n in zip(at, kept.shape[:-1], strict=True))
-        k, b, x = kept[(*at, 0)], before[(*at, 0)], seen[rows]
-        settled = (k + b) * x[..., :1]
-        out[rows] = lfilter([now[(*at, 0)], b], [1.0, -k], x, axis=-1, zi=settled)[0]
+        out[rows] = _of_one_lag(seen[rows], kept[(*at, 0)], before[(*at, 0)], now[(*at, 0)])
     return out
+
+
+def _of_one_lag(seen: Array, kept: complex, before: complex, now: complex) -> Array:
+    settled = (kept + before) * seen[..., :1]
+    return np.asarray(lfilter([now, before], [1.0, -kept], seen, axis=-1, zi=settled)[0])
 
 
 def _scanned(seen: Array, kept: Array, before: Array, now: Array) -> Array:

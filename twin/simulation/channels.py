@@ -5,7 +5,7 @@ Every law is passed in order with its tangents, if there are any: derivatives by
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -105,9 +105,8 @@ class Rows:
         return [self.air.borders(s, self.every) for s in range(self.air.steady_degC.shape[1])]
 
     def _call(self, law: Law, effect: str, seen: Array | None, degC: Mapping[str, Array], values: Array) -> Array:
-        rise_K = {role: t - t[..., :1] for role, t in degC.items()}
         driver = {role: self._drivers[c] for role, c in law.drivers.items()}
-        view = View(degC, rise_K, driver, self.time_s, self._clock_h, self._step_s)
+        view = View(degC, _Rises(degC), driver, self.time_s, self._clock_h, self._step_s)
         p = parameters_of(law, values, 2)
         method = getattr(law.mechanism, effect)
         return np.asarray(method(view, p) if seen is None else method(seen, view, p))
@@ -130,6 +129,22 @@ class Rows:
         steps = np.diff(self.time_s, axis=1)
         even = steps.size and np.ptp(steps) < 1e-6 * steps.max()
         return float(steps[0, 0]) if even else float("nan")
+
+
+@dataclass(frozen=True)
+class _Rises(Mapping[str, Array]):
+    """Temperatures less their first value, worked out for laws that ask."""
+
+    degC: Mapping[str, Array]
+
+    def __getitem__(self, role: str) -> Array:
+        return np.asarray(self.degC[role] - self.degC[role][..., :1])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.degC)
+
+    def __len__(self) -> int:
+        return len(self.degC)
 
 
 def watch(network: Network, places: Places) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.network import Edge
+from twin.network import Edge, Heat, Network
 from twin.simulation.air import effect_K, follows
 from twin.simulation.balance import Balance
 from twin.simulation.interval_means import bulge_K
@@ -54,11 +54,7 @@ class UnknownsOf:
         self.network, self.values = solved.balance.network, solved.balance.values
         self.bulge_K = bulge_K(solved, cells_degC[None])[0]
         self.shape = (*self.balance.inputs.valid.shape, 2)
-        self.edges = defaultdict(list)  # that a parameter changes, by its number
-        for edge in self.network.edges:
-            laws = [self.network.factors[k] for k in edge.factors]
-            for j in {k for k, _ in edge.conductance.powers}.union(*(law.parameters.values() for law in laws)):
-                self.edges[j].append(edge)
+        self.edges, self.heats = _by_parameter(self.network)
 
     def parameter(self, j: int) -> Unknown:
         """By a parameter's value, in its own unit."""
@@ -86,9 +82,9 @@ class UnknownsOf:
         return out
 
     def _capacities(self, out: Unknown, j: int) -> None:
-        slopes = np.array([c.slope(self.values, j)[0] for c in self.network.capacities])
-        if not slopes.any():
+        if not any(j == k for c in self.network.capacities for k, _ in c.powers):
             return
+        slopes = np.array([c.slope(self.values, j)[0] for c in self.network.capacities])
         out.ratio = slopes / self.balance.capacity_J_per_K[0]
         conductance = self.balance.conductance_W_per_K[0]
         for i in np.flatnonzero(slopes):
@@ -105,7 +101,7 @@ class UnknownsOf:
         by_name = {s.name: s for s in self.solved.sources if isinstance(s, HeatSource)}
         borders = self.solved.coupled.borders if self.solved.coupled is not None else None
         every = slice(0, self.shape[1])
-        for heat in self.network.heats:
+        for heat in self.heats[j]:
             in_law = any(j in law.parameters.values() for law in (heat.law, *heat.factors))
             in_share = heat.direction_slope(j)
             for values in [stepped(self.values, j)] * in_law + [self.values] * bool(in_share.any()):
@@ -151,6 +147,21 @@ class UnknownsOf:
 
     def _add(self, out: Unknown, direction: Array, series: Array) -> None:
         out.pairs.append((np.repeat(direction[None], self.balance.regimes.count, axis=0), series))
+
+
+def _by_parameter(network: Network) -> tuple[dict[int, list[Edge]], dict[int, list[Heat]]]:
+    """The edges and the heats that each parameter changes, by its number."""
+    edges: dict[int, list[Edge]] = defaultdict(list)
+    heats: dict[int, list[Heat]] = defaultdict(list)
+    for edge in network.edges:
+        laws = [network.factors[k] for k in edge.factors]
+        for j in {k for k, _ in edge.conductance.powers}.union(*(law.parameters.values() for law in laws)):
+            edges[j].append(edge)
+    for heat in network.heats:
+        shares = {o.share for o in heat.outlets if o.share is not None}
+        for j in shares.union(*(law.parameters.values() for law in (heat.law, *heat.factors))):
+            heats[j].append(heat)
+    return edges, heats
 
 
 def edge_slope(balance: Balance, edge: Edge, j: int) -> Array:
