@@ -19,7 +19,7 @@ from twin.quantity import Spec
 CAPACITY = Spec("capacity", "A*h", "charge at the last of the evenly spaced points", 3.0, 0.01, 1e-3, 1e4)
 START = Spec("start", "A*h", "charge drawn before the batch begins", 0.0, 0.05, -1e4, 1e4, "linear")
 VOLTAGES = (4.1, 4.05, 3.95, 3.8, 3.7, 3.6, 3.5, 3.2)  # usual for a nickel-rich lithium-ion cell
-STRAINS, STRAINS_PER_K = 8, 5  # points beyond charge 0, where the strain counts as 0, and points from charge 0
+STRAINS, STRAINS_PER_K = 12, 5  # points beyond charge 0, where the strain counts as 0, and points from charge 0
 
 
 class VoltageLossHeat(Mechanism):
@@ -62,8 +62,8 @@ class ChargeStrain(Mechanism):
 
     key = "charge_strain"
     words = "growth of a cell with the charge drawn"
-    equation = "strain = f(q) + θ g(q), q = start - integral of I dt; splines through 0, f1 … f8 and g0 … g4"
-    source = "Louli, Ellis and Dahn 2019, Joule 3, 745: volume over charge; linear thermal expansion beside it"
+    equation = "strain = f(q) + θ g(q), q = start - integral of I dt; splines through 0, f1 … f12 and g0 … g4"
+    source = "Louli, Ellis and Dahn 2019, Joule 3, 745: pressure over charge; linear thermal expansion beside it"
     signature = "the same course over the charge at every rate, and not over time or temperature"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = {"current": "A"}

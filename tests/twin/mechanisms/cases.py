@@ -133,7 +133,7 @@ def _voltage_loss(q: SimpleNamespace) -> Any:
 
 def _charge_strain(q: SimpleNamespace) -> Any:
     drawn = q.start - q.current * q.t
-    f = _through(q, drawn, [0 * q.f1, *(getattr(q, f"f{k}") for k in range(1, 9))])
+    f = _through(q, drawn, [0 * q.f1, *(getattr(q, f"f{k}") for k in range(1, 13))])
     return f + q.rise_body * _through(q, drawn, [getattr(q, f"g{k}") for k in range(5)])
 
 
@@ -178,7 +178,7 @@ CASES: Mapping[str, Case] = {
     "voltage_loss_heat": Case(_voltage_loss, {f"u{k}": 3.4 for k in range(8)}, {"capacity": 30.0, "start": 28.0}),
     "charge_strain": Case(
         _charge_strain,
-        {**{f"f{k}": 0.0 for k in range(1, 9)}, **{f"g{k}": 0.0 for k in range(5)}},
+        {**{f"f{k}": 0.0 for k in range(1, 13)}, **{f"g{k}": 0.0 for k in range(5)}},
         {"capacity": 30.0, "start": 28.0},
     ),
     "column_bending": Case(None, {"gain": 0.0}),

@@ -61,7 +61,7 @@ def joint_slip(m: Mechanism) -> None:
 
 
 def charge_strain(m: Mechanism) -> None:
-    shape = usual(m, **{f"f{k}": 300.0 * np.sin(0.4 * k) for k in range(1, 9)})
+    shape = usual(m, **{f"f{k}": 300.0 * np.sin(0.27 * k) for k in range(1, 13)})
 
     def strain(current_A: float, rise_K: float = 0.0) -> Array:
         time_s = np.linspace(0.0, 3600.0 * 2.9 / current_A, 200)
