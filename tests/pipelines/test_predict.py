@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 from data.errors import InputError
@@ -18,6 +19,7 @@ from models.base import Family
 from pipelines import model_store, registry, tracking
 from pipelines.predict import load_model, predict_file
 from pipelines.promotion import choose
+from tests.models.twin_year import recording, two_errors
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +132,20 @@ def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
 
 @pytest.mark.parametrize("key", list(FAMILIES))
 def test_every_family_is_stored_without_loss(key, tmp_path):
-    batches = toy_batches("toy-family", 5)
     cls = FAMILIES[key]
-    fitted = cls().fit(batches[:4], ("front", "bed") if cls.uses_inputs else (), "z")
-    model_store.save(tmp_path, fitted, machine_yaml("toy-family"), {})
+    if cls.needs_twin:
+        machine, sensors = two_errors(), ("t_shaft", "t_head")
+        batches = [recording(machine, k) for k in range(5)]
+        text = yaml.safe_dump(machine.model_dump(mode="json", exclude_none=True), sort_keys=False)
+    else:
+        machine, sensors, batches, text = (
+            None,
+            ("front", "bed"),
+            toy_batches("toy-family", 5),
+            machine_yaml("toy-family"),
+        )
+    fitted = cls().fit(batches[:4], sensors if cls.uses_inputs else (), "z", machine)
+    model_store.save(tmp_path, fitted, text, {})
     model = model_store.load(tmp_path)
     assert np.array_equal(model.predict(batches[4]), fitted.predict(batches[4]), equal_nan=True)
     assert model.family.n_parameters() == fitted.n_parameters()
