@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,16 @@ def test_every_kind_of_parameter() -> None:
     few = [j for j, q in zip(numbers, gap, strict=True) if q > 1e-4]  # strong feedback: second order, as the simulation
     finer = gaps(net, inputs.refined(4), at(25, net), few)
     np.testing.assert_allclose(gap[[numbers.index(j) for j in few]] / finer, 4, rtol=0.15)
+
+
+def test_behind_the_end_of_a_short_batch_derivatives_hold_like_readings() -> None:
+    net = everything()
+    time_s = np.arange(0, 7201.0, 60.0)
+    inputs = drive(time_s, rpm=4000.0, room=20 + time_s / 7200, n_batches=2)
+    inputs = replace(inputs, n_intervals=np.array([120, 47]))
+    names = [p.name for p in net.parameters]
+    numbers = [j for j, name in enumerate(names) if net.values[j] != 0 and not name.startswith("mechanisms.gate")]
+    assert gaps(net, inputs, at(25, net), numbers).max() < 4e-3
 
 
 def test_starts_and_offsets_are_each_batchs_own() -> None:

@@ -1,8 +1,8 @@
 """Forward sensitivities: how every channel changes with every parameter, start temperature and offset.
 
 The derivative of the heat balance is a heat balance with other heat: all unknowns are right-hand sides of one linear
-run with the simulation's own modes (Tomovic and Vukobratovic 1972, General Sensitivity Theory). What multiplies a
-temperature is linear within an interval, so derivatives are of second order in it, like the simulation itself.
+run with the simulation's own modes (Tomovic and Vukobratovic 1972, General Sensitivity Theory), and heat answers to
+them interval by interval (`tangent_answer`). What multiplies a temperature is linear within an interval, so derivatives are of second order in it, like the simulation itself.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from twin.simulation.tangent_forcing import Unknown, UnknownsOf, few
 
 Array = NDArray[np.float64]
 
-RELATIVE = 1e-6  # to which the derivatives' own iteration converges
+RELATIVE = 1e-6  # to which derivatives of heat that needs the past converge
 ROUNDS = 60
 
 
@@ -185,13 +185,13 @@ class _Tangents:
 
     def _slopes(self, source: Source, slope: Array, given: Array) -> None:
         """Fill in a point-by-point source's W/K at its places, and its heat by derivatives of surroundings."""
-        coupled, every = self.solved.coupled, slice(0, self.balance.inputs.valid.shape[1])
+        coupled, part = self.solved.coupled, slice(0, self.balance.inputs.valid.shape[1])
         assert coupled is not None
         if source.along:
             return
-        for place, watts in source.slopes(coupled.borders, every).items():
+        for place, watts in source.slopes(coupled.borders, part).items():
             slope[..., place] = np.moveaxis(watts[0], 1, 2)
-        for s, watts in source.surrounding_slopes(coupled.borders, every).items():
+        for s, watts in source.surrounding_slopes(coupled.borders, part).items():
             for i, q in enumerate(self.thermal):
                 if s in self.unknowns[q].air_K:
                     by_air = np.moveaxis(watts[0], 1, 2) * self.unknowns[q].air_K[s]

@@ -24,16 +24,17 @@ class Answer:
 
     def __init__(self, solved: Solved, matrix: Array, slope: Array) -> None:
         balance, modes = solved.balance, solved.response.modes
-        schedule = balance.schedule
+        schedule, valid = balance.schedule, balance.inputs.valid
         self.matrix, self.slope = matrix, slope
-        pairs, number = np.unique(schedule.regime * len(schedule.step_s) + schedule.step, return_inverse=True)
-        self.number = number.reshape(schedule.regime.shape)  # of each interval's regime and step
-        regime, dt_s = pairs // len(schedule.step_s), schedule.step_s[pairs % len(schedule.step_s), None]
-        decay, start_s, end_s = first_order_hold(modes.rate_per_s[0, regime], dt_s)
+        kind = np.where(valid, schedule.regime * len(schedule.step_s) + schedule.step, -1)
+        kinds, number = np.unique(kind, return_inverse=True)
+        self.number = number.reshape(kind.shape)  # of each interval's regime and step
+        regime, dt_s = kinds // len(schedule.step_s), schedule.step_s[kinds % len(schedule.step_s), None]
+        decay, start_s, end_s = first_order_hold(modes.rate_per_s[0, regime], dt_s * (kinds >= 0)[:, None])
         shape = modes.shape[0, regime]
         modal = (outlets(balance, solved.sources)[0, regime] @ shape).swapaxes(-1, -2)
-        self.keeps = (shape * decay[:, None]) @ modes.inverse[0, regime]  # (pairs, N, N)
-        self.of_start = shape @ (start_s[..., None] * modal)  # (pairs, N, k)
+        self.keeps = (shape * decay[:, None]) @ modes.inverse[0, regime]  # (kinds, N, N); behind the end all of it
+        self.of_start = shape @ (start_s[..., None] * modal)  # (kinds, N, k)
         self.of_end = shape @ (end_s[..., None] * modal)
         loop = slope[:, :, 1] @ (matrix[: slope.shape[-1]] @ self.of_end)[self.number]
         self.solution = np.linalg.inv(np.eye(loop.shape[-1]) - loop)  # (B, M, k, k)
