@@ -32,14 +32,21 @@ class Air:
 
     def ends(self, s: int, part: slice = slice(None)) -> Array:
         """Temperature of surrounding s (P, B, M, 2) in some intervals."""
-        follow, steady = self.follow[:, s, None, None, None], self.steady_degC[:, s, None, None, None]
-        out: Array = follow * self.recorded_degC[s][:, part] + steady
-        return out if self.extra_K is None else out + self.extra_K[:, s][:, :, part]
+        extra = None if self.extra_K is None else self.extra_K[:, s][:, :, part]
+        return self._sum(s, self.recorded_degC[s][:, part], extra)
 
     def borders(self, s: int, every: int = 1) -> Array:
         """The same at the interval borders ``::every`` (P, B, K): where it jumps, as it was before the jump."""
-        ends = self.ends(s)
-        return np.concatenate([ends[:, :, :1, 0], ends[..., 1]], axis=-1)[..., ::every]
+
+        def before(ends: Array) -> Array:
+            return np.concatenate([ends[..., :1, 0], ends[..., 1]], axis=-1)[..., ::every]
+
+        return self._sum(s, before(self.recorded_degC[s]), None if self.extra_K is None else before(self.extra_K[:, s]))
+
+    def _sum(self, s: int, recorded_degC: Array, extra_K: Array | None) -> Array:
+        axes = (slice(None), s, *(None,) * recorded_degC.ndim)
+        out: Array = self.follow[axes] * recorded_degC + self.steady_degC[axes]
+        return out if extra_K is None else out + extra_K
 
 
 def air_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | None = None) -> Air:

@@ -2,7 +2,8 @@
 
 The derivative of the heat balance is a heat balance with other heat: all unknowns are right-hand sides of one linear
 run with the simulation's own modes (Tomovic and Vukobratovic 1972, General Sensitivity Theory), and heat answers to
-them interval by interval (`tangent_answer`). What multiplies a temperature is linear within an interval, so derivatives are of second order in it, like the simulation itself.
+them interval by interval (`tangent_answer`). What multiplies a temperature is linear within an interval, so
+derivatives are of second order in it, like the simulation itself.
 """
 
 from __future__ import annotations
