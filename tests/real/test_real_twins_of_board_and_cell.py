@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import ArrayLike
 
 from data.batch import Batch
 from data.checks import check_batch, check_machine
@@ -60,8 +61,8 @@ def predicted(machine: Machine, fitted: Batch, other: Batch) -> list[float]:
     return [rms(error[problem.measured[0].channel == c]) for c in range(2)]
 
 
-def rms(error: object) -> float:
-    return math.sqrt(float(np.mean(np.square(error))))
+def rms(error: ArrayLike) -> float:
+    return math.sqrt(float(np.mean(np.asarray(error, float) ** 2)))
 
 
 @pytest.mark.parametrize("name", ["tclab_board", "cell_30q"])
