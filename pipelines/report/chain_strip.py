@@ -40,17 +40,19 @@ def chain_strip(fig: Figure, chains: Sequence[ChainView], height_in: float) -> N
     zero = _LEFT_IN + left * scale
     unit = "m" if metres else f"{_unit(chains[0].unit)}/K"
     ax.plot([0.3, width - 0.3], [height_in - 0.05] * 2, color="#d5dbe1", lw=0.8)
-    words = f"Error chains, lengths in {unit}" if metres else f"Error chains in {unit}"
+    drawn = any(sides)  # errors of laws alone have no lengths to draw
+    words = "Errors" if not drawn else f"Error chains, lengths in {unit}" if metres else f"Error chains in {unit}"
     say(ax, (0.3, height_in - 0.24), words, 8.5, INK, ha="left", fontweight="bold")
-    say(ax, (zero - 0.1, height_in - 0.24), "◂ −", 7.5, SOFT, ha="right")
-    say(ax, (zero + 0.1, height_in - 0.24), "+ ▸", 7.5, SOFT, ha="left")
+    if drawn:
+        say(ax, (zero - 0.1, height_in - 0.24), "◂ −", 7.5, SOFT, ha="right")
+        say(ax, (zero + 0.1, height_in - 0.24), "+ ▸", 7.5, SOFT, ha="left")
+        ax.plot([zero, zero], [0.12, height_in - _HEAD_IN + 0.06], color=INK, lw=1.0, zorder=6)
     for k, (c, row) in enumerate(zip(chains, sides, strict=True)):
         y = height_in - _HEAD_IN - _ROW_IN * (k + 0.5) + 0.06
         color = CHAINS[k % len(CHAINS)]
         say(ax, (0.3, y), c.channel, 10, color, ha="left", fontweight="bold")
         _bars(ax, c, row, zero, scale, y, color)
-        _side_words(ax, c, row, metres, width - tilt_in, y)
-    ax.plot([zero, zero], [0.12, height_in - _HEAD_IN + 0.06], color=INK, lw=1.0, zorder=6)
+        _side_words(ax, c, row, metres, width - tilt_in if drawn else _LEFT_IN + width_in(c.channel, 10), y)
 
 
 def _values(c: ChainView, metres: bool) -> list[float]:
@@ -83,7 +85,7 @@ def _side_words(ax: Axes, c: ChainView, row: Sequence[float], metres: bool, x: f
         lines.append("closes: both sides are equal" if closed else f"open by {number(total, 3, sign=True)} m")
     for hot, cold, gain in c.tilts:
         lines.append(f"tilt {number(gain, 2, sign=True)} {_unit(c.unit)}/K × ({hot} − {cold})")
-    lines += [f"and {name}" for name in c.also]
+    lines += [f"and {name}" if lines else name for name in c.also]
     for k, text in enumerate(lines):
         say(ax, (x, y + 0.13 * ((len(lines) - 1) / 2 - k)), text, 7.6, SOFT, ha="left")
 

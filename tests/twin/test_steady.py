@@ -48,10 +48,11 @@ def test_what_is_missing_or_misspelt_is_told() -> None:
         steady_state(net, {"rpm": 1.0}, {"floor": 20.0})
 
 
-def test_a_body_that_only_radiates_needs_an_exposure() -> None:
-    net = network(
-        exposures={},
-        mechanisms__glow={"law": "radiation", "at": {"body": "head", "surrounding": "room"}, "into": "head"},
-    )
-    with pytest.raises(InputError, match="needs a conductance from every body to a surrounding"):
-        steady_state(net, {"rpm": 1000.0}, 20.0)
+def test_a_body_that_only_radiates_settles_where_it_radiates_its_heat() -> None:
+    glow = {"law": "radiation", "at": {"body": "head", "surrounding": "room"}, "into": "head"}
+    net = network(exposures={}, mechanisms__glow=glow)
+    found = steady_state(net, {"rpm": 6000.0}, 20.0)
+    watts = dict(zip([h.law.name for h in net.heats], found.heat_W, strict=True))
+    assert watts["belt"] == pytest.approx(120.0)
+    assert watts["glow"] == pytest.approx(-120.0, abs=1e-6)
+    assert found.degC[1] > 40.0

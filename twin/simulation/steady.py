@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from twin.simulation.law_calls import heat_W, parameters_of
 
 Array = NDArray[np.float64]
 
-_STEPS, _CLOSE_K, _SINGULAR = 200, 1e-9, 1e-13
+_STEPS, _CLOSE_K, _SINGULAR, _TINY = 60, 1e-9, 1e-13, 1e-30
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def steady_state(
 ) -> Steady:
     """The steady state at held drivers, with every surrounding at a temperature; laws of time see time 0.
 
-    Heat that depends on temperature is found by repetition, at most 200 times, to 1e-9 K.
+    Newton steps with derivatives by the complex step, shortened where they would not help, to 1e-9 K.
 
     Raises:
         InputError: a driver or surrounding of another name or without a value, or a state that does not settle.
@@ -51,28 +52,36 @@ def steady_state(
                 f"machine {network.machine}: no driver {name!r} in the twin; {closest(name, network.drivers)}"
             )
     degC = np.full(network.n_cells, float(np.mean(air)) if len(air) else 20.0)
-    factor = np.array([float(_called(law, "factor", values, drivers, degC, air)) for law in network.factors])
+    factor = np.array([np.real(_called(law, "factor", values, drivers, degC, air)) for law in network.factors])
     conductance = network.conductance_W_per_K(values, factor[None])[0]
-    if np.linalg.cond(conductance) > 1.0 / _SINGULAR:
-        raise InputError(
-            f"machine {network.machine}: the steady state needs a conductance from every body to a surrounding, not "
-            "only heat that depends on temperature; add an exposure"
-        )
     known = air @ network.surrounding_W_per_K(values, factor[None])[0]
     direction = np.array([h.direction(values)[0] for h in network.heats]).reshape(-1, network.n_cells)
+
+    def watts(degC: Array) -> Array:
+        return np.array([_watts(network, k, values, drivers, degC, air) for k in range(len(network.heats))])
+
+    def excess_W(degC: Array) -> Array:
+        return known - conductance @ degC + watts(degC) @ direction
+
+    now = excess_W(degC)
     for _ in range(_STEPS):
-        watts = np.array([_watts(network, k, values, drivers, degC, air) for k in range(len(network.heats))])
-        following = np.linalg.solve(conductance, known + watts @ direction)
-        change = float(np.abs(following - degC).max())
-        if not np.isfinite(change):
-            break
-        degC = 0.5 * degC + 0.5 * following  # half a step: friction that falls as it warms would swing
-        if change < _CLOSE_K:
+        slope = np.stack([np.imag(excess_W(degC + 1j * _TINY * e)) / _TINY for e in np.eye(network.n_cells)], axis=1)
+        if np.linalg.cond(slope) > 1.0 / _SINGULAR:
+            raise InputError(
+                f"machine {network.machine}: no steady state: some body has no path to a surrounding; add an exposure"
+            )
+        step = np.linalg.solve(slope, -now)
+        for share in 0.5 ** np.arange(20):
+            after = excess_W(degC + share * step)
+            if np.linalg.norm(after) < np.linalg.norm(now) or np.abs(share * step).max() < _CLOSE_K:
+                break
+        degC, now = degC + share * step, after
+        if np.abs(share * step).max() < _CLOSE_K:
             edges = np.array([float(network.edge_W_per_K(e, values, factor[None])[0]) for e in network.edges])
-            return Steady(degC, air, watts, factor, edges)
+            return Steady(degC, air, np.real(watts(degC)), factor, edges)
     raise InputError(
-        f"machine {network.machine}: the steady state does not settle (still {change:.2g} K after {_STEPS} steps); "
-        "look for heat that grows with temperature"
+        f"machine {network.machine}: the steady state does not settle (still {np.abs(now).max():.2g} W off after "
+        f"{_STEPS} steps); look for heat that grows with temperature"
     )
 
 
@@ -86,11 +95,11 @@ def _surroundings(network: Network, given: float | Mapping[str, float]) -> Array
     return np.array([float(given[n]) for n in names])
 
 
-def _watts(network: Network, k: int, values: Array, drivers: Mapping[str, float], degC: Array, air: Array) -> float:
+def _watts(network: Network, k: int, values: Array, drivers: Mapping[str, float], degC: Array, air: Array) -> Any:
     def call(law: Law, effect: str) -> Array:
         return _called(law, effect, values, drivers, degC, air)
 
-    return float(heat_W(network.heats[k], call))
+    return heat_W(network.heats[k], call)
 
 
 def _called(law: Law, effect: str, values: Array, drivers: Mapping[str, float], degC: Array, air: Array) -> Array:
@@ -101,4 +110,4 @@ def _called(law: Law, effect: str, values: Array, drivers: Mapping[str, float], 
     driver = {role: np.array([float(drivers[c])]) for role, c in law.drivers.items()}
     view = View(seen, rise, driver, np.zeros(1), np.zeros(1), 1.0)
     p = {name: v[0] for name, v in parameters_of(law, values, 1).items()}
-    return np.asarray(getattr(law.mechanism, effect)(view, p), float).reshape(-1)[0]
+    return np.asarray(getattr(law.mechanism, effect)(view, p)).reshape(-1)[0]
