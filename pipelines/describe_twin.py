@@ -129,7 +129,7 @@ def _print(table: Table) -> None:
     shown = Shown(box=SIMPLE_HEAD, title=table.caption, title_justify="left", title_style="bold", pad_edge=False)
     for c in table.columns:
         heading = f"{c.title} ({c.unit})" if c.unit else c.title
-        shown.add_column(escape(heading), justify="right" if c.kind == "number" else "left")
+        shown.add_column(escape(heading), justify="right" if c.kind == "number" else "left", overflow="fold")
     for row in table.rows:
         shown.add_row(*(escape(str(cell)) for cell in row.cells))
     screen.out.print(shown)
