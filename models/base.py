@@ -35,6 +35,7 @@ class Family(ABC):
     closed_form: ClassVar[bool] = True  # False: iterative, so the grid takes a stated few n_tsp
     rowwise: ClassVar[bool] = True  # a prediction at a row needs that row alone (sklearn's checks apply)
     needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
+    shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work
     on_request: ClassVar[bool] = False  # True: slow, so the grid takes it only where it is named
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from threading import Lock
 from types import TracebackType
 from typing import Self
 
@@ -29,27 +30,36 @@ class Workers:
 
     Most of a small fit's time is Python's own, so threads would take turns; processes do not. They are spawned, never
     forked: a fork of a process that runs threads (an orchestrator's, OpenMP's) can hang. What a family raises is raised
-    here. Results do not depend on n.
+    here. Results do not depend on n. Families that share work over the error channels have one process more, all in it.
     """
 
     def __init__(self, crossings: Mapping[str, Crossing], n: int) -> None:
         self._crossings = crossings
-        self._pool: ProcessPoolExecutor | None = None
-        if n > 1:
-            self._pool = ProcessPoolExecutor(n, get_context("spawn"), _start, (dict(crossings),))
+        self._pool = _processes(n, crossings) if n > 1 else None
+        self._sharing: ProcessPoolExecutor | None = None
+        self._lock = Lock()
 
     def cross(self, job: tuple[str, str]) -> FamilyResult:
         """`cross_family` of (error channel, family); waits for it."""
         if self._pool is None:
             return cross_family(self._crossings[job[0]], job[1])
-        return self._pool.submit(_cross, job).result()
+        return self._pool_of(job).submit(_cross, job).result()
+
+    def _pool_of(self, job: tuple[str, str]) -> ProcessPoolExecutor:
+        assert self._pool is not None
+        if not FAMILIES[job[1]].shares_targets:
+            return self._pool
+        with self._lock:
+            self._sharing = self._sharing or _processes(1, self._crossings)
+            return self._sharing
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        for pool in (self._pool, self._sharing):
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
 
 
 def workers_for(families: Sequence[str]) -> int:
@@ -58,8 +68,13 @@ def workers_for(families: Sequence[str]) -> int:
 
 
 def jobs_of(plan: Plan, targets: Sequence[str]) -> list[tuple[str, str]]:
-    """(error channel, family) pairs, the slow, iterative families first, so that none of them is alone at the end."""
-    return [(t, f) for f in sorted(plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
+    """(error channel, family) pairs, the slow, iterative families first, so that none of them is alone at the end.
+
+    Of families that share work over the error channels one goes before all others; those that wait for it come last.
+    """
+    jobs = [(t, f) for f in sorted(plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
+    sharing = [(t, f) for f in plan.families if FAMILIES[f].shares_targets for t in targets]
+    return [*sharing[:1], *(j for j in jobs if j not in sharing), *sharing[1:]]
 
 
 def run_grid(
@@ -146,6 +161,10 @@ def _subset_table(crossing: Crossing) -> pd.DataFrame:
                 for n in n_all if SELECTORS[selector].takes_n_tsp else n_all[-1:]:
                     rows.append((protocol, selector, n, fold.name, "|".join(crossing.inputs(selector, fold.train, n))))
     return pd.DataFrame(rows, columns=["protocol", "selector", "n_tsp", "fold", "inputs"])
+
+
+def _processes(n: int, crossings: Mapping[str, Crossing]) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(n, get_context("spawn"), _start, (dict(crossings),))
 
 
 def _start(crossings: Mapping[str, Crossing]) -> None:

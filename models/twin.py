@@ -41,6 +41,7 @@ class Twin(Family):
     uses_inputs = False
     rowwise = False
     needs_twin = True
+    shares_targets = True
     rank = 30
 
     def __init__(self, every_s: float = 300.0, channels: tuple[str, ...] = (), start: str = "usual") -> None:

@@ -14,6 +14,7 @@ from features.design import Design
 from models import FAMILIES
 from models.base import Family, family_from_plain
 from models.crossing import Plan, cross_family, prepare
+from models.grid import jobs_of
 from models.twin import Twin
 from models.twin_folds import Calibrations
 from models.twin_kalman import TwinKalman
@@ -237,6 +238,12 @@ def test_a_plan_takes_the_twin_where_the_machine_file_has_one():
     assert set(usual) - set(without) == {"twin", "twin_residual"}
     assert without == Plan().suited(None).families == tuple(k for k in FAMILIES if not FAMILIES[k].needs_twin)
     assert Plan(families=("twin_kalman",)).suited(MACHINE).families == ("twin_kalman",)
+
+
+def test_the_grid_starts_with_one_job_of_the_twin_and_ends_with_those_that_share_its_work():
+    jobs = jobs_of(Plan(families=("zero", "twin", "bp", "twin_residual")), ("z", "x"))
+    assert jobs[0] == ("z", "twin") and set(jobs[1:5]) == {(t, f) for t in "zx" for f in ("bp", "zero")}
+    assert jobs[5:] == [("x", "twin"), ("z", "twin_residual"), ("x", "twin_residual")]
 
 
 def test_the_grid_crosses_them():
