@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipelines import cli
+from pipelines import cli, screen
 from pipelines.describe_twin import describe_twin
 from tests.twin.machines import TWO_BODIES
 
@@ -38,7 +38,7 @@ def two(tmp_path: Path) -> Path:
 
 
 def test_tables_and_picture_of_the_sample_machine(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "220")
+    monkeypatch.setattr(screen.out, "width", 220)  # whatever an earlier test has seen of the terminal
     out = tmp_path / "network.svg"
     code, said, err = call("--twin", MACHINES / "sample_vmc.yml", "--at", "spindle_rpm=6 krpm", "--out", out)
     assert code == 0 and err == "" and out.read_text(encoding="utf-8").startswith("<?xml")
