@@ -1,4 +1,4 @@
-"""One tracking store for all tests of this folder: making it takes seconds."""
+"""One tracking store and one compiled sample machine for all tests of this folder: making them takes seconds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from data.machine import load_machine
+from twin.compile import compile_network, expanded
+from twin.network import Network
+from twin.schema import twin_part
+from twin.simulation.steady import steady_state
+from twin.views.overview import Overview, overview
+
+SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 
 
 @pytest.fixture(scope="session")
@@ -30,3 +39,17 @@ def store(store_home: Path) -> Iterator[object]:
         os.environ["THERMODRIFT_HOME"] = before
     tracking.open_store(settings)
     yield settings
+
+
+@pytest.fixture(scope="session")
+def network() -> Network:
+    """The sample machine's network."""
+    return compile_network(load_machine(SAMPLE))
+
+
+@pytest.fixture(scope="session")
+def view(network: Network) -> Overview:
+    """What its picture shows, at 4000 rpm."""
+    machine, drivers = load_machine(SAMPLE), {"spindle_rpm": 4000.0}
+    steady = steady_state(network, drivers, 20.0)
+    return overview(network, expanded(twin_part(machine)), machine.description, machine.simulated, steady, drivers)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from command import Call, in_process
 
 from data import sample_machine
 from data.batch import Batch
@@ -31,31 +29,12 @@ PLANS = ROOT / "docs" / "plans"
 HOUR = 360  # steps of 10 s
 
 
-@dataclass
-class Done:
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Done]
-
-
 @pytest.fixture
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
     """`thermodrift ARGS` in this process, in an empty folder, with a lake of its own."""
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-
-    def run(*args: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["thermodrift", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capsys.readouterr()
-        return Done(int(ended.value.code or 0), shown.out, shown.err)
-
-    return run
+    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture

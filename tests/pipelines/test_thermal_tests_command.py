@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from command import Call, in_process
 
 from data.batch import Batch
 from data.errors import InputError
 from data.lake import Lake
 from data.lakefile import content_digest, encode
 from data.machine import load_machine
-from pipelines import cli
 from pipelines.thermal_tests import write_thermal_tests
 from tests.twin.machines import TWO_BODIES
-
-
-@dataclass
-class Done:
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Done]
 
 
 @pytest.fixture
@@ -37,16 +24,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tm
     """`thermodrift ARGS` in this process, in an empty folder, with a lake of its own."""
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-
-    def run(*args: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["thermodrift", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        shown = capsys.readouterr()
-        return Done(int(ended.value.code or 0), shown.out, shown.err)
-
-    return run
+    return in_process(monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from toy_twin import batch, flows
 
 from data.errors import InputError
-from data.machine import load_machine
 from pipelines.report.chain_strip import by_length
 from pipelines.report.flow_figures import heat_stack
 from pipelines.report.flow_picture import flow_picture
@@ -24,28 +23,11 @@ from pipelines.report.network_glyphs import Rect
 from pipelines.report.network_picture import network_picture, picture_bytes
 from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
 from pipelines.report.twin_report import write_picture
-from twin.compile import compile_network, expanded
-from twin.network import Network
-from twin.schema import twin_part
-from twin.simulation.steady import steady_state
 from twin.views.compared import rms_table
 from twin.views.mode_words import ModeView
-from twin.views.overview import Overview, overview
+from twin.views.overview import Overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
-
-
-@pytest.fixture(scope="module")
-def network() -> Network:
-    return compile_network(load_machine(SAMPLE))
-
-
-@pytest.fixture(scope="module")
-def view(network: Network) -> Overview:
-    machine = load_machine(SAMPLE)
-    drivers = {"spindle_rpm": 4000.0}
-    steady = steady_state(network, drivers, 20.0)
-    return overview(network, expanded(twin_part(machine)), machine.description, machine.simulated, steady, drivers)
 
 
 @pytest.fixture(scope="module")

@@ -12,34 +12,17 @@ from toy_twin import batch, flows
 
 from data.batch import Batch
 from data.errors import InputError
-from data.machine import load_machine
 from pipelines.report import twin_tables
 from pipelines.report.twin_data import twin_data
 from pipelines.report.twin_report import TwinData, twin_page, worst, write_twin_report
 from tests.twin.machines import machine as two_bodies
 from twin.calibration.identifiability import Interval
-from twin.compile import compile_network, expanded
 from twin.network import Network
 from twin.quantity import Parameter
-from twin.schema import twin_part
-from twin.simulation.steady import steady_state
 from twin.views.mode_words import ModeView
-from twin.views.overview import Overview, overview
+from twin.views.overview import Overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
-
-
-@pytest.fixture(scope="module")
-def network() -> Network:
-    return compile_network(load_machine(SAMPLE))
-
-
-@pytest.fixture(scope="module")
-def view(network: Network) -> Overview:
-    machine = load_machine(SAMPLE)
-    drivers = {"spindle_rpm": 4000.0}
-    steady = steady_state(network, drivers, 20.0)
-    return overview(network, expanded(twin_part(machine)), machine.description, machine.simulated, steady, drivers)
 
 
 def test_a_parameter_is_told_with_prior_interval_and_what_it_rests_on(network: Network) -> None:
