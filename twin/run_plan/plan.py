@@ -60,11 +60,6 @@ class RunPlan:
     source: str = ""
 
     @property
-    def step_lengths_s(self) -> Array:
-        """Length of every interval, (n,), s."""
-        return np.diff(self.time_s)
-
-    @property
     def on_step(self) -> NDArray[np.bool_]:
         """Which of `time_s` are multiples of the step, (n + 1,): the rows of a regular table."""
         return np.abs(self.time_s / self.step_s - np.rint(self.time_s / self.step_s)) * self.step_s < 1e-5
