@@ -97,7 +97,7 @@ def train(
     recordings: Annotated[list[Path] | None, typer.Option(help="files or folders to ingest first")] = None,
     channels: Annotated[str, typer.Option(help="error channels, comma separated; default: all")] = "",
     selectors: Annotated[str, typer.Option(help="selectors, comma separated; default: all")] = "",
-    families: Annotated[str, typer.Option(help="model families, comma separated; default: all")] = "",
+    families: Annotated[str, typer.Option(help="model families, comma separated; default: what suits it")] = "",
     protocols: Annotated[str, typer.Option(help="protocols, comma separated; default: all")] = "",
     report: Annotated[Path | None, typer.Option(help="where the report goes")] = None,
     promote: Annotated[bool, typer.Option(help="promote the best cell")] = True,

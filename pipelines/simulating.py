@@ -12,11 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from data.atomic_file import write_atomic
 from data.batch import Batch
 from data.errors import InputError
 from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine, load_machine
-from pipelines.report.iso230_3 import _write_bytes, write_iso_report
+from pipelines.report.iso230_3 import write_iso_report
 from twin.compile import compile_network
 from twin.network import Network
 from twin.run_plan import RunPlan, load_run_plan
@@ -240,6 +241,6 @@ def _check_folder(folder: Path, files: Sequence[Path], overwrite: bool) -> None:
 
 def _write(file: Path, content: bytes) -> None:
     try:
-        _write_bytes(file, content)
+        write_atomic(file, content)
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror}); give another --out") from None

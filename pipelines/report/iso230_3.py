@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from uuid import uuid4
 
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field
 
+from data.atomic_file import write_atomic
 from data.batch import Batch
 from data.errors import InputError
 from pipelines.report.iso_figure import iso_figure, png
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.words import listed, number
-from pipelines.report.write import _environment, _write
+from pipelines.report.write import template_environment
 from twin.iso230_3 import ProbePair, ThermalTest, thermal_test
 from twin.iso230_3.kind import clock
 
@@ -100,11 +99,11 @@ def write_iso_report(
     embedded = base64.b64encode(picture).decode("ascii")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_bytes(folder / FILES[2], picture)
-        _write(folder / FILES[3], test.quantities.to_csv(index=False, lineterminator="\n"))
+        write_atomic(folder / FILES[2], picture)
+        write_atomic(folder / FILES[3], test.quantities.to_csv(index=False, lineterminator="\n"))
         for name in FILES[:2]:
-            template = _environment(name.endswith(".html")).get_template(f"iso230_3{Path(name).suffix}.j2")
-            _write(folder / name, template.render(page=shown, written=written, picture=embedded, file=FILES[2]))
+            template = template_environment(name.endswith(".html")).get_template(f"iso230_3{Path(name).suffix}.j2")
+            write_atomic(folder / name, template.render(page=shown, written=written, picture=embedded, file=FILES[2]))
     except OSError as error:
         raise InputError(f"report {folder}: cannot be written ({error.strerror}); give another folder") from None
     return folder / FILES[0]
@@ -183,15 +182,3 @@ def _temperatures(test: ThermalTest) -> Table:
         numbers = [number(v) for v in (begin, end, least, greatest)]
         rows.append(Row((str(record["channel"]), str(record["role"]), *numbers, number(end - begin, sign=True))))
     return Table("Temperatures over the stated period", columns, tuple(rows), test.simulated)
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    scratch = path.with_name(f".{path.name}.{uuid4().hex}.part")
-    try:
-        with scratch.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from data.atomic_file import write_atomic
 from data.errors import InputError
 from pipelines.report import twin_tables as tables
 from pipelines.report.flow_figures import heat_stack
@@ -18,7 +19,7 @@ from pipelines.report.flow_picture import flow_picture
 from pipelines.report.layout import Table
 from pipelines.report.network_picture import counted, network_picture, picture_bytes
 from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
-from pipelines.report.write import FORMATS, _environment, _write
+from pipelines.report.write import FORMATS, template_environment
 from twin.calibration.identifiability import Interval
 from twin.quantity import Parameter
 from twin.views.compared import Compared, rms_table
@@ -98,9 +99,10 @@ def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST
     html = path.suffix == ".html"
     page = twin_page(data, most_batches, pictures=html)
     written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    text = _environment(html).get_template(f"twin{path.suffix}.j2").render(page=page, written=written)
+    text = template_environment(html).get_template(f"twin{path.suffix}.j2").render(page=page, written=written)
     try:
-        _write(path, text)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text)
     except OSError as error:
         raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
     return path

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from uuid import uuid4
 
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from data.atomic_file import write_atomic
 from data.errors import InputError
 from pipelines.report.layout import Strip
 from pipelines.report.page import page
@@ -40,16 +39,17 @@ def write_report(trainings: Sequence[Training], path: Path, settings: Settings) 
     shown = page(trainings, settings)
     written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
     html = path.suffix == ".html"
-    text = _environment(html).get_template(f"report{path.suffix}.j2").render(page=shown, written=written)
+    text = template_environment(html).get_template(f"report{path.suffix}.j2").render(page=shown, written=written)
     try:
-        _write(path, text)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text)
     except OSError as error:
         raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
     return path
 
 
 @cache
-def _environment(html: bool) -> Environment:
+def template_environment(html: bool) -> Environment:
     env = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=html, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, keep_trailing_newline=True, finalize=None if html else _markdown,
@@ -66,16 +66,3 @@ def _environment(html: bool) -> Environment:
 def _markdown(value: object) -> object:
     """Names and words as they are: what Markdown would read as markup gets a backslash."""
     return _MARKDOWN.sub(r"\\\g<0>", value).replace("\n", " ") if isinstance(value, str) else value
-
-
-def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{uuid4().hex}.part")
-    try:
-        with scratch.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)

@@ -15,12 +15,13 @@ import pytest
 from plotly.offline import get_plotlyjs
 from report_training import HOSTILE, Maker, column, promotion, results, settings, table_after, training
 
+from data import atomic_file
 from data.errors import InputError
 from models.crossing import Plan
 from models.grid import run_grid
 from models.result import GridResult
 from pipelines.promotion import Choice, choose
-from pipelines.report import figure_pngs, write, write_report
+from pipelines.report import figure_pngs, write_report
 from pipelines.report.extracts import frequencies, left_out_batches, picked, scored
 from pipelines.report.layout import Scale
 from pipelines.report.records import changed_batches
@@ -297,7 +298,7 @@ def test_a_failure_leaves_the_old_report_whole(
     def broken(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(write.os, "fsync", broken)
+    monkeypatch.setattr(atomic_file.os, "fsync", broken)
     with pytest.raises(InputError, match="No space left on device"):
         write_report([training(results(toy_batches)["x"])], target, settings(tmp_path))
     assert target.read_text(encoding="utf-8") == before

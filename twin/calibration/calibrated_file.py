@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 
+from data.atomic_file import write_atomic
 from data.errors import InputError, WorkError
 from data.machine import parse_machine
 from twin.calibration.identifiability import Interval
@@ -81,17 +81,10 @@ def write_file(path: Path, text: str, source: Path, overwrite: bool = False) -> 
         WorkError: the file cannot be written.
     """
     check_target(path, source, overwrite)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        write_atomic(path, text)
     except OSError as error:
         raise WorkError(f"{path}: cannot be written ({error}); what stood there is unchanged") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_target(path: Path, source: Path, overwrite: bool = False) -> None:
