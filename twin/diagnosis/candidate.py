@@ -1,0 +1,52 @@
+"""A candidate: what may be missing and where, as a change of a machine file's twin part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from twin.quantity import Value
+from twin.schema import MechanismPart, TwinPart
+
+Kind = Literal["node", "link", "sensor", "error"]
+RIVALS = ("wrong_parameter", "coarse_network", "varies_between_runs")  # no mechanisms: what else explains a mismatch
+
+
+@dataclass(frozen=True)
+class Where:
+    """A place: a body or surrounding (node), a link or exposure (link), a sensor or an error channel."""
+
+    kind: Kind
+    name: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mechanism at one place, or a rival that needs no new physics.
+
+    `part` is the instance as a machine file would state it, every value fixed at `Spec.value`; `amplitudes` its
+    parameters that switch it off and the values at which they do; `shape` those that are freed beside them.
+    """
+
+    mechanism: str
+    where: Where
+    name: str  # unique; the instance's name in a machine file
+    words: str
+    part: MechanismPart | None = None
+    amplitudes: Mapping[str, float] = field(default_factory=dict)
+    shape: tuple[str, ...] = ()
+    fault: bool = False
+
+    def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
+        """The twin part with this candidate in it; `values` replace its parameters' own.
+
+        Raises:
+            ValueError: the name is taken, or a rival that has no instance.
+        """
+        if self.part is None:
+            raise ValueError(f"{self.name}: {self.mechanism} is no mechanism that a machine file can state")
+        if self.name in part.mechanisms:
+            raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")
+        given = self.part.model_copy(update={"parameters": {**self.part.parameters, **(values or {})}})
+        return part.model_copy(update={"mechanisms": {**part.mechanisms, self.name: given}})
