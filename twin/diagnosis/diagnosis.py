@@ -1,0 +1,49 @@
+"""A diagnosis: what was found, the network before and after, and the tables that a report shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from data.machine import Machine
+from twin.schema import TwinPart
+
+if TYPE_CHECKING:
+    from twin.diagnosis.findings import Findings
+
+# Left-out values throughout. Errors less their first sample, sensors in degC; gain in nats of left-out log score.
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "rms": ("batch", "channel", "unit", "rows", "before", "after", "floor"),
+    "series": ("batch", "channel", "unit", "time_s", "recorded", "before", "after"),
+    "acf": ("channel", "lag_s", "before", "after"),
+    "candidates": ("rank", "mechanism", "kind", "name", "words", "cluster", "gain", "improved", "batches", "absorbed",
+                   "amplitude", "unit", "probability"),
+    "map": ("kind", "place", "by", "label", "value", "unit", "z"),  # by: batch, regime, hour or since_start
+    "steps": ("step", "words", "gain", "threshold", "improved", "accepted"),
+    "refinements": ("what", "why", "before", "after"),
+    "limits": ("mechanism", "kind", "name", "words", "limit", "unit", "absorbed", "absorbed_by"),
+    "flux": ("kind", "place", "batch", "time_s", "value", "sd", "unit"),
+    "null": ("replicate", "gain", "floor"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that a report of a diagnosis consumes.
+
+    `part_before` is the refined and recalibrated baseline, `part_after` the same with what was found. `simulated`:
+    the recordings come from a simulation. `drafted`: the machine file had no twin part. `words` are remarks: what was
+    refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
+    """
+
+    machine: Machine
+    findings: Findings
+    part_before: TwinPart
+    part_after: TwinPart
+    simulated: bool
+    drafted: bool
+    words: tuple[str, ...]
+    tables: Mapping[str, pd.DataFrame]
