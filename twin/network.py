@@ -26,13 +26,18 @@ class Port:
 
 @dataclass(frozen=True)
 class Law:
-    """A mechanism at work: parameter numbers by name, driver channels and ports by the law's own names for them."""
+    """A mechanism at work: parameter numbers by name, driver channels and ports by the law's own names for them.
+
+    One `asleep` stands at values without effect: it costs a simulation nothing, and derivatives by its parameters are
+    what it would do. So a diagnosis looks at every candidate in one pass.
+    """
 
     name: str
     mechanism: Mechanism
     parameters: Mapping[str, int]
     drivers: Mapping[str, str]
     ports: Mapping[str, Port]
+    asleep: bool = False
 
     @property
     def temperature_dependent(self) -> bool:
@@ -56,6 +61,11 @@ class Heat:
     outlets: tuple[Outlet, ...]
     factors: tuple[Law, ...] = ()
     taken: Array | None = None
+
+    @property
+    def asleep(self) -> bool:
+        """Whether its watts do not count: some law of it is a candidate's."""
+        return self.law.asleep or any(f.asleep for f in self.factors)
 
     @property
     def temperature_dependent(self) -> bool:
@@ -186,7 +196,7 @@ class Network:
     @property
     def linear(self) -> bool:
         """Whether no heat depends on temperature."""
-        return not any(h.temperature_dependent for h in self.heats)
+        return not any(h.temperature_dependent and not h.asleep for h in self.heats)
 
     def index(self, name: str) -> int:
         """Number of a parameter.

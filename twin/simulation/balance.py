@@ -132,7 +132,7 @@ def _finer(
     network: Network, values: Array, inputs: Inputs, regimes: Regimes
 ) -> tuple[Regimes, Array, NDArray[np.int64], tuple[Heat, ...]]:
     """Regimes in which driven heats hold as well; their watts, the given regime of each, and the heats left over."""
-    driven = [h for h in network.heats if not h.temperature_dependent]
+    driven = [h for h in network.heats if not h.temperature_dependent and not h.asleep]
     held = [h for h in driven if not _timed(h)]
     number, first = distinct(
         inputs, [c for h in held for law in (h.law, *h.factors) for c in law.drivers.values()], regimes.of

@@ -55,13 +55,18 @@ class Rows:
 
     def law(self, law: Law, effect: str, seen: Array | None, tangents: Tangents | None, d_seen: Array | None) -> Any:
         """A law's effect (P, B, K) on what it sees, and, with tangents, its derivative (Q, B, K), else None."""
+        if law.asleep and tangents is None:
+            return seen if seen is not None else np.zeros((1, 1, 1)), None
         degC = {role: self._port(port) for role, port in law.ports.items()}
         shape = (len(self.values), *self.time_s.shape)
         out = np.broadcast_to(self._call(law, effect, seen, degC, self.values), shape)
         if tangents is None:
             return out, None
         d_out = np.zeros((tangents.degC.shape[1], *self.time_s.shape))
-        self._pass_on(law, effect, (seen, degC), (d_seen, self._tangents_of(law, tangents)), d_out)
+        if law.asleep:  # what it sees passes as it is
+            out, d_out = (out, d_out) if seen is None or d_seen is None else (seen, d_seen.copy())
+        else:
+            self._pass_on(law, effect, (seen, degC), (d_seen, self._tangents_of(law, tangents)), d_out)
         for j in set(law.parameters.values()) & set(tangents.parameters):
             moved = self._call(law, effect, seen, degC, stepped(self.values, j))
             d_out[tangents.parameters[j]] += np.broadcast_to(moved, shape)[0].imag / STEP

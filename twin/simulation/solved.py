@@ -14,7 +14,7 @@ from twin.simulation.channels import Rows, watch
 from twin.simulation.coupling import Coupled, outlets, plain_modes, solve
 from twin.simulation.inputs import Inputs
 from twin.simulation.response import Response, States
-from twin.simulation.sources import Places, Source, sources_of
+from twin.simulation.sources import HeatSource, Places, Source, sources_of
 from twin.simulation.start import excess_K
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ class Solved:
     response: Response
     coupled: Coupled | None
     states: States
+    asleep: Sequence[HeatSource] = ()  # heat of candidates, which does not count
 
 
 def solved_balance(
@@ -47,7 +48,7 @@ def solved_balance(
     The states of a linear network stand at every `every`-th border, of another at all of them.
     """
     balance, places = balance_of(network, values, inputs, offsets_K), Places()
-    sources = sources_of(balance, places)
+    sources, asleep = sources_of(balance, places)
     n_places = len(places.rows)
     watch(network, places)
     excess = excess_K(network, values, inputs)
@@ -56,12 +57,12 @@ def solved_balance(
     if not sources:
         response = Response(plain_modes(balance), balance.schedule)
         states = response.run(balance.forcing(response), start_degC, every)
-        return Solved(balance, sources, places, start_degC, response, None, states)
+        return Solved(balance, sources, places, start_degC, response, None, states, asleep)
     rows = np.array(places.rows[:n_places]).reshape(n_places, network.n_cells)
     coupled = solve(balance, sources, rows, start_degC, tolerance_K)
     response = Response(coupled.chord.modes, balance.schedule)
     heat = balance.forcing(response) + response.forcing(outlets(balance, sources), coupled.series_W)
-    return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC))
+    return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), asleep)
 
 
 def rows_of(solved: Solved, every: int, states_every: int) -> Rows:

@@ -213,9 +213,10 @@ class ExchangeSource:
         return np.repeat(self.excess_W_per_K[..., None, part], 2, axis=-2)
 
 
-def sources_of(balance: Balance, places: Places) -> list[Source]:
-    """All temperature-dependent heat of a balance; the places that it looks at join `places`."""
-    out: list[Source] = []
+def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[HeatSource]]:
+    """All temperature-dependent heat of a balance, and that asleep; the places that they look at join `places`."""
+    awake: list[Source] = []
+    asleep: list[HeatSource] = []
     for heat in balance.network.heats:
         if heat.temperature_dependent:
             numbers = {
@@ -224,8 +225,12 @@ def sources_of(balance: Balance, places: Places) -> list[Source]:
                 for role, port in law.ports.items()
                 if port.cells is not None
             }
-            out.append(HeatSource(balance, heat, numbers))
+            source = HeatSource(balance, heat, numbers)
+            if heat.asleep:
+                asleep.append(source)
+            else:
+                awake.append(source)
     for edge in balance.network.edges:
         if set(edge.factors) & set(balance.regimes.varying):
-            out.append(ExchangeSource(balance, edge, places.number(edge.direction)))
-    return out
+            awake.append(ExchangeSource(balance, edge, places.number(edge.direction)))
+    return awake, asleep

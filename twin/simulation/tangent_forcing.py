@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from twin.simulation.interval_means import bulge_K
 from twin.simulation.law_calls import STEP, stepped
 from twin.simulation.regimes import factor_series
 from twin.simulation.solved import Solved
-from twin.simulation.sources import HeatSource
+from twin.simulation.sources import Borders, HeatSource
 from twin.simulation.start import excess_K
 
 Array = NDArray[np.float64]
@@ -98,21 +99,28 @@ class UnknownsOf:
         self._add(out, edge.direction, slope[..., None] * lead)
 
     def _heats(self, out: Unknown, j: int) -> None:
-        by_name = {s.name: s for s in self.solved.sources if isinstance(s, HeatSource)}
-        borders = self.solved.coupled.borders if self.solved.coupled is not None else None
+        sources = [s for s in (*self.solved.sources, *self.solved.asleep) if isinstance(s, HeatSource)]
+        by_heat = {id(s.heat): s for s in sources}
         every = slice(0, self.shape[1])
         for heat in self.heats[j]:
             in_law = any(j in law.parameters.values() for law in (heat.law, *heat.factors))
             in_share = heat.direction_slope(j)
             for values in [stepped(self.values, j)] * in_law + [self.values] * bool(in_share.any()):
-                if heat.temperature_dependent and borders is not None:
-                    watts = np.moveaxis(by_name[heat.law.name].watts(borders, every, values), -2, -1)[0]
+                if heat.temperature_dependent:
+                    watts = np.moveaxis(by_heat[id(heat)].watts(self.borders, every, values), -2, -1)[0]
                 else:
                     watts = self.balance.driven_W(heat, values)[0]
                 if np.iscomplexobj(values):
                     self._add(out, heat.direction(self.values)[0], np.imag(watts) / STEP)
                 else:
                     self._add(out, in_share, watts)
+
+    @cached_property
+    def borders(self) -> Borders:
+        """What temperature-dependent heat sees."""
+        if self.solved.coupled is not None:
+            return self.solved.coupled.borders
+        return Borders(np.moveaxis(self.cells_degC @ np.array(self.solved.places.rows).T, -1, 0)[:, None])
 
     def _surroundings(self, out: Unknown, j: int) -> None:
         inputs = self.balance.inputs
@@ -158,6 +166,10 @@ def _by_parameter(network: Network) -> tuple[dict[int, list[Edge]], dict[int, li
         for j in {k for k, _ in edge.conductance.powers}.union(*(law.parameters.values() for law in laws)):
             edges[j].append(edge)
     for heat in network.heats:
+        if heat.asleep:  # its twin that is awake has the other parameters
+            for j in {k for law in (heat.law, *heat.factors) if law.asleep for k in law.parameters.values()}:
+                heats[j].append(heat)
+            continue
         shares = {o.share for o in heat.outlets if o.share is not None}
         for j in shares.union(*(law.parameters.values() for law in (heat.law, *heat.factors))):
             heats[j].append(heat)
