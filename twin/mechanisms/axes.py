@@ -25,6 +25,7 @@ class NutFriction(Mechanism):
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"feed": "mm/min"}
     parameters = (Spec("moment", "N*m", "friction moment", 0.5, 0.5, 0.0, 50.0), LEAD)
+    off: ClassVar[Mapping[str, float]] = {"moment": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         turns_per_min = size(view.driver["feed"]) / p["lead"]
@@ -55,6 +56,7 @@ class GuideFriction(Mechanism):
         Spec("friction", "1", "coefficient of friction mu", 0.01, 1.0, 0.0, 1.0),
         Spec("load", "N", "load F on the guides: weight and preload", 5000.0, 0.3, 1.0, 1e6),
     )
+    off: ClassVar[Mapping[str, float]] = {"friction": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         speed_m_per_s = size(view.driver["feed"]) / 60e3

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 Array = NDArray[Any]  # float64, or complex128 while a derivative is taken
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
+# Where a diagnosis looks for a port's temperature: at the place acted at, at each surrounding, at each body linked
+# with that place, at any other body, or at the places that the heat acted on goes into.
+PortRole = Literal["itself", "surrounding", "neighbour", "body", "outlet"]
+SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
+
 
 @dataclass(frozen=True)
 class View:
@@ -61,9 +66,25 @@ class Mechanism(ABC):
     parameters: ClassVar[tuple[Spec, ...]] = ()
     along_time: ClassVar[bool] = False  # True: the effect at a time needs the times before it (lag, slip, hysteresis)
 
+    # What a diagnosis needs
+    off: ClassVar[Mapping[str, float] | None]  # what scales the effect, at the values without one; None: nothing does
+    shape: ClassVar[tuple[str, ...]] = ()  # parameters that change its form in time or over drivers, not its size
+    ghost: ClassVar[Mapping[str, float]] = {}  # values at which a structural one hardly loads its neighbours
+    fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
+    port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
+    proposable: ClassVar[bool] = True  # False: no use as a candidate
+
     linear_reading: ClassVar[bool] = (
         False  # True: `reading` is a linear map of what is seen and the ports, plus a constant
     )
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Fills in the usual roles: at a node the first port is the node itself, and air is a surrounding."""
+        super().__init_subclass__(**kwargs)
+        itself = cls.ports[:1] if "node" in getattr(cls, "acts_at", ()) else ()
+        usual: dict[str, PortRole] = {port: "itself" for port in itself}
+        usual |= {port: "surrounding" for port in cls.ports if port in SURROUNDING_PORTS}
+        cls.port_roles = {**usual, **cls.port_roles}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         """Heat into the places of `into`, W. A law with ports is temperature-dependent."""

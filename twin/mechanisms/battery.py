@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from twin.mechanisms.analytic import steps_s
-from twin.mechanisms.base import Array, Mechanism, View
+from twin.mechanisms.base import Array, Mechanism, PortRole, View
 from twin.mechanisms.course import course
 from twin.quantity import Spec
 
@@ -44,6 +44,7 @@ class VoltageLossHeat(Mechanism):
             for k, value in enumerate(VOLTAGES)
         ),
     )
+    off = None  # its watts are the whole difference of two voltages
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         current_A = view.driver["current"]
@@ -82,6 +83,11 @@ class ChargeStrain(Mechanism):
             for k in range(STRAINS_PER_K)
         ),
     )  # fmt: skip
+    off: ClassVar[Mapping[str, float]] = {
+        **{f"f{k}": 0.0 for k in range(1, STRAINS + 1)},
+        **{f"g{k}": 0.0 for k in range(STRAINS_PER_K)},
+    }
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "body"}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
         step_s = np.diff(view.time_s, axis=-1)  # a row's driver is that of the interval which ends there

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from twin.mechanisms.analytic import power, size
-from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
 from twin.quantity import Spec
 
 W_PER_RPM_NMM = 1.047e-4
@@ -40,6 +40,7 @@ class BearingViscous(Mechanism):
         Spec("lubrication", "1", "Palmgren's f0: 1 to 2 grease, 1.7 oil mist, 3 to 6 oil", 1.0, 0.4, 0.0, 20.0),
         Spec("viscosity", "mm**2/s", "kinematic viscosity of the oil at work", 22.0, 0.5, 1.0, 1000.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"lubrication": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         n = size(view.driver["speed"])
@@ -69,6 +70,7 @@ class BearingLoad(Mechanism):
         Spec("load_factor", "1", "Palmgren's z", 0.001, 0.3, 0.0, 0.01),
         Spec("load_exponent", "1", "Palmgren's y", 0.33, 0.1, 0.1, 1.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"load_factor": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         stress = (p["preload"] / p["static_capacity"]) ** p["load_exponent"]
@@ -95,6 +97,8 @@ class ViscosityFeedback(Mechanism):
         Spec("slope", "1/K", "relative fall of the viscosity per kelvin", 0.035, 0.3, 0.0, 0.1),
         Spec("reference", "degC", "temperature at which the viscosity is stated", 40.0, 0.1, -20.0, 120.0, "linear"),
     )
+    off: ClassVar[Mapping[str, float]] = {"slope": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"oil": "outlet"}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(np.exp(-VISCOSITY_EXPONENT * p["slope"] * (view.degC["oil"] - p["reference"])))
@@ -117,6 +121,8 @@ class PreloadFeedback(Mechanism):
         Spec("kappa", "1/K", "relative rise of the preload per kelvin of the shaft's lead", 0.05, 0.6, 0.0, 0.5),
         Spec("load_exponent", "1", "Palmgren's y, as in the load's law", 0.33, 0.1, 0.1, 1.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"kappa": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"shaft": "outlet", "housing": "outlet"}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         preload = 1.0 + p["kappa"] * (view.degC["shaft"] - view.degC["housing"])

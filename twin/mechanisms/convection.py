@@ -32,6 +32,8 @@ class RotatingConvection(Mechanism):
         Spec("exponent", "1", "how it grows with speed", 2.0 / 3.0, 0.1, 0.3, 1.0),
         Spec("rated", "rpm", "speed at which the gain is stated", 6000.0, 0.01, 1.0, 2e5),
     )
+    off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
+    shape = ("exponent",)
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(1.0 + p["gain"] * power(view.driver["speed"] / p["rated"], p["exponent"]))
@@ -55,6 +57,7 @@ class NaturalConvection(Mechanism):
         Spec("area", "m**2", "surface", 1.0, 0.7, 0.0, 200.0),
         Spec("height", "m", "height of the wall", 0.5, 0.3, 0.005, 10.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"area": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         lead = view.degC["air"] - view.degC["body"]
@@ -81,6 +84,7 @@ class Radiation(Mechanism):
         Spec("area", "m**2", "radiating surface, times the view factor", 1.0, 0.7, 0.0, 200.0),
         Spec("emissivity", "1", "emissivity: 0.9 painted, 0.1 to 0.3 bare metal", 0.9, 0.5, 0.01, 1.0, "logit"),
     )
+    off: ClassVar[Mapping[str, float]] = {"area": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         body_K, other_K = view.degC["body"] + ZERO_DEGC_K, view.degC["surrounding"] + ZERO_DEGC_K
@@ -107,6 +111,8 @@ class Draught(Mechanism):
         Spec("factor", "1", "what the exchange is multiplied by", 2.0, 0.4, 0.1, 20.0),
         Spec("drop", "K", "by how much the air is colder meanwhile", 4.0, 0.6, 0.0, 40.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"factor": 1.0, "drop": 0.0}
+    shape = ("start", "duration")
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(np.where(self.blows(view, p), p["factor"], 1.0))

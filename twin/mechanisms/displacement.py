@@ -14,7 +14,7 @@ import numpy as np
 
 from data.errors import closest
 from twin.compiling.scope import several
-from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
 from twin.quantity import Spec, Value
 from twin.schema import Body, ChainLink, ErrorChain, Link, MechanismPart, Tilt, TwinPart
 
@@ -36,6 +36,8 @@ class ColumnBending(Mechanism):
     parameters = (
         Spec("gain", "um/K", "displacement per kelvin between the sides, signed", 10.0, 15.0, -500.0, 500.0, "linear"),
     )
+    off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"hot": "body", "cold": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         at, given = _places(name, self, part, twin), _given(name, self, part)
@@ -60,6 +62,8 @@ class SpindleGrowth(Mechanism):
             "gain", "um/K", "displacement per kelvin of the spindle's rise, signed", 1.2, 2.5, -100.0, 100.0, "linear"
         ),
     )
+    off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"spindle": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         at, given = _places(name, self, part, twin), _given(name, self, part)
@@ -82,9 +86,14 @@ class MandrelFixture(Mechanism):
     ports = ("seat",)
     parameters = (
         Spec("gain", "um/K", "displacement per kelvin of the bar's rise, signed", 2.3, 2.5, -50.0, 50.0, "linear"),
-        Spec("capacity", "J/K", "heat capacity of the bar or fixture", 2000.0, 0.7, 10.0, 1e5),
-        Spec("conductance", "W/K", "conductance from its seat", 3.0, 0.7, 0.01, 200.0),
+        Spec("capacity", "J/K", "heat capacity of the bar or fixture", 2000.0, 0.7, 1.0, 1e5),
+        Spec("conductance", "W/K", "conductance from its seat", 3.0, 0.7, 1e-3, 200.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
+    shape = ("capacity", "conductance")
+    # a thousandth of the usual: as late as it
+    ghost: ClassVar[Mapping[str, float]] = {"capacity": 2.0, "conductance": 0.003}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"seat": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         at, given = _places(name, self, part, twin), _given(name, self, part)
@@ -112,6 +121,7 @@ class SpeedShift(Mechanism):
         Spec("shift", "um", "displacement at the rated speed, signed", 3.0, 5.0, -200.0, 200.0, "linear"),
         Spec("rated", "rpm", "speed at which `shift` is stated", 6000.0, 0.01, 1.0, 2e5),
     )
+    off: ClassVar[Mapping[str, float]] = {"shift": 0.0}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["shift"] * (view.driver["speed"] / p["rated"]) ** 2)
@@ -140,6 +150,9 @@ class ScrewElongation(Mechanism):
         Spec("fixed_end", "mm", "position of the locating bearing", 0.0, 200.0, -1e4, 1e4, "linear"),
         Spec("pretension", "K", "rise that uses up the screw's stretch", 3.0, 0.5, 0.0, 20.0),
     )  # fmt: skip
+    off: ClassVar[Mapping[str, float]] = {"expansion": 0.0}
+    shape = ("fixed_end", "pretension")
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"screw": "body"}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
         over_K = view.rise_K["screw"] - p["pretension"]
@@ -163,6 +176,9 @@ class JointSlip(Mechanism):
         Spec("limit", "um", "displacement at which the joint slips", 3.0, 0.7, 0.0, 200.0),
     )
     along_time = True
+    off: ClassVar[Mapping[str, float]] = {"limit": 0.0}  # with no gain it would be a growth that never slips
+    shape = ("gain",)
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"part": "body"}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
         free, limit = np.broadcast_arrays(p["gain"] * view.rise_K["part"], p["limit"])

@@ -30,6 +30,7 @@ class MotorLoss(Mechanism):
         Spec("quadratic", "W", "loss proportional to speed squared, at the rated speed", 80.0, 0.6, 0.0, 20e3),
         RATED,
     )
+    off: ClassVar[Mapping[str, float]] = {"idle": 0.0, "linear": 0.0, "quadratic": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         x = size(view.driver["speed"]) / p["rated"]
@@ -51,6 +52,8 @@ class BeltLoss(Mechanism):
         Spec("exponent", "1", "how it grows with speed", 1.5, 0.15, 0.5, 3.0),
         RATED,
     )
+    off: ClassVar[Mapping[str, float]] = {"power": 0.0}
+    shape = ("exponent",)
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["power"] * power(view.driver["speed"] / p["rated"], p["exponent"]))

@@ -23,6 +23,7 @@ class ElectricalHeat(Mechanism):
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"level": "1"}
     parameters = (Spec("gain", "W", "heat per unit of the driver", 1.0, 1.0, 0.0, 1e6),)
+    off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["gain"] * view.driver["level"])
@@ -45,6 +46,7 @@ class SupplySag(Mechanism):
         Spec("sag", "1", "share of the heat that is lost at the other's rated level", 0.2, 0.8, 0.0, 1.0, "logit"),
         Spec("rated", "1", "level of the other, in its channel's unit, at which `sag` is stated", 1.0, 0.01, 1e-6, 1e6),
     )
+    off: ClassVar[Mapping[str, float]] = {"sag": 0.0}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(1.0 - p["sag"] * view.driver["other"] / p["rated"])
@@ -71,6 +73,8 @@ class OhmicHeat(Mechanism):
         Spec("reference", "degC", "temperature at which the resistance is stated", 25.0, 0.1, -40.0, 200.0, "linear"),
         Spec("entropic", "V/K", "reversible heat per ampere and kelvin", 0.0, 2e-4, -2e-3, 2e-3, "linear"),
     )
+    off: ClassVar[Mapping[str, float]] = {"resistance": 0.0, "entropic": 0.0}
+    shape = ("coefficient",)
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         current_A, body_degC = view.driver["current"], view.degC["body"]

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from twin.mechanisms.analytic import steps_s
-from twin.mechanisms.base import Array, Mechanism, View, real
+from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
 from twin.quantity import Spec
 
 
@@ -36,6 +36,8 @@ class JacketChiller(Mechanism):
         Spec("set_point", "degC", "middle of the thermostat's band", 22.0, 2.0, -10.0, 80.0, "linear"),
         Spec("hysteresis", "K", "half of the thermostat's band", 1.0, 0.5, 0.01, 20.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
+    shape = ("supply", "set_point")
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         names = [s.name for s in self.parameters]
@@ -88,6 +90,8 @@ class CuttingFluid(Mechanism):
     ports = ("body", "tank")
     takes_from: ClassVar[str | None] = "tank"
     parameters = (Spec("conductance", "W/K", "exchange with the fluid at full flow", 200.0, 0.8, 0.0, 5000.0),)
+    off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"tank": "surrounding"}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["conductance"] * view.driver["flow"] * (view.degC["tank"] - view.degC["body"]))

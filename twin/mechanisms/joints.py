@@ -28,6 +28,7 @@ class JointConductance(Mechanism):
     drivers: ClassVar[Mapping[str, str]] = {"closed": "1"}
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"closed"})
     parameters = (Spec("ratio", "1", "conductance of the joint over the one assumed", 1.0, 0.7, 0.01, 100.0),)
+    off: ClassVar[Mapping[str, float]] = {"ratio": 1.0}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["ratio"] ** view.driver.get("closed", 1.0))

@@ -24,6 +24,7 @@ class CabinetHeat(Mechanism):
     drivers: ClassVar[Mapping[str, str]] = {"running": "1"}
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"running"})
     parameters = (Spec("heat", "W", "heat that reaches the machine", 200.0, 0.8, 0.0, 10e3),)
+    off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["heat"] * view.driver.get("running", 1.0))
@@ -50,6 +51,8 @@ class HydraulicUnit(Mechanism):
         Spec("duty", "1", "share of the time that the pump runs", 0.4, 0.8, 0.0, 1.0, "logit"),
         Spec("period", "min", "length of a cycle", 10.0, 0.7, 0.1, 1440.0),
     )
+    off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
+    shape = ("duty", "period")
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         period_s, step_s = 60.0 * p["period"], steps_s(view)
@@ -73,6 +76,8 @@ class Sun(Mechanism):
         Spec("rise", "h", "time of day at which the sun reaches the face", 8.0, 1.5, 0.0, 24.0, "linear"),
         Spec("set", "h", "time of day at which it leaves the face", 16.0, 1.5, 0.0, 24.0, "linear"),
     )
+    off: ClassVar[Mapping[str, float]] = {"irradiance": 0.0}
+    shape = ("rise", "set")
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         since_h, day_h = view.clock_h - p["rise"], p["set"] - p["rise"]
@@ -92,6 +97,7 @@ class CuttingHeat(Mechanism):
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"power": "W"}
     parameters = (Spec("share", "1", "share of the power that warms these places", 0.05, 0.7, 0.0, 1.0, "logit"),)
+    off: ClassVar[Mapping[str, float]] = {"share": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
         power_W = view.driver["power"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ class SensorSwap(Mechanism):
     source = "a permutation of two labels; no parameter"
     signature = "order of the time constants is wrong: the sensor near the heat is late, its partner early"
     acts_at = ("sensor",)
+    off = None  # exchanged or not
+    fault = True
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         on = several(part.acts_on)
@@ -49,6 +52,8 @@ class SensorStuck(Mechanism):
         Spec("start", "s", "time in the run from which the sensor hangs", 3600.0, 3600.0, 0.0, 1e7, "linear"),
     )
     along_time = True
+    off = None  # a start beyond the run is one, but nothing leads there by small steps
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         stuck = real(view.time_s) > real(p["start"])
@@ -65,6 +70,9 @@ class SensorQuantised(Mechanism):
     signature = "stairs in one channel, no displacement with them; jumps of rates computed from it"
     acts_at = ("sensor",)
     parameters = (Spec("step", "K", "width of a step", 0.1, 0.7, 0.0, 5.0),)
+    off: ClassVar[Mapping[str, float]] = {"step": 0.0}
+    fault = True
+    proposable = False  # steps leave no smooth trace
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         step, true = real(p["step"]), real(seen)
@@ -83,6 +91,8 @@ class TimeSkew(Mechanism):
     acts_at = ("sensor", "error")
     parameters = (Spec("delay", "s", "how far the channel runs ahead, signed", 0.0, 120.0, -3600.0, 3600.0, "linear"),)
     along_time = True
+    off: ClassVar[Mapping[str, float]] = {"delay": 0.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return _value_at(seen, view, view.time_s + p["delay"])

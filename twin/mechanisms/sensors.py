@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -28,6 +29,8 @@ class SensorLag(Mechanism):
     parameters = (Spec("lag", "s", "time constant of the sensor in its place", 40.0, 0.7, 0.0, 3600.0),)
     along_time = True
     linear_reading = True
+    off: ClassVar[Mapping[str, float]] = {"lag": 0.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         seen, lag = _along_time(seen, p["lag"])
@@ -49,6 +52,8 @@ class SensorBonding(Mechanism):
     ports = ("air",)
     parameters = (Spec("bonding", "1", "share of the surface in what the sensor shows", 0.95, 0.7, 0.0, 1.0, "logit"),)
     linear_reading = True
+    off: ClassVar[Mapping[str, float]] = {"bonding": 1.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         air = view.degC["air"]
@@ -68,6 +73,8 @@ class SensorOffset(Mechanism):
         Spec("offset", "K", "reading at equilibrium less the true temperature", 0.0, 0.5, -10.0, 10.0, "linear"),
     )
     linear_reading = True
+    off: ClassVar[Mapping[str, float]] = {"offset": 0.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["offset"])
@@ -86,6 +93,8 @@ class SensorDrift(Mechanism):
         Spec("rate", "K/h", "change of the sensor's error per hour of a run", 0.0, 0.02, -5.0, 5.0, "linear"),
     )
     linear_reading = True
+    off: ClassVar[Mapping[str, float]] = {"rate": 0.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["rate"] * view.time_s / 3600.0)
@@ -102,6 +111,8 @@ class SensorSelfHeat(Mechanism):
     acts_at = ("sensor",)
     parameters = (Spec("excess", "K", "rise of the sensor above its place by its own current", 0.1, 0.8, 0.0, 5.0),)
     linear_reading = True
+    off: ClassVar[Mapping[str, float]] = {"excess": 0.0}
+    fault = True
 
     def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(seen + p["excess"])

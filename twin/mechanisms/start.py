@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ class InitialState(Mechanism):
             "excess", "K", "temperature at the start above what the first readings say", 0.0, 2.0, -50.0, 50.0, "linear"
         ),
     )
+    off: ClassVar[Mapping[str, float]] = {"excess": 0.0}
 
     def start_K(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["excess"])

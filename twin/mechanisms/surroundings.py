@@ -6,12 +6,13 @@ Enclosure air and floor are structural: they write bodies, surroundings and expo
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
 from data.errors import closest
 from twin.compiling.scope import several
-from twin.mechanisms.base import Array, Mechanism, View
+from twin.mechanisms.base import Array, Mechanism, PortRole, View
 from twin.quantity import Spec, Value
 from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart
 
@@ -33,6 +34,7 @@ class EnclosureAir(Mechanism):
         Spec("capacity", "J/K", "heat capacity of the air with the sheet metal", 25e3, 0.7, 10.0, 1e7),
         Spec("conductance", "W/K", "exchange of the enclosure with the room", 70.0, 0.7, 0.1, 5000.0),
     )
+    off = None  # it moves exposures; no value of its own leaves them where they were
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         """Raises ValueError: a name that is taken, unknown exposures; the message starts with the key."""
@@ -61,6 +63,7 @@ class Stratification(Mechanism):
         Spec("gradient", "K/m", "rise of the air's temperature per metre of height", 0.6, 0.8, 0.0, 10.0),
         Spec("height", "m", "height above the air's sensor, negative below it", 1.0, 0.2, -20.0, 20.0, "linear"),
     )
+    off: ClassVar[Mapping[str, float]] = {"gradient": 0.0}
 
     def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(p["gradient"] * p["height"])
@@ -87,6 +90,9 @@ class FloorSink(Mechanism):
         Spec("temperature", "degC", "annual mean of the ground", 18.0, 4.0, -20.0, 40.0, "linear"),
         Spec("follow", "1", "share of the room's deviation that the ground follows", 0.5, 0.8, 0.0, 1.0, "logit"),
     )
+    off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
+    shape = ("temperature", "follow")
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "itself", "room": "surrounding"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         """Raises ValueError: a name that is taken, no place, no such surrounding; the message starts with the key."""

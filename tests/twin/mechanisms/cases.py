@@ -1,4 +1,4 @@
-"""Of every mechanism: its equation once more with units that pint checks, and the parameters that switch it off.
+"""Of every mechanism: its equation once more with units that pint checks.
 
 An equation here sees quantities, each in the unit that its Spec (or driver) states: `q.area`, `q.speed`; temperatures
 as `q.T_port` (absolute, K) and `q.rise_port`; what a sensor sees as `q.seen` = `q.s0` + `q.slope` `q.t`. Constants of
@@ -29,13 +29,12 @@ Formula = Callable[[SimpleNamespace], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """`off`: parameter values without effect. `values` and `ports` (degC over time in h) shape the point of the test.
+    """`values` and `ports` (degC over time in h) shape the point of the test.
 
     Effects that a class has besides its first one stand in `more`.
     """
 
-    formula: Formula | None
-    off: Mapping[str, float] | None
+    formula: Formula | None  # None: structural, nothing to evaluate
     values: Mapping[str, float] = field(default_factory=dict)
     ports: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
     more: Mapping[str, Formula] = field(default_factory=dict)
@@ -142,63 +141,55 @@ def _friction(q: SimpleNamespace) -> Any:
 
 
 CASES: Mapping[str, Case] = {
-    "bearing_viscous": Case(_viscous, {"lubrication": 0.0}),
-    "bearing_load": Case(_load, {"load_factor": 0.0}),
-    "viscosity_feedback": Case(lambda q: np.exp(-2 / 3 * q.slope * (q.T_oil - q.reference)), {"slope": 0.0}),
-    "preload_feedback": Case(
-        lambda q: (1 + q.kappa * (q.T_shaft - q.T_housing)) ** (1 + q.load_exponent), {"kappa": 0.0}
-    ),
-    "motor_loss": Case(_motor, {"idle": 0.0, "linear": 0.0, "quadratic": 0.0}),
-    "belt_loss": Case(lambda q: q.power * (q.speed / q.rated) ** q.exponent, {"power": 0.0}),
-    "nut_friction": Case(_friction, {"moment": 0.0}),
-    "guide_friction": Case(lambda q: q.friction * q.load * q.feed, {"friction": 0.0}),
-    "screw_bearing": Case(_friction, {"moment": 0.0}),
-    "rotating_convection": Case(lambda q: 1 + q.gain * (q.speed / q.rated) ** q.exponent, {"gain": 0.0}),
-    "natural_convection": Case(_wall, {"area": 0.0}),
-    "radiation": Case(lambda q: q.emissivity * SIGMA * q.area * (q.T_surrounding**4 - q.T_body**4), {"area": 0.0}),
+    "bearing_viscous": Case(_viscous),
+    "bearing_load": Case(_load),
+    "viscosity_feedback": Case(lambda q: np.exp(-2 / 3 * q.slope * (q.T_oil - q.reference))),
+    "preload_feedback": Case(lambda q: (1 + q.kappa * (q.T_shaft - q.T_housing)) ** (1 + q.load_exponent)),
+    "motor_loss": Case(_motor),
+    "belt_loss": Case(lambda q: q.power * (q.speed / q.rated) ** q.exponent),
+    "nut_friction": Case(_friction),
+    "guide_friction": Case(lambda q: q.friction * q.load * q.feed),
+    "screw_bearing": Case(_friction),
+    "rotating_convection": Case(lambda q: 1 + q.gain * (q.speed / q.rated) ** q.exponent),
+    "natural_convection": Case(_wall),
+    "radiation": Case(lambda q: q.emissivity * SIGMA * q.area * (q.T_surrounding**4 - q.T_body**4)),
     "draught": Case(
         lambda q: np.where(_blows(q), q.factor, 1.0 * U.dimensionless),
-        {"factor": 1.0, "drop": 0.0},
         {"start": 0.52, "duration": 45.0},
         more={"surrounding_K": lambda q: np.where(_blows(q), -q.drop, 0.0 * K)},
     ),
-    "joint_conductance": Case(lambda q: q.ratio ** q.closed[0], {"ratio": 1.0}),
-    "jacket_chiller": Case(_chiller, {"conductance": 0.0}, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
-    "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body), {"conductance": 0.0}),
-    "enclosure_air": Case(None, None),
-    "stratification": Case(lambda q: q.gradient * q.height, {"gradient": 0.0}),
-    "floor_sink": Case(None, {"conductance": 0.0}),
-    "cabinet_heat": Case(lambda q: q.heat * q.running, {"heat": 0.0}),
-    "hydraulic_unit": Case(_cycle, {"heat": 0.0}, {"period": 11.3}),
-    "sun": Case(_sun, {"irradiance": 0.0}),
-    "cutting_heat": Case(lambda q: q.share * q.power, {"share": 0.0}),
-    "electrical_heat": Case(lambda q: q.gain * q.level, {"gain": 0.0}),
-    "supply_sag": Case(lambda q: 1 - q.sag * q.other / q.rated, {"sag": 0.0}),
-    "ohmic_heat": Case(_ohmic, {"resistance": 0.0, "entropic": 0.0}),
-    "voltage_loss_heat": Case(_voltage_loss, {f"u{k}": 3.4 for k in range(8)}, {"capacity": 30.0, "start": 28.0}),
-    "charge_strain": Case(
-        _charge_strain,
-        {**{f"f{k}": 0.0 for k in range(1, 13)}, **{f"g{k}": 0.0 for k in range(5)}},
-        {"capacity": 30.0, "start": 28.0},
-    ),
-    "column_bending": Case(None, {"gain": 0.0}),
-    "spindle_growth": Case(None, {"gain": 0.0}),
-    "speed_shift": Case(lambda q: q.shift * (q.speed / q.rated) ** 2, {"shift": 0.0}),
+    "joint_conductance": Case(lambda q: q.ratio ** q.closed[0]),
+    "jacket_chiller": Case(_chiller, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
+    "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body)),
+    "enclosure_air": Case(None),
+    "stratification": Case(lambda q: q.gradient * q.height),
+    "floor_sink": Case(None),
+    "cabinet_heat": Case(lambda q: q.heat * q.running),
+    "hydraulic_unit": Case(_cycle, {"period": 11.3}),
+    "sun": Case(_sun),
+    "cutting_heat": Case(lambda q: q.share * q.power),
+    "electrical_heat": Case(lambda q: q.gain * q.level),
+    "supply_sag": Case(lambda q: 1 - q.sag * q.other / q.rated),
+    "ohmic_heat": Case(_ohmic),
+    "voltage_loss_heat": Case(_voltage_loss, {"capacity": 30.0, "start": 28.0}),
+    "charge_strain": Case(_charge_strain, {"capacity": 30.0, "start": 28.0}),
+    "column_bending": Case(None),
+    "spindle_growth": Case(None),
+    "speed_shift": Case(lambda q: q.shift * (q.speed / q.rated) ** 2),
     "screw_elongation": Case(
         lambda q: q.expansion * np.maximum(q.rise_screw - q.pretension, 0 * K) * (q.position - q.fixed_end),
-        {"expansion": 0.0},
         ports={"screw": lambda t_h: 20.0 + 6.0 * t_h},
     ),
-    "joint_slip": Case(lambda q: np.minimum(q.gain * q.rise_part, q.limit), {"limit": 0.0}, {"limit": 3.1}),
-    "mandrel_fixture": Case(None, {"gain": 0.0}),
-    "sensor_lag": Case(_lag, {"lag": 0.0}, {"lag": 900.0}),
-    "sensor_bonding": Case(lambda q: q.T_air + q.bonding * (q.seen - q.T_air), {"bonding": 1.0}),
-    "sensor_offset": Case(lambda q: q.seen + q.offset, {"offset": 0.0}),
-    "sensor_drift": Case(lambda q: q.seen + q.rate * q.t, {"rate": 0.0}),
-    "sensor_self_heat": Case(lambda q: q.seen + q.excess, {"excess": 0.0}),
-    "sensor_swap": Case(None, None),
-    "sensor_stuck": Case(lambda q: q.s0 + q.slope * np.minimum(q.t, q.start), {"start": 1e6}),
-    "sensor_quantised": Case(_steps, {"step": 0.0}, {"step": 0.13}),
-    "time_skew": Case(_skew, {"delay": 0.0}),
-    "initial_state": Case(lambda q: q.excess, {"excess": 0.0}),
+    "joint_slip": Case(lambda q: np.minimum(q.gain * q.rise_part, q.limit), {"limit": 3.1}),
+    "mandrel_fixture": Case(None),
+    "sensor_lag": Case(_lag, {"lag": 900.0}),
+    "sensor_bonding": Case(lambda q: q.T_air + q.bonding * (q.seen - q.T_air)),
+    "sensor_offset": Case(lambda q: q.seen + q.offset),
+    "sensor_drift": Case(lambda q: q.seen + q.rate * q.t),
+    "sensor_self_heat": Case(lambda q: q.seen + q.excess),
+    "sensor_swap": Case(None),
+    "sensor_stuck": Case(lambda q: q.s0 + q.slope * np.minimum(q.t, q.start)),
+    "sensor_quantised": Case(_steps, {"step": 0.13}),
+    "time_skew": Case(_skew),
+    "initial_state": Case(lambda q: q.excess),
 }

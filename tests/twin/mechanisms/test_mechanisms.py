@@ -124,16 +124,6 @@ def wrong_units(unit: str) -> Iterator[str]:
 
 
 @laws
-def test_without_its_cause_it_does_nothing(key):
-    m, off = made(key), CASES[key].off
-    assert off is not None
-    point = Point.of(m).told(**off)
-    for effect in m.effects():
-        nothing = point.seen if effect == "reading" else NOTHING[effect]
-        assert point.effect(effect) == pytest.approx(nothing, rel=1e-12, abs=0.0), effect
-
-
-@laws
 def test_without_its_driver_it_does_nothing(key):
     m = made(key)
     for effect in {"heat_W", "factor"} & set(m.effects()) if m.drivers else ():
@@ -269,24 +259,6 @@ def test_a_structural_one_is_written_out_with_its_values_and_units(key):
         )
     usual = network_with(m, {s.name: {"free": False, "value": f"{s.value} {s.unit}"} for s in m.parameters})
     assert network_with(m, {}).values == pytest.approx(usual.values)
-
-
-@structural
-def test_a_structural_one_can_be_switched_off(key):
-    off = CASES[key].off
-    if off is None:
-        assert key in ("enclosure_air", "sensor_swap")  # they move what is there, and add nothing that could be 0
-        return
-    m, bare = made(key), machine_with(made(key))
-    bare.twin["mechanisms"].pop("tried")
-    before = compile_network(bare)
-    after = network_with(m, {name: f"{v} {m.spec(name).unit}" for name, v in off.items()})
-    n = before.n_cells
-    if "conductance" in off:
-        assert (after.conductance_W_per_K(after.values)[:n, :n] == before.conductance_W_per_K(before.values)).all()
-    for one, other in zip(before.errors, after.errors, strict=True):
-        assert (other.matrix(after.values)[:n] == one.matrix(before.values)).all()
-        assert (other.matrix(after.values)[n:] == 0).all()
 
 
 @every
