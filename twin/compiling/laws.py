@@ -60,7 +60,7 @@ def _drivers(scope: Scope, key: str, mechanism: Mechanism, given: MechanismPart)
                 f"{key}.drivers.{role}: no channel {channel!r}; {closest(channel, scope.machine.channels)}"
             )
         unit = scope.machine.channels[channel].unit
-        if not same_dimension(unit, mechanism.drivers[role]):
+        if role not in mechanism.any_unit and not same_dimension(unit, mechanism.drivers[role]):
             raise ValueError(
                 f"{key}.drivers.{role}: channel {channel!r} is in {unit}, {mechanism.key} needs "
                 f"{mechanism.drivers[role]}; name another channel"

@@ -25,7 +25,7 @@ Array = NDArray[Any]  # float64, or complex128 while a derivative is taken
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
 # Where a diagnosis looks for a port's temperature: at the place acted at, at each surrounding, at each body linked
-# with that place, at any other body, or at the places that the heat acted on goes into.
+# with that place (of an error, with the port before it), at any other body, or where the heat acted on goes into.
 PortRole = Literal["itself", "surrounding", "neighbour", "body", "outlet"]
 SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
 
@@ -61,6 +61,7 @@ class Mechanism(ABC):
     acts_at: ClassVar[tuple[Target, ...]]
     drivers: ClassVar[Mapping[str, str]] = {}  # the law's name for a driver -> unit
     optional_drivers: ClassVar[frozenset[str]] = frozenset()  # those of `drivers` that a machine file may leave out
+    any_unit: ClassVar[frozenset[str]] = frozenset()  # those of `drivers` whose channel may have any unit, its own
     takes_from: ClassVar[str | None] = None  # the port that loses the heat which `into` gains, where it is a body
     ports: ClassVar[tuple[str, ...]] = ()  # names of the temperatures that the law needs
     parameters: ClassVar[tuple[Spec, ...]] = ()

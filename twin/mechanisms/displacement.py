@@ -37,7 +37,7 @@ class ColumnBending(Mechanism):
         Spec("gain", "um/K", "displacement per kelvin between the sides, signed", 10.0, 15.0, -500.0, 500.0, "linear"),
     )
     off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
-    port_roles: ClassVar[Mapping[str, PortRole]] = {"hot": "body", "cold": "body"}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"hot": "body", "cold": "neighbour"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         at, given = _places(name, self, part, twin), _given(name, self, part)

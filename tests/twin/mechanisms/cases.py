@@ -136,6 +136,10 @@ def _charge_strain(q: SimpleNamespace) -> Any:
     return f + q.rise_body * _through(q, drawn, [getattr(q, f"g{k}") for k in range(5)])
 
 
+def _free(q: SimpleNamespace, over: Any) -> Any:
+    return q.linear * q.level + q.square * q.level**2 + (q.per_K + q.product * q.level) * over
+
+
 def _friction(q: SimpleNamespace) -> Any:
     return 2 * np.pi * (q.feed / q.lead) * q.moment
 
@@ -186,10 +190,13 @@ CASES: Mapping[str, Case] = {
     "sensor_bonding": Case(lambda q: q.T_air + q.bonding * (q.seen - q.T_air)),
     "sensor_offset": Case(lambda q: q.seen + q.offset),
     "sensor_drift": Case(lambda q: q.seen + q.rate * q.t),
+    "sensor_place": Case(lambda q: q.seen + q.share * (q.T_towards - q.seen)),
     "sensor_self_heat": Case(lambda q: q.seen + q.excess),
     "sensor_swap": Case(None),
     "sensor_stuck": Case(lambda q: q.s0 + q.slope * np.minimum(q.t, q.start)),
     "sensor_quantised": Case(_steps, {"step": 0.13}),
     "time_skew": Case(_skew),
     "initial_state": Case(lambda q: q.excess),
+    "free_flux": Case(lambda q: q.constant + _free(q, q.T_body - ZERO - 20 * K)),
+    "free_shift": Case(lambda q: _free(q, q.rise_body)),
 }

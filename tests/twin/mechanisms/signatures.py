@@ -60,6 +60,12 @@ def joint_slip(m: Mechanism) -> None:
     assert um[25] != pytest.approx(um[-26])  # another path on cooling
 
 
+def free_shift(m: Mechanism) -> None:
+    view = View(rise_K={"body": np.array([0.0, 4.0, 4.0])}, driver={"level": np.array([2.0, 2.0, 0.0])})
+    told = usual(m, linear=1.5, square=-0.5, per_K=2.0, product=0.25)
+    assert m.displacement(view, told).tolist() == [1.0, 11.0, 8.0]
+
+
 def charge_strain(m: Mechanism) -> None:
     shape = usual(m, **{f"f{k}": 300.0 * np.sin(0.27 * k) for k in range(1, 13)})
 
@@ -97,6 +103,11 @@ def adds_the_same(amount_K: float, **p: float) -> Callable[[Mechanism], None]:
         assert more == pytest.approx(amount_K) and np.ptp(more) < 1e-12  # rises are untouched
 
     return check
+
+
+def sensor_place(m: Mechanism) -> None:
+    assert residual(m, degC={"towards": COURSE + 8.0}, share=0.25) == pytest.approx(2.0)
+    assert residual(m, degC={"towards": COURSE}, share=0.25) == pytest.approx(0.0)
 
 
 def sensor_drift(m: Mechanism) -> None:
@@ -140,7 +151,7 @@ SIGNATURES: Mapping[str, Callable[[Mechanism], None]] = {
     **HEAT,
     **{f.__name__: f for f in (
         column_bending, spindle_growth, speed_shift, screw_elongation, joint_slip, mandrel_fixture, sensor_lag,
-        charge_strain,
+        charge_strain, free_shift, sensor_place,
         sensor_bonding, sensor_drift, sensor_swap, sensor_stuck, sensor_quantised, time_skew, initial_state,
     )},
     "sensor_offset": adds_the_same(-0.3, offset=-0.3),

@@ -190,6 +190,12 @@ def electrical_heat(m: Mechanism) -> None:
     assert heat(m, p={"gain": 0.02}, level=[0.0, 50.0, 100.0]).tolist() == [0.0, 1.0, 2.0]
 
 
+def free_flux(m: Mechanism) -> None:
+    warm, told = {"body": 25.0}, {"constant": 3.0, "linear": 2.0, "square": 0.5, "per_K": -1.0, "product": 0.1}
+    assert heat(m, warm, told, level=[0.0, 2.0, -2.0]).tolist() == [-2.0, 5.0, -5.0]
+    assert heat(m, warm, told) == heat(m, warm, told, level=0.0)
+
+
 def ohmic_heat(m: Mechanism) -> None:
     charge, discharge, twice = heat(m, {"body": 25.0}, {"entropic": 1e-4}, current=[10.0, -10.0, 20.0])
     assert charge - discharge == pytest.approx(2 * 1e-4 * 10 * 298.15)
@@ -227,7 +233,7 @@ HEAT: Mapping[str, Callable[[Mechanism], None]] = {
         bearing_viscous, bearing_load, viscosity_feedback, preload_feedback, motor_loss, belt_loss, rotating_convection,
         natural_convection, radiation, draught, joint_conductance, jacket_chiller, cutting_fluid, enclosure_air,
         stratification, floor_sink, cabinet_heat, hydraulic_unit, sun, cutting_heat, electrical_heat, ohmic_heat,
-        supply_sag, voltage_loss_heat,
+        supply_sag, voltage_loss_heat, free_flux,
     )},
     "nut_friction": feed_friction(1000 * 2 * np.pi * 0.5 / 60),
     "screw_bearing": feed_friction(1000 * 2 * np.pi * 0.3 / 60),

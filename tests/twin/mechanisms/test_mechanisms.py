@@ -30,7 +30,8 @@ TARGETS = {
 }  # fmt: skip
 LAWS = [k for k in MECHANISMS if k not in CASES or CASES[k].formula]
 STRUCTURAL = [k for k in MECHANISMS if k not in LAWS]
-SIGNED_HEAT = {"jacket_chiller", "ohmic_heat", "voltage_loss_heat"}  # and exchanges: heat either way
+SIGNED_HEAT = {"jacket_chiller", "ohmic_heat", "voltage_loss_heat", "free_flux"}  # and exchanges: heat either way
+FREE_FORM = {"free_flux", "free_shift"}  # without their driver they go on, by temperature alone
 every = pytest.mark.parametrize("key", list(MECHANISMS))
 laws = pytest.mark.parametrize("key", LAWS)
 structural = pytest.mark.parametrize("key", STRUCTURAL)
@@ -126,7 +127,7 @@ def wrong_units(unit: str) -> Iterator[str]:
 @laws
 def test_without_its_driver_it_does_nothing(key):
     m = made(key)
-    for effect in {"heat_W", "factor"} & set(m.effects()) if m.drivers else ():
+    for effect in {"heat_W", "factor"} & set(m.effects()) if m.drivers and key not in FREE_FORM else ():
         assert (Point.of(m).at_rest().effect(effect) == NOTHING[effect]).all()
 
 
@@ -239,9 +240,10 @@ def test_drivers_that_may_be_left_out(key):
     if optional:
         rest = {role: f"{role}_driver" for role in m.drivers if role not in optional}
         assert at_work(network_with(m, drivers=rest))
-        point, always = Point.of(m), {role: np.ones(TIME_S.shape) for role in optional}
+        counts_as = 0.0 if key in FREE_FORM else 1.0
+        point, held = Point.of(m), {role: np.full(TIME_S.shape, counts_as) for role in optional}
         for effect in m.effects():
-            driven = point.seeing(driver={**point.view.driver, **always}).effect(effect)
+            driven = point.seeing(driver={**point.view.driver, **held}).effect(effect)
             assert (point.seeing(driver={r: point.view.driver[r] for r in rest}).effect(effect) == driven).all()
 
 
