@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from points import TIME_S, Point
 from small_machine import machine_with, network_with
-from test_mechanisms import NOTHING, at_work, every, laws, made, structural
+from test_mechanisms import FREE_FORM, NOTHING, at_work, every, laws, made, structural
 
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
@@ -55,6 +55,16 @@ def test_everything_that_switches_it_off_is_needed_for_that(key: str) -> None:
     m = made(key)
     for name in m.off or {}:
         assert not does_nothing(switched_off(m).told(**{name: Point.of(m).values[name]})), name
+
+
+@laws
+def test_switched_off_every_amplitude_still_has_a_slope(key: str) -> None:
+    m = made(key)
+    off = switched_off(m)
+    for name in m.off or {}:
+        slopes = [np.imag(off.told(**{name: off.values[name] + 1e-30j}).effect(e)) / 1e-30 for e in m.effects()]
+        assert all(np.isfinite(s).all() for s in slopes), name
+        assert m.proposable == any(s.any() for s in slopes) or key in FREE_FORM, name
 
 
 @laws
