@@ -88,8 +88,9 @@ class Value(BaseModel):
 
     `spread` is the prior's standard deviation: of the logarithm for positive parameters (0.5 is about a factor 1.6),
     of the value itself, with a unit, for signed ones. A spread frees the parameter; `free: false` holds it all the
-    same. `bounds` in the parameter's unit. A calibrated file keeps the prior's centre in `prior` and says how sure the
-    value is in `interval90`.
+    same. `bounds` in the parameter's unit. `per_batch` is how much the value differs from run to run, like `spread` the
+    prior's sd in the fitting coordinate: each batch of a calibration has a deviation of its own, a prediction none. A
+    calibrated file keeps the prior's centre in `prior` and says how sure the value is in `interval90`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -98,6 +99,7 @@ class Value(BaseModel):
     spread: str | float | None = None
     bounds: tuple[str | float, str | float] | None = None
     free: bool | None = None
+    per_batch: str | float | None = None
     prior: str | float | None = None
     interval90: tuple[str | float, str | float] | None = None
     source: str = ""
@@ -141,6 +143,7 @@ class Parameter:
     free: bool
     source: str = ""
     prior: float = math.nan  # the prior's centre, in `unit`; nan: the value
+    per_batch: float = 0.0  # sd of each batch's own deviation in fitting coordinates; 0: none
 
     @property
     def prior_value(self) -> float:
@@ -201,27 +204,32 @@ def parameter(path: str, spec: Spec, given: Value | None, default_source: str = 
         raise ValueError(
             f"{path}: {value:g} {spec.unit} lies outside the bounds {low:g} to {high:g}; widen them or mend it"
         )
-    spread = _spread(path, spec, given, value)
+    spread = _deviation(path, "spread", spec, given.spread)
     free = given.free if given.free is not None else math.isfinite(spread)
     if free and not math.isfinite(spread):
         raise ValueError(f"{path} is free but has no prior; add 'spread', e.g. spread: {spec.spread or 0.5}")
-    return Parameter(path, spec.unit, spec.words, value, spread, low, high, spec.scale, free, given.source, prior)
+    per_batch = _deviation(path, "per_batch", spec, given.per_batch)
+    return Parameter(
+        path, spec.unit, spec.words, value, spread, low, high, spec.scale, free, given.source, prior,
+        per_batch if math.isfinite(per_batch) else 0.0,
+    )  # fmt: skip
 
 
-def _spread(path: str, spec: Spec, given: Value, value: float) -> float:
-    if given.spread is None:
+def _deviation(path: str, key: str, spec: Spec, given: str | float | None) -> float:
+    """A standard deviation in the fitting coordinate; nan where none is given."""
+    if given is None:
         return math.nan
     try:
         if spec.scale == "linear":
             delta = "K" if spec.unit == "degC" else spec.unit
-            spread = convert(given.spread, delta)
+            out = convert(given, delta)
         else:
-            spread = convert(given.spread, "1")
+            out = convert(given, "1")
     except ValueError as error:
-        raise ValueError(f"{path}.spread: {error}") from None
-    if spread <= 0:
-        raise ValueError(f"{path}.spread: got {given.spread!r}, expected a number above 0 (or leave it out to fix it)")
-    return spread
+        raise ValueError(f"{path}.{key}: {error}") from None
+    if out <= 0:
+        raise ValueError(f"{path}.{key}: got {given!r}, expected a number above 0 (or leave it out to fix it)")
+    return out
 
 
 @dataclass(frozen=True)

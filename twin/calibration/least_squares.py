@@ -72,17 +72,30 @@ def fit(
         InputError: no free parameter, or fewer usable rows than free parameters.
         WorkError: the model is not finite at the prior's mean.
     """
-    unknowns = problem.unknowns
-    if not unknowns:
+    best, notes = settled(problem, starts, seed, max_iterations, tolerance, progress, reweight)
+    return _result(problem, best, tolerance, notes)
+
+
+def settled(
+    problem: Problem,
+    starts: int = 1,
+    seed: int = 0,
+    max_iterations: int = 60,
+    tolerance: float = 1e-6,
+    progress: Callable[[str], None] | None = None,
+    reweight: bool = False,
+) -> tuple[State, str]:
+    """Where `fit` ends, with the linearisation there, and what is to be said of it; arguments and errors as there."""
+    if not problem.unknowns:
         raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
     limits = max_iterations, tolerance
     with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
         first = _first(problem, *limits, reweight, progress)
         best, notes = _best_start(problem, first, starts, seed, *limits, progress)
         if reweight:
-            best, settled = _with_noise(problem, best, *limits, progress)
-            notes += settled
-        return _result(problem, best, tolerance, notes)
+            best, changed = _with_noise(problem, best, *limits, progress)
+            notes += changed
+        return best, notes
 
 
 @cache

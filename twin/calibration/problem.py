@@ -29,14 +29,18 @@ MOST_NUMBERS = 20_000_000  # derivatives held at once (160 MB): batches beyond i
 
 @dataclass(frozen=True)
 class Nuisances:
-    """What each batch has of its own, all of prior N(0, 1): start of every body, first samples, surroundings' offsets.
+    """What each batch has of its own, all of prior N(0, 1): start of every body, first samples, surroundings' offsets,
+    parameters that differ from run to run.
 
-    `start_K` (bodies, N) cells' deviation per unit, `surroundings` their numbers with `offset_K` per unit.
+    `start_K` (bodies, N) cells' deviation per unit, `surroundings` their numbers with `offset_K` per unit,
+    `parameters` numbers with their `deviation` per unit in fitting coordinates.
     """
 
     start_K: Array
     surroundings: NDArray[np.int64]
     offset_K: Array
+    parameters: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    deviation: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, network: Network) -> Nuisances:
@@ -45,17 +49,19 @@ class Nuisances:
             start_K[k, cells] = network.start_spread_K
         spread = np.array([s.per_batch_K for s in network.surroundings])
         at = np.flatnonzero(spread > 0)
-        return cls(start_K if network.start_spread_K > 0 else start_K[:0], at, spread[at])
+        own = np.array([p.per_batch for p in network.parameters])
+        varying = np.flatnonzero(own > 0)
+        return cls(start_K if network.start_spread_K > 0 else start_K[:0], at, spread[at], varying, own[varying])
 
     @property
     def size(self) -> Array:
-        """K per unit of each that a batch's errors and sensors share."""
-        return np.concatenate([self.start_K.max(axis=1), self.offset_K])
+        """Per unit of each that a batch's errors and sensors share: K, or a parameter's fitting coordinate."""
+        return np.concatenate([self.start_K.max(axis=1), self.offset_K, self.deviation])
 
     @property
     def shared(self) -> int:
         """How many come before a batch's error offsets, which are as many as its usable error channels."""
-        return len(self.start_K) + len(self.surroundings)
+        return len(self.start_K) + len(self.surroundings) + len(self.parameters)
 
 
 @dataclass(frozen=True)
@@ -164,10 +170,29 @@ class CalibrationProblem:
 
     def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
         """(measured − simulated) / noise of every batch, (n_b,) each."""
+        if len(self.nuisances.parameters) and len(self.measured) > 1:
+            return [r for one, v in zip(self._singles, nuisance, strict=True) for r in one.residuals(x, [v])]
         start, offset = self._own(nuisance)
-        simulation = simulate(self.network, self.values_at(x), self.inputs, start, offsets_K=offset)
+        values = self._own_values(x, nuisance)
+        simulation = simulate(self.network, values, self.inputs, start, offsets_K=offset)
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
+
+    @cached_property
+    def _singles(self) -> list[CalibrationProblem]:
+        """Every batch by itself, where each has parameters of its own."""
+        return [self.only([b]) for b in range(len(self.measured))]
+
+    def _own_values(self, x: Array, nuisance: Sequence[Array]) -> Array:
+        """Parameter values (n,) at x, with the only batch's own deviations where there are any."""
+        values = self.values_at(x)
+        if len(self.nuisances.parameters):
+            first = self.nuisances.shared - len(self.nuisances.parameters)
+            own = nuisance[0][first : self.nuisances.shared] * self.nuisances.deviation
+            for k, step in zip(self.nuisances.parameters, own, strict=True):
+                p = self.network.parameters[k]
+                values[k] = np.clip(p.from_x(p.to_x(values[k]) + step), p.low, p.high)
+        return values
 
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
@@ -189,14 +214,21 @@ class CalibrationProblem:
         return out
 
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
+        if len(self.nuisances.parameters) and len(self.measured) > 1:
+            for one, v in zip(self._singles, nuisance, strict=True):
+                yield from one._blocks(x, [v])
+            return
         start, offset = self._own(nuisance)
+        numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         simulation, *slopes = sensitivities(
-            self.network, self.values_at(x), self.inputs, start, starts=len(self.nuisances.start_K) > 0,
-            offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
+            self.network, self._own_values(x, nuisance), self.inputs, start, numbers,
+            starts=len(self.nuisances.start_K) > 0, offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
         )  # fmt: skip
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
         free = len(self.unknowns)
+        varying = [numbers.index(k) for k in self.nuisances.parameters.tolist()]
+        slope = np.concatenate([slope[:free], slope[len(numbers) :], slope[varying]])
         for b, m in enumerate(self.measured):
             whitened = (m.of(slope[:, b]) / self.noise[m.channel]).T
             own = [whitened[:, free:] * self.nuisances.size, self._first_samples(m)]
@@ -212,7 +244,8 @@ class CalibrationProblem:
         if not len(self.nuisances.surroundings):
             return start[None], None
         offset = np.zeros((len(nuisance), len(self.network.surroundings)))
-        offset[:, self.nuisances.surroundings] = shared[:, bodies:] * self.nuisances.offset_K
+        own = shared[:, bodies : bodies + len(self.nuisances.surroundings)]
+        offset[:, self.nuisances.surroundings] = own * self.nuisances.offset_K
         return start[None], offset[None]
 
     def _residual(self, m: Measured, series: Array, nuisance: Array) -> Array:

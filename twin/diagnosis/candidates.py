@@ -1,0 +1,180 @@
+"""Every mechanism of the registry at every place where it may act: what a diagnosis screens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+from data.machine import Machine
+from twin.compiling.scope import several
+from twin.diagnosis.candidate import Candidate, Kind, Where
+from twin.mechanisms import MECHANISMS
+from twin.mechanisms.base import Mechanism, PortRole, Target
+from twin.quantity import same_dimension
+from twin.schema import MechanismPart, TwinPart
+
+KIND: Mapping[Target, Kind] = {
+    "node": "node", "start": "node", "surrounding": "node", "heat": "node", "link": "link", "exposure": "link",
+    "sensor": "sensor", "error": "error",
+}  # fmt: skip
+DRIVING = ("driver", "position")  # roles of channels that a law may be driven by
+
+
+@dataclass(frozen=True)
+class Site:
+    """One place of one kind: `acts_on` or `into` names it; `outlets` are the bodies that its heat goes into."""
+
+    kind: Kind
+    name: str
+    outlets: tuple[str, ...] = ()
+
+
+def candidates(machine: Machine, part: TwinPart) -> list[Candidate]:
+    """All candidates for a machine, sorted by mechanism and place; those that the file has already are left out."""
+    out: dict[str, Candidate] = {}
+    for key in MECHANISMS:
+        mechanism: type[Mechanism] = MECHANISMS[key]
+        if not mechanism.proposable:
+            continue
+        for target in mechanism.acts_at:
+            for site in _sites(part, target):
+                for c in _at(machine, part, mechanism, target, site):
+                    if not _there_already(part, c):
+                        out.setdefault(c.name, c)
+    return [out[name] for name in sorted(out)]
+
+
+def _at(
+    machine: Machine, part: TwinPart, mechanism: type[Mechanism], target: Target, site: Site
+) -> Iterator[Candidate]:
+    for drivers in _drivers(machine, mechanism):
+        for ports in _ports(part, mechanism, target, site):
+            kind = KIND[target]
+            where = Where(kind, site.outlets[0] if target == "heat" and site.outlets else site.name)
+            also = [*drivers.values(), *(place for role, place in ports.items() if place != site.name)]
+            name = "_".join([mechanism.key, site.name.replace("-", "_"), *also]).replace("@", "_").replace(".", "_")
+            into = target in ("node", "start")
+            yield Candidate(
+                mechanism.key,
+                where,
+                name,
+                _words(mechanism, site, also),
+                MechanismPart(
+                    law=mechanism.key,
+                    at=ports or None,
+                    into=site.name if into and "expand" not in mechanism.effects() else None,
+                    acts_on=None if into else site.name,
+                    drivers=drivers or None,
+                ),
+                dict(mechanism.off or {}),
+                mechanism.shape,
+                mechanism.fault,
+            )
+
+
+def _words(mechanism: type[Mechanism], site: Site, also: Sequence[str]) -> str:
+    with_ = f" ({', '.join(also)})" if also else ""
+    return f"{mechanism.words}: {site.name}{with_}"
+
+
+def _sites(part: TwinPart, target: Target) -> list[Site]:
+    kind = KIND[target]
+    if target in ("node", "start"):
+        return [Site(kind, name) for name in part.bodies]
+    if target == "heat":
+        return [
+            Site(kind, name, _outlets(given))
+            for name, given in part.mechanisms.items()
+            if "heat_W" in MECHANISMS[given.law].effects()
+        ]
+    groups: dict[Target, Mapping[str, object]] = {
+        "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
+        "surrounding": part.surroundings,
+    }  # fmt: skip
+    return [Site(kind, name) for name in groups[target]]
+
+
+def _outlets(given: MechanismPart) -> tuple[str, ...]:
+    if isinstance(given.into, Mapping):
+        return tuple(given.into)
+    return (given.into,) if given.into else (given.at,) if isinstance(given.at, str) else ()
+
+
+def _drivers(machine: Machine, mechanism: type[Mechanism]) -> Iterator[dict[str, str]]:
+    """Channels by the law's drivers, every combination; an optional driver is left out, or named where it switches."""
+    choices: list[list[tuple[str, str | None]]] = []
+    for role, unit in mechanism.drivers.items():
+        fits: list[tuple[str, str | None]] = [
+            (role, name)
+            for name, channel in machine.channels.items()
+            if channel.role in DRIVING and same_dimension(channel.unit, unit)
+        ]
+        choices.append([(role, None), *fits] if role in mechanism.optional_drivers else fits)
+    for chosen in product(*choices):
+        named = {role: name for role, name in chosen if name is not None}
+        if len(set(named.values())) == len(named):
+            yield named
+
+
+def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Site) -> Iterator[dict[str, str]]:
+    """Places by the law's ports, every combination that its roles allow; of two signed sides one order."""
+    choices = [
+        [(port, place) for place in _places(part, mechanism.port_roles[port], site)] for port in mechanism.ports
+    ]
+    seen: set[frozenset[str]] = set()
+    two_sides = len(mechanism.ports) == 2 and target == "error"  # of a body that bends: signed, so one order does
+    for chosen in product(*choices):
+        places = [place for _, place in chosen]
+        if len(set(places)) < len(places):
+            continue
+        if two_sides:
+            if frozenset(places) in seen or places[1] not in linked(part, places[0]):
+                continue
+            seen.add(frozenset(places))
+        yield dict(chosen)
+
+
+def _places(part: TwinPart, role: PortRole, site: Site) -> list[str]:
+    if role == "itself":
+        return [site.name]
+    if role == "surrounding":
+        return list(part.surroundings)
+    if role == "outlet":
+        return list(site.outlets)
+    if role == "neighbour" and site.kind == "sensor":
+        return linked(part, part.sensors[site.name].at.partition("@")[0])
+    if role == "neighbour" and site.name in part.bodies:
+        return linked(part, site.name)
+    return list(part.bodies)
+
+
+def linked(part: TwinPart, body: str) -> list[str]:
+    """The bodies that a body has a link with, in the file's order."""
+    ends = [tuple(place.partition("@")[0] for place in link.between) for link in part.links.values()]
+    near = {b if a == body else a for a, b in ends if body in (a, b)}
+    return [name for name in part.bodies if name in near and name != body]
+
+
+def _there_already(part: TwinPart, c: Candidate) -> bool:
+    """Whether the machine file has this law at this place with these drivers: its values are the baseline's to fit."""
+    assert c.part is not None
+    for given in part.mechanisms.values():
+        if given.law != c.mechanism or _channels(given) != _channels(c.part):
+            continue
+        if c.part.into is not None:
+            if c.part.into in _outlets(given):
+                return True
+        elif set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at):
+            return True
+        elif c.part.acts_on is None and given.at == c.part.at:
+            return True
+    sensor = part.sensors.get(str(c.part.acts_on))
+    own = {"sensor_lag": "lag", "sensor_bonding": "bonding", "sensor_offset": "offset"}.get(c.mechanism)
+    return sensor is not None and own is not None and getattr(sensor, own) is not None
+
+
+def _channels(given: MechanismPart) -> set[str]:
+    if isinstance(given.drivers, str):
+        return {given.drivers}
+    return set((given.drivers or {}).values())

@@ -1,0 +1,67 @@
+"""A fit carried over to another network of the same machine: parameters, starts and offsets by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from data.batch import Batch
+from twin.calibration.fit_problem import Array
+from twin.calibration.problem import CalibrationProblem, Nuisances
+from twin.network import Network
+from twin.simulation.inputs import inputs_of
+
+
+def on_network(
+    problem: CalibrationProblem, batches: Sequence[Batch], network: Network, free_starts: bool = False
+) -> CalibrationProblem:
+    """The same recordings posed to a network with more bodies, laws or drivers.
+
+    A new body starts as the one that it is linked with most strongly; with `free_starts` each batch may say otherwise.
+    """
+    inputs = inputs_of(network, list(batches)).refined(problem.inputs.every)
+    start = np.full((problem.inputs.n_batches, network.n_cells), np.nan)
+    nuisances = Nuisances.of(network)
+    start_K = nuisances.start_K.copy()
+    for name, cells in network.bodies.items():
+        if name in problem.network.bodies and len(problem.network.bodies[name]) == len(cells):
+            start[:, cells] = problem.start_degC[:, problem.network.bodies[name]]
+    for k, (name, cells) in enumerate(network.bodies.items()):
+        if name not in problem.network.bodies:
+            start[:, cells] = _beside(network, start, cells)[:, None]
+            if len(start_K) and not free_starts:
+                start_K[k] = 0.0
+    kept = Nuisances(start_K, nuisances.surroundings, nuisances.offset_K)
+    return CalibrationProblem(network, inputs, problem.measured, start, kept)
+
+
+def carried_nuisances(
+    old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]
+) -> list[Array]:
+    """Each batch's own unknowns in the new network's order; what is new stands at its prior's mean, 0."""
+    names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
+    out = []
+    for own in nuisance:
+        shared = np.array([own[before[n]] if n in before else 0.0 for n in names])
+        out.append(np.concatenate([shared, own[old.nuisances.shared :]]))
+    return out
+
+
+def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Array:
+    """The parameters that both networks fit at their old place, the others at their priors' mean."""
+    by_name = {u.name: u.prior + u.spread * v for u, v in zip(old.unknowns, z, strict=True)}
+    return np.array([(by_name.get(u.name, u.prior) - u.prior) / u.spread for u in new.unknowns])
+
+
+def _names(problem: CalibrationProblem) -> list[str]:
+    bodies = list(problem.network.bodies) if len(problem.nuisances.start_K) else []
+    air = [f"surrounding {problem.network.surroundings[s].name}" for s in problem.nuisances.surroundings]
+    return bodies + air
+
+
+def _beside(network: Network, start: Array, cells: Array) -> Array:
+    """The start temperature (B,) of the known cell that new ones are linked with most strongly."""
+    conductance = -network.conductance_W_per_K(network.values)[cells].sum(axis=0)
+    conductance[np.isnan(start[0])] = -np.inf
+    return np.asarray(start[:, int(np.argmax(conductance))])

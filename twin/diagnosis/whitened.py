@@ -1,0 +1,86 @@
+"""A linearised fit as a plain regression: rows of unit noise in which each batch's own unknowns are integrated out.
+
+With nuisances of prior N(0, 1) a batch's rows have the covariance ``I + N Nᵀ``; multiplied by its inverse square root
+they are independent again, and what is left is linear in the shared parameters and in the candidates' amplitudes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.calibration.fit_problem import Array, Block, Unknown
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """One batch: ``target = jacobian z + columns g + noise`` of unit variance; z = (x − prior) / spread ~ N(0, 1).
+
+    target (n,), jacobian (n, p), columns (n, C), channel (n,) of every row, in order of channels; `mixing` (n, q) and
+    `damping` (q,) are the nuisances' part: ``(I + N Nᵀ)^(-1/2) = I - mixing diag(damping) mixingᵀ``.
+    """
+
+    batch_id: str
+    target: Array
+    jacobian: Array
+    columns: Array
+    channel: NDArray[np.int64]
+    scale: Array  # (n,) sqrt of the rows' weights
+    mixing: Array
+    damping: Array
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """Rows at which each channel begins."""
+        return np.flatnonzero(np.r_[True, np.diff(self.channel) != 0])
+
+    @cached_property
+    def channels(self) -> NDArray[np.int64]:
+        """The numbers of the channels that have rows."""
+        return self.channel[self.starts]
+
+    @cached_property
+    def slices(self) -> list[tuple[int, slice]]:
+        """Every channel's number and rows."""
+        ends = [*self.starts[1:].tolist(), len(self.channel)]
+        return [(c, slice(a, b)) for c, a, b in zip(self.channels.tolist(), self.starts.tolist(), ends, strict=True)]
+
+    def of(self, rows: Array) -> Array:
+        """Other quantities of the same rows (n, …), in units of the given noise, whitened alike."""
+        rows = rows * self.scale.reshape(-1, *(1,) * (rows.ndim - 1))
+        return np.asarray(rows - self.mixing @ (self.damping * (self.mixing.T @ rows).T).T)
+
+
+def whitened(
+    block: Block, nuisance: Array, z: Array, unknowns: Sequence[Unknown], columns: Sequence[int], weight: Array
+) -> Whitened:
+    """A block at z and its nuisances (q,), the unknowns numbered `columns` taken as amplitudes.
+
+    z (p,) of the other unknowns in their order; `weight` (channels,) of the rows.
+    """
+    scale = np.sqrt(weight[block.channel])
+    own = block.nuisance * scale[:, None]
+    u, s, _ = np.linalg.svd(own, full_matrices=False)
+    kept = s > 1e-9
+    mixing, damping = u[:, kept], 1.0 - 1.0 / np.sqrt(1.0 + s[kept] ** 2)
+    chosen = np.zeros(len(unknowns), bool)
+    chosen[list(columns)] = True
+    spread = np.array([u.spread for u in unknowns])
+    out = Whitened(
+        block.batch_id, np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), block.channel, scale, mixing, damping
+    )
+    rows = out.of(
+        np.column_stack(
+            [block.residual + block.nuisance @ nuisance, block.jacobian[:, ~chosen] * spread[~chosen],
+             block.jacobian[:, list(columns)]]
+        )
+    )  # fmt: skip
+    p = int((~chosen).sum())
+    jacobian = rows[:, 1 : 1 + p]
+    return Whitened(
+        block.batch_id, rows[:, 0] + jacobian @ z, jacobian, rows[:, 1 + p :], block.channel, scale, mixing, damping
+    )
