@@ -1,0 +1,73 @@
+"""What an effect of a plant is: physics, or a fault of a recording, that the machine file says nothing of.
+
+To add one: a class in the file of its group and a line in `twin/plants/effects/__init__.py`; override what it changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from twin.plants.casting import Array
+from twin.plants.conditions import Now
+from twin.plants.machine import Plant, Sensor
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a diagnosis should say: mechanism (None: no listed one), place, values with units.
+
+    `also` are places that mean the same; `parameters` is the equation's, in the mechanism's own names.
+    """
+
+    mechanism: str | None
+    kind: str
+    name: str
+    parameters: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    also: tuple[str, ...] = ()
+    words: str = ""
+
+
+class Effect:
+    """An effect in a plant, `size` 1 about as strong as engineers meet it, 0 nothing at all."""
+
+    key: ClassVar[str]
+    has: ClassVar[frozenset[str]] = frozenset()  # features that the plant must have for it
+    withholds: ClassVar[str | None] = None  # the feature that the machine file leaves out
+
+    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        self.plant, self.size = plant, size
+
+    def answer(self) -> Answer:
+        """Where and what it is."""
+        raise NotImplementedError
+
+    def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
+        """Adds to the heat into the cells in place; both (N, B)."""
+
+    def friction(self, source: str, cells_degC: Array, now: Now) -> Array | float:
+        """What a source's heat is multiplied by, (B,)."""
+        return 1.0
+
+    def displaced_um(self, speed_rpm: Array) -> Mapping[str, Array]:
+        """Added to error channels, in the shape of `speed_rpm` (K, B)."""
+        return {}
+
+    def sensed(self, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+        """The sensors as they are with the fault."""
+        return sensors
+
+    def ahead_s(self) -> Mapping[str, float]:
+        """By how much the clock of a channel runs ahead."""
+        return {}
+
+    def amount(self, feature: str) -> float:
+        """What a withheld feature of the plant is multiplied by."""
+        return self.size if feature == self.withholds else 1.0
+
+    def misread(self) -> Mapping[str, float]:
+        """Parameters of the machine file that are wrong by a factor, by dotted path below `twin`."""
+        return {}

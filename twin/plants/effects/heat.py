@@ -1,0 +1,150 @@
+"""Heat from beside the spindle: floor, cabinet, guides, sun, and two that no list of mechanisms has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.plants.casting import Array, Cells
+from twin.plants.conditions import Now
+from twin.plants.effects.base import Answer, Effect
+from twin.plants.machine import Plant
+
+
+class FloorSink(Effect):
+    """The bed's foot exchanges with the ground: G (T_ground - T), the ground half a season behind."""
+
+    key = "floor_sink"
+
+    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        super().__init__(plant, size, rng)
+        bed = plant.structure.castings["bed"]
+        self.feet = plant.structure.cells["bed"][bed.box(height=(0.0, 0.3))]
+        self.conductance_W_per_K = float(rng.uniform(18.0, 32.0)) * size
+
+    def answer(self) -> Answer:
+        values = {"conductance": (self.conductance_W_per_K, "W/K"), "temperature": (18.0, "degC"), "follow": (0.5, "1")}
+        return Answer(self.key, "node", "bed", values, words="the bed loses heat to the floor")
+
+    def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
+        each = self.conductance_W_per_K / len(self.feet)
+        heat_W[self.feet] += each * (now.ground_degC - cells_degC[self.feet])
+
+
+class _Steady(Effect):
+    """Watts into the cells of one body, by the drivers."""
+
+    body: str
+    watts: float
+
+    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        super().__init__(plant, size, rng)
+        self.at: Cells = self._cells(plant)
+        self.power_W = self.watts * float(rng.uniform(0.8, 1.25)) * size
+
+    def _cells(self, plant: Plant) -> Cells:
+        return plant.cells(self.body)
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        """Of the full power, (B,)."""
+        raise NotImplementedError
+
+    def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
+        heat_W[self.at] += self.power_W / len(self.at) * self.share(cells_degC, now)
+
+
+class CabinetHeat(_Steady):
+    """A cabinet at the upper back of the column that is always on."""
+
+    key = "cabinet_heat"
+    body, watts = "column_back", 80.0
+
+    def _cells(self, plant: Plant) -> Cells:
+        column = plant.structure.castings["column"]
+        back = plant.structure.cells["column"][column.box((0.0, 0.3), (0.35, 0.9))]
+        return np.intersect1d(back, plant.cells("column_back"))
+
+    def answer(self) -> Answer:
+        return Answer(
+            "cabinet_heat", "node", self.body, {"heat": (self.power_W, "W")}, words="a cabinet warms the back"
+        )
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return np.ones(cells_degC.shape[1])
+
+
+class PumpHeat(CabinetHeat):
+    """The coolant pump behind the column: heat while it runs."""
+
+    key = "pump_heat"
+    has = frozenset({"coolant"})
+    watts = 120.0
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return now.coolant
+
+
+class GuideFriction(_Steady):
+    """Coulomb friction under the table, μ F v."""
+
+    key = "guide_friction"
+    has = frozenset({"feed"})
+    body, watts = "table", 160.0  # at FAST_MM_PER_MIN
+    FAST_MM_PER_MIN, LOAD_N = 8000.0, 5000.0
+
+    def answer(self) -> Answer:
+        friction = self.power_W / (self.LOAD_N * self.FAST_MM_PER_MIN / 60e3)
+        values = {"friction": (friction, "1"), "load": (self.LOAD_N, "N")}
+        return Answer(self.key, "node", "table", values, words="the guides rub under the table")
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return np.abs(now.feed_mm_per_min) / self.FAST_MM_PER_MIN
+
+
+class Sun(_Steady):
+    """The sun on the column's back between two hours of the day: half a sine of a clear day."""
+
+    key = "sun"
+    body, watts = "column_back", 140.0
+
+    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        super().__init__(plant, size, rng)
+        self.rise_h, self.set_h = float(rng.uniform(8.0, 10.0)), float(rng.uniform(14.0, 17.0))
+
+    def answer(self) -> Answer:
+        values = {"power": (self.power_W, "W"), "rise": (self.rise_h, "h"), "set": (self.set_h, "h")}
+        return Answer(self.key, "node", self.body, values, words="the sun on the column's back")
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        up = (now.clock_h - self.rise_h) / (self.set_h - self.rise_h)
+        return np.where((up > 0) & (up < 1), np.sin(np.pi * up), 0.0)
+
+
+class UnlistedWarmSpeed(_Steady):
+    """Not in any list: heat into the head's rear by speed times the head's excess over 20 degC."""
+
+    key = "unlisted_warm_speed"
+    watts = 50.0  # at the rated speed and 10 K above 20 degC
+
+    def _cells(self, plant: Plant) -> Cells:
+        self.body = plant.body_like("head_rear", "head")
+        return plant.cells(self.body)
+
+    def answer(self) -> Answer:
+        values = {"power": (self.power_W, "W")}
+        return Answer(None, "node", self.body, values, words="power (n / rated) (T - 20 degC) / 10 K")
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return now.speed_rpm / self.plant.rated_rpm * (cells_degC[self.at].mean(axis=0) - 20.0) / 10.0
+
+
+class UnlistedCoolantSpeed(PumpHeat):
+    """Not in any list: heat into the column's back while coolant flows, by the speed squared."""
+
+    key = "unlisted_coolant_speed"
+    watts = 180.0
+
+    def answer(self) -> Answer:
+        return Answer(None, "node", self.body, {"power": (self.power_W, "W")}, words="power coolant (n / rated)^2")
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return now.coolant * (now.speed_rpm / self.plant.rated_rpm) ** 2

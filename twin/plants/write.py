@@ -1,0 +1,52 @@
+"""A case on disk as a user would have it: a machine file and CSV recordings; the answer key stands elsewhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import yaml
+
+from data.atomic_file import write_atomic
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from twin.plants.plant import Case
+
+
+def write_case(case: Case, folder: Path, key_folder: Path | None = None) -> tuple[Path, Path, Path]:
+    """Writes `machine.yml` and `recordings/*.csv` below `folder`, `truth.json` into `key_folder`.
+
+    Returns the machine file, the recordings' folder and the key. `key_folder` is by default beside `folder`, with
+    `_key` added to its name; it must not lie inside, where whoever is asked could find it.
+
+    Raises:
+        InputError: the key would lie in the case's folder, or a folder cannot be written.
+    """
+    key_folder = folder.with_name(f"{folder.name}_key") if key_folder is None else key_folder
+    if key_folder.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"plant: the key's folder {key_folder} lies in {folder}; give one outside")
+    recordings = folder / "recordings"
+    machine, key = folder / "machine.yml", key_folder / "truth.json"
+    try:
+        recordings.mkdir(parents=True, exist_ok=True)
+        key_folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(machine, machine_text(case.machine))
+        for batch in case.batches:
+            write_atomic(recordings / f"{batch.batch_id}.csv", csv_text(batch))
+        write_atomic(key, json.dumps(case.truth, indent=1) + "\n")
+    except OSError as error:
+        raise InputError(f"plant: {folder} cannot be written ({error}); give a folder that can be") from None
+    return machine, recordings, key
+
+
+def machine_text(machine: Machine) -> str:
+    """The machine as a machine file's text; reads back as the same."""
+    plain = machine.model_dump(mode="json", exclude_defaults=True)
+    return "# Simulated machine; no recording of a real one.\n" + yaml.safe_dump(plain, sort_keys=False, width=120)
+
+
+def csv_text(batch: Batch) -> str:
+    """The recording with a first line that calls it simulated; a lost sample is an empty cell."""
+    head = f"# simulated recording, machine {batch.machine}\n"
+    return head + str(batch.table.to_csv(index=False, float_format="%.10g", lineterminator="\n"))
