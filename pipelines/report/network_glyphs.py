@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.patheffects import withStroke
@@ -96,11 +97,20 @@ def pills(ax: Axes, y: float, x: float, labels: Sequence[tuple[str, str]], size_
     for (text, color), w in zip(labels, widths, strict=True):
         ax.add_patch(
             FancyBboxPatch(
-                (left + 0.03, y - 0.04), w - 0.06, 0.08, boxstyle="round,pad=0.03", fc=color, ec="none", zorder=5
+                (left + 0.03, y - 0.04), w - 0.06, 0.08, boxstyle="round,pad=0.03", fc=color,
+                ec=LINK if _light(color) else "none", lw=0.6, zorder=5,
             )
-        )
-        say(ax, (left + w / 2, y), text, size_pt, "white", fontweight="bold", va="center_baseline")
+        )  # fmt: skip
+        ink = INK if _light(color) else "white"
+        say(ax, (left + w / 2, y), text, size_pt, ink, fontweight="bold", va="center_baseline")
         left += w + 0.05
+
+
+def _light(color: str) -> bool:
+    """Whether dark words read better on it (relative luminance, WCAG 2.1)."""
+    rgb = np.array(to_rgb(color))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722]) > 0.3
 
 
 def pills_width(labels: Iterable[tuple[str, str]], size_pt: float = 6.8) -> float:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from data.machine import Machine
+from twin.diagnosis.findings import Findings
 from twin.schema import TwinPart
 
-if TYPE_CHECKING:
-    from twin.diagnosis.findings import Findings
-
-# Left-out values throughout. Errors less their first sample, sensors in degC; gain in nats of left-out log score.
+# Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
+# Errors less their first sample, sensors in degC; gain in nats of left-out log score.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "rms": ("batch", "channel", "unit", "rows", "before", "after", "floor"),
     "series": ("batch", "channel", "unit", "time_s", "recorded", "before", "after"),
