@@ -57,6 +57,13 @@ def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) ->
         for a in c.amplitudes:
             by_mark[_instance(c), a].append(c.name)
     owner = {c.name: c for c in smooth}
+    rivals = [c for c in candidates if c.change is not None]
+    for c in rivals:
+        assert c.change is not None
+        j = network.index(c.change.parameter.name)
+        if not parameters[j].free:  # in its own scale: what is doubted is a factor
+            parameters[j] = replace(parameters[j], free=True, spread=1.0)
+        found[c.name].append(j)
     for j, p in enumerate(parameters):
         if not p.source.startswith(MARK):
             continue

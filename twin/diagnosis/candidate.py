@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from twin.quantity import Value
+from twin.diagnosis.values_of_part import with_value
+from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
 
 Kind = Literal["node", "link", "sensor", "error"]
@@ -22,11 +23,21 @@ class Where:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A value of the machine file that a rival doubts: freed with this spread, or different from run to run."""
+
+    parameter: Parameter
+    spread: float | None = None  # in the fitting coordinate
+    per_batch: float | None = None
+
+
+@dataclass(frozen=True)
 class Candidate:
     """One mechanism at one place, or a rival that needs no new physics.
 
     `part` is the instance as a machine file would state it, every value fixed at `Spec.value`; `amplitudes` its
-    parameters that switch it off and the values at which they do; `shape` those that are freed beside them.
+    parameters that switch it off and the values at which they do; `shape` those that are freed beside them. A rival
+    that changes a value has a `change` instead.
     """
 
     mechanism: str
@@ -37,15 +48,18 @@ class Candidate:
     amplitudes: Mapping[str, float] = field(default_factory=dict)
     shape: tuple[str, ...] = ()
     fault: bool = False
+    change: Change | None = None
 
     def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
         """The twin part with this candidate in it; `values` replace its parameters' own.
 
         Raises:
-            ValueError: the name is taken, or a rival that has no instance.
+            ValueError: the name is taken.
         """
-        if self.part is None:
-            raise ValueError(f"{self.name}: {self.mechanism} is no mechanism that a machine file can state")
+        if self.change is not None:
+            new = {"spread": self.change.spread, "per_batch": self.change.per_batch}
+            return with_value(part, self.change.parameter, **{k: v for k, v in new.items() if v is not None})
+        assert self.part is not None
         if self.name in part.mechanisms:
             raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")
         given = self.part.model_copy(update={"parameters": {**self.part.parameters, **(values or {})}})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 
 from data.machine import Machine
 from twin.compiling.scope import several
@@ -23,11 +23,15 @@ DRIVING = ("driver", "position")  # roles of channels that a law may be driven b
 
 @dataclass(frozen=True)
 class Site:
-    """One place of one kind: `acts_on` or `into` names it; `outlets` are the bodies that its heat goes into."""
+    """One place of one kind: `acts_on` or `into` names it; `outlets` are the bodies that its heat goes into.
+
+    `others` are acted on by the same instance.
+    """
 
     kind: Kind
     name: str
     outlets: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
 
 def candidates(machine: Machine, part: TwinPart) -> list[Candidate]:
@@ -38,7 +42,7 @@ def candidates(machine: Machine, part: TwinPart) -> list[Candidate]:
         if not mechanism.proposable:
             continue
         for target in mechanism.acts_at:
-            for site in _sites(part, target):
+            for site in _sites(part, mechanism, target):
                 for c in _at(machine, part, mechanism, target, site):
                     if not _there_already(part, c):
                         out.setdefault(c.name, c)
@@ -52,7 +56,7 @@ def _at(
         for ports in _ports(part, mechanism, target, site):
             kind = KIND[target]
             where = Where(kind, site.outlets[0] if target == "heat" and site.outlets else site.name)
-            also = [*drivers.values(), *(place for role, place in ports.items() if place != site.name)]
+            also = [*site.others, *drivers.values(), *(place for role, place in ports.items() if place != site.name)]
             name = "_".join([mechanism.key, site.name.replace("-", "_"), *also]).replace("@", "_").replace(".", "_")
             into = target in ("node", "start")
             yield Candidate(
@@ -64,7 +68,7 @@ def _at(
                     law=mechanism.key,
                     at=ports or None,
                     into=site.name if into and "expand" not in mechanism.effects() else None,
-                    acts_on=None if into else site.name,
+                    acts_on=None if into else (site.name, *site.others) if site.others else site.name,
                     drivers=drivers or None,
                 ),
                 dict(mechanism.off or {}),
@@ -78,8 +82,10 @@ def _words(mechanism: type[Mechanism], site: Site, also: Sequence[str]) -> str:
     return f"{mechanism.words}: {site.name}{with_}"
 
 
-def _sites(part: TwinPart, target: Target) -> list[Site]:
+def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[Site]:
     kind = KIND[target]
+    if target == "exposure" and "surrounding" in mechanism.acts_at and "expand" in mechanism.effects():
+        return []  # it stands between a surrounding and all that it surrounds
     if target in ("node", "start"):
         return [Site(kind, name) for name in part.bodies]
     if target == "heat":
@@ -92,7 +98,8 @@ def _sites(part: TwinPart, target: Target) -> list[Site]:
         "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
         "surrounding": part.surroundings,
     }  # fmt: skip
-    return [Site(kind, name) for name in groups[target]]
+    chosen = combinations(groups[target], mechanism.together)
+    return [Site(kind, first, others=tuple(others)) for first, *others in chosen]
 
 
 def _outlets(given: MechanismPart) -> tuple[str, ...]:

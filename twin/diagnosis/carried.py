@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,15 +26,15 @@ def on_network(
     nuisances = Nuisances.of(network)
     start_K = nuisances.start_K.copy()
     for name, cells in network.bodies.items():
-        if name in problem.network.bodies and len(problem.network.bodies[name]) == len(cells):
-            start[:, cells] = problem.start_degC[:, problem.network.bodies[name]]
+        before = problem.start_degC[:, problem.network.bodies[name]] if name in problem.network.bodies else None
+        if before is not None:  # a body that is cut finer starts at its mean
+            start[:, cells] = before if before.shape[1] == len(cells) else before.mean(axis=1, keepdims=True)
     for k, (name, cells) in enumerate(network.bodies.items()):
         if name not in problem.network.bodies:
             start[:, cells] = _beside(network, start, cells)[:, None]
             if len(start_K) and not free_starts:
                 start_K[k] = 0.0
-    kept = Nuisances(start_K, nuisances.surroundings, nuisances.offset_K)
-    return CalibrationProblem(network, inputs, problem.measured, start, kept)
+    return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
 
 
 def carried_nuisances(
@@ -57,7 +58,8 @@ def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Arr
 def _names(problem: CalibrationProblem) -> list[str]:
     bodies = list(problem.network.bodies) if len(problem.nuisances.start_K) else []
     air = [f"surrounding {problem.network.surroundings[s].name}" for s in problem.nuisances.surroundings]
-    return bodies + air
+    varying = [problem.network.parameters[k].name for k in problem.nuisances.parameters]
+    return bodies + air + varying
 
 
 def _beside(network: Network, start: Array, cells: Array) -> Array:

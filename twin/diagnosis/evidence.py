@@ -10,7 +10,7 @@ Amplitudes maximise the same density of the other batches: a channel that the ba
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -112,8 +112,12 @@ class Evidence:
         return np.asarray(np.where(self.rows > 0, total / np.maximum(self._least, TINY), np.nan))
 
     def base_score(self, targets: Sequence[Array] | None = None) -> Array:
-        """Log density (R,) of batches left out without any candidate, in nats up to a constant."""
-        return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets))))
+        """Log density (R,) of batches left out without any candidate, in nats up to a constant.
+
+        What the nuisances could do counts too, by the volume that they leave open (the determinant of a covariance).
+        """
+        volume = sum(float(np.sum(np.log1p(-b.damping))) for b in self.batches)
+        return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets)))) + volume
 
     def density(self, mean_squares: Array) -> Array:
         """Log density (…,) in nats of mean squares (…, K); noise is not rewarded below what is given."""
@@ -159,6 +163,12 @@ class Evidence:
             gain[0], (falls[0] > 0).sum(axis=0), along / np.sqrt(inside), amplitude[0], 1.0 / np.sqrt(inside),
             1.0 - inside / np.maximum(every, TINY), falls[0],
         )  # fmt: skip
+
+    def own_gain(self, columns: Sequence[Array]) -> float:
+        """What it gains, in nats, that each batch has one more unknown of its own of prior N(0, 1), B columns (n_b,)."""
+        batches = tuple(b.with_own(c) for b, c in zip(self.batches, columns, strict=True))
+        own = replace(self, batches=batches, low=self.low[:0], high=self.high[:0])
+        return float(own.base_score()[0] - self.base_score()[0])
 
     def flipped(self, flips: int, seed: int = 0) -> Array:
         """The largest gain (flips,) of any column when every batch's left-out residual takes a random sign.

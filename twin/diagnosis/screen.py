@@ -2,76 +2,155 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data.batch import Batch
-from data.machine import Machine
-from twin.calibration.descent import State, x_of
+from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
-from twin.calibration.problem import CalibrationProblem
-from twin.diagnosis.asleep import asleep
+from twin.diagnosis.asleep import Asleep, asleep
 from twin.diagnosis.candidate import Candidate
+from twin.diagnosis.candidates import candidates
 from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.evidence import Evidence
-from twin.diagnosis.whitened import whitened
+from twin.diagnosis.finite import differences
+from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.rivals import rivals
+from twin.diagnosis.slack import slack
+from twin.diagnosis.whitened import Whitened, whitened
 from twin.mechanisms import MECHANISMS
-from twin.schema import TwinPart
+
+FACTOR = 3.0  # bounds of the logarithm of a value that is doubted
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
+class Scored:
+    """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
 
-    machine: Machine
-    part: TwinPart
-    batches: tuple[Batch, ...]
-    problem: CalibrationProblem
-    state: State
+    `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
+    recalibration takes.
+    """
 
-    @property
-    def x(self) -> Array:
-        return x_of(self.problem.unknowns, self.state.z)
+    candidate: Candidate
+    gain: float
+    improved: int
+    absorbed: float
+    amplitudes: dict[str, float]
+    sd: float
+    column: int
 
 
 @dataclass(frozen=True)
 class Screen:
-    """Candidates with a signature, their columns in the evidence, and those without one, with the reason."""
+    """All candidates that have a signature, best first, the evidence and the reasons of those left out."""
 
-    candidates: tuple[Candidate, ...]
-    columns: dict[str, tuple[int, ...]]
+    scored: tuple[Scored, ...]
     evidence: Evidence
     left_out: dict[str, str]
 
 
-def screen(fitted: Fitted, proposed: Sequence[Candidate]) -> Screen:
-    """The evidence for all candidates that can be switched off, each amplitude a column."""
-    found = asleep(fitted.machine, fitted.part, proposed)
-    problem = on_network(fitted.problem, fitted.batches, found.network)
-    numbers = {j: k for k, j in enumerate(found.network.free.tolist())}
-    waking = sorted({j for js in found.amplitudes.values() for j in js})
-    place = {j: c for c, j in enumerate(waking)}
-    columns = [numbers[j] for j in waking]
-    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
-    z = fitted.state.z
-    weight = fitted.state.noise.weight
-    nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
-    blocks = problem.linearise(x, nuisance)
-    batches = tuple(
-        whitened(block, own, z, problem.unknowns, columns, weight) for block, own in zip(blocks, nuisance, strict=True)
-    )
-    low, high = np.full(len(waking), -np.inf), np.full(len(waking), np.inf)
-    kept = [c for c in proposed if c.name in found.amplitudes]
-    for c in kept:
-        for amplitude, j in zip(c.amplitudes, found.amplitudes[c.name], strict=False):
-            spec = MECHANISMS[c.mechanism].spec(amplitude)
-            off = c.amplitudes[amplitude]
-            low[place[j]], high[place[j]] = spec.low - off, spec.high - off
-    noise = fitted.state.noise
-    rows = np.bincount(np.concatenate(fitted.state.channels), minlength=len(problem.channels))
-    evidence = Evidence(batches, rows.astype(float), rows / noise.inflation, weight, low, high)
-    names = {c.name: tuple(place[j] for j in found.amplitudes[c.name]) for c in kept}
-    return Screen(tuple(kept), names, evidence, dict(found.left_out))
+def proposed(fitted: Fitted) -> list[Candidate]:
+    """All mechanisms at all places, and the rivals that doubt the file's values."""
+    return candidates(fitted.machine, fitted.part) + rivals(fitted.problem.network)
 
+
+def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
+    """The evidence for all candidates that can be switched off or whose value may be doubted."""
+    line = _Line.at(fitted, every, fitted.state.noise.inflation)
+    finite, refused = differences(fitted, every)
+    batches = tuple(
+        replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
+        for k, b in enumerate(line.batches)
+    )
+    low, high = _bounds(line, every)
+    low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
+    evidence = _evidence(fitted, batches, fitted.state.noise.inflation, low, high)
+    return Screen(tuple(_scored(line, every, list(finite), evidence)), evidence, {**line.found.left_out, **refused})
+
+
+def alone(fitted: Fitted, inflation: Array) -> Evidence:
+    """How well a fit predicts batches left out, with slack and no candidates; `inflation` (K,) of what is compared."""
+    every = proposed(fitted)
+    loose = slack(every)
+    line = _Line.at(fitted, [c for c in every if c.name in loose], inflation)
+    batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
+    return _evidence(fitted, batches, inflation, np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A linearisation with candidates asleep: whitened batches, and the parameter number of every column."""
+
+    found: Asleep
+    batches: tuple[Whitened, ...]
+    numbers: list[int]
+    own: dict[str, int]  # parameters that the fit has already, by name
+
+    @classmethod
+    def at(cls, fitted: Fitted, every: Sequence[Candidate], inflation: Array) -> _Line:
+        found = asleep(fitted.machine, fitted.part, every)
+        problem = on_network(fitted.problem, fitted.batches, found.network)
+        own = {u.name: k for k, u in enumerate(fitted.problem.unknowns)}
+        waking = sorted({j for js in found.amplitudes.values() for j in js})
+        numbers = [j for j in waking if found.network.parameters[j].name not in own]
+        at = {j: k for k, j in enumerate(found.network.free.tolist())}
+        loose = {numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every).items() if n in found.amplitudes}
+        z = carried_z(fitted.problem, problem, fitted.state.z)
+        nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
+        weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+        batches = tuple(
+            whitened(block, v, fitted.state.z, problem.unknowns, [at[j] for j in numbers], weight).with_slack(loose)
+            for block, v in zip(problem.linearise(x_of(problem.unknowns, z), nuisance), nuisance, strict=True)
+        )
+        return cls(found, batches, numbers, own)
+
+
+def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], inflation: Array, low: Array, high: Array) -> Evidence:
+    weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+    return Evidence(batches, fitted.rows, fitted.rows / inflation, weight, low, high)
+
+
+def _bounds(line: _Line, every: Sequence[Candidate]) -> tuple[Array, Array]:
+    """Of every column's amplitude, less the value at which it is off."""
+    low, high = np.full(len(line.numbers), -FACTOR), np.full(len(line.numbers), FACTOR)
+    place = {j: c for c, j in enumerate(line.numbers)}
+    for c in every:
+        for amplitude, j in zip(c.amplitudes, line.found.amplitudes.get(c.name, ()), strict=False):
+            spec, off = MECHANISMS[c.mechanism].spec(amplitude), c.amplitudes[amplitude]
+            low[place[j]], high[place[j]] = spec.low - off, spec.high - off
+    return low, high
+
+
+def _scored(line: _Line, every: Sequence[Candidate], finite: Sequence[str], evidence: Evidence) -> list[Scored]:
+    scores = evidence.scores()
+    place = {j: c for c, j in enumerate(line.numbers)}
+    out = []
+    for c in every:
+        if c.name not in line.found.amplitudes and c.name not in finite:
+            continue
+        if c.change is not None and c.change.per_batch is not None:
+            out.append(Scored(c, _varying(line, place, evidence, c), len(evidence.batches), 0.0, {}, 0.0, -1))
+            continue
+        columns = [place[j] for j in line.found.amplitudes.get(c.name, ())]
+        columns = columns or [len(line.numbers) + finite.index(c.name)]
+        best = max(columns, key=lambda k: scores.gain[k])
+        amplitudes = dict(zip(c.amplitudes or ("factor",), scores.amplitude[columns].tolist(), strict=False))
+        out.append(
+            Scored(
+                c, float(scores.gain[best]), int(scores.improved[best]), float(scores.absorbed[best]), amplitudes,
+                float(scores.sd[best]), best,
+            )
+        )  # fmt: skip
+    return sorted(out, key=lambda s: (-s.gain, s.candidate.name))
+
+
+def _varying(line: _Line, place: Mapping[int, int], evidence: Evidence, c: Candidate) -> float:
+    """What it gains that a value differs from run to run."""
+    assert c.change is not None and c.change.per_batch is not None
+    (j,) = line.found.amplitudes[c.name]
+    p = line.found.network.parameters[j]
+    if j in place:
+        return evidence.own_gain([b.columns[:, place[j]] * c.change.per_batch for b in evidence.batches])
+    k = line.own[p.name]
+    return evidence.own_gain([b.jacobian[:, k] * c.change.per_batch / p.spread for b in evidence.batches])

@@ -6,8 +6,8 @@ they are independent again, and what is left is linear in the shared parameters 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +48,29 @@ class Whitened:
         """Every channel's number and rows."""
         ends = [*self.starts[1:].tolist(), len(self.channel)]
         return [(c, slice(a, b)) for c, a, b in zip(self.channels.tolist(), self.starts.tolist(), ends, strict=True)]
+
+    def with_slack(self, loose: Mapping[int, float]) -> Whitened:
+        """The same batch in which some columns are shared unknowns too, of the prior sd given, about 0."""
+        if not loose:
+            return self
+        more = self.columns[:, list(loose)] * np.array(list(loose.values()))
+        return replace(self, jacobian=np.hstack([self.jacobian, more]))
+
+    def with_own(self, column: Array) -> Whitened:
+        """The same batch with one more unknown of its own, of prior N(0, 1); column (n,) is whitened already."""
+        square = float(column @ column)
+        if square < 1e-18:
+            return self
+        damping = 1.0 - 1.0 / np.sqrt(1.0 + square)
+        unit = column / np.sqrt(square)
+
+        def damped(rows: Array) -> Array:
+            return np.asarray(rows - damping * np.multiply.outer(unit, unit @ rows))
+
+        return replace(
+            self, target=damped(self.target), jacobian=damped(self.jacobian), columns=self.columns[:, :0],
+            damping=np.append(self.damping, damping), mixing=np.column_stack([self.mixing, unit]),
+        )  # fmt: skip
 
     def of(self, rows: Array) -> Array:
         """Other quantities of the same rows (n, …), in units of the given noise, whitened alike."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -73,6 +74,7 @@ class Mechanism(ABC):
     ghost: ClassVar[Mapping[str, float]] = {}  # values at which a structural one hardly loads its neighbours
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
+    together: ClassVar[int] = 1  # how many targets one instance acts on
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 
     linear_reading: ClassVar[bool] = (
@@ -121,8 +123,7 @@ class Mechanism(ABC):
     @classmethod
     def effects(cls) -> tuple[str, ...]:
         """Names of the effects that this class has."""
-        every = ("heat_W", "factor", "displacement", "reading", "surrounding_K", "start_K", "expand")
-        return tuple(e for e in every if getattr(cls, e) is not getattr(Mechanism, e))
+        return _effects(cls)
 
     @classmethod
     def spec(cls, name: str) -> Spec:
@@ -132,3 +133,9 @@ class Mechanism(ABC):
 def real(a: Array) -> NDArray[np.float64]:
     """The real part, for comparisons in `numpy.where` that must not see a derivative's imaginary part."""
     return np.real(a)
+
+
+@cache
+def _effects(mechanism: type[Mechanism]) -> tuple[str, ...]:
+    every = ("heat_W", "factor", "displacement", "reading", "surrounding_K", "start_K", "expand")
+    return tuple(e for e in every if getattr(mechanism, e) is not getattr(Mechanism, e))

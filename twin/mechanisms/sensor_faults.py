@@ -25,6 +25,7 @@ class SensorSwap(Mechanism):
     signature = "order of the time constants is wrong: the sensor near the heat is late, its partner early"
     acts_at = ("sensor",)
     off = None  # exchanged or not
+    together = 2
     fault = True
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:

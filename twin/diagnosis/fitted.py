@@ -1,0 +1,74 @@
+"""A twin part at its best fit, and how well it predicts batches left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from data.batch import Batch
+from data.machine import Machine
+from twin.calibration.annealing import noise_left, with_noise
+from twin.calibration.descent import State, descend, x_of, z_bounds
+from twin.calibration.fit_problem import Array
+from twin.calibration.problem import CalibrationProblem
+from twin.compile import compile_network
+from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
+from twin.schema import TwinPart
+
+STEPS, TOLERANCE = 6, 0.05  # of a refit: a candidate's place in the ranking needs no more
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
+
+    machine: Machine
+    part: TwinPart
+    batches: tuple[Batch, ...]
+    problem: CalibrationProblem
+    state: State
+
+    @property
+    def x(self) -> Array:
+        return x_of(self.problem.unknowns, self.state.z)
+
+    @property
+    def values(self) -> Array:
+        """Parameter values (n,) of the network."""
+        return self.problem.values_at(self.x)
+
+    @cached_property
+    def rows(self) -> Array:
+        """Rows (K,) of each channel in all batches."""
+        return np.bincount(np.concatenate(self.state.channels), minlength=len(self.problem.channels)).astype(float)
+
+
+def refitted(
+    old: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = STEPS, tolerance: float = TOLERANCE
+) -> Fitted:
+    """The same recordings fitted by a changed twin part, from the old fit; `at` gives values where to begin.
+
+    The noise is estimated again at the start and once more on the way, so that a channel which the old fit had given
+    up counts again.
+
+    Raises:
+        InputError: the part does not compile; WorkError: it cannot be simulated there.
+    """
+    network = compile_network(old.machine, part=part)
+    problem = on_network(old.problem, old.batches, network, free_starts=True)
+    z = carried_z(old.problem, problem, old.state.z)
+    for k, u in enumerate(problem.unknowns):
+        if at and u.name in at:
+            p = network.parameters[network.index(u.name)]
+            z[k] = (float(p.to_x(at[u.name])) - u.prior) / u.spread
+    z = np.clip(z, *z_bounds(problem.unknowns))
+    nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
+    state = State.at(problem, z, nuisance, old.state.noise)
+    for _ in range(2):
+        state = with_noise(problem, state, noise_left(problem, state))
+        state = descend(problem, state, len(state.history) + (steps + 1) // 2, tolerance)
+    state = with_noise(problem, state, noise_left(problem, state))
+    return replace(old, part=part, problem=problem, state=state)

@@ -1,0 +1,94 @@
+"""The structural null: what the whole search would find where nothing is missing but a finer network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data.errors import InputError, WorkError
+from twin.calibration.descent import x_of
+from twin.calibration.fit_problem import Array
+from twin.compile import compile_network
+from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.evidence import Evidence
+from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.refined import refined
+
+TWINS = 10  # refined machines
+SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the misfit of each
+
+
+@dataclass(frozen=True)
+class Null:
+    """Recordings of T refined machines with the misfit at S scales: largest gain of any candidate (T, S) in nats, the
+    log density of batches left out (T, S) before any candidate, and their mean squares (T, S, K)."""
+
+    gain: Array
+    density: Array
+    mean_squares: Array
+
+    def threshold(self, density: float, share: float = 0.99) -> float:
+        """The gain that structure alone exceeds in 1 - share of the cases, where it may leave as much as `density` says.
+
+        Of each machine counts the largest misfit that predicts left-out batches no worse. A Gumbel distribution
+        through their mean and spread (Gumbel 1958), as there are few.
+        """
+        gain = self.typical(density)
+        if len(gain) < 2:
+            return float("inf")
+        scale = float(np.std(gain, ddof=1)) * np.sqrt(6.0) / np.pi
+        location = float(np.mean(gain)) - np.euler_gamma * scale
+        return max(location - scale * float(np.log(-np.log(share))), float(gain.max()))
+
+    def typical(self, density: float) -> Array:
+        """The largest gain (T,) of each machine at that misfit."""
+        allowed = self.density >= density
+        last = np.where(allowed.any(axis=1), allowed.shape[1] - 1 - np.argmax(allowed[:, ::-1], axis=1), 0)
+        return np.asarray(self.gain[np.arange(len(self.gain)), last])
+
+
+def structural_null(
+    fitted: Fitted,
+    evidence: Evidence,
+    counts: Sequence[int],
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Null:
+    """Refined machines driven as the recordings were, their left-out gains by the same evidence in one step each.
+
+    Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers the
+    columns whose gain would be an alarm.
+    """
+    rng = np.random.default_rng(seed)
+    base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
+    targets: list[list[Array]] = [[] for _ in base]
+    for k in range(TWINS):
+        try:
+            rows = _misfit(fitted, base, seed + k)
+        except (InputError, WorkError):
+            continue  # a draw that no machine has
+        for b, (whitened, misfit) in enumerate(zip(evidence.batches, rows, strict=True)):
+            noise = rng.standard_normal(len(misfit))
+            targets[b] += [whitened.of(scale * misfit + noise) for scale in SCALES]
+        if progress:
+            progress(k + 1, TWINS)
+    z = np.zeros(evidence.batches[0].jacobian.shape[1])
+    z[: len(fitted.state.z)] = fitted.state.z
+    shifted = [
+        np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)
+    ]
+    gain = evidence.gains(shifted)[0][:, list(counts)].max(axis=1)
+    squares = evidence.mean_squares(evidence.left_out(shifted))
+    shape = (-1, len(SCALES))
+    return Null(gain.reshape(shape), evidence.base_score(shifted).reshape(shape), squares.reshape(*shape, squares.shape[1]))
+
+
+def _misfit(fitted: Fitted, base: list[Array], seed: int) -> list[Array]:
+    """What a refined machine shows beyond the fitted one, (n_b,) per batch in units of the given noise."""
+    part = refined(fitted.part, fitted.problem.network, fitted.values, seed)
+    problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
+    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
+    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
+    return [b - a for b, a in zip(base, after, strict=True)]
