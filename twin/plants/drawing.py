@@ -16,6 +16,7 @@ CHANCE = {
     "motor_loss": 0.75, "bending": 0.75, "growth": 0.85, "mandrel": 0.5,
 }  # fmt: skip
 UNSENSED = ("shaft", "mandrel", AIR)
+SELDOM_SENSED = ("saddle", "table", "screw")
 
 
 def draw_plant(seed: int, has: frozenset[str], lacks: frozenset[str]) -> Plant:
@@ -98,8 +99,7 @@ def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
     for body, cells in s.bodies.items():
         missing, order = rng.random(), rng.permutation(len(cells))
         lag_s, offset_K = float(rng.uniform(30.0, 60.0)), float(rng.uniform(-0.15, 0.15))
-        rare = 0.6 if body in ("saddle", "table", "screw") else 0.05
-        if body in UNSENSED or missing < (rare if body not in ("column_front", "column_back", "bed", "front") else 0.0):
+        if body in UNSENSED or (body in SELDOM_SENSED and missing < 0.4):
             continue
         off = _off_middle(s, cells)
         far = [int(cells[k]) for k in order if 0.35 <= off[k] <= 1.05]

@@ -31,11 +31,9 @@ def draw_layout(seed: int, mandrel: bool) -> Layout:
     enclosed, screw, saddle, head_halves = (bool(rng.random() < p) for p in (0.6, 0.6, 0.4, 0.6))
     air_J_per_K, air_room_W_per_K = float(rng.uniform(18e3, 40e3)), float(rng.uniform(45.0, 95.0))
     head_at = float(rng.uniform(0.62, 0.8))
+    absent = {n for n, there in (("screw", screw), ("saddle", saddle), ("mandrel", mandrel)) if not there}
     for casting in _castings(size, sizes, counts, head_at):
-        if (
-            casting.name in ("screw", "saddle", "mandrel")
-            and not {"screw": screw, "saddle": saddle, "mandrel": mandrel}[casting.name]
-        ):
+        if casting.name in absent:
             continue
         a.add(casting, halves=casting.name == "column" or (casting.name == "head" and head_halves))
     a.air_J_per_K = air_J_per_K if enclosed else None

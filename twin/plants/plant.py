@@ -19,6 +19,7 @@ from twin.plants.physics import LEAD_S, simulated
 from twin.plants.recorded import recordings
 from twin.plants.runs import plan_runs
 from twin.plants.seeds import stream
+from twin.plants.structure import AIR
 
 
 @dataclass(frozen=True)
@@ -82,24 +83,36 @@ def _with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
 
 def truth_of(effect: str | None, size: float, plant: Plant, effects: list[Effect]) -> dict[str, Any]:
     """The answer key: plain data."""
-    terms = [_term(e.key, e.answer()) for e in effects] if size else []
-    first = terms[0] if terms else {"mechanism": None, "where": None, "also": [], "parameters": {}, "words": ""}
+    terms = [_term(e.key, e.answer(), plant) for e in effects] if size else []
+    first = (
+        terms[0]
+        if terms
+        else {"where": None, "also": [], "neighbours": []} | {"mechanism": None, "parameters": {}, "words": ""}
+    )
     return {
         "simulated": True, "effect": effect if size else None, "size": size,
-        **{k: first[k] for k in ("mechanism", "where", "also", "parameters", "words")},
+        **{k: first[k] for k in ("mechanism", "where", "also", "neighbours", "parameters", "words")},
         "terms": terms, "features": sorted(plant.features), "cells": plant.structure.size,
     }  # fmt: skip
 
 
-def _term(key: str, answer: Answer) -> dict[str, Any]:
+def _term(key: str, answer: Answer, plant: Plant) -> dict[str, Any]:
     return {
         "effect": key,
         "mechanism": answer.mechanism,
         "where": {"kind": answer.kind, "name": answer.name},
         "also": list(answer.also),
+        "neighbours": _neighbours(answer, plant),
         "parameters": {k: {"value": v, "unit": u} for k, (v, u) in answer.parameters.items()},
         "words": answer.words,
     }
+
+
+def _neighbours(answer: Answer, plant: Plant) -> list[str]:
+    """Bodies that touch the answer's body, or one end of its link; the air touches too many to count as an end."""
+    s = plant.structure
+    ends = set(answer.name.split("-")) & set(s.bodies) - {AIR} if answer.kind in ("node", "link") else set()
+    return sorted({body for pair in s.touching() if ends & pair for body in pair} - ends)
 
 
 def _checked(seed: int, size: float, kind: type[Options], given: Mapping[str, Any]) -> Options:

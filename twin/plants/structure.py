@@ -47,9 +47,11 @@ class Structure:
         np.add.at(out, self.one[self.surfaces > 0], self.between_W_per_K[self.surfaces > 0])
         return out
 
-    def body_of(self) -> dict[int, str]:
-        """Cell -> body."""
-        return {int(c): name for name, cells in self.bodies.items() for c in cells}
+    def touching(self) -> set[frozenset[str]]:
+        """Pairs of bodies between which heat flows directly."""
+        body = {int(c): name for name, cells in self.bodies.items() for c in cells}
+        pairs = {frozenset((body[int(i)], body[int(j)])) for i, j in zip(self.one, self.other, strict=True)}
+        return {pair for pair in pairs if len(pair) == 2}
 
     def losses(self) -> sparse.csc_matrix:
         """The matrix L of ``C dT/dt = -L T + heat``, W/K, (N, N): symmetric, its rows add up to `room_W_per_K`."""
