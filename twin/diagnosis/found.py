@@ -92,7 +92,7 @@ class Found:
 def place_words(where: Where, part: TwinPart) -> str:
     """``the bed``, ``the shaft and the front bearing housing`` of a link, channels by their name.
 
-    A body goes by its `words`, or its name with blanks for underscores.
+    A body goes by its `words`, or by its name with blanks for underscores (words with a colon explain, not name).
     """
     if where.kind == "link" and where.name in part.links:
         return listed([_thing(p, part) for p in part.links[where.name].between])
@@ -123,6 +123,6 @@ def _thing(place: str, part: TwinPart) -> str:
     """A body or surrounding with its article; numbered ones (node3) have none."""
     name, _, at = place.partition("@")
     held = part.bodies.get(name) or part.surroundings.get(name)
-    words = held.words if held and held.words else name.replace("_", " ")
+    words = held.words if held and held.words and ":" not in held.words else name.replace("_", " ")
     article = "" if words[-1].isdigit() or words.split()[0].lower() in ("a", "an", "the") else "the "
     return f"{article}{words}{f' at {at}' if at else ''}"

@@ -109,8 +109,9 @@ def verdict_statement(
     if verdict == "consistent":
         return _consistent(rms, limits, places)
     if verdict == "undecidable":
-        words = "Something is missing, and these runs cannot tell what"
-        words += f": {claim_words(found[0])}." if found else "."
+        tied = found and found[0].tied
+        words = "Something is missing." if tied else "Something is missing, and these runs cannot tell what."
+        words += f" {claim_words(found[0])}." if found else ""
         return words + (f" {_capital(separates)} would tell." if separates else "")
     if verdict == "unlisted":
         words = "No listed mechanism explains the difference"
@@ -169,12 +170,16 @@ def _noun(key: str, where: Where, place: str, beside: str = "") -> str:
     }
     if key not in MECHANISMS:
         return rivals.get(key, f"{key.replace('_', ' ')} {_at(where, place)}")
-    words, things = MECHANISMS[key].words, _THINGS[where.kind]
-    linked = where.kind == "link"
-    named, n = re.subn(rf"\b(?:a )?({things})\b", rf"the \1 {'between ' * linked}{place}", words, count=1)
-    if where.kind == "sensor" and not n:
+    words, linked = MECHANISMS[key].words, "between " if where.kind == "link" else ""
+    thing = re.search(rf"(^|\ba |\b)({_THINGS[where.kind]})\b", words)
+    if (
+        thing
+    ):  # "a sensor" and a leading "sensor" become "the sensor front", "bonded sensor" becomes "bonded sensor front"
+        the = "the " if thing[1] or thing.start() == 0 else ""
+        named = f"{words[: thing.start()]}{the}{thing[2]} {linked}{place}{words[thing.end() :]}"
+    elif where.kind == "sensor":
         named = f"{words}: {place}"
-    elif not n:
+    else:
         named = f"{words} {_at(where, place)}"
     return named + _in_brackets(beside)
 
