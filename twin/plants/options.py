@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Options:
-    """Batches of `hours`, rows every `step_s`; the solver's step is `solver_s`.
+    """Batches of `hours`, rows every `step_s`; the solver's step is `solver_s`, and it starts `before_h` earlier.
 
     `has` and `lacks` overrule the features that the seed gives (`twin.plants.machine.FEATURES`). `file_error` is the
     sd of the logarithm of what the engineer's values are off by, `mass_error` that of masses.
@@ -16,6 +16,7 @@ class Options:
     batches: int = 12
     step_s: float = 300.0
     hours: float = 6.0
+    before_h: float = 10.0
     noise_K: float = 0.03
     noise_um: float = 0.8
     quantisation_K: float = 0.1

@@ -11,7 +11,7 @@ from twin.plants.casting import Array
 from twin.plants.conditions import Now, moments
 from twin.plants.effects.base import Effect
 from twin.plants.machine import Plant, Source
-from twin.plants.runs import BEFORE_H, Run
+from twin.plants.runs import Run
 from twin.plants.solver import GAMMA, Heat, integrate
 
 LEAD_S, TAIL_S = 900.0, 900.0  # simulated finely about the run itself: lags settle, clocks may be off
@@ -29,13 +29,15 @@ class Course:
     wall_degC: Array
 
 
-def simulated(plant: Plant, runs: Sequence[Run], effects: Sequence[Effect], step_s: float) -> Course:
-    """All runs of a case, from hours before their starts to a little beyond their ends, kept from `LEAD_S` before on.
+def simulated(
+    plant: Plant, runs: Sequence[Run], effects: Sequence[Effect], step_s: float, before_h: float = 10.0
+) -> Course:
+    """All runs of a case, from `before_h` before their starts to `TAIL_S` beyond their ends, kept from -`LEAD_S` on.
 
     `step_s` divides `LEAD_S`; the runs are equally long.
     """
     s = plant.structure
-    first_s = -3600.0 * BEFORE_H
+    first_s = -3600.0 * before_h
     room0 = np.array([float(r.room_degC(np.array([first_s]))[0]) for r in runs])
     slow = np.zeros(s.size)
     slow[np.concatenate([s.cells[n] for n in ("bed", "column", "table")])] = 1.0

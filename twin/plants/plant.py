@@ -51,7 +51,7 @@ def draw(
     name = f"plant_{seed:04d}"
     machine = machine_file(plant, effects, name, seed, asked)
     runs = plan_runs(seed, asked.batches, asked.hours, asked.step_s, plant.rated_rpm, asked.friction_scatter)
-    course = simulated(_with_amounts(plant, effects), runs, effects, asked.solver_s)
+    course = simulated(_with_amounts(plant, effects), runs, effects, asked.solver_s, asked.before_h)
     shown = recordings(
         _with_amounts(plant, effects), runs, course, effects, seed, name, machine.batch_channels(), asked
     )
@@ -123,14 +123,15 @@ def _checked(seed: int, size: float, kind: type[Options], given: Mapping[str, An
     for name in (*options.has, *options.lacks):
         if name not in FEATURES:
             raise InputError(f"plant: unknown feature {name!r}; {closest(name, FEATURES)}")
-    steps = LEAD_S / options.solver_s
+    whole = all((s / options.solver_s).is_integer() for s in (LEAD_S, options.step_s))
     for what, got, fits, expected in (
         ("seed", seed, seed >= 0, "0 or more"),
         ("size", size, size >= 0, "0 or more"),
         ("batches", options.batches, 1 <= options.batches <= 60, "1 to 60"),
         ("step_s", options.step_s, 10.0 <= options.step_s <= 1800.0, "10 to 1800 s"),
         ("hours", options.hours, 0.5 <= options.hours <= 24.0, "0.5 to 24 h"),
-        ("solver_s", options.solver_s, steps == round(steps), f"a divisor of {LEAD_S:g} s"),
+        ("before_h", options.before_h, 1.0 <= options.before_h <= 240.0, "1 to 240 h"),
+        ("solver_s", options.solver_s, whole, f"a divisor of {LEAD_S:g} s and of step_s"),
     ):
         if not fits:
             raise InputError(f"plant: {what}: got {got}, expected {expected}; choose another value")

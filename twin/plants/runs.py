@@ -11,7 +11,6 @@ import pandas as pd
 from twin.plants.casting import Array
 from twin.plants.seeds import stream
 
-BEFORE_H = 10.0  # simulated before a batch, so that it starts off equilibrium
 COLDEST_DEGC, WARMEST_DEGC = 12.0, 28.0
 GROUND_MEAN_DEGC, GROUND_FOLLOWS = 18.0, 0.5
 STANDING_S = 300.0

@@ -15,7 +15,10 @@ from twin.plants.machine import Plant
 from twin.plants.plant import Case, draw
 
 Array = NDArray[np.float64]
-QUIET: dict[str, Any] = {"batches": 4, "hours": 4.0, "noise_K": 0.0, "noise_um": 0.0, "quantisation_K": 1e-6}
+QUIET: dict[str, Any] = {
+    "batches": 4, "hours": 4.0, "before_h": 5.0, "solver_s": 50.0,
+    "noise_K": 0.0, "noise_um": 0.0, "quantisation_K": 1e-6,
+}  # fmt: skip
 SEED = 3
 NONE: frozenset[str] = frozenset()
 

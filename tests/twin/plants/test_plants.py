@@ -199,7 +199,7 @@ def test_options_shape_the_recordings() -> None:
         ({"has": ("fead",)}, "unknown feature 'fead'; did you mean 'feed'"),
         ({"size": -1.0}, "size: got -1.0, expected 0 or more"),
         ({"batches": 0}, "batches: got 0, expected 1 to 60"),
-        ({"solver_s": 7.0}, "solver_s: got 7.0, expected a divisor of 900 s"),
+        ({"solver_s": 7.0}, "solver_s: got 7.0, expected a divisor of 900 s and of step_s"),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(given: dict[str, Any], words: str) -> None:
