@@ -14,7 +14,9 @@ from data.machine import parse_machine
 from twin.calibration.identifiability import Interval
 from twin.calibration.rewrite import Update, with_calibrated, with_values
 from twin.compile import compile_network
+from twin.compiling.own_paths import own_paths
 from twin.network import Network
+from twin.schema import twin_part
 
 DIGITS = 5e-5  # relative: what `twin.calibration.rewrite` keeps of a value
 
@@ -45,8 +47,10 @@ def check_writable(source: Path, network: Network) -> str:
         text = source.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"machine file {source}: cannot be read ({error}); give the path of a .yml file") from None
+    where = f"machine file {source}"
     free = [network.parameters[k] for k in network.free]
-    with_values(text, {p.name: Update(p, p.value, (p.value, p.value)) for p in free}, f"machine file {source}")
+    own = _own_paths(text, where)
+    with_values(text, {own.get(p.name, p.name): Update(p, p.value, (p.value, p.value)) for p in free}, where)
     return text
 
 
@@ -58,8 +62,10 @@ def calibrated_text(
     Raises:
         WorkError: the new text does not read back as the same network with these values.
     """
+    own = _own_paths(text, where)
     updates = {
-        i.name: Update(network.parameters[network.index(i.name)], values[i.name], (i.low, i.high)) for i in intervals
+        own.get(i.name, i.name): Update(network.parameters[network.index(i.name)], values[i.name], (i.low, i.high))
+        for i in intervals
     }
     new = with_calibrated(with_values(text, updates, where), _lines(origin))
     try:
@@ -71,6 +77,11 @@ def calibrated_text(
         if not math.isclose(kept, value, rel_tol=DIGITS * 2, abs_tol=1e-12):
             raise WorkError(f"{where}: {name} reads back as {kept:g} instead of {value:g}; nothing was written")
     return new
+
+
+def _own_paths(text: str, where: str) -> dict[str, str]:
+    machine = parse_machine(text, where)
+    return own_paths(machine, twin_part(machine, where))
 
 
 def write_file(path: Path, text: str, source: Path, overwrite: bool = False) -> None:
