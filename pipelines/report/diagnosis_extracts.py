@@ -53,11 +53,14 @@ def telling(rms: pd.DataFrame, changed: bool, most: int = 3) -> list[tuple[str, 
 
 
 def chosen_channels(channels: pd.DataFrame, changed: bool, most: int = 4) -> list[str]:
-    """Two to four channels that change most (without a change: that differ most), errors and temperatures mixed."""
+    """Two to four channels that change most (without a change: that differ most), one displacement at least."""
     size = (channels["before"] - channels["after"] if changed else channels["before"]) / channels["floor"]
     ranked = channels.assign(size=size.fillna(0.0)).sort_values("size", ascending=False, kind="stable")
     strong = ranked[ranked["size"] > 0.1 * ranked["size"].max()] if len(ranked) else ranked
     names = [str(c) for c in (strong if len(strong) >= 2 else ranked)["channel"][:most]]
+    errors = [str(c) for c in ranked["channel"][~ranked["unit"].isin(["K", "degC"])]]
+    if errors and not set(errors) & set(names):
+        names = [*names[: most - 1], errors[0]]
     return [str(c) for c in by_change(channels)["channel"] if c in names]
 
 

@@ -15,7 +15,7 @@ from pipelines.report.twin_figures import _WIDTH_IN, SOFT, _calm, _head
 from pipelines.report.words import BLUE, INK, ORANGE, number
 
 FLOOR = "#cfd6dd"
-_ROW_IN, _MOST_ROWS, _MOST_RUNS = 0.27, 16, 30
+_ROW_IN, _MOST_ROWS, _MOST_RUNS = 0.27, 12, 30
 _NAMES_IN, _NUMBERS_IN = 1.15, 1.95
 
 
@@ -23,10 +23,12 @@ def before_after(channels: pd.DataFrame, changed: bool, simulated: bool) -> Figu
     """A dumbbell per channel, displacements left and temperatures right, with the noise floor as a bar behind.
 
     Args:
-        channels: `diagnosis_extracts.by_channel`, in the order to draw; at most 16 of a unit are drawn.
+        channels: `diagnosis_extracts.by_channel`, in the order to draw; at most 12 of a unit are drawn.
         changed: whether something was found; else there is one dot a channel.
     """
-    groups = [part[:_MOST_ROWS] for _, part in channels.groupby(channels["unit"].isin(["K", "degC"]), sort=False)]
+    groups = [part for _, part in channels.groupby(channels["unit"].isin(["K", "degC"]), sort=False)]
+    left_over = [max(len(g) - _MOST_ROWS, 0) for g in groups]
+    groups = [g[:_MOST_ROWS] for g in groups]
     high = _ROW_IN * max(len(g) for g in groups) + 1.3
     fig = Figure(figsize=(_WIDTH_IN, high))
     panel = _WIDTH_IN / len(groups)
@@ -35,6 +37,8 @@ def before_after(channels: pd.DataFrame, changed: bool, simulated: bool) -> Figu
         ax = fig.add_axes((left / _WIDTH_IN, 1 - (0.86 + tall) / high, wide / _WIDTH_IN, tall / high))
         _bells(ax, part, [str(c) for c in part["channel"]], changed)
         _numbers(ax, part, changed, wide)
+        if left_over[k]:
+            ax.set_xlabel(f"{ax.get_xlabel()}; {left_over[k]} more channels change less", fontsize=8, labelpad=1)
     _head(fig, "Error of left-out runs against the noise floor", simulated)
     _keys(fig, changed)
     return fig
@@ -42,22 +46,23 @@ def before_after(channels: pd.DataFrame, changed: bool, simulated: bool) -> Figu
 
 def by_run(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated: bool) -> Figure:
     """The same run by run (at most 30), a panel for each of the given channels."""
-    runs = list(dict.fromkeys(rms["batch"]))[:_MOST_RUNS]
+    every = list(dict.fromkeys(rms["batch"]))
+    runs = every[:_MOST_RUNS]
     high = 0.2 * len(runs) + 1.35
     fig = Figure(figsize=(_WIDTH_IN, high))
     wide = (_WIDTH_IN - _NAMES_IN) / len(channels)
     for k, channel in enumerate(channels):
-        part = rms[rms["channel"] == channel].drop_duplicates("batch").set_index("batch").reindex(runs)
+        own = rms[rms["channel"] == channel].drop_duplicates("batch").set_index("batch")
+        part = own.reindex(runs)
         size = ((_NAMES_IN + k * wide) / _WIDTH_IN, 0.45 / high, (wide - 0.25) / _WIDTH_IN, 0.2 * len(runs) / high)
         ax = fig.add_axes(size)
-        _bells(ax, part, [str(r) for r in runs] if k == 0 else [""] * len(runs), changed)
+        _bells(ax, part, [_shortened(str(r)) for r in runs] if k == 0 else [""] * len(runs), changed)
         ax.set_title(_free(channel), fontsize=9, loc="left", color=INK, pad=4)
         if changed:
-            better = int((part["after"] < part["before"]).sum())
-            ax.set_title(
-                f"{better} of {int(part['after'].notna().sum())} better", fontsize=8, loc="right", color=SOFT, pad=4
-            )
-    _head(fig, "Run by run, each predicted from the others", simulated)
+            better = f"{int((own['after'] < own['before']).sum())} of {int(own['after'].notna().sum())} better"
+            ax.set_title(better, fontsize=8, loc="right", color=SOFT, pad=4)
+    first = f" (the first {len(runs)} of {len(every)})" if len(every) > len(runs) else ""
+    _head(fig, f"Run by run, each predicted from the others{first}", simulated)
     _keys(fig, changed)
     return fig
 
@@ -164,6 +169,11 @@ def _run(ax: Axes, own: pd.DataFrame, told: pd.DataFrame, channel: str, changed:
     ax.locator_params(axis="y", nbins=4)
     if len(hours) > 1:
         ax.set_xlim(hours[0], hours[-1])
+
+
+def _shortened(name: str) -> str:
+    """Both ends of a long name: what tells runs apart stands mostly last."""
+    return name if len(name) <= 13 else f"{name[:4]}…{name[-8:]}"
 
 
 def _digits(value: float) -> int:

@@ -24,7 +24,7 @@ from pipelines.report.network_boxes import (
     segments,
     title,
 )
-from pipelines.report.network_glyphs import SOFT, Point, Rect, box, say, width_in
+from pipelines.report.network_glyphs import SOFT, Point, Rect, box, pills, pills_width, say, width_in
 from pipelines.report.network_picture import grown, link_width_pt
 from pipelines.report.words import BLUE, INK, number
 from twin.views.overview import BodyView, Overview, Tie
@@ -32,6 +32,7 @@ from twin.views.overview import BodyView, Overview, Tie
 MISMATCH = LinearSegmentedColormap.from_list("mismatch", ["#fdf3ea", "#fad3b0", "#f0a266", "#d9692a"])
 CALM, GREY = "#f6f8fa", "#9aa5b1"
 _LEGEND_IN, _ERRORS_IN, _SPARE_IN = 0.62, 0.72, 0.42
+_WIDEST_IN, _MOST_PILL_ROWS, _ROW_IN, _LINE_IN = 1.42, 2, 0.17, 0.165  # of the sensors in a box
 KINDS = {"heat": "unexplained heat", "displacement": "unexplained displacement", "sensor": "unexplained reading"}
 _UNITS = {"um": "µm", "um/m": "µm/m", "degC": "K"}
 
@@ -95,6 +96,7 @@ def mismatch_picture(view: Overview, found: pd.DataFrame, marks: Sequence[Mark])
     bodies = placed(bodies, lines)
     for body in bodies:
         draw(ax, body)
+        _sensors(ax, body, _sensor_rows(view, body.name, tints))
     errors = _errors(ax, view, tints)
     _legend(ax, tints, found)
     drawn = _Drawn({b.name: b.rect for b in bodies}, dict(zip([t.name for t in links], lines, strict=True)), errors)
@@ -131,15 +133,44 @@ def _tints(found: pd.DataFrame) -> _Tints:
 
 def _body(view: Overview, b: BodyView, tints: _Tints) -> Body:
     words = tints.words("heat", b.name)
-    sensors = [c for c, body in view.sensors if body == b.name]
-    pills = []
-    for c in sensors:
-        told = tints.words("sensor", c)
-        pills.append((f"◆ {c} {told}".strip(), tints.color("sensor", c, "#ffffff")))
     stubs = tuple(_stub(view, t) for t in view.ties if t.ground and t.ends[0] == b.name)
     ring = "#7c8896" if given_to(view, b.name) else ""
-    lines = ((words, INK),) if words else ()
-    return Body(b.name, lines, grown(view, b), tuple(pills), (), stubs, tints.color("heat", b.name), ring)
+    rows = _sensor_rows(view, b.name, tints)
+    last = rows[-1] if rows else ()
+    lines = (((words, INK),) if words else ()) + ((" ", INK),) * (len(rows) - 1)  # lines that further pills take
+    return Body(b.name, lines, grown(view, b), tuple(last), (), stubs, tints.color("heat", b.name), ring)
+
+
+def _sensor_rows(view: Overview, body: str, tints: _Tints) -> list[list[tuple[str, str]]]:
+    """Pills of a body's sensors in rows that a box holds, those with a mismatch first; the last counts the rest."""
+    own = [c for c, at in view.sensors if at == body]
+    own.sort(key=lambda c: -tints.of.get(("sensor", c), (0.0, 0.0, ""))[0])
+    rows: list[list[tuple[str, str]]] = []
+    for k, c in enumerate(own):
+        pill = (_pill(c, tints.words("sensor", c)), tints.color("sensor", c, "#ffffff"))
+        if rows and pills_width([*rows[-1], pill]) <= _WIDEST_IN:
+            rows[-1].append(pill)
+        elif len(rows) < _MOST_PILL_ROWS:
+            rows.append([pill])
+        else:
+            rows[-1][-1] = (f"{len(own) - k + 1} more", "#ffffff")
+            break
+    return sorted(rows, key=pills_width)  # the widest last: the box is made for it
+
+
+def _pill(channel: str, told: str) -> str:
+    words = f"◆ {channel} {told}".strip()
+    while pills_width([(words, "")]) > _WIDEST_IN and len(channel) > 4:
+        channel = channel[:-2].rstrip("…") + "…"
+        words = f"◆ {channel} {told}".strip()
+    return words
+
+
+def _sensors(ax: Axes, b: Body, rows: list[list[tuple[str, str]]]) -> None:
+    """All but the last row of pills, which the box draws itself."""
+    low = b.rect.y - _ROW_IN * (b.rows - 1) / 2 - 0.015
+    for k, row in enumerate(reversed(rows[:-1]), 1):
+        pills(ax, low + _LINE_IN * k, b.rect.x, row)
 
 
 def _stub(view: Overview, t: Tie) -> Stub:
@@ -206,7 +237,7 @@ def _marked(ax: Axes, view: Overview, m: Mark, drawn: _Drawn) -> bool:
     if r is None:
         return False
     _ringed(ax, r)
-    _tab(ax, (r.x, r.y + side * (r.h / 2 + 0.02)), m.label)
+    _tab(ax, (r.x, r.y + side * (r.h / 2 + 0.08)), m.label)
     return True
 
 

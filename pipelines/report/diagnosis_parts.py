@@ -87,7 +87,8 @@ def _where(d: Diagnosis, pictures: bool) -> Part | None:
 
 
 def _short(mechanism: str) -> str:
-    return "missing heat" if mechanism == "free_flux" else mechanism.replace("_", " ")
+    known = {"free_flux": "missing heat", "free_shift": "missing displacement", "unlisted": "not listed"}
+    return known.get(mechanism) or mechanism.replace("_", " ")
 
 
 def _better(d: Diagnosis, pictures: bool) -> Part | None:

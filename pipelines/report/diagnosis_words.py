@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from pipelines.report.words import count, listed, number
 from twin.diagnosis.findings import NextExperiment
+from twin.diagnosis.statement import LIKELY, SURE
 
 # Mastrandrea et al. 2010, IPCC guidance note on uncertainties, table 1: lower bound of the probability, its words.
 _LIKELIHOOD = (
@@ -14,12 +15,13 @@ _LIKELIHOOD = (
 )  # fmt: skip
 NARROW = "\u202f"  # a space that does not break
 CHIPS = {
-    "consistent": "nothing missing", "explained": "explained", "partly_explained": "partly explained",
+    "consistent": "consistent", "explained": "explained", "partly_explained": "partly explained",
     "unlisted": "not in the library", "undecidable": "cannot tell yet",
 }  # fmt: skip
 _RIVALS = {
     "wrong_parameter": "a wrong parameter", "coarse_network": "too coarse a network",
     "varies_between_runs": "something that varies between runs", "free_flux": "missing heat of no listed mechanism",
+    "free_shift": "missing displacement of no listed mechanism", "unlisted": "no listed mechanism",
 }  # fmt: skip
 UNITS = {"um": "µm", "um/m": "µm/m", "degC": "°C", "1": "", "um/K": "µm/K", "um/m/K": "µm/m/K"}
 
@@ -68,13 +70,15 @@ def probability_words(probability: float) -> str:
     return ("> 99 %" if percent > 99 else "< 1 %" if percent < 1 else f"{percent:.0f} %").replace(" ", NARROW)
 
 
-def headline(verdict: str, n: int) -> str:
-    """The verdict as one line for the shop floor; n findings."""
+def headline(verdict: str, probabilities: Sequence[float]) -> str:
+    """The verdict as one line for the shop floor, never more certain than the least probable of its findings."""
+    n, least = len(probabilities), min(probabilities, default=1.0)
+    the = "The" if least >= SURE else "Most likely the" if least >= LIKELY else "Perhaps the"
     effects = "one effect" if n == 1 else f"{_spelled(n)} effects"
     return {
-        "consistent": "Nothing is missing: the remaining error is the noise.",
-        "explained": f"The simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",
-        "partly_explained": f"The simulation left out {effects}; something else is still missing.",
+        "consistent": "Consistent: the remaining error is the noise.",
+        "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",
+        "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",
         "unlisted": "Something is missing that no listed mechanism explains.",
         "undecidable": "Something is missing, but these recordings cannot tell what.",
     }[verdict]

@@ -110,7 +110,7 @@ def _light(color: str) -> bool:
     """Whether dark words read better on it (relative luminance, WCAG 2.1)."""
     rgb = np.array(to_rgb(color))
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722]) > 0.3
+    return float(linear @ [0.2126, 0.7152, 0.0722]) > 0.22
 
 
 def pills_width(labels: Iterable[tuple[str, str]], size_pt: float = 6.8) -> float:

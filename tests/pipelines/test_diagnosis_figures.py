@@ -10,10 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 from toy_diagnosis import BATCHES, toy_diagnosis
 
 from pipelines.report import diagnosis_evidence, diagnosis_extracts, diagnosis_figures
 from pipelines.report.diagnosis_map import Mark, mismatch_picture
+from pipelines.report.network_boxes import PITCH_IN
 from twin.diagnosis.diagnosis import COLUMNS
 from twin.views.overview import Overview
 
@@ -155,3 +157,22 @@ def test_names_with_dollars_and_many_runs_are_drawn() -> None:
         figure.savefig(io.BytesIO(), format="svg")
         assert any("z\\$1\\$" in s for s in texts(figure))
     assert len(figures[1].axes[0].get_yticks()) == 30
+
+
+def test_many_sensors_of_a_body_fit_its_box(view: Overview) -> None:
+    """Those with a mismatch come first, the rest are counted; no box grows into its neighbour."""
+    more = tuple((f"a_channel_{k}", "bed") for k in range(9))
+    found = pd.DataFrame(
+        [("sensor", "a_channel_7", "K", 0.3, -0.3, True)], columns=["kind", "place", "unit", "size", "mean", "shown"]
+    )
+    figure = mismatch_picture(replace(view, sensors=(*view.sensors, *more)), found, [])
+    said = texts(figure)
+    assert "◆ a_channel_7 −0.30 K" in said and "8 more" in said and "◆ a_channel_0" not in said
+    boxes = [p for p in figure.axes[0].patches if isinstance(p, FancyBboxPatch) and p.get_height() > 0.25]
+    assert max(p.get_width() for p in boxes) + 0.12 < PITCH_IN[0]
+
+
+def test_a_displacement_is_always_among_the_drawn_channels() -> None:
+    rows = [("a", f"t{k}", "K", 9, 5.0, 0.1, 0.1) for k in range(6)] + [("a", "z", "um", 9, 2.0, 1.0, 1.0)]
+    channels = diagnosis_extracts.by_channel(pd.DataFrame(rows, columns=list(COLUMNS["rms"])))
+    assert diagnosis_extracts.chosen_channels(channels, True) == ["z", "t0", "t1", "t2"]

@@ -19,12 +19,12 @@ from toy_diagnosis import BATCHES, toy_diagnosis
 from data.errors import InputError
 from pipelines.report import diagnosis_tables
 from pipelines.report.diagnosis_report import diagnosis_page, write_diagnosis_report
-from pipelines.report.diagnosis_words import GLOSSARY, METHOD, likelihood, probability_words
+from pipelines.report.diagnosis_words import GLOSSARY, METHOD, headline, likelihood, probability_words
 from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
 from twin.diagnosis.findings import Findings
 
 VERDICTS = {
-    "consistent": ("nothing missing", "Nothing is missing: the remaining error is the noise."),
+    "consistent": ("consistent", "Consistent: the remaining error is the noise."),
     "explained": ("explained", "The simulation left out one effect; with it only the noise remains."),
     "partly_explained": (
         "partly explained",
@@ -81,7 +81,9 @@ def test_a_finding_is_told_with_place_time_probability_and_what_else_it_may_be()
     assert (free.what, free.when) == ("missing heat of no listed mechanism", "spindle_rpm > 0")
 
 
-def test_no_probability_is_certain() -> None:
+def test_no_headline_or_probability_is_more_certain_than_the_finding() -> None:
+    assert headline("explained", [0.97, 0.7]).startswith("Most likely the simulation left out two effects; with them")
+    assert headline("partly_explained", [0.4]).startswith("Perhaps the simulation left out one effect; something else")
     assert [likelihood(p) for p in (1.0, 0.95, 0.9, 0.66, 0.5, 0.33, 0.1, 0.0)] == [
         "virtually certain", "extremely likely", "very likely", "likely", "more likely than not",
         "about as likely as not", "unlikely", "very unlikely",
@@ -161,11 +163,15 @@ def test_sections_come_in_order_and_without_data_not_at_all(full: str) -> None:
 def test_words_from_the_findings_are_text_and_no_markup(folder: Path) -> None:
     d = toy_diagnosis("explained")
     odd = d.findings.findings[0].model_copy(update={"statement": "a <b>bold</b> & $ claim"})
-    d = replace(changed(d, findings=(odd,), statement="Why <i>so</i>."), words=("<script>alert(1)</script>",))
+    d = replace(changed(d, findings=(odd,)), words=("<script>alert(1)</script>",))
     write_diagnosis_report(folder / "odd.html", d, pictures=False)
     text = (folder / "odd.html").read_text(encoding="utf-8")
-    assert "a &lt;b&gt;bold&lt;/b&gt; &amp; $ claim" in text and "Why &lt;i&gt;so&lt;/i&gt;." in text
+    assert "a &lt;b&gt;bold&lt;/b&gt; &amp; $ claim" in text
     assert "<script" not in text
+    quiet = changed(toy_diagnosis("consistent"), statement="Why <i>so</i>.")
+    write_diagnosis_report(folder / "quiet.html", quiet, pictures=False)
+    said = '<p class="lead">Why &lt;i&gt;so&lt;/i&gt;.</p>'
+    assert said in (folder / "quiet.html").read_text(encoding="utf-8")
 
 
 def test_a_wrong_place_is_told_in_one_line(folder: Path) -> None:
