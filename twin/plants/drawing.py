@@ -93,8 +93,9 @@ def _growths(layout: Layout, features: frozenset[str]) -> tuple[Growth, ...]:
 
 
 def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
-    """One in most bodies, at a cell away from the body's middle."""
+    """One in most bodies, at a cell away from the body's middle and from its joints."""
     rng = stream(seed, "sensors")
+    joined = s.joined()
     out = []
     for body, cells in s.bodies.items():
         missing, order = rng.random(), rng.permutation(len(cells))
@@ -102,7 +103,7 @@ def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
         if body in UNSENSED or (body in SELDOM_SENSED and missing < 0.4):
             continue
         off = _off_middle(s, cells)
-        far = [int(cells[k]) for k in order if 0.35 <= off[k] <= 1.05]
+        far = [int(cells[k]) for k in order if 0.35 <= off[k] <= 1.05 and cells[k] not in joined]
         out.append(Sensor(f"t_{body}", body, (far or [int(cells[order[0]])])[0], lag_s, offset_K))
     return tuple(out)
 

@@ -70,7 +70,7 @@ def _castings(s: float, f: dict[str, float], n: dict[str, int], head_at: float) 
         Casting("front", steel, 17 * f["spindle"], 0.15, 0.18, 0.05, (5, 1), head_m),
         Casting("rear", steel, 10.5 * f["spindle"], 0.12, 0.15, 0.05, (4, 1), head_m + 0.35),
         Casting("motor", steel, 50 * f["motor"], 0.26, 0.22, 0.22, (5, 1), head_m + 0.45 * s),
-        Casting("head", iron, 240 * s * s * f["head"], 0.62 * s, 0.45 * s, 0.3 * s, (n["head_x"], n["head_z"]), head_m),
+        Casting("head", iron, 320 * s * s * f["head"], 0.62 * s, 0.45 * s, 0.3 * s, (n["head_x"], n["head_z"]), head_m),
         Casting("column", iron, 640 * s * s * f["column"], 0.5 * s, 1.4 * s, 0.45 * s, column, foot),
         Casting("bed", iron, 1700 * s * s * f["bed"], 1.8 * s, 0.45 * s, 0.7 * s, (n["bed"], 3), 0.0),
         Casting("saddle", iron, 220 * s * s * f["saddle"], 0.7 * s, 0.12 * s, 0.5 * s, (6, 1), foot),
@@ -84,8 +84,8 @@ def _join(a: Assembly, g: dict[str, float], head_at: float) -> None:
     """Contacts where they are on a machine of this kind; the shaft's first cells are its nose."""
     a.joint(a.box("shaft", (0.12, 0.36)), a.box("front", (0.0, 0.35)), g["shaft-front"])
     a.joint(a.box("shaft", (0.68, 0.88)), a.box("rear", (0.0, 0.35)), g["shaft-rear"])
-    a.joint(a.box("front", (0.6, 1.0)), a.box("head", (0.78, 1.0), (0.0, 0.3)), g["front-head"])
-    a.joint(a.box("rear", (0.6, 1.0)), a.box("head", (0.3, 0.49), (0.7, 1.0)), g["rear-head"])
+    a.joint(a.box("front", (0.6, 1.0)), a.box("head", (0.72, 1.0), (0.0, 0.55)), g["front-head"])
+    a.joint(a.box("rear", (0.6, 1.0)), a.box("head", (0.25, 0.49), (0.45, 1.0)), g["rear-head"])
     a.joint(a.box("motor", (0.0, 0.25)), a.box("head", (0.1, 0.45), (0.8, 1.0)), g["motor-head"])
     slide = (head_at - 0.16, head_at + 0.16)
     a.joint(a.box("head", (0.0, 0.12)), a.box("column", (0.85, 1.0), slide), g["head-column"])

@@ -53,6 +53,14 @@ class Structure:
         pairs = {frozenset((body[int(i)], body[int(j)])) for i, j in zip(self.one, self.other, strict=True)}
         return {pair for pair in pairs if len(pair) == 2}
 
+    def joined(self) -> set[int]:
+        """Cells in contact with another casting."""
+        casting = np.full(self.size, -1)
+        for k, cells in enumerate(self.cells.values()):
+            casting[cells] = k
+        contact = (casting[self.one] != casting[self.other]) & (self.surfaces == 0)
+        return {int(c) for c in np.concatenate([self.one[contact], self.other[contact]])}
+
     def losses(self) -> sparse.csc_matrix:
         """The matrix L of ``C dT/dt = -L T + heat``, W/K, (N, N): symmetric, its rows add up to `room_W_per_K`."""
         n, g = self.size, self.between_W_per_K

@@ -28,6 +28,12 @@ def quiet(effect: str | None, size: float, has: tuple[str, ...] = (), lacks: tup
     return draw(SEED, effect, size, has=has, lacks=lacks, **QUIET)
 
 
+@cache
+def brief(effect: str | None, size: float, has: tuple[str, ...] = (), lacks: tuple[str, ...] = ()) -> Case:
+    """Two short batches, for what only has to be the same."""
+    return draw(SEED, effect, size, 2, has=has, lacks=lacks, hours=1.0, before_h=1.0, solver_s=50.0)
+
+
 def plant(seed: int = SEED, *has: str) -> Plant:
     return draw_plant(seed, frozenset(has), NONE)
 

@@ -86,6 +86,7 @@ def test_machines_differ_and_are_resolved_finely(seed: int) -> None:
     assert 7 <= len(p.sensors) <= 12
     for sensor in p.sensors:
         assert sensor.cell in s.bodies[sensor.body]
+        assert sensor.cell not in s.joined() or len(s.bodies[sensor.body]) <= 5
         assert 30 <= sensor.lag_s <= 60
     for source in p.sources.values():
         assert source.share.sum() == pytest.approx(1.0)
