@@ -1,0 +1,99 @@
+"""What is plausible of a candidate before the recordings are asked: the size of its amplitude, where its fit begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.screen import Scored
+from twin.mechanisms import MECHANISMS
+from twin.quantity import Spec, Value
+
+WIDE = 1.5  # least spread of an amplitude's logarithm: machines differ by more than their handbook values
+LEAST = 1e-3  # of the usual value: where a fit of a positive amplitude begins at the lowest
+
+
+def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
+    """A candidate's free values with priors, and parameter values by network name where its fit begins.
+
+    The prior's centre is the usual value, its spread wide; the fit begins at the amplitude that the screen found.
+    """
+    c = s.candidate
+    if c.change is not None:
+        name = c.change.parameter.name
+        value = c.change.parameter.value
+        factor = float(np.exp(np.clip(s.amplitudes.get("factor", 0.0), -2.0, 2.0)))
+        p = c.change.parameter
+        return {}, {name: float(np.clip(value * factor, p.low, p.high))} if c.change.spread else {}
+    mechanism = MECHANISMS[c.mechanism]
+    values: dict[str, Value] = {}
+    at: dict[str, float] = {}
+    for amplitude, off in (mechanism.off or {}).items():
+        spec = mechanism.spec(amplitude)
+        begin = off + s.amplitudes.get(amplitude, 0.0)
+        values[amplitude], begin = _free(spec, off, begin)
+        at[f"mechanisms.{c.name}.{amplitude}"] = begin
+    for name in c.shape:
+        spec = mechanism.spec(name)
+        values[name] = Value(value=f"{spec.value:g} {spec.unit}", spread=_spread(spec), bounds=_bounds(spec))
+    if mechanism.off is None:
+        values |= {
+            p.name: Value(value=f"{p.value:g} {p.unit}", spread=_spread(p), bounds=_bounds(p))
+            for p in mechanism.parameters
+            if p.value is not None and p.spread is not None
+        }
+    return values, at
+
+
+def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:
+    if spec.scale == "linear":
+        spread = max(3.0 * (spec.spread or 1.0), 2.0 * abs(begin - off))
+        low, high = spec.low, spec.high
+        begin = float(np.clip(begin, low, high))
+        return Value(value=f"{off:g} {spec.unit}", spread=f"{spread:.4g} {_delta(spec)}", bounds=_bounds(spec)), begin
+    usual = spec.value or 1.0
+    if spec.scale == "logit":
+        begin = float(np.clip(begin, 0.005, 0.995))
+        usual = float(np.clip(usual, 0.005, 0.995))
+        return Value(value=f"{usual:g} {spec.unit}", spread=max(WIDE, spec.spread or 0.0), bounds=_bounds(spec)), begin
+    low = max(spec.low, LEAST * usual)
+    begin = float(np.clip(begin, max(low, LEAST * usual), spec.high))
+    spread = max(WIDE, spec.spread or 0.0, abs(float(np.log(begin / usual))) / 2.0)
+    return Value(value=f"{usual:g} {spec.unit}", spread=spread, bounds=_bounds(spec)), begin
+
+
+def _spread(spec: Spec) -> str | float:
+    spread = spec.spread if spec.spread is not None else 0.5
+    return f"{spread:g} {_delta(spec)}" if spec.scale == "linear" else spread
+
+
+def _delta(spec: Spec) -> str:
+    return "K" if spec.unit == "degC" else spec.unit
+
+
+def _bounds(spec: Spec) -> tuple[str, str] | None:
+    if not (np.isfinite(spec.low) and np.isfinite(spec.high)):
+        return None
+    return f"{spec.low:g} {spec.unit}", f"{spec.high:g} {spec.unit}"
+
+
+def log_prior(s: Scored, fitted: Fitted | None) -> float:
+    """Log density of an amplitude's size about the usual one, 0 at best; signed amplitudes by their usual spread."""
+    c = s.candidate
+    if c.mechanism not in MECHANISMS:
+        return 0.0
+    mechanism = MECHANISMS[c.mechanism]
+    out = 0.0
+    for amplitude, off in (mechanism.off or {}).items():
+        spec = mechanism.spec(amplitude)
+        value = off + s.amplitudes.get(amplitude, 0.0)
+        name = f"mechanisms.{c.name}.{amplitude}"
+        if fitted is not None and any(p.name == name for p in fitted.problem.network.parameters):
+            value = float(fitted.values[fitted.problem.network.index(name)])
+        if spec.scale == "log" and spec.value and value > 0:
+            out = min(out, -0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
+        elif spec.scale == "linear" and spec.spread:
+            out = min(out, -0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
+    return out
