@@ -88,9 +88,8 @@ class Value(BaseModel):
 
     `spread` is the prior's standard deviation: of the logarithm for positive parameters (0.5 is about a factor 1.6),
     of the value itself, with a unit, for signed ones. A spread frees the parameter; `free: false` holds it all the
-    same. `bounds` in the parameter's unit. `per_batch` is how much the value differs from run to run, like `spread` the
-    prior's sd in the fitting coordinate: each batch of a calibration has a deviation of its own, a prediction none. A
-    calibrated file keeps the prior's centre in `prior` and says how sure the value is in `interval90`.
+    same. `bounds` in the parameter's unit. `per_batch`, on the size of a heat, is how much it differs from run to run:
+    the sd of its logarithm; each batch of a calibration has a deviation of its own, a prediction none. A calibrated file keeps the prior's centre in `prior` and says how sure the value is in `interval90`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

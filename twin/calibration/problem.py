@@ -170,29 +170,28 @@ class CalibrationProblem:
 
     def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
         """(measured − simulated) / noise of every batch, (n_b,) each."""
-        if len(self.nuisances.parameters) and len(self.measured) > 1:
-            return [r for one, v in zip(self._singles, nuisance, strict=True) for r in one.residuals(x, [v])]
         start, offset = self._own(nuisance)
-        values = self._own_values(x, nuisance)
-        simulation = simulate(self.network, values, self.inputs, start, offsets_K=offset)
+        simulation = simulate(self.network, self.values_at(x), self._own_heat(nuisance), start, offsets_K=offset)
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
     @cached_property
-    def _singles(self) -> list[CalibrationProblem]:
-        """Every batch by itself, where each has parameters of its own."""
-        return [self.only([b]) for b in range(len(self.measured))]
+    def _heats(self) -> list[tuple[str, ...]]:
+        """The heat laws that each varying parameter scales."""
+        laws = [h.law for h in self.network.heats if not h.asleep]
+        return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
-    def _own_values(self, x: Array, nuisance: Sequence[Array]) -> Array:
-        """Parameter values (n,) at x, with the only batch's own deviations where there are any."""
-        values = self.values_at(x)
-        if len(self.nuisances.parameters):
-            first = self.nuisances.shared - len(self.nuisances.parameters)
-            own = nuisance[0][first : self.nuisances.shared] * self.nuisances.deviation
-            for k, step in zip(self.nuisances.parameters, own, strict=True):
-                p = self.network.parameters[k]
-                values[k] = np.clip(p.from_x(p.to_x(values[k]) + step), p.low, p.high)
-        return values
+    def _own_heat(self, nuisance: Sequence[Array]) -> Inputs:
+        """The inputs with each batch's own size of the heats that differ from run to run."""
+        if not self._heats:
+            return self.inputs
+        first = self.nuisances.shared - len(self._heats)
+        own = np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
+        times: dict[str, Array] = {}
+        for names, deviation in zip(self._heats, own.T, strict=True):
+            for name in names:
+                times[name] = times.get(name, 1.0) * np.exp(deviation)
+        return self.inputs.with_times(times)
 
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
@@ -214,14 +213,10 @@ class CalibrationProblem:
         return out
 
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
-        if len(self.nuisances.parameters) and len(self.measured) > 1:
-            for one, v in zip(self._singles, nuisance, strict=True):
-                yield from one._blocks(x, [v])
-            return
         start, offset = self._own(nuisance)
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         simulation, *slopes = sensitivities(
-            self.network, self._own_values(x, nuisance), self.inputs, start, numbers,
+            self.network, self.values_at(x), self._own_heat(nuisance), start, numbers,
             starts=len(self.nuisances.start_K) > 0, offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
         )  # fmt: skip
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)

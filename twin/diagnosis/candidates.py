@@ -44,7 +44,7 @@ def candidates(machine: Machine, part: TwinPart) -> list[Candidate]:
         for target in mechanism.acts_at:
             for site in _sites(part, mechanism, target):
                 for c in _at(machine, part, mechanism, target, site):
-                    if not _there_already(part, c):
+                    if _fits(machine, mechanism, c) and not _there_already(part, c):
                         out.setdefault(c.name, c)
     return [out[name] for name in sorted(out)]
 
@@ -92,7 +92,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
         return [
             Site(kind, name, _outlets(given))
             for name, given in part.mechanisms.items()
-            if "heat_W" in MECHANISMS[given.law].effects()
+            if "heat_W" in MECHANISMS[given.law].effects() and given.law in (mechanism.multiplies or (given.law,))
         ]
     groups: dict[Target, Mapping[str, object]] = {
         "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
@@ -120,14 +120,15 @@ def _drivers(machine: Machine, mechanism: type[Mechanism]) -> Iterator[dict[str,
         choices.append([(role, None), *fits] if role in mechanism.optional_drivers else fits)
     for chosen in product(*choices):
         named = {role: name for role, name in chosen if name is not None}
-        if len(set(named.values())) == len(named):
+        if len(set(named.values())) == len(named) and (named or not mechanism.only_driven):
             yield named
 
 
 def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Site) -> Iterator[dict[str, str]]:
     """Places by the law's ports, every combination that its roles allow; of two signed sides one order."""
     choices = [
-        [(port, place) for place in _places(part, mechanism.port_roles[port], site)] for port in mechanism.ports
+        [(port, place) for place in _places(part, role, site, port not in mechanism.ports)]
+        for port, role in mechanism.port_roles.items()
     ]
     seen: set[frozenset[str]] = set()
     two_sides = len(mechanism.ports) == 2 and target == "error"  # of a body that bends: signed, so one order does
@@ -142,11 +143,11 @@ def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Sit
         yield dict(chosen)
 
 
-def _places(part: TwinPart, role: PortRole, site: Site) -> list[str]:
+def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) -> list[str]:
     if role == "itself":
         return [site.name]
     if role == "surrounding":
-        return list(part.surroundings)
+        return [name for name, s in part.surroundings.items() if s.channel or not recorded]
     if role == "outlet":
         return list(site.outlets)
     if role == "neighbour" and site.kind == "sensor":
@@ -179,6 +180,15 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
     sensor = part.sensors.get(str(c.part.acts_on))
     own = {"sensor_lag": "lag", "sensor_bonding": "bonding", "sensor_offset": "offset"}.get(c.mechanism)
     return sensor is not None and own is not None and getattr(sensor, own) is not None
+
+
+def _fits(machine: Machine, mechanism: type[Mechanism], c: Candidate) -> bool:
+    """Whether what a law adds to an error channel can be in the channel's unit: per kelvin, or by a travel."""
+    if c.where.kind != "error" or c.fault or not mechanism.off:
+        return True
+    unit, own = machine.channels[c.where.name].unit, mechanism.spec(next(iter(mechanism.off))).unit
+    by_travel = any(same_dimension(u, "mm") for u in mechanism.drivers.values())
+    return by_travel or same_dimension(own, unit) or same_dimension(own, f"{unit}/K")
 
 
 def _channels(given: MechanismPart) -> set[str]:

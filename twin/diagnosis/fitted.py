@@ -10,7 +10,7 @@ import numpy as np
 
 from data.batch import Batch
 from data.machine import Machine
-from twin.calibration.annealing import noise_left, with_noise
+from twin.calibration.annealing import SETTLED, noise_left, with_noise
 from twin.calibration.descent import State, descend, x_of, z_bounds
 from twin.calibration.fit_problem import Array
 from twin.calibration.problem import CalibrationProblem
@@ -67,8 +67,24 @@ def refitted(
     z = np.clip(z, *z_bounds(problem.unknowns))
     nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
     state = State.at(problem, z, nuisance, old.state.noise)
+    still = np.zeros(len(z))  # what each batch has of its own follows first: its steps are safe
+    own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
+    state = State.at(problem, z, own, old.state.noise)
     for _ in range(2):
         state = with_noise(problem, state, noise_left(problem, state))
         state = descend(problem, state, len(state.history) + (steps + 1) // 2, tolerance)
     state = with_noise(problem, state, noise_left(problem, state))
     return replace(old, part=part, problem=problem, state=state)
+
+
+def settle(fitted: Fitted, steps: int = 20, tolerance: float = 0.01) -> Fitted:
+    """The same fit taken on to its optimum, the noise estimated until it stands."""
+    problem, state = fitted.problem, fitted.state
+    for _ in range(4):
+        state = descend(problem, state, len(state.history) + steps, tolerance)
+        noise = noise_left(problem, state)
+        change = noise.change(state.noise)
+        state = with_noise(problem, state, noise)
+        if change < SETTLED:
+            break
+    return replace(fitted, state=state)

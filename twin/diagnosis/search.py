@@ -11,14 +11,15 @@ from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.evidence import Evidence
-from twin.diagnosis.fitted import Fitted, refitted
+from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null, structural_null
 from twin.diagnosis.priors import log_prior, start_values
 from twin.diagnosis.screen import Scored, Screen, alone, proposed, screen
 from twin.diagnosis.slack import slack
 
 MOST_EFFECTS = 4
-REFITS = 8  # of each round, one of each cluster
+REFITS, FEWEST = 8, 4  # of each round, one of each cluster
+HOPELESS = 0.3  # of the best refit's gain: what the screen gives less is not refitted
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 IMPROVED = 0.75  # share of the left-out batches that must improve
@@ -89,7 +90,9 @@ def search(baseline: Fitted, seed: int = 0, progress: Progress | None = None) ->
         if not done.accepted or len(rounds) > MOST_EFFECTS:
             break
         assert done.best is not None and done.best.fitted is not None
-        now = done.best.fitted
+        tell = progress or (lambda step, n, of: None)
+        tell("settle", len(rounds), MOST_EFFECTS)
+        now = settle(done.best.fitted)
     return Search(baseline, now, tuple(rounds))
 
 
@@ -130,15 +133,18 @@ def _tried(
     worth = [s for s in news if s.gain > WORTH][: 6 * REFITS]
     clusters = _clusters(worth, evidence)
     chosen: list[int] = []
-    for k in range(len(worth)):
-        if len(chosen) < REFITS and not any(clusters[k] == clusters[j] for j in chosen):
-            chosen.append(k)
-    out = []
-    for n, k in enumerate(chosen):
-        tell("refit", n + 1, len(chosen))
-        done = _refit(now, worth[k], base, inflation)
+    out: list[Tried] = []
+    for k, s in enumerate(worth):
+        best = max((t.gain for t in out), default=0.0)
+        if len(chosen) >= REFITS or (len(chosen) >= FEWEST and s.gain < HOPELESS * best):
+            break
+        if any(clusters[k] == clusters[j] for j in chosen):
+            continue
+        chosen.append(k)
+        tell("refit", len(chosen), REFITS)
+        done = _refit(now, s, base, inflation)
         if done is not None:
-            out.append(Tried(worth[k], done[1], done[2], clusters[k], log_prior(worth[k], done[0]), done[0]))
+            out.append(Tried(s, done[1], done[2], clusters[k], log_prior(s, done[0]), done[0]))
     best_in = {t.cluster: t for t in out}
     for k, s in enumerate(worth):
         if k not in chosen and clusters[k] in best_in:  # as much worse as the screen says

@@ -75,6 +75,8 @@ class Mechanism(ABC):
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on
+    multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
+    only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 
     linear_reading: ClassVar[bool] = (

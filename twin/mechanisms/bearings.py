@@ -85,6 +85,7 @@ class ViscosityFeedback(Mechanism):
     """
 
     key = "viscosity_feedback"
+    multiplies = ("bearing_viscous",)
     words = "lubricant that thins as it warms"
     equation = (
         "nu = nu_ref exp(-slope (T_oil - reference)), so heat is multiplied by exp(-2/3 slope (T_oil - reference))"
@@ -111,6 +112,7 @@ class PreloadFeedback(Mechanism):
     """
 
     key = "preload_feedback"
+    multiplies = ("bearing_load",)
     words = "preload that rises with the shaft's lead over the housing"
     equation = "F = F0 [1 + kappa (T_shaft - T_housing)], so heat is multiplied by (F/F0)^(1 + y), and by 0 where F < 0"
     source = "Stein and Tu 1994, J. Dyn. Syst. Meas. Control 116, thermally induced preload; Palmgren 1959 for 1 + y"

@@ -98,6 +98,9 @@ class Balance:
             return np.asarray(getattr(law.mechanism, effect)(views.view(law, along), p))
 
         out = heat_W(heat, call)
+        times = self.inputs.times.get(heat.law.name)
+        if times is not None:
+            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
         shape = (len(values), *self.inputs.valid.shape)
         if along:
             return np.broadcast_to(np.broadcast_to(out, shape)[..., None], (*shape, 2))
@@ -133,7 +136,7 @@ def _finer(
 ) -> tuple[Regimes, Array, NDArray[np.int64], tuple[Heat, ...]]:
     """Regimes in which driven heats hold as well; their watts, the given regime of each, and the heats left over."""
     driven = [h for h in network.heats if not h.temperature_dependent and not h.asleep]
-    held = [h for h in driven if not _timed(h)]
+    held = [h for h in driven if not _timed(h) and h.law.name not in inputs.times]
     number, first = distinct(
         inputs, [c for h in held for law in (h.law, *h.factors) for c in law.drivers.values()], regimes.of
     )

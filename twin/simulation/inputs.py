@@ -33,7 +33,7 @@ class Inputs:
     in each interval; recorded surroundings by channel (B, M + 1) at the borders, linear between (a plan may also give
     one by the surrounding's own name); clock_h (B,) time of day at the start, nan if unknown; first: by channel the
     first readings (B,), nan where there is none; every: how many intervals lie between two rows of the recording, so
-    that borders ``::every`` are its rows.
+    that borders ``::every`` are its rows; times: by heat law what its watts are multiplied by in each batch (B,).
     """
 
     batch_ids: tuple[str, ...]
@@ -44,6 +44,7 @@ class Inputs:
     clock_h: Array
     first: Mapping[str, Array]
     every: int = 1
+    times: Mapping[str, Array] = field(default_factory=dict)
     kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
 
     @cached_property
@@ -84,6 +85,12 @@ class Inputs:
             every=self.every * factor,
         )
 
+    def with_times(self, times: Mapping[str, Array]) -> Inputs:
+        """The same with heats of each batch's own size, (B,) by law; what is worked out once stays shared."""
+        out = replace(self, times=times)
+        object.__setattr__(out, "kept", self.kept)
+        return out
+
     def batch(self, numbers: Sequence[int] | slice) -> Inputs:
         """Some of the batches."""
         at = np.arange(self.n_batches)[numbers]
@@ -96,6 +103,7 @@ class Inputs:
             recorded={n: v[at] for n, v in self.recorded.items()},
             clock_h=self.clock_h[at],
             first={n: v[at] for n, v in self.first.items()},
+            times={n: v[at] for n, v in self.times.items()},
         )
 
 

@@ -153,6 +153,9 @@ class HeatSource:
             return np.asarray(getattr(law.mechanism, effect)(view, parameters_of(law, values, 2 if along else 3)))
 
         out = heat_W(self.heat, call)
+        times = balance.inputs.times.get(self.name)
+        if times is not None:
+            out = out * times.reshape(-1, *(1,) * (1 if along else 2))
         n_sets, n_batches = max(len(values), seen.degC.shape[1]), seen.degC.shape[2]
         if along:
             out = np.broadcast_to(out, (n_sets, n_batches, hi))[..., lo::step]
