@@ -1,0 +1,181 @@
+"""A free smooth series at a place, each batch its own: how far it explains what a calibration left, and what it is.
+
+The series is a Gaussian process on hats (Rasmussen and Williams 2006, eq. 2.30): amplitude sigma by the marginal
+likelihood, correlation falling with exp(-t / 1.5 h), so that it may jump where something is switched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import cholesky
+
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.forced import Hats
+
+Kind = Literal["heat", "displacement", "sensor"]
+
+CORRELATION_S = 5400.0
+# Of the best seen mode's signal against its noise, in sd: below the first nothing is seen, above the last all is.
+STRENGTHS = np.geomspace(0.3, 3e4, 16)
+REFINED = 5  # strengths tried again around the best
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Unit hats at P places of one kind: `rows` by batch (P, K, n_b) in given noises, K hats."""
+
+    kind: Kind
+    places: tuple[str, ...]
+    units: tuple[str, ...]
+    hats: Hats
+    rows: list[Array]
+
+    @cached_property
+    def root(self) -> Array:
+        """Lower triangular (K, K) of the hats' correlation."""
+        gap_s = np.abs(self.hats.knot_s[:, None] - self.hats.knot_s)
+        return np.asarray(cholesky(np.exp(-gap_s / CORRELATION_S), lower=True))
+
+    @cached_property
+    def shown(self) -> Array:
+        """(K, K) from a series' values to what can be known of them: errors count from their first value."""
+        out = np.eye(len(self.hats.knot_s))
+        if self.kind == "displacement":
+            out[:, 0] -= 1.0
+        return out
+
+    def nuisance(self, place: int, sigma: float) -> list[Array]:
+        """By batch the rows (n_b, K) of one place's series as K nuisances of prior N(0, 1)."""
+        return [(sigma * self.root.T @ rows[place]).T for rows in self.rows]
+
+
+@dataclass(frozen=True)
+class FreeSeries:
+    """A basis beside parameters, of `information` (p, p) and `pull` (p,), in modes that are a batch's independent hats.
+
+    `modes` (B, P, K, K) lead from modes to the values shown at the hats, of unit prior variance times sigma²;
+    `strength` (B, P, K) is their squared signal to noise per sigma²; `by_z` (B, P, K, p) and `along` (B, P, K) what
+    they see of the parameters and of the residual.
+    """
+
+    basis: Basis
+    information: Array
+    pull: Array
+    modes: Array
+    strength: Array
+    by_z: Array
+    along: Array
+
+    @classmethod
+    def of(cls, basis: Basis, own: Array, seen: Array, information: Array, pull: Array) -> FreeSeries:
+        """From the hats' products free of nuisances: with each other (B, P, K, K), with [J r] (B, P, K, p + 1)."""
+        strength, turned = np.linalg.eigh(basis.root.T @ own @ basis.root)
+        modes = basis.root @ turned
+        now = np.swapaxes(modes, -1, -2) @ seen
+        return cls(
+            basis, information, pull, basis.shown @ modes, np.maximum(strength, 0.0), now[..., :-1], now[..., -1]
+        )
+
+    @cached_property
+    def _scale(self) -> Array:
+        """The sigma (P,) at which the best seen mode has a signal of one noise; 0 where nothing is seen."""
+        best = self.strength.max(axis=(0, 2))
+        return np.asarray(1.0 / np.sqrt(np.where(best > 0, best, np.inf)))
+
+    @cached_property
+    def _by_place(self) -> tuple[Array, Array, Array]:
+        """Strength, by_z and along with places first and all batches' modes in one axis."""
+        places, z = len(self.basis.places), len(self.pull)
+        strength, along = (np.moveaxis(a, 1, 0).reshape(places, -1) for a in (self.strength, self.along))
+        return strength, np.moveaxis(self.by_z, 1, 0).reshape(places, -1, z), along
+
+    def gains(self, sigma: Array) -> Array:
+        """Log marginal likelihood (P,) at amplitudes (P,) less that at sigma = 0, nats."""
+        strength, by_z, along = self._by_place
+        var = sigma[:, None] ** 2
+        kept = var / (1.0 + var * strength)
+        scaled = np.sqrt(kept)[..., None] * by_z
+        information = self.information - np.swapaxes(scaled, -1, -2) @ scaled
+        pull = self.pull - ((kept * along)[:, None] @ by_z)[:, 0]
+        root = np.linalg.cholesky(information)
+        half = np.linalg.solve(root, pull[..., None])[..., 0]
+        gained = (kept * along**2).sum(axis=1) + (half**2).sum(axis=1)
+        spent = np.log1p(var * strength).sum(axis=1) + 2 * np.log(np.diagonal(root, 0, -2, -1)).sum(axis=1)
+        return np.asarray(0.5 * (gained - spent) - self._nothing)
+
+    @cached_property
+    def _nothing(self) -> float:
+        root = np.linalg.cholesky(self.information)
+        return float(0.5 * np.sum(np.linalg.solve(root, self.pull) ** 2) - np.log(root.diagonal()).sum())
+
+    @cached_property
+    def _tried(self) -> tuple[Array, Array]:
+        sigma = STRENGTHS[:, None] * self._scale
+        return sigma, np.stack([self.gains(s) for s in sigma])
+
+    @cached_property
+    def evidence(self) -> Array:
+        """Log marginal likelihood (P,) less that of nothing, averaged over log sigma: what a free amplitude costs."""
+        _, gain = self._tried
+        return np.asarray(np.logaddexp.reduce(gain, axis=0) - np.log(len(gain)))
+
+    @cached_property
+    def best(self) -> tuple[Array, Array]:
+        """Sigma of the highest marginal likelihood and its gain, (P,) each; 0 and 0 where nothing is gained."""
+        sigma, gain = self._tried
+        at, each = gain.argmax(axis=0), np.arange(len(self.basis.places))
+        step = STRENGTHS[1] / STRENGTHS[0]
+        finer = sigma[at, each] * np.geomspace(1 / step, step, REFINED + 2)[1:-1, None]
+        finer_gain = np.stack([self.gains(s) for s in finer])
+        at = finer_gain.argmax(axis=0)
+        gained = finer_gain[at, each]
+        return np.where(gained > 0, finer[at, each], 0.0), np.maximum(gained, 0.0)
+
+    def posterior(self, place: int) -> Posterior:
+        """What the series at one place is, at its best sigma."""
+        sigma = float(self.best[0][place])
+        kept = sigma**2 / (1.0 + sigma**2 * self.strength[:, place])
+        by_z, along = self.by_z[:, place], self.along[:, place]
+        flat, flat_kept = by_z.reshape(-1, len(self.pull)), kept.reshape(-1)
+        information = self.information - flat.T @ (flat_kept[:, None] * flat)
+        dz = np.linalg.solve(information, self.pull - flat.T @ (flat_kept * along.reshape(-1)))
+        mean = kept * (along - by_z @ dz)
+        return Posterior(
+            self.modes[:, place], mean, kept, kept[..., None] * by_z, np.asarray(np.linalg.cholesky(information))
+        )
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Mean and covariance of one place's series in B batches at K hats, parameters and nuisances integrated out."""
+
+    modes: Array  # (B, K, K)
+    mode_mean: Array  # (B, K)
+    mode_var: Array  # (B, K), given the parameters
+    by_z: Array  # (B, K, p) the modes' shift with dz
+    z_root: Array  # (p, p) lower triangular, of dz's information
+
+    @cached_property
+    def mean(self) -> Array:
+        """At the hats, (B, K)."""
+        return np.asarray((self.modes @ self.mode_mean[..., None])[..., 0])
+
+    @cached_property
+    def sd(self) -> Array:
+        """At the hats, (B, K)."""
+        own = np.einsum("bkm,bm->bk", self.modes**2, self.mode_var)
+        shift = np.linalg.solve(self.z_root, (self.modes @ self.by_z).reshape(-1, len(self.z_root)).T)
+        return np.asarray(np.sqrt(own + (shift**2).sum(axis=0).reshape(own.shape)))
+
+    def averages(self, weights: Array) -> tuple[Array, Array]:
+        """Mean and sd (A,) of weighted sums over all batches' hats, weights (A, B, K)."""
+        turned = np.moveaxis(np.moveaxis(weights, 0, 1) @ self.modes, 0, 1)
+        own = ((turned**2) * self.mode_var).sum(axis=(1, 2))
+        seen = turned.reshape(len(turned), -1) @ self.by_z.reshape(-1, len(self.z_root))
+        shift = np.linalg.solve(self.z_root, seen.T)
+        mean = (turned * self.mode_mean).sum(axis=(1, 2))
+        return mean, np.asarray(np.sqrt(own + (shift**2).sum(axis=0)))
