@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pandas as pd
+from pydantic import BaseModel
 
 from data.machine import Machine
+from twin.calibration.identifiability import Interval
 from twin.diagnosis.findings import Findings
+from twin.network import Network
 from twin.schema import TwinPart
 
 # Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
@@ -30,11 +33,15 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that a report of a diagnosis consumes.
+    """Everything that a report of a diagnosis consumes, and what its machine file and next run are written from.
 
     `part_before` is the refined and recalibrated baseline, `part_after` the same with what was found. `simulated`:
     the recordings come from a simulation. `drafted`: the machine file had no twin part. `words` are remarks: what was
     refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
+
+    For the machine file, as `twin.diagnosis.machine_file.diagnosed_text` takes them: `network` of `part_after`, fitted
+    `values` and `intervals` of its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the
+    next run as a run plan (YAML), None where there is none.
     """
 
     machine: Machine
@@ -45,3 +52,9 @@ class Diagnosis:
     drafted: bool
     words: tuple[str, ...]
     tables: Mapping[str, pd.DataFrame]
+    network: Network | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+    intervals: tuple[Interval, ...] = ()
+    added: Mapping[str, BaseModel] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
+    plan_text: str | None = None
