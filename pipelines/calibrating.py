@@ -12,14 +12,10 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from data.batch import Batch
-from data.checks import check_machine
-from data.errors import InputError, closest
-from data.ingest import ingest
-from data.lake import Lake
-from data.machine import Machine, load_machine
+from data.errors import InputError
+from data.machine import load_machine
 from pipelines import screen
-from pipelines.settings import home
+from pipelines.recordings import gather_batches
 from twin.calibration import Calibration, calibrate
 from twin.calibration.calibrated_file import Origin, calibrated_text, check_target, check_writable, write_file
 from twin.calibration.identifiability import Interval, readable_names
@@ -69,7 +65,7 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: screen.Done) -> 
     machine = load_machine(request.machine_file)
     network = compile_network(machine, f"machine file {request.machine_file}")
     text = check_writable(request.machine_file, network)
-    batches = _batches(request, machine, say)
+    batches = gather_batches(machine, request.recordings, request.batch_ids, say).batches
     say(f"calibrate {machine.machine}: {len(network.free)} free parameters, {len(batches)} batches")
 
     def told(step: str, n: int, of: int) -> None:
@@ -93,28 +89,6 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: screen.Done) -> 
     page = request.out.with_suffix(".html")
     write_twin_report(page, twin_data(machine, batches, found))
     return CalibrationOutcome(found, request.out, when, page)
-
-
-def _batches(request: CalibrationRequest, machine: Machine, say: Say) -> list[Batch]:
-    """The batches to calibrate on, from the lake, where `--recordings` are put first."""
-    missing = [str(p) for p in request.recordings if not p.exists()]
-    if missing:
-        raise InputError(f"--recordings {', '.join(missing)}: no such file or folder; give existing ones")
-    lake = Lake(home() / "lake")
-    wanted: set[str] | None = None
-    if request.recordings:
-        report = ingest(list(request.recordings), machine, lake, progress=say)
-        wanted = {r.batch_id for r in report.batches}
-        if not wanted:
-            reason = f"; {report.quarantined[0].reason}" if report.quarantined else ""
-            raise InputError(f"--recordings: no recording of {machine.machine} could be used{reason}")
-    held = check_machine(lake.load_all(machine.machine), machine)
-    held = [b for b in held if wanted is None or b.batch_id in wanted]
-    ids = [b.batch_id for b in held]
-    for name in request.batch_ids:
-        if name not in ids:
-            raise InputError(f"--batches: no batch {name!r} of {machine.machine}; {closest(name, ids)}")
-    return [b for b in held if not request.batch_ids or b.batch_id in request.batch_ids]
 
 
 def _rounded(found: Calibration) -> dict[str, float]:

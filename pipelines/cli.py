@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from data.errors import InputError, WorkError, closest
-from pipelines import screen
+from data.errors import InputError, WorkError
+from pipelines import report_command, screen, twin_commands
 from pipelines import settings as settings_module
+from pipelines.options import Json, MachineFile, names, split
 
 app = typer.Typer(
     name="thermodrift",
@@ -19,8 +20,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-MachineFile = Annotated[Path, typer.Option("--machine", help="machine file (.yml)")]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables")]
 
 
 @app.command()
@@ -114,11 +113,11 @@ def train(
 
     settings = settings_module.load()
     chosen = (
-        _names(selectors, SELECTORS, "selector"),
-        _names(families, FAMILIES, "family") if families else (),  # none: what suits the machine
-        _names(protocols, PROTOCOLS, "protocol"),
+        names(selectors, SELECTORS, "selector"),
+        names(families, FAMILIES, "family") if families else (),  # none: what suits the machine
+        names(protocols, PROTOCOLS, "protocol"),
     )
-    targets = _split(channels)
+    targets = split(channels)
     request = TrainRequest(machine, tuple(recordings or ()), targets, Plan(*chosen), report, promote)
     check_request(request, settings)  # before anything is started
     server = None
@@ -127,10 +126,11 @@ def train(
 
         server = start_server()
     from pipelines import training
+    from pipelines.caller import DirectCaller
 
     with screen.progress(as_json) as (say, done):
         if direct:
-            outcome = training.train(request, settings, training.DirectCaller(done=done), say)
+            outcome = training.train(request, settings, DirectCaller(done=done), say)
         else:
             outcome = train_in_flow(request, settings, say, done, server)
     if as_json:
@@ -139,66 +139,7 @@ def train(
         screen.print_outcome(outcome)
 
 
-@app.command()
-def report(
-    machine: Annotated[str, typer.Option("--machine", help="machine name; with --iso its file")],
-    subjects: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[TRAININGS]...",
-            help="training ids; default: the latest per channel. With --iso: files, folders "
-            "or batch ids in the lake; default: every batch there",
-        ),
-    ] = None,
-    iso: Annotated[
-        bool, typer.Option("--iso", help="judge recordings as thermal tests in the style of ISO 230-3")
-    ] = False,
-    sheet: Annotated[Path | None, typer.Option(help="test sheet (.yml) for --iso: position, probes, tilts …")] = None,
-    form: Annotated[str, typer.Option("--format", help="html or md; default: by --out, else html")] = "",
-    to: Annotated[
-        Path | None, typer.Option("--out", help="default: var/reports/MACHINE.html; with --iso a folder")
-    ] = None,
-) -> None:
-    """A comparison report from tracked trainings; with --iso a thermal test's report from every recording."""
-    settings_module.configure_environment()
-    if form not in ("", "html", "md"):
-        raise InputError(f"--format: got {form!r}, expected html or md")
-    if iso:
-        _thermal_tests(Path(machine), subjects or [], to, sheet, form)
-        return
-    if sheet is not None:
-        raise InputError("--sheet: a test sheet belongs to a thermal test; add --iso")
-    from pipelines import tracking
-    from pipelines.report import write_report
-    from pipelines.request import REPORT_ENDINGS, check_ending
-
-    if to is not None:
-        check_ending("--out", to, (f".{form}",) if form else REPORT_ENDINGS)
-
-    settings = settings_module.load()
-    ids = subjects
-    if not ids:
-        past = tracking.trainings(machine, None, settings)
-        if past.empty:
-            raise InputError(f"no training of {machine!r} is tracked; call `thermodrift train` first")
-        ids = past.drop_duplicates("target")["training_id"].tolist()
-    path = to or settings_module.home() / "reports" / f"{machine}.{form or 'html'}"
-    write_report([tracking.load_training(i, settings) for i in ids], path, settings)
-    screen.line(path)
-
-
-def _thermal_tests(machine: Path, recordings: list[str], to: Path | None, sheet: Path | None, form: str) -> None:
-    from data.lake import Lake
-    from pipelines.thermal_tests import write_thermal_tests
-
-    if form:
-        raise InputError("--format: with --iso both forms are written; leave it out")
-    home = settings_module.home()
-    folder = to or home / "reports" / f"iso-{machine.stem}"
-    with screen.progress(False) as (say, _):
-        reports = write_thermal_tests(machine, recordings, folder, Lake(home / "lake"), sheet, say)
-    for path in reports:
-        screen.line(path)
+app.command()(report_command.report)
 
 
 @app.command()
@@ -247,79 +188,8 @@ def predict(
         table.to_csv(to, index=False)
 
 
-@app.command()
-def simulate(
-    plans: Annotated[list[Path] | None, typer.Argument(help="run plans: stages (.yml) or tables over time")] = None,
-    machine: Annotated[Path | None, typer.Option("--machine", help="machine file (.yml) with a twin part")] = None,
-    sample_year: Annotated[bool, typer.Option("--sample-year", help="the built-in year of 30 batches")] = False,
-    to: Annotated[Path | None, typer.Option("--out", help="folder; default: simulated, or sample_year")] = None,
-    step: Annotated[float | None, typer.Option(help="seconds from row to row; default: the plan's step")] = None,
-    noise: Annotated[bool, typer.Option("--noise", help="add noise and resolution of sensors and probes")] = False,
-    seed: Annotated[int, typer.Option(help="of the noise, or of the sample year")] = 0,
-    begins: Annotated[str, typer.Option(help="date and time of the first row; sunlight needs it")] = "",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace recordings of the same name")] = False,
-    as_json: Json = False,
-) -> None:
-    """Simulate run plans by a machine file's twin, or the sample year; written as recordings, labelled simulated."""
-    if sample_year:
-        if plans or machine is not None:
-            raise InputError("simulate: --sample-year has its own machine and plans; leave out --machine and PLANS")
-        from data.sample_year import write_sample_year
-
-        folder = to or Path("sample_year")
-        files = write_sample_year(folder, seed=seed)
-        screen.line(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
-        return
-    if not plans and machine is None:
-        raise InputError(
-            "simulate: got nothing to simulate; call `thermodrift simulate --sample-year --out FOLDER`, or "
-            "`thermodrift simulate PLAN --machine FILE --out FOLDER`"
-        )
-    if not plans:
-        raise InputError("simulate: got no run plan; name one or more (.yml with stages, or a table over time)")
-    if machine is None:
-        raise InputError("simulate: got a run plan and no machine; give its file by --machine")
-    from pipelines.simulating import SimulationRequest, beginning, simulate_plans
-    from pipelines.simulation_screen import outcome_dict, print_outcome
-
-    folder = to or Path("simulated")
-    request = SimulationRequest(machine, tuple(plans), folder, step, noise, seed, beginning(begins), overwrite)
-    with screen.progress(as_json) as (say, done):
-        outcome = simulate_plans(request, say, done)
-    if as_json:
-        screen.print_json(outcome_dict(outcome))
-    else:
-        print_outcome(outcome)
-
-
-@app.command()
-def calibrate(
-    machine: MachineFile,
-    to: Annotated[Path, typer.Option("--out", help="the calibrated machine file")],
-    recordings: Annotated[
-        list[Path] | None, typer.Option(help="files or folders to ingest and calibrate on; default: the lake")
-    ] = None,
-    batches: Annotated[str, typer.Option(help="batch ids, comma separated; default: all")] = "",
-    starts: Annotated[int, typer.Option(help="starts of the fit: the priors' means, then draws from them")] = 1,
-    leave_out: Annotated[
-        bool, typer.Option("--leave-out/--no-leave-out", help="predict every batch by a fit on the others")
-    ] = True,
-    report: Annotated[bool, typer.Option(help="pictures of the fit beside --out, as .html")] = True,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace --out if it exists")] = False,
-    as_json: Json = False,
-) -> None:
-    """Fit the machine file's free parameters to recordings: values with 90 % intervals, and what they are worth."""
-    from pipelines.calibrating import CalibrationRequest, calibrate_file, outcome_dict, print_outcome
-
-    request = CalibrationRequest(
-        machine, to, tuple(recordings or ()), _split(batches), starts, leave_out, report, overwrite
-    )
-    with screen.progress(as_json) as (say, done):
-        outcome = calibrate_file(request, say, done)
-    if as_json:
-        screen.print_json(outcome_dict(outcome))
-    else:
-        print_outcome(outcome)
+for command in (twin_commands.simulate, twin_commands.calibrate, twin_commands.diagnose):
+    app.command()(command)
 
 
 @app.command()
@@ -347,16 +217,18 @@ def status(as_json: Json = False) -> None:
     settings_module.configure_environment()
     from data.lake import Lake
     from pipelines import registry, tracking
+    from pipelines.diagnosis_tracking import diagnoses
 
     settings = settings_module.load()
     models, trainings = registry.status(settings), tracking.trainings(settings=settings)
+    diagnosed = diagnoses(settings=settings)
     lake = Lake(settings_module.home() / "lake")
     held = {m: {"batches": len(lake.batch_ids(m)), "quarantined": len(lake.quarantined(m))} for m in lake.machines()}
     if as_json:
-        tables = {"models": screen.records(models), "trainings": screen.records(trainings)}
-        screen.print_json({**tables, "lake": held})
+        tables = {"models": models, "trainings": trainings, "diagnoses": diagnosed}
+        screen.print_json({**{k: screen.records(v) for k, v in tables.items()}, "lake": held})
     else:
-        screen.print_status(models, trainings, held)
+        screen.print_status(models, trainings, diagnosed, held)
 
 
 def main() -> None:
@@ -380,18 +252,6 @@ def main() -> None:
         asked = f"thermodrift {context.info_name}" if context is not None and context.parent else "thermodrift"
         screen.trouble(f"{error.format_message().rstrip('.')}; see `{asked} --help`")
         sys.exit(2)
-
-
-def _split(given: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(n.strip() for n in given.split(",") if n.strip()))
-
-
-def _names(given: str, allowed: Any, kind: str) -> tuple[str, ...]:
-    names = _split(given)
-    for n in names:
-        if n not in allowed:
-            raise InputError(f"unknown {kind} {n!r}: {closest(n, allowed)}")
-    return names or tuple(allowed)
 
 
 if __name__ == "__main__":

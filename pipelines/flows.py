@@ -24,9 +24,11 @@ from prefect.types.entrypoint import EntrypointType
 from threadpoolctl import threadpool_limits
 
 from data.errors import InputError, WorkError
+from pipelines.caller import LANES, Done, gather
+from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
 from pipelines.request import TrainRequest
 from pipelines.settings import Settings, load
-from pipelines.training import LANES, Done, TrainOutcome, gather, train
+from pipelines.training import TrainOutcome, train
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -118,8 +120,29 @@ def retrain(machine_file: str, recordings: list[str]) -> str:
     words = outcome.stopped or "; ".join(p.words for p in outcome.promotions.values())
     quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
     words += f" (files in quarantine: {quarantined})" if quarantined else ""
+    words += f"; {outcome.diagnosis_words}" if outcome.diagnosis_words else ""
     print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {words}", flush=True)
     return words
+
+
+@flow(name="thermodrift-diagnose", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
+def diagnose(machine_file: str, recordings: list[str], out: str = "") -> str:
+    """`pipelines.diagnosing.diagnose_file` as a flow, in a folder of its own day where no `out` is given; in words.
+
+    What stops it is printed in one line, and the run counts as failed.
+    """
+    _one_line_of_trouble()
+    file = Path(machine_file)
+    folder = Path(out) if out else dated_folder(file.stem)
+    request = DiagnosisRequest(file, folder, tuple(Path(r) for r in recordings), overwrite=True)
+    try:
+        outcome = diagnose_file(request, load(), caller=PrefectCaller())
+    except (InputError, WorkError) as error:
+        print(f"{datetime.now():%Y-%m-%d %H:%M} not diagnosed: {error}", flush=True)
+        raise
+    machine = outcome.diagnosis.findings.machine
+    print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {outcome.words}", flush=True)
+    return outcome.words
 
 
 def serve_schedule(

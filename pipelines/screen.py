@@ -118,6 +118,8 @@ def print_outcome(outcome: TrainOutcome) -> None:
     for target, training in outcome.training_ids.items():
         line(outcome.promotions[target].words if target in outcome.promotions else f"training {target} {training}")
     line(f"report   {outcome.report}")
+    if outcome.diagnosis_words:
+        line(f"diagnose {outcome.diagnosis_words}")
     line("seconds  " + ", ".join(f"{k} {v:g}" for k, v in outcome.seconds.items()))
 
 
@@ -135,12 +137,16 @@ def outcome_dict(outcome: TrainOutcome) -> dict[str, Any]:
         "best": best,
         "promotions": {t: p.words for t, p in outcome.promotions.items()},
         "report": str(outcome.report) if outcome.report else None,
+        "diagnosis": str(outcome.diagnosis.out) if outcome.diagnosis else None,
+        "diagnosis_words": outcome.diagnosis_words,
         "seconds": outcome.seconds,
         "stopped": outcome.stopped,
     }
 
 
-def print_status(models: pd.DataFrame, trainings: pd.DataFrame, lake: dict[str, dict[str, int]]) -> None:
+def print_status(
+    models: pd.DataFrame, trainings: pd.DataFrame, diagnoses: pd.DataFrame, lake: dict[str, dict[str, int]]
+) -> None:
     """Lines and not tables: names, ids and reasons are long, and a terminal is 80 wide."""
     out.print("Lake", style="bold")
     for machine, held in lake.items():
@@ -165,6 +171,14 @@ def print_status(models: pd.DataFrame, trainings: pd.DataFrame, lake: dict[str, 
         )
     if trainings.empty:
         line("  none")
+    if not diagnoses.empty:
+        out.print("Last diagnosis of each machine", style="bold")
+    for d in _rows(diagnoses.drop_duplicates("machine")):
+        found = f"; {d.mechanism.replace('_', ' ')}, {d.where} ({100 * d.probability:.0f} %)" if d.mechanism else ""
+        line(
+            f"  {d.run_id} {d.machine} {d.started:%Y-%m-%d %H:%M}, {d.n_batches} batches{_label(d)}: "
+            f"{d.verdict.replace('_', ' ')}{found}"
+        )
 
 
 def _rows(frame: pd.DataFrame) -> Iterator[Any]:

@@ -1,10 +1,10 @@
-"""`mlflow.yml`: store, names and the promotion rule; and the folder that everything is written to."""
+"""`mlflow.yml`: store, names and rules; and the folder that everything is written to."""
 
 from __future__ import annotations
 
 import os
 import string
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -72,10 +72,17 @@ class PromotionRule(_Part):
         return value
 
 
+class DiagnoseRule(_Part):
+    """When a training is followed by a diagnosis: growth of a twin family's left-out error as a share, None: never."""
+
+    when_error_grows_by: Annotated[float, Field(gt=0)] | None = 0.25
+
+
 class _File(_Part):
     tracking: TrackingPart = TrackingPart()
     names: NamesPart = NamesPart()
     promotion: PromotionRule = PromotionRule()
+    diagnose: DiagnoseRule = DiagnoseRule()
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,7 @@ class Settings:
     artifacts_uri: str | None
     names: NamesPart
     promotion: PromotionRule
+    diagnose: DiagnoseRule = field(default_factory=DiagnoseRule)
 
     def experiment(self, machine: str, target: str) -> str:
         """Name of the experiment of one machine's error channel."""
@@ -140,7 +148,7 @@ def load(path: Path | str | None = None) -> Settings:
     if artifacts is not None:
         artifacts = artifacts.format(home=base.as_posix())
         artifacts = artifacts if "://" in artifacts else (base / artifacts).as_uri()
-    return Settings(base, store, artifacts, parsed.names, parsed.promotion)
+    return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose)
 
 
 def _placeholders(value: str, allowed: set[str], needed: set[str]) -> str:

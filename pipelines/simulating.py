@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,7 @@ from data.batch import Batch
 from data.errors import InputError
 from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine, load_machine
+from pipelines.out_folder import check_folder
 from pipelines.report.iso230_3 import write_iso_report
 from twin.compile import compile_network
 from twin.network import Network
@@ -94,7 +95,7 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, in
 
     network, machine, jobs = jobs_of(request)
     picture, page = request.out / OVERVIEW, request.out / TWIN
-    _check_folder(request.out, [*(j.file for j in jobs), picture, page], request.overwrite)
+    check_folder(request.out, [*(j.file for j in jobs), picture, page], request.overwrite)
     out: list[Simulated] = []
     for job in jobs:
         say(f"{job.file.stem}: {job.plan.name}")
@@ -224,19 +225,6 @@ def _rows(plan: RunPlan, step_s: float | None) -> NDArray[np.int64]:
             "expected 2 or more"
         )
     return rows
-
-
-def _check_folder(folder: Path, files: Sequence[Path], overwrite: bool) -> None:
-    for file in files:
-        if file.exists() and not overwrite:
-            raise InputError(f"{file} exists; give another --out, or --overwrite to replace it")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable.part"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror}); give another folder") from None
 
 
 def _write(file: Path, content: bytes) -> None:

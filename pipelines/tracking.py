@@ -18,7 +18,7 @@ from typing import Any
 import mlflow
 import numpy as np
 import pandas as pd
-from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
+from mlflow.entities import Metric, Param, Run, RunTag
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 
@@ -27,14 +27,12 @@ from models import FAMILIES
 from models.result import GridResult
 from pipelines.promotion import choose, score_um
 from pipelines.settings import PromotionRule, Settings, load
+from pipelines.tracked_runs import dataset_inputs, experiment_id, finished_runs, log_values, started, yes_or_no
 
 CELL_METRICS = (
     "S_mean_um", "S_std_um", "max_abs_um", "eta", "compensation_effect", "grey_degree", "rmse_um", "tsp_stability",
 )  # fmt: skip
 _GRID = "grid"
-_METRICS_AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
-_DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
-
 
 _OPENING = threading.Lock()  # MLflow's own lock on a first migration holds between processes only
 
@@ -106,17 +104,17 @@ def log_training(
     """
     client = open_store(settings, say)
     with store_errors(settings):
-        experiment_id = _experiment(client, result, settings)
-        common = {"simulated": _yes(result.simulated), "machine": result.machine, "target": result.target}
+        experiment = experiment_id(client, settings, result.machine, result.target, result.simulated)
+        common = {"simulated": yes_or_no(result.simulated), "machine": result.machine, "target": result.target}
         name = f"{result.machine} {result.target} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
-        parent = client.create_run(experiment_id, tags={**common, "kind": "training"}, run_name=name).info.run_id
+        parent = client.create_run(experiment, tags={**common, "kind": "training"}, run_name=name).info.run_id
         status = "FAILED"
         try:
             _log_parent(client, parent, result, settings.promotion, params or {})
             _log_files(client, parent, result, figures or {})
-            client.log_inputs(parent, datasets=_dataset_inputs(result))
+            client.log_inputs(parent, datasets=dataset_inputs(result.batches))
             for (selector, family), cells in result.cells.groupby(["selector", "family"], sort=False):
-                _log_cell(client, experiment_id, parent, common, str(selector), str(family), cells, result, settings)
+                _log_cell(client, experiment, parent, common, str(selector), str(family), cells, result, settings)
             status = "FINISHED"
         finally:
             client.set_terminated(parent, status)
@@ -132,19 +130,8 @@ def trainings(machine: str | None = None, target: str | None = None, settings: S
     """
     settings = settings or load()
     client = open_store(settings)
-    runs: list[Run] = []
     with store_errors(settings):
-        experiments = client.search_experiments(filter_string="tags.kind = 'thermodrift'")
-        ids, token = [e.experiment_id for e in experiments], None
-        while ids:
-            page = client.search_runs(
-                ids, "tags.kind = 'training' and attributes.status = 'FINISHED'", page_token=token,
-                order_by=["attributes.start_time DESC"],
-            )  # fmt: skip
-            runs += page
-            token = page.token
-            if not token:
-                break
+        runs = finished_runs(client, "training")
     columns = ["training_id", "machine", "target", "started", "n_batches", "best", "score_um", "simulated",
                "promotion", "model"]  # fmt: skip
     table = pd.DataFrame([_training_row(r) for r in runs], columns=columns)
@@ -177,7 +164,7 @@ def load_training(training_id: str, settings: Settings) -> Training:
         raise InputError(f"training {training_id}: its tables in {folder} cannot be read ({error})") from None
     tags = run.data.tags
     return Training(
-        training_id, _when(run), tags.get("simulated") == "true", result, dict(run.data.params),
+        training_id, started(run), tags.get("simulated") == "true", result, dict(run.data.params),
         json.loads(tags.get("promotion", "{}")),
     )  # fmt: skip
 
@@ -185,20 +172,6 @@ def load_training(training_id: str, settings: Settings) -> Training:
 def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str, Any]) -> None:
     """Keep on the training what became of it."""
     client.set_tag(training_id, "promotion", json.dumps(promotion, ensure_ascii=False))
-
-
-def _experiment(client: MlflowClient, result: GridResult, settings: Settings) -> str:
-    name = settings.experiment(result.machine, result.target)
-    found = client.get_experiment_by_name(name)
-    if found is not None:
-        if found.lifecycle_stage == "deleted":
-            client.restore_experiment(found.experiment_id)
-        if found.tags.get("simulated") != _yes(result.simulated):
-            client.set_experiment_tag(found.experiment_id, "simulated", _yes(result.simulated))
-        return str(found.experiment_id)
-    where = f"{settings.artifacts_uri}/{result.machine}/{result.target}" if settings.artifacts_uri else None
-    tags = {"simulated": _yes(result.simulated), "machine": result.machine, "target": result.target}
-    return str(client.create_experiment(name, artifact_location=where, tags={**tags, "kind": "thermodrift"}))
 
 
 def _log_parent(
@@ -233,23 +206,9 @@ def _log_files(client: MlflowClient, run_id: str, result: GridResult, figures: d
         client.log_artifacts(run_id, scratch)
 
 
-def _dataset_inputs(result: GridResult) -> list[DatasetInput]:
-    out = []
-    for row in result.batches.to_dict("records"):
-        digest, version = str(row["digest"]), row.get("version", 1)
-        source = json.dumps({"source": str(row.get("source", "")), "batch": row["batch_id"], "version": int(version)})
-        dataset = Dataset(
-            name=str(row["batch_id"]), digest=digest[:_DIGEST_LENGTH] or f"v{version}", source_type="thermodrift_lake",
-            source=source, profile=json.dumps({"num_rows": int(row["n_rows"])}),
-        )  # fmt: skip
-        tags = [InputTag("mlflow.data.context", "training"), InputTag("digest", digest or f"v{version}")]
-        out.append(DatasetInput(dataset, tags))
-    return out
-
-
 def _log_cell(
     client: MlflowClient,
-    experiment_id: str,
+    experiment: str,
     parent: str,
     common: dict[str, str],
     selector: str,
@@ -283,10 +242,8 @@ def _log_cell(
         per_fold = picked.groupby("fold", sort=False)["S_um"].mean()
         metrics += [Metric(key, float(v), now, i) for i, v in enumerate(per_fold) if np.isfinite(v)]
     tags = {**common, "kind": "cell", "mlflow.parentRunId": parent, "selector": selector, "family": family}
-    run_id = client.create_run(experiment_id, tags=tags, run_name=f"{selector} × {family}").info.run_id
-    for first in range(0, len(metrics) or 1, _METRICS_AT_ONCE):
-        chunk = metrics[first : first + _METRICS_AT_ONCE]
-        client.log_batch(run_id, metrics=chunk, params=[Param(k, v) for k, v in params.items()] if not first else [])
+    run_id = client.create_run(experiment, tags=tags, run_name=f"{selector} × {family}").info.run_id
+    log_values(client, run_id, metrics, params)
     client.set_terminated(run_id)
 
 
@@ -298,7 +255,7 @@ def _training_row(run: Run) -> dict[str, Any]:
         "training_id": run.info.run_id,
         "machine": tags["machine"],
         "target": tags["target"],
-        "started": _when(run),
+        "started": started(run),
         "n_batches": int(run.data.metrics.get("n_batches", 0)),
         "best": tags.get("best", ""),
         "score_um": run.data.metrics.get("best_score_um", float("nan")),
@@ -306,11 +263,3 @@ def _training_row(run: Run) -> dict[str, Any]:
         "promotion": promotion.get("outcome", ""),
         "model": version,
     }
-
-
-def _when(run: Run) -> pd.Timestamp:
-    return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
-
-
-def _yes(value: bool) -> str:
-    return "true" if value else "false"

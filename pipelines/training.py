@@ -1,23 +1,17 @@
-"""The yearly job as one list of steps: ingest → features → grid → track → promote → report.
+"""The yearly job as one list of steps: ingest → features → grid → track → promote → report, and a diagnosis if need be.
 
-The steps are plain functions; a `Caller` decides how they run. `DirectCaller` calls them here and now,
-`pipelines.flows.PrefectCaller` as tasks of a flow: same functions, same numbers.
+The steps are plain functions; a `pipelines.caller.Caller` decides how they run: here and now, or as tasks of a flow.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
-
-from threadpoolctl import threadpool_limits
 
 from data.batch import Batch
 from data.checks import check_machine
@@ -31,52 +25,14 @@ from models.grid import Workers, assemble, jobs_of, workers_for
 from models.region import region_of
 from models.result import GridResult
 from pipelines import promotion, registry, tracking
+from pipelines.caller import RETRIES, Caller
+from pipelines.diagnosing import DiagnosisOutcome
+from pipelines.diagnosis_trigger import diagnose_if_grown
 from pipelines.report import figure_pngs, write_report
 from pipelines.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
 
-T = TypeVar("T")
-R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
-Done = Callable[[str, int, int], None]
 Say = Callable[[str], None]
-LANES = max(2, os.cpu_count() or 1)  # steps under way at once: no fewer than `workers_for` gives processes
-RETRIES = 2  # for steps that touch a share or a store, where a second try can succeed
-
-
-class Caller(Protocol):
-    """How steps are run."""
-
-    def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
-        """`work` on every item, results in the items' order; an exception of any of them is raised."""
-
-
-class DirectCaller:
-    """Steps as plain calls, some at a time."""
-
-    def __init__(self, done: Done | None = None) -> None:
-        self.done = done
-
-    def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
-        with threadpool_limits(limits=1), ThreadPoolExecutor(LANES) as pool:
-            return gather(step, [pool.submit(work, item) for item in items], self.done)
-
-
-class Future(Protocol[R_co]):
-    """What has been submitted, to a thread pool or to Prefect."""
-
-    def result(self) -> R_co:
-        """Waits for it; raises what it raised."""
-
-
-def gather(step: str, futures: Sequence[Future[R]], done: Done | None) -> list[R]:
-    """Results in the order of submission, telling how many of how many have come."""
-    results: list[R] = []
-    for future in futures:
-        results.append(future.result())
-        if done:
-            done(step, len(results), len(futures))
-    return results
 
 
 @dataclass
@@ -91,6 +47,8 @@ class TrainOutcome:
     choices: dict[str, promotion.Choice] = field(default_factory=dict)
     promotions: dict[str, registry.Promotion] = field(default_factory=dict)
     report: Path | None = None
+    diagnosis: DiagnosisOutcome | None = None
+    diagnosis_words: str = ""  # why there was a diagnosis, and what it says; empty where none was called for
     seconds: dict[str, float] = field(default_factory=dict)
     stopped: str = ""  # why nothing was trained
 
@@ -144,6 +102,12 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
     outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
     clock("report")
+    if machine.twin is not None:
+        diagnose = partial(
+            diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
+        )
+        outcome.diagnosis, outcome.diagnosis_words = caller.map("diagnose", diagnose, [outcome.results])[0]
+        clock("diagnose")
     return outcome
 
 

@@ -18,6 +18,7 @@ from data.errors import InputError, WorkError
 from models.crossing import Plan
 from pipelines import settings as settings_module
 from pipelines import training
+from pipelines.caller import RETRIES, DirectCaller
 from pipelines.request import TrainRequest
 
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
@@ -58,7 +59,7 @@ def request_for(year: Path, name: str, plan: Plan = SMALL) -> TrainRequest:
 def test_same_numbers_with_prefect_and_without(flows: ModuleType, store: Any, year: Path) -> None:
     steps: list[tuple[str, int, int]] = []
     flowed = flows.train_in_flow(request_for(year, "flow-a", PLAN), store, done=lambda *step: steps.append(step))
-    direct = training.train(request_for(year, "flow-b", PLAN), store, training.DirectCaller())
+    direct = training.train(request_for(year, "flow-b", PLAN), store, DirectCaller())
     a, b = flowed.results["z"], direct.results["z"]
     for table in ("scores", "cells", "subsets", "predictions"):
         pd.testing.assert_frame_equal(getattr(a, table), getattr(b, table), check_exact=True)
@@ -99,7 +100,7 @@ def test_a_step_that_keeps_failing_ends_in_our_words(
     monkeypatch.setattr(training, "_track", broken)
     with pytest.raises(WorkError, match=r"^tracking store: database is locked$"):
         flows.train_in_flow(request_for(year, "flow-broken"), store)
-    assert len(calls) == 1 + training.RETRIES
+    assert len(calls) == 1 + RETRIES
     shown = capfd.readouterr()
     assert "Traceback" not in shown.out + shown.err
 

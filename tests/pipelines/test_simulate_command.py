@@ -262,7 +262,7 @@ def test_a_machine_without_error_channels_gets_no_report(call: Call, small: Path
         ("", ("--step", "2000"), "--step: 2000 s leaves 1 row of plan.yml, which lasts 1200 s; expected 2 or more"),
         ("", ("--seed", "-1"), "--seed: got -1, expected 0 or more"),
         ("", ("--begins", "soon"), "--begins: got 'soon', expected a local date and time such as '2025-07-15 06:30'"),
-        ("", ("--out", "two.yml"), "--out two.yml: cannot be written (File exists); give another folder"),
+        ("", ("--out", "two.yml"), "--out two.yml: is a file, expected a folder; give another --out"),
         ("", ("--out", "two.yml/deep"), "--out two.yml/deep: cannot be written (Not a directory); give another folder"),
         ("", ("copy/plan.yml",), "plan.yml and copy/plan.yml would both be written as plan.parquet; rename one"),
         ("", ("missing.yml",), "run plan missing.yml: cannot be read ([Errno 2] No such file"),

@@ -18,8 +18,9 @@ from data.lake import Lake
 from models import FAMILIES
 from models.crossing import Plan
 from pipelines import registry, tracking
+from pipelines.caller import DirectCaller
 from pipelines.predict import predict_file
-from pipelines.training import DirectCaller, TrainOutcome, TrainRequest, load_batches, promote_tracked, train
+from pipelines.training import TrainOutcome, TrainRequest, load_batches, promote_tracked, train
 
 NAME = "small-train"
 MODEL = f"{NAME}-z"

@@ -30,7 +30,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def job(name: str, targets: tuple[str, ...] = ()) -> Any:
     from pipelines import settings
-    from pipelines.training import DirectCaller, TrainRequest, train
+    from pipelines.caller import DirectCaller
+    from pipelines.training import TrainRequest, train
 
     if not (DATA / name).is_dir():
         pytest.skip(f"no ../shared/data/{name}")
