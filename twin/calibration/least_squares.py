@@ -19,7 +19,7 @@ from twin.calibration.descent import State, Step, descend, x_of, z_bounds
 from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array, Block, Problem, Scale, Unknown
 
-__all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit"]
+__all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit", "result", "settled"]
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum
 # What a model's rounding and its derivatives may hide of the cost, where no step lowers it any more. An undamped step
@@ -73,7 +73,7 @@ def fit(
         WorkError: the model is not finite at the prior's mean.
     """
     best, notes = settled(problem, starts, seed, max_iterations, tolerance, progress, reweight)
-    return _result(problem, best, tolerance, notes)
+    return result(problem, best, tolerance, notes)
 
 
 def settled(
@@ -192,7 +192,8 @@ def _starts_in_words(best: State, ends: Sequence[State], starts: int, lost: int)
     return words + (f"; {lost} could not be simulated" if lost else "")
 
 
-def _result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
+def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
+    """What `fit` returns for the state where it ended."""
     unknowns, steps = problem.unknowns, len(state.history)
     by_noise = state.stuck and state.small(MODEL_NOISE)
     converged = by_noise or state.small(tolerance)

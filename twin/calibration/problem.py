@@ -170,8 +170,8 @@ class CalibrationProblem:
 
     def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
         """(measured − simulated) / noise of every batch, (n_b,) each."""
-        start, offset = self._own(nuisance)
-        simulation = simulate(self.network, self.values_at(x), self._own_heat(nuisance), start, offsets_K=offset)
+        start, offset = self.own(nuisance)
+        simulation = simulate(self.network, self.values_at(x), self.own_heat(nuisance), start, offsets_K=offset)
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
@@ -181,7 +181,7 @@ class CalibrationProblem:
         laws = [h.law for h in self.network.heats if not h.asleep]
         return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
-    def _own_heat(self, nuisance: Sequence[Array]) -> Inputs:
+    def own_heat(self, nuisance: Sequence[Array]) -> Inputs:
         """The inputs with each batch's own size of the heats that differ from run to run."""
         if not self._heats:
             return self.inputs
@@ -213,10 +213,10 @@ class CalibrationProblem:
         return out
 
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
-        start, offset = self._own(nuisance)
+        start, offset = self.own(nuisance)
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
         simulation, *slopes = sensitivities(
-            self.network, self.values_at(x), self._own_heat(nuisance), start, numbers,
+            self.network, self.values_at(x), self.own_heat(nuisance), start, numbers,
             starts=len(self.nuisances.start_K) > 0, offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
         )  # fmt: skip
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
@@ -231,7 +231,7 @@ class CalibrationProblem:
                 m.batch_id, self._residual(m, series[b], nuisance[b]), whitened[:, :free], np.hstack(own), m.channel
             )
 
-    def _own(self, nuisance: Sequence[Array]) -> tuple[Array, Array | None]:
+    def own(self, nuisance: Sequence[Array]) -> tuple[Array, Array | None]:
         """Start temperatures (1, B, N) and surroundings' offsets (1, B, S) that the batches' nuisances make."""
         bodies = len(self.nuisances.start_K)
         shared = np.array([v[: self.nuisances.shared] for v in nuisance]).reshape(len(nuisance), -1)

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from pydantic import BaseModel
+
 from twin.diagnosis.values_of_part import with_value
 from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
@@ -37,7 +39,7 @@ class Candidate:
 
     `part` is the instance as a machine file would state it, every value fixed at `Spec.value`; `amplitudes` its
     parameters that switch it off and the values at which they do; `shape` those that are freed beside them. A rival
-    that changes a value has a `change` instead.
+    that changes a value has a `change` instead, one that cuts a body has `parts`.
     """
 
     mechanism: str
@@ -49,6 +51,12 @@ class Candidate:
     shape: tuple[str, ...] = ()
     fault: bool = False
     change: Change | None = None
+    parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
+
+    @property
+    def physics(self) -> bool:
+        """Whether it would be physics of the machine that was left out."""
+        return self.mechanism not in RIVALS and not self.fault
 
     def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
         """The twin part with this candidate in it; `values` replace its parameters' own.
@@ -59,6 +67,13 @@ class Candidate:
         if self.change is not None:
             new = {"spread": self.change.spread, "per_batch": self.change.per_batch}
             return with_value(part, self.change.parameter, **{k: v for k, v in new.items() if v is not None})
+        if self.parts:
+            groups = {path.partition(".")[0] for path in self.parts}
+            own = {g: dict(getattr(part, g)) for g in groups}
+            for path, new_part in self.parts.items():
+                group, _, name = path.partition(".")
+                own[group][name] = new_part
+            return part.model_copy(update=own)
         assert self.part is not None
         if self.name in part.mechanisms:
             raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")

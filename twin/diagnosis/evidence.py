@@ -82,13 +82,15 @@ class Evidence:
         return out
 
     @cached_property
-    def _factor(self) -> tuple[Array, bool]:
-        return cho_factor(sum(b.jacobian.T @ b.jacobian for b in self.batches) + np.eye(self.batches[0].jacobian.shape[1]))
+    def factor(self) -> tuple[Array, bool]:
+        """Cholesky of all batches' information and the prior."""
+        own = sum(b.jacobian.T @ b.jacobian for b in self.batches)
+        return cho_factor(own + np.eye(self.batches[0].jacobian.shape[1]))
 
     @cached_property
     def beyond(self) -> list[Array]:
         """Every batch's columns (n, C) beyond what the parameters of the whole fit can do."""
-        shadow = cho_solve(self._factor, sum(b.jacobian.T @ b.columns for b in self.batches))
+        shadow = cho_solve(self.factor, sum(b.jacobian.T @ b.columns for b in self.batches))
         return [b.columns - b.jacobian @ shadow for b in self.batches]
 
     @cached_property
@@ -119,6 +121,22 @@ class Evidence:
         volume = sum(float(np.sum(np.log1p(-b.damping))) for b in self.batches)
         return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets)))) + volume
 
+    def group_score(self, group: Sequence[int]) -> float:
+        """Log density of some batches left out together, per batch, predicted by all others."""
+        chosen = set(group)
+        rest = [b for k, b in enumerate(self.batches) if k not in chosen]
+        own = sum(b.jacobian.T @ b.jacobian for b in rest) + np.eye(self.batches[0].jacobian.shape[1])
+        z = cho_solve(cho_factor(own), sum(b.jacobian.T @ b.target for b in rest))
+        square, least = np.zeros(len(self.rows)), np.zeros(len(self.rows))
+        for k in group:
+            b = self.batches[k]
+            square += self._by_channel(b, (b.target - b.jacobian @ z) ** 2)
+            least += self._by_channel(b, np.ones(len(b.target))) * self.weight
+        volume = sum(float(np.sum(np.log1p(-self.batches[k].damping))) for k in group)
+        share = least / np.maximum(self._least, TINY)
+        mean = np.where(least > 0, square / np.maximum(least, TINY), 1.0)
+        return float(-0.5 * np.sum(self.count * share * np.log(np.maximum(mean, 1.0))) + volume)
+
     def density(self, mean_squares: Array) -> Array:
         """Log density (…,) in nats of mean squares (…, K); noise is not rewarded below what is given."""
         return np.asarray(-0.5 * np.log(np.maximum(mean_squares, 1.0)) @ self.count)
@@ -127,7 +145,7 @@ class Evidence:
         """Of all columns one by one: gains (R, C) in nats, amplitudes (R, C), falls of batches' squares (R, B, C)."""
         targets = self.targets if targets is None else targets
         total = sum(b.jacobian.T @ t for b, t in zip(self.batches, targets, strict=True))
-        z = cho_solve(self._factor, total)
+        z = cho_solve(self.factor, total)
         inside = [t - b.jacobian @ z for b, t in zip(self.batches, targets, strict=True)]
         own = np.stack([self._by_channel(b, e**2).T for b, e in zip(self.batches, inside, strict=True)], axis=1)
         cross = np.stack([self._products(b, e, c) for b, e, c in zip(self.batches, inside, self.beyond, strict=True)], 1)
@@ -155,7 +173,7 @@ class Evidence:
         inside = np.maximum(self._squares.sum(axis=(0, 1)), TINY)
         every = sum(np.einsum("nc,nc->c", b.columns, b.columns) for b in self.batches)
         total = sum(b.jacobian.T @ b.target for b in self.batches)
-        z = cho_solve(self._factor, total)
+        z = cho_solve(self.factor, total)
         along = sum(
             c.T @ (b.target - b.jacobian @ z) for b, c in zip(self.batches, self.beyond, strict=True)
         )  # fmt: skip

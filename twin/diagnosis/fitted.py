@@ -40,6 +40,11 @@ class Fitted:
         """Parameter values (n,) of the network."""
         return self.problem.values_at(self.x)
 
+    @property
+    def step_s(self) -> float:
+        """The longest spacing of the recordings' rows."""
+        return max(b.step_s for b in self.batches)
+
     @cached_property
     def rows(self) -> Array:
         """Rows (K,) of each channel in all batches."""

@@ -65,9 +65,9 @@ class ForcedNetwork:
         Raises:
             WorkError: the simulation fails there.
         """
-        start, offset = problem._own(nuisance)
+        start, offset = problem.own(nuisance)
         values = problem.values_at(x)[None]
-        solved = solved_balance(problem.network, values, problem.inputs, start, TOLERANCE_K, 1, offset)
+        solved = solved_balance(problem.network, values, problem.own_heat(nuisance), start, TOLERANCE_K, 1, offset)
         out = cls(problem, solved)
         for weights in out.weights:
             solved.places.number(weights)

@@ -6,22 +6,26 @@ likelihood, correlation falling with exp(-t / 1.5 h), so that it may jump where 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.forced import Hats
 
+Indices = NDArray[np.int64]
 Kind = Literal["heat", "displacement", "sensor"]
 
 CORRELATION_S = 5400.0
 # Of the best seen mode's signal against its noise, in sd: below the first nothing is seen, above the last all is.
-STRENGTHS = np.geomspace(0.3, 3e4, 16)
-REFINED = 5  # strengths tried again around the best
+STRENGTHS = np.geomspace(0.3, 3e4, 9)
+RANGE = float(np.log(STRENGTHS[-1] / STRENGTHS[0]))
+HALVINGS = 3  # of the step between strengths
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,18 @@ class Basis:
 
 
 @dataclass(frozen=True)
+class Amplitudes:
+    """Best sigma of some places (P,), their gain over sigma = 0 in nats, 0 where nothing is gained, and evidence.
+
+    The evidence is the marginal likelihood averaged over log sigma (Laplace): what a free amplitude costs is paid.
+    """
+
+    sigma: Array
+    gain: Array
+    evidence: Array
+
+
+@dataclass(frozen=True)
 class FreeSeries:
     """A basis beside parameters, of `information` (p, p) and `pull` (p,), in modes that are a batch's independent hats.
 
@@ -81,21 +97,15 @@ class FreeSeries:
         )
 
     @cached_property
-    def _scale(self) -> Array:
-        """The sigma (P,) at which the best seen mode has a signal of one noise; 0 where nothing is seen."""
-        best = self.strength.max(axis=(0, 2))
-        return np.asarray(1.0 / np.sqrt(np.where(best > 0, best, np.inf)))
-
-    @cached_property
     def _by_place(self) -> tuple[Array, Array, Array]:
         """Strength, by_z and along with places first and all batches' modes in one axis."""
         places, z = len(self.basis.places), len(self.pull)
         strength, along = (np.moveaxis(a, 1, 0).reshape(places, -1) for a in (self.strength, self.along))
         return strength, np.moveaxis(self.by_z, 1, 0).reshape(places, -1, z), along
 
-    def gains(self, sigma: Array) -> Array:
-        """Log marginal likelihood (P,) at amplitudes (P,) less that at sigma = 0, nats."""
-        strength, by_z, along = self._by_place
+    def gains(self, sigma: Array, places: Indices | slice = slice(None)) -> Array:
+        """Log marginal likelihood (P,) of some places at amplitudes (P,) less that at sigma = 0, nats."""
+        strength, by_z, along = (a[places] for a in self._by_place)
         var = sigma[:, None] ** 2
         kept = var / (1.0 + var * strength)
         scaled = np.sqrt(kept)[..., None] * by_z
@@ -114,30 +124,48 @@ class FreeSeries:
 
     @cached_property
     def _tried(self) -> tuple[Array, Array]:
-        sigma = STRENGTHS[:, None] * self._scale
+        """Sigmas and gains (strengths, P) all over the range of sigma; 0 where a place is not seen at all."""
+        best = self.strength.max(axis=(0, 2))
+        sigma = STRENGTHS[:, None] / np.sqrt(np.where(best > 0, best, np.inf))
         return sigma, np.stack([self.gains(s) for s in sigma])
 
-    @cached_property
-    def evidence(self) -> Array:
-        """Log marginal likelihood (P,) less that of nothing, averaged over log sigma: what a free amplitude costs."""
-        _, gain = self._tried
-        return np.asarray(np.logaddexp.reduce(gain, axis=0) - np.log(len(gain)))
+    def promising(self, margin: float, without: Sequence[int] = ()) -> Indices:
+        """Places that may be within `margin` nats of the best of them, before any sigma is refined."""
+        gain = self._tried[1].max(axis=0)
+        gain[list(without)] = -np.inf
+        return np.flatnonzero((gain >= gain.max() - margin) & np.isfinite(gain))
+
+    def refined(self, places: Indices) -> Amplitudes:
+        """Sigma of the highest marginal likelihood at some places, by halving steps and a parabola through the last."""
+        sigma, gain = (a[:, places] for a in self._tried)
+        at, each = gain.argmax(axis=0), np.arange(len(places))
+        best, top = sigma[at, each], gain[at, each]
+        step = float(np.log(STRENGTHS[1] / STRENGTHS[0]))
+        for _ in range(HALVINGS):
+            step /= 2
+            around = np.stack([best * np.exp(-step), best, best * np.exp(step)])
+            three = np.stack([self.gains(around[0], places), top, self.gains(around[2], places)])
+            at = three.argmax(axis=0)
+            centre, best, top = best, around[at, each], three[at, each]
+        bend = (three[0] - 2 * three[1] + three[2]) / step**2
+        hump = bend < 0
+        move = np.where(hump, (three[0] - three[2]) / (2 * step * np.where(hump, bend, -1.0)), 0.0)
+        vertex = centre * np.exp(np.clip(move, -step, step))
+        there = self.gains(vertex, places)
+        best, top = np.where(there > top, vertex, best), np.maximum(there, top)
+        width = np.sqrt(2 * np.pi / np.where(hump, -bend, 1e-9))
+        evidence = top + np.log(np.minimum(width / RANGE, 1.0))
+        average = np.logaddexp.reduce(gain, axis=0) - np.log(len(gain))
+        return Amplitudes(np.where(top > 0, best, 0.0), np.maximum(top, 0.0), np.maximum(evidence, average))
 
     @cached_property
-    def best(self) -> tuple[Array, Array]:
-        """Sigma of the highest marginal likelihood and its gain, (P,) each; 0 and 0 where nothing is gained."""
-        sigma, gain = self._tried
-        at, each = gain.argmax(axis=0), np.arange(len(self.basis.places))
-        step = STRENGTHS[1] / STRENGTHS[0]
-        finer = sigma[at, each] * np.geomspace(1 / step, step, REFINED + 2)[1:-1, None]
-        finer_gain = np.stack([self.gains(s) for s in finer])
-        at = finer_gain.argmax(axis=0)
-        gained = finer_gain[at, each]
-        return np.where(gained > 0, finer[at, each], 0.0), np.maximum(gained, 0.0)
+    def best(self) -> Amplitudes:
+        """Of every place."""
+        return self.refined(np.arange(len(self.basis.places)))
 
     def posterior(self, place: int) -> Posterior:
         """What the series at one place is, at its best sigma."""
-        sigma = float(self.best[0][place])
+        sigma = float(self.best.sigma[place])
         kept = sigma**2 / (1.0 + sigma**2 * self.strength[:, place])
         by_z, along = self.by_z[:, place], self.along[:, place]
         flat, flat_kept = by_z.reshape(-1, len(self.pull)), kept.reshape(-1)

@@ -11,6 +11,7 @@ from data.errors import InputError, WorkError
 from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
 from twin.compile import compile_network
+from twin.diagnosis.acceptance import gumbel
 from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.fitted import Fitted
@@ -32,15 +33,13 @@ class Null:
     def threshold(self, density: float, share: float = 0.99) -> float:
         """The gain that structure alone exceeds in 1 - share of the cases, where it may leave as much as `density` says.
 
-        Of each machine counts the largest misfit that predicts left-out batches no worse. A Gumbel distribution
-        through their mean and spread (Gumbel 1958), as there are few.
+        Of each machine counts the largest misfit that predicts left-out batches no worse. As
+        there are few, a Gumbel distribution goes through their mean and spread.
         """
         gain = self.typical(density)
         if len(gain) < 2:
             return float("inf")
-        scale = float(np.std(gain, ddof=1)) * np.sqrt(6.0) / np.pi
-        location = float(np.mean(gain)) - np.euler_gamma * scale
-        return max(location - scale * float(np.log(-np.log(share))), float(gain.max()))
+        return max(gumbel(gain, share), float(gain.max()))
 
     def typical(self, density: float) -> Array:
         """The largest gain (T,) of each machine at that misfit."""

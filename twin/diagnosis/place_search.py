@@ -8,12 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from twin.calibration.annealing import SETTLED
 from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.fit_rows import FitRows, Optimum
 from twin.diagnosis.free_series import Basis, FreeSeries
 
 SEEN = 5.0  # nats of evidence beyond the number of places: odds of 150 to 1
+NOISE_ROUNDS = 5
+MARGIN = 200.0  # nats that a rough amplitude may cost a place
 REMAINS = 0.01  # of the first place's evidence: less may be what hats and linearisation leave of a strong effect
 
 
@@ -90,10 +93,14 @@ class PlaceSearch:
 
     def best(self, held: Sequence[Held]) -> tuple[Held, float]:
         """The place of most evidence beside what is held, and its evidence in nats."""
-        series, taken = self.series(held), {h.at for h in held}
-        tried = [(i, k) for i, s in enumerate(series) for k in range(len(s.evidence)) if (i, k) not in taken]
-        i, k = max(tried, key=lambda at: float(series[at[0]].evidence[at[1]]))
-        return Held(i, k, float(series[i].best[0][k])), float(series[i].evidence[k])
+        found: list[tuple[float, Held]] = []
+        for i, series in enumerate(self.series(held)):
+            places = series.promising(MARGIN, [h.place for h in held if h.basis == i])
+            got = series.refined(places)
+            for place, sigma, evidence in zip(places.tolist(), got.sigma, got.evidence, strict=True):
+                found.append((float(evidence), Held(i, place, float(sigma))))
+        evidence, best = max(found, key=lambda f: f[0])
+        return best, evidence
 
     def forward(self, most: int) -> list[Held]:
         """Places taken one after the other while the evidence is beyond chance, each then tried against all others."""
@@ -110,15 +117,24 @@ class PlaceSearch:
         return held
 
     def optimum(self, held: Sequence[Held]) -> Optimum:
-        """Of all unknowns beside what is held."""
+        """Of all unknowns beside what is held, under the noise that is left there.
+
+        Hats miss what is switched between them: under too small a noise the parameters would make up for that.
+        """
         series = [self.bases[h.basis].nuisance(h.place, h.sigma) for h in held]
-        return self.fitted.optimum(series, self.noise.weight)
+        noise = self.noise
+        for _ in range(NOISE_ROUNDS):
+            found = self.fitted.optimum(series, noise.weight)
+            if found.noise.change(noise) < SETTLED:
+                break
+            noise = found.noise
+        return found
 
     def probabilities(self, held: Sequence[Held] = ()) -> list[Array]:
         """By basis each place's probability beside what is held; with that of nothing they sum to 1.
 
         Nothing and each kind are as likely beforehand, and within a kind each place.
         """
-        log = [s.evidence - np.log(len(s.evidence)) for s in self.series(held)]
+        log = [s.best.evidence - np.log(len(s.best.evidence)) for s in self.series(held)]
         total = np.logaddexp.reduce(np.concatenate([[0.0], *log]))
         return [np.asarray(np.exp(e - total)) for e in log]

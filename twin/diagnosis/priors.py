@@ -27,6 +27,8 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
         factor = float(np.exp(np.clip(s.amplitudes.get("factor", 0.0), -2.0, 2.0)))
         p = c.change.parameter
         return {}, {name: float(np.clip(value * factor, p.low, p.high))} if c.change.spread else {}
+    if c.parts:
+        return {}, {}
     mechanism = MECHANISMS[c.mechanism]
     values: dict[str, Value] = {}
     at: dict[str, float] = {}

@@ -72,7 +72,7 @@ def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
 def alone(fitted: Fitted, inflation: Array) -> Evidence:
     """How well a fit predicts batches left out, with slack and no candidates; `inflation` (K,) of what is compared."""
     every = proposed(fitted)
-    loose = slack(every)
+    loose = slack(every, fitted.step_s)
     line = _Line.at(fitted, [c for c in every if c.name in loose], inflation)
     batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
     return _evidence(fitted, batches, inflation, np.zeros(0), np.zeros(0))
@@ -95,7 +95,7 @@ class _Line:
         waking = sorted({j for js in found.amplitudes.values() for j in js})
         numbers = [j for j in waking if found.network.parameters[j].name not in own]
         at = {j: k for k, j in enumerate(found.network.free.tolist())}
-        loose = {numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every).items() if n in found.amplitudes}
+        loose = {numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every, fitted.step_s).items() if n in found.amplitudes}
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
         weight = 1.0 / (fitted.state.noise.factor**2 * inflation)

@@ -27,7 +27,7 @@ from twin.diagnosis.point import Point
 from twin.diagnosis.regimes import Regime, regimes_of
 
 RANKING = ("rank", "kind", "place", "gain", "evidence", "probability", "sigma", "unit")
-MOVES = 2  # at most: beyond it places and series no longer change
+MOVES = 3  # at most: beyond it places and series hardly change
 SHOWS = 2.0  # sd: a window is where a series is farther from 0
 
 
@@ -160,7 +160,7 @@ def _odds(search: PlaceSearch, held: Sequence[Held]) -> dict[str, float]:
 def _found(search: PlaceSearch, held: Sequence[Held], k: int) -> Found:
     others, own = [h for h in held if h is not held[k]], held[k]
     basis, series = search.bases[own.basis], search.series(others)[own.basis]
-    sigma, gain = (float(v[own.place]) for v in series.best)
+    sigma, gain = float(series.best.sigma[own.place]), float(series.best.gain[own.place])
     return Found(
         basis.kind, basis.places[own.place], basis.units[own.place], gain, sigma, _odds(search, others),
         series.posterior(own.place),
@@ -172,9 +172,8 @@ def _ranking(search: PlaceSearch) -> pd.DataFrame:
     for series, probability in zip(search.series(), search.probabilities(), strict=True):
         basis = series.basis
         for k, place in enumerate(basis.places):
-            sigma, gain = (float(v[k]) for v in series.best)
-            rows.append((basis.kind, place, gain, float(series.evidence[k]), float(probability[k]), sigma,
-                         basis.units[k]))  # fmt: skip
+            sigma, gain, evidence = (float(v[k]) for v in (series.best.sigma, series.best.gain, series.best.evidence))
+            rows.append((basis.kind, place, gain, evidence, float(probability[k]), sigma, basis.units[k]))
     rows.sort(key=lambda r: -r[3])
     return pd.DataFrame([(n + 1, *r) for n, r in enumerate(rows)], columns=list(RANKING))
 

@@ -60,7 +60,7 @@ class Whitened:
         """The same batch with one more unknown of its own, of prior N(0, 1); column (n,) is whitened already."""
         square = float(column @ column)
         if square < 1e-18:
-            return self
+            return replace(self, columns=self.columns[:, :0])
         damping = 1.0 - 1.0 / np.sqrt(1.0 + square)
         unit = column / np.sqrt(square)
 

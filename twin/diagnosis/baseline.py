@@ -1,0 +1,46 @@
+"""A fair baseline: the machine file at its best recalibration, before anything is said to be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from twin.calibration.least_squares import settled
+from twin.calibration.problem import CalibrationProblem
+from twin.compile import compile_network
+from twin.diagnosis.fitted import Fitted
+from twin.schema import TwinPart
+
+TOLERANCE, STEPS = 1e-2, 40
+
+
+def baseline(
+    machine: Machine, part: TwinPart, batches: Sequence[Batch], progress: Callable[[str, int, int], None] | None = None
+) -> Fitted:
+    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it.
+
+    Raises:
+        InputError: batches of another machine, twice the same, or that cannot be simulated.
+        WorkError: the model fails at the priors' means.
+    """
+    ids = [b.batch_id for b in batches]
+    for batch in batches:
+        if batch.machine != machine.machine:
+            raise InputError(
+                f"batch {batch.batch_id}: is of machine {batch.machine!r}, expected {machine.machine!r}; leave it out"
+            )
+        if ids.count(batch.batch_id) > 1:
+            raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
+    problem = CalibrationProblem.of(compile_network(machine, part=part), batches)
+    steps = 0
+
+    def told(_: str) -> None:
+        nonlocal steps
+        steps += 1
+        if progress:
+            progress("baseline", steps, 0)
+
+    state, _ = settled(problem, reweight=True, tolerance=TOLERANCE, max_iterations=STEPS, progress=told)
+    return Fitted(machine, part, tuple(batches), problem, state)

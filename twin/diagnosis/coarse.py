@@ -1,0 +1,71 @@
+"""The rival "the network is too coarse here": a piece of its own around a sensor, with or without a neighbour's heat.
+
+A sensor in a big casting sees what is near it first. A local node of part of the casting's capacity behind a free
+conductance is the least refinement that can lag, and lead where a neighbour's heat enters through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from twin.diagnosis.candidate import Candidate, Where
+from twin.diagnosis.fitted import Fitted
+from twin.quantity import Value
+from twin.schema import Body, Link
+
+SHARE = 0.15  # of the body's capacity
+STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
+SPREAD = 1.0  # of the logarithm of both
+NEAR = "_near"
+
+
+def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, worse: float = 9.0) -> list[Candidate]:
+    """Refinements at the sensors whose left-out mean square (in units of the given noise's) is `worse` and largest."""
+    names = [r.channel for r in fitted.problem.network.readings]
+    ranked = sorted(range(len(names)), key=lambda k: -np.nan_to_num(mean_squares[k]))
+    out = []
+    for k in ranked[:most]:
+        if mean_squares[k] > worse:
+            out += list(_of_sensor(fitted, names[k]))
+    return out
+
+
+def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
+    part, network = fitted.part, fitted.problem.network
+    sensor = part.sensors[channel]
+    body = sensor.at.partition("@")[0]
+    near = f"{channel}{NEAR}"
+    if near in part.bodies or part.bodies[body].shape != "lump":
+        return
+    cell = int(network.bodies[body][0])
+    capacity = float(network.capacity_J_per_K(fitted.values)[cell])
+    leaves = float(network.conductance_W_per_K(fitted.values)[cell, cell])
+    piece = {
+        f"bodies.{near}": Body(
+            capacity=Value(value=f"{SHARE * capacity:.4g} J/K", spread=SPREAD),
+            material=part.bodies[body].material,
+            words=f"{part.bodies[body].words or body}, near the sensor {channel}",
+        ),
+        f"links.{near}-{body}": Link(
+            between=(near, body), conductance=Value(value=f"{STIFF * leaves:.4g} W/K", spread=SPREAD)
+        ),
+        f"sensors.{channel}": sensor.model_copy(update={"at": near}),
+    }
+    where = Where("sensor", channel)
+    words = f"a piece of the {body} of its own around {channel}"
+    yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
+    for key, link in part.links.items():
+        ends = [place.partition("@")[0] for place in link.between]
+        if body not in ends:
+            continue
+        moved = tuple(near if end == body else place for end, place in zip(ends, link.between, strict=True))
+        other = ends[1 - ends.index(body)]
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_{other}",
+            f"{words}, through which the heat of {other} enters",
+            parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
+        )

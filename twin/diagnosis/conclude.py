@@ -1,0 +1,149 @@
+"""From the search to findings: what was found where, when, how large, how sure, and what would tell ties apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from twin.calibration.identifiability import Interval
+from twin.diagnosis.activity import activity
+from twin.diagnosis.changes import deviations
+from twin.diagnosis.findings import Verdict
+from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.found import Found, Other, Rms, beside_words, place_words
+from twin.diagnosis.honest_digits import Estimate
+from twin.diagnosis.probability import Explanation, explanations, told
+from twin.diagnosis.search import Round, Search
+from twin.diagnosis.unseen import unseen
+from twin.mechanisms import MECHANISMS
+from twin.schema import TwinPart
+
+SURE = 0.6  # below it the best explanation does not stand by itself
+
+
+def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
+    """Root mean squares over all left-out rows by channel, errors first."""
+    errors = {e.channel for e in fitted.problem.network.errors}
+    out = []
+    for channel, rows in table.groupby("channel", sort=False):
+        n = rows["rows"].to_numpy(float)
+
+        def pooled(column: str, rows: pd.DataFrame = rows, n: np.ndarray = n) -> float:
+            return float(np.sqrt(np.average(rows[column].to_numpy(float) ** 2, weights=n)))
+
+        unit = str(rows["unit"].iloc[0])
+        out.append(
+            Rms(str(channel), unit, pooled("before"), pooled("after"), pooled("floor"), sensor=channel not in errors)
+        )
+    return tuple(sorted(out, key=lambda r: (r.sensor, -r.before / max(r.after, 1e-12))))
+
+
+def found_of(
+    search: Search, done: Round, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], separates: str
+) -> Found:
+    """One accepted round as a finding; `intervals` of the final fit's parameters by network name."""
+    every, _, _ = explanations(done)
+    best = next(e for e in every if done.best is not None and e.tried is done.best)
+    rest = [e for e in every if e.tried is not done.best]
+    c = best.tried.candidate
+    final = search.final
+    parameters, was = _parameters(final, best, intervals)
+    regime, windows = activity(final, c)
+    after = [r for r in search.rounds if r is not done]
+    given = c.part
+    return Found(
+        mechanism=c.mechanism,
+        where=c.where,
+        place=place_words(c.where, part),
+        parameters=parameters,
+        probability=best.probability,
+        name=c.name if c.part is not None else "",
+        beside=beside_words(given, c.where, part) if given is not None else "",
+        others=tuple(_other(e, part) for e in told([best, *rest])),
+        regime=regime,
+        windows=windows,
+        rms=tuple(rms),
+        separates=separates,
+        caps=caps(len(final.batches)),
+        evidence={
+            "gain_nats": best.tried.gain,
+            "threshold_nats": done.threshold,
+            "batches_improved": best.tried.improved,
+            "batches": len(final.batches),
+            "sign_test_p": done.sign_p,
+            "absorbed_share": best.tried.scored.absorbed,
+            "round": len(search.rounds) - len(after),
+            **unseen(done.before, best.tried.fitted or final, done.before.state.noise.inflation),
+        },
+        was=was,
+    )
+
+
+def _other(e: Explanation, part: TwinPart) -> Other:
+    c = e.tried.candidate
+    beside = beside_words(c.part, c.where, part) if c.part is not None else ""
+    return Other(c.mechanism, c.where, place_words(c.where, part), e.probability, beside, e.alike)
+
+
+def _parameters(
+    final: Fitted, best: Explanation, intervals: Mapping[str, Interval]
+) -> tuple[dict[str, Estimate], dict[str, float]]:
+    """Fitted values of what was found, in their units, and those that the machine file had."""
+    c = best.tried.candidate
+    network = final.problem.network
+    if c.change is not None:
+        name = c.change.parameter.name
+        if c.change.per_batch is not None:
+            sd = deviations(final).get(name, float("nan"))
+            n = len(final.batches)  # of a standard deviation from n batches: chi-square
+            return {name: Estimate(sd, "1", sd * (1 - 1.16 / np.sqrt(n)), sd * (1 + 1.16 / np.sqrt(n)))}, {}
+        found = intervals.get(name)
+        was = {name: c.change.parameter.value}
+        if found is None:
+            return {}, was
+        return {name: Estimate(found.value, found.unit, found.low, found.high)}, was
+    out: dict[str, Estimate] = {}
+    mechanism = MECHANISMS.get(c.mechanism) if c.mechanism in MECHANISMS else None
+    for spec in mechanism.parameters if mechanism else ():
+        at = _network_name(final, c.name, spec.name, c.where.name)
+        if at in intervals:
+            i = intervals[at]
+            out[spec.name] = Estimate(i.value, i.unit, i.low, i.high)
+        elif at is not None:
+            p = network.parameters[network.index(at)]
+            out[spec.name] = Estimate(p.value, p.unit)
+    return out, {}
+
+
+def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:
+    """Where a mechanism's parameter stands in the network: by its instance, or in what a structural one wrote."""
+    names = [p.name for p in final.problem.network.parameters]
+    plain = f"mechanisms.{instance}.{parameter}"
+    if plain in names:
+        return plain
+    ends = [n for n in names if n.endswith(f".{parameter}") and instance in n]
+    if ends:
+        return ends[0]
+    if parameter == "temperature":
+        return next((n for n in names if n == f"surroundings.{instance}.value"), None)
+    if parameter == "gain":  # a link or tilt at the end of an error's chain
+        own = [n for n in names if n.startswith(f"errors.{place}.") and n.endswith(".gain")]
+        kept = {p.name for p in final.problem.network.parameters if p.free}
+        return next((n for n in reversed(own) if n in kept), None)
+    return None
+
+
+def caps(n: int) -> tuple[str, ...]:
+    """What keeps a probability from being higher."""
+    return () if n >= 6 else (f"{n} runs only",)
+
+
+def verdict_of(search: Search, found: Sequence[Found], more: bool) -> Verdict:
+    """`more`: what is left over follows something that no listed mechanism is."""
+    if not found:
+        return "unlisted" if more else "consistent"
+    if found[0].probability < SURE and found[0].tied:
+        return "undecidable"
+    return "partly_explained" if more else "explained"

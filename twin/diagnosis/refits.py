@@ -1,0 +1,117 @@
+"""Full refits of the candidates that a screen thinks worth it, and their gains on batches left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data.errors import InputError, WorkError
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.candidate import Candidate
+from twin.diagnosis.evidence import Evidence
+from twin.diagnosis.fitted import Fitted, refitted
+from twin.diagnosis.priors import log_prior, start_values
+from twin.diagnosis.screen import Scored, alone
+
+BEST, KINDS = 5, 14  # refits of a round: the best of all, and with the best of every other mechanism
+LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
+WORTH = 0.5  # nats in the screen that are worth a refit
+LOOKED_AT = 80
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
+
+    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size.
+    """
+
+    scored: Scored
+    gain: float
+    improved: int
+    cluster: int
+    log_prior: float
+    fitted: Fitted | None = None
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.scored.candidate
+
+
+def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
+    """What is worth a look, its clusters, and the numbers of those to refit, one of each cluster.
+
+    A baseline bent far by what it lacks shows little in the screen, so every mechanism may send its best.
+    """
+    worth = [s for s in news if s.gain > WORTH][:LOOKED_AT]
+    clusters = _clusters(worth, evidence)
+    chosen: list[int] = []
+    seen: set[str] = set()
+    for k, s in enumerate(worth):
+        if len(chosen) >= KINDS:
+            break
+        new = s.candidate.mechanism not in seen
+        if (len(chosen) < BEST or new) and not any(clusters[k] == clusters[j] for j in chosen):
+            chosen.append(k)
+            seen.add(s.candidate.mechanism)
+    return worth, clusters, chosen
+
+
+def refit(now: Fitted, base: Evidence, inflation: Array, s: Scored) -> Tried | None:
+    """One candidate in full; None where it cannot be simulated."""
+    values, at = start_values(s, now)
+    try:
+        fitted = refitted(now, s.candidate.applied(now.part, values), at)
+        after = alone(fitted, inflation)
+    except (InputError, WorkError):
+        return None
+    gain = float(after.base_score()[0] - base.base_score()[0])
+    return Tried(s, gain, improved(base, after), 0, log_prior(s, fitted), fitted)
+
+
+def with_clusters(
+    done: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]
+) -> list[Tried]:
+    """The others of each refitted cluster, as much worse as the screen says."""
+    best_in = {t.cluster: t for t in done}
+    out = []
+    for k, s in enumerate(worth):
+        if k not in chosen and clusters[k] in best_in:
+            like = best_in[clusters[k]]
+            gain = like.gain - max(0.0, like.scored.gain - s.gain)
+            out.append(Tried(s, gain, s.improved, clusters[k], log_prior(s, None)))
+    return out
+
+
+def improved(before: Evidence, after: Evidence) -> int:
+    """Left-out batches whose squares fall, each channel in units of what is left of it afterwards."""
+    left, right = before.left_out(), after.left_out()
+    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), 1.0)
+    count = 0
+    for b, a, e, f in zip(before.batches, after.batches, left, right, strict=True):
+        old = (e[:, 0] ** 2 / (before.weight * unit)[b.channel] / before.rows[b.channel]) @ before.count[b.channel]
+        new = (f[:, 0] ** 2 / (after.weight * unit)[a.channel] / after.rows[a.channel]) @ after.count[a.channel]
+        count += int(new < old)
+    return count
+
+
+def _clusters(worth: Sequence[Scored], evidence: Evidence) -> list[int]:
+    """A number for every candidate, the same for those whose signatures agree with the first of their cluster."""
+    columns = [s.column for s in worth if s.column >= 0]
+    like = evidence.likeness(columns) if columns else np.zeros((0, 0))
+    place = {c: k for k, c in enumerate(columns)}
+    heads: list[int] = []
+    out = []
+    for s in worth:
+        if s.column < 0:
+            out.append(-1 - len(out))
+            continue
+        k = place[s.column]
+        head = next((h for h in heads if like[k, place[h]] > LIKE), None)
+        if head is None:
+            heads.append(s.column)
+            head = s.column
+        out.append(heads.index(head))
+    return out
