@@ -184,12 +184,13 @@ class _Shop:
         """The machine at rest and the room moving."""
         if not self.room_degC:
             return
-        night = {n: ((0.0, T), (self._s(8), T - NIGHT_K)) for n, T in self.room_degC.items()}
+        night = {n: ((0.0, T), (self._s(8), self._within(n, T - NIGHT_K))) for n, T in self.room_degC.items()}
         yield self._run("a night switched off", [(8.0, {})], night, clock_h=EVENING_H)
-        heated = {
-            n: ((0.0, T), (self._s(0.5), T), (self._s(1.5), T + HEATING_K), (self._s(8), T + HEATING_K))
-            for n, T in self.room_degC.items()
-        }
+        on_s, warm_s, end_s = self._s(0.5), self._s(0.5) + self._s(1), self._s(8)
+        heated = {}
+        for name, cool in self.room_degC.items():
+            warm = self._within(name, cool + HEATING_K)
+            heated[name] = ((0.0, cool), (on_s, cool), (warm_s, warm), (end_s, warm))
         yield self._run(f"{self._span(8)} at rest in a hall that is heated by {HEATING_K:g} K", [(8.0, {})], heated)
 
     def _run(
@@ -207,6 +208,11 @@ class _Shop:
     def _stages(self, given: Sequence[tuple[float, Mapping[str, float]]]) -> tuple[Stage, ...]:
         held = {n: v for n, v in self.rest.items() if v}
         return tuple(Stage(self._s(hours), held | dict(drivers)) for hours, drivers in given)
+
+    def _within(self, name: str, degC: float) -> float:
+        """No farther than the channel's range."""
+        low, high = self.machine.channels[name].range or (-math.inf, math.inf)
+        return float(np.clip(degC, low, high))
 
     def _s(self, hours: float) -> float:
         """So long at the machine's pace, in whole rows."""
