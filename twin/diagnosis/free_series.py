@@ -26,6 +26,8 @@ CORRELATION_S = 5400.0
 STRENGTHS = np.geomspace(0.3, 3e4, 9)
 RANGE = float(np.log(STRENGTHS[-1] / STRENGTHS[0]))
 HALVINGS = 3  # of the step between strengths
+CORNER = 1e300
+PEAKED = 5.0  # nats of gain, above which a marginal likelihood is a peak
 
 
 @dataclass(frozen=True)
@@ -97,30 +99,25 @@ class FreeSeries:
         )
 
     @cached_property
-    def _by_place(self) -> tuple[Array, Array, Array]:
-        """Strength, by_z and along with places first and all batches' modes in one axis."""
-        places, z = len(self.basis.places), len(self.pull)
-        strength, along = (np.moveaxis(a, 1, 0).reshape(places, -1) for a in (self.strength, self.along))
-        return strength, np.moveaxis(self.by_z, 1, 0).reshape(places, -1, z), along
+    def _by_place(self) -> tuple[Array, Array]:
+        """Strength, and what is seen of dz and residual, with places first and all batches' modes in one axis."""
+        places, seen = len(self.basis.places), np.concatenate([self.by_z, self.along[..., None]], axis=-1)
+        strength = np.moveaxis(self.strength, 1, 0).reshape(places, -1)
+        return strength, np.moveaxis(seen, 1, 0).reshape(places, -1, seen.shape[-1])
+
+    @cached_property
+    def _shared(self) -> Array:
+        """Information with the pull beside it (p + 1, p + 1)."""
+        return np.block([[self.information, self.pull[:, None]], [self.pull, np.zeros(1)]])
 
     def gains(self, sigma: Array, places: Indices | slice = slice(None)) -> Array:
         """Log marginal likelihood (P,) of some places at amplitudes (P,) less that at sigma = 0, nats."""
-        strength, by_z, along = (a[places] for a in self._by_place)
+        strength, seen = (a[places] for a in self._by_place)
         var = sigma[:, None] ** 2
-        kept = var / (1.0 + var * strength)
-        scaled = np.sqrt(kept)[..., None] * by_z
-        information = self.information - np.swapaxes(scaled, -1, -2) @ scaled
-        pull = self.pull - ((kept * along)[:, None] @ by_z)[:, 0]
-        root = np.linalg.cholesky(information)
-        half = np.linalg.solve(root, pull[..., None])[..., 0]
-        gained = (kept * along**2).sum(axis=1) + (half**2).sum(axis=1)
-        spent = np.log1p(var * strength).sum(axis=1) + 2 * np.log(np.diagonal(root, 0, -2, -1)).sum(axis=1)
-        return np.asarray(0.5 * (gained - spent) - self._nothing)
-
-    @cached_property
-    def _nothing(self) -> float:
-        root = np.linalg.cholesky(self.information)
-        return float(0.5 * np.sum(np.linalg.solve(root, self.pull) ** 2) - np.log(root.diagonal()).sum())
+        scaled = np.sqrt(var / (1.0 + var * strength))[..., None] * seen
+        gram = np.swapaxes(scaled, -1, -2) @ scaled
+        spent = np.log1p(var * strength).sum(axis=1)
+        return np.asarray(_log(self._shared - gram) + 0.5 * (gram[:, -1, -1] - spent) - _log(self._shared))
 
     @cached_property
     def _tried(self) -> tuple[Array, Array]:
@@ -154,9 +151,9 @@ class FreeSeries:
         there = self.gains(vertex, places)
         best, top = np.where(there > top, vertex, best), np.maximum(there, top)
         width = np.sqrt(2 * np.pi / np.where(hump, -bend, 1e-9))
-        evidence = top + np.log(np.minimum(width / RANGE, 1.0))
+        peak = top + np.log(np.minimum(width / RANGE, 1.0))
         average = np.logaddexp.reduce(gain, axis=0) - np.log(len(gain))
-        return Amplitudes(np.where(top > 0, best, 0.0), np.maximum(top, 0.0), np.maximum(evidence, average))
+        return Amplitudes(np.where(top > 0, best, 0.0), np.maximum(top, 0.0), np.where(top > PEAKED, peak, average))
 
     @cached_property
     def best(self) -> Amplitudes:
@@ -207,3 +204,12 @@ class Posterior:
         shift = np.linalg.solve(self.z_root, seen.T)
         mean = (turned * self.mode_mean).sum(axis=(1, 2))
         return mean, np.asarray(np.sqrt(own + (shift**2).sum(axis=0)))
+
+
+def _log(shared: Array) -> Array:
+    """``(bᵀ A⁻¹ b - log det A) / 2`` of an information A with its pull b beside it (..., p + 1, p + 1)."""
+    shared = shared.copy()
+    shared[..., -1, -1] = CORNER  # whatever stands there, the row before it becomes the half-solved pull
+    root = np.linalg.cholesky(shared)
+    log_root = np.log(np.diagonal(root, 0, -2, -1)[..., :-1]).sum(axis=-1)
+    return np.asarray(0.5 * (root[..., -1, :-1] ** 2).sum(axis=-1) - log_root)
