@@ -22,7 +22,7 @@ from twin.calibration.least_squares import settled
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.diagnosis.fitted import Fitted
-from twin.diagnosis.foreseen import _Model, begun, foreseen
+from twin.diagnosis.foreseen import _floating, _Model, begun, foreseen
 from twin.diagnosis.menu import Run, menu
 from twin.diagnosis.next_experiment import COLUMNS, SETTLES, TELLS, Proposal, next_experiment
 from twin.run_plan import RunPlan, load_run_plan
@@ -45,8 +45,8 @@ def fitted(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> Fitt
 
 @cache
 def tied(bare: bool = False) -> dict[str, Fitted]:
-    """Two rivals and recordings at one speed, which tell little of them; `bare`: no sensor on the head."""
-    changes: dict[str, Any] = {"sensors__t_head": None} if bare else {}
+    """Two rivals and recordings at one speed, which tell little of them; `bare`: no sensor on the shaft."""
+    changes: dict[str, Any] = {"sensors__t_shaft": None} if bare else {}
     air, loss = machine(**AIR, **changes), machine(**LOSS, **changes)
     steady = [replace(b, table=b.table.assign(rpm=3000.0)) for b in empty_batches(air, 4)]
     shown = recorded(air, steady, seed=1)
@@ -93,6 +93,9 @@ def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
     like_before = foreseen(list(rivals.values()), [again(first, 4.0, 3000.0)]).nats[..., 0]
     by_words = chosen.table.set_index("run")["nats"]
     assert like_before.max() < 0.1 * by_words.min()  # another one at that speed tells next to nothing
+    run = next(r for r in menu(rivals["air"].machine, rivals["air"].batches, ["rpm"]) if r.words == chosen.words)
+    both = foreseen(list(rivals.values()), [run]).nats[..., 0]
+    assert chosen.nats == pytest.approx(min(both[0, 1], both[1, 0])) and both[0, 1] > 2 * both[1, 0]
     assert list(chosen.table.columns) == list(COLUMNS) and by_words.is_monotonic_decreasing
     cool = next(w for w in by_words.index if w.startswith("a cool-down"))
     assert by_words[cool] > SETTLES
@@ -116,29 +119,49 @@ def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) 
     assert 0.5 * told < after - before < 1.5 * told
 
 
-def test_foreseen_is_the_least_squares_after_a_refit() -> None:
+@pytest.mark.parametrize(("bare", "number"), [(False, 0), (False, 4), (True, 3)])
+def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) -> None:
     """The same number from one dense system: data of one rival, parameters and nuisances of the other with priors."""
-    rivals = list(tied().values())
-    runs = menu(rivals[0].machine, rivals[0].batches, ["rpm"])[:2]
-    truth, other = (_Model.of(f, runs, ()) for f in rivals)
-    seen = foreseen(rivals, runs).nats
-    for r in range(2):
+    rivals = list(tied(bare).values())
+    run = menu(rivals[0].machine, rivals[0].batches, ["rpm"])[number]
+    truth, other = (_Model.of(f, [run], ()) for f in rivals)
+    weight = np.min([f.state.noise.weight for f in rivals], axis=0)
 
-        def left(model: _Model, r: int = r) -> float:
-            block, spread = model.blocks[r], np.array([u.spread for u in model.problem.unknowns])
-            apart = model.foretold(truth.first)[r] - truth.shown[r]
-            weight = np.min([f.state.noise.weight for f in rivals], axis=0)
-            scale = np.sqrt(weight[block.channel])
-            root, q = model.fitted.state.arrow.root, block.nuisance.shape[1]
-            rows = scale[:, None] * np.hstack([block.nuisance, block.jacobian * spread])
-            prior = np.block([[np.eye(q), np.zeros((q, len(root)))], [np.zeros((len(root), q)), root]])
-            system, aim = np.vstack([rows, prior]), np.append(scale * apart, np.zeros(len(prior)))
-            return float(np.sum((aim - system @ np.linalg.lstsq(system, aim, rcond=None)[0]) ** 2))
+    def left(model: _Model) -> float:
+        block, spread = model.blocks[0], np.array([u.spread for u in model.problem.unknowns])
+        apart = model.foretold(truth.first)[0] - truth.shown[0]
+        scale = np.sqrt(weight[block.channel])
+        root, q = model.fitted.state.arrow.root, block.nuisance.shape[1]
+        rows = scale[:, None] * np.hstack([block.nuisance, block.jacobian * spread])
+        prior = np.block([[np.eye(q), np.zeros((q, len(root)))], [np.zeros((len(root), q)), root]])
+        system, aim = np.vstack([rows, prior]), np.append(scale * apart, np.zeros(len(prior)))
+        return float(np.sum((aim - system @ np.linalg.lstsq(system, aim, rcond=None)[0]) ** 2))
 
-        own, count = left(truth), runs[r].rows * sum(1 / np.max([f.state.noise.inflation for f in rivals], axis=0))
-        assert seen[0, 1, r] == pytest.approx(0.5 * (left(other) - own) / (1 + own / count), rel=1e-6)
-        assert own < 0.02 * left(other)
+    seen = foreseen(rivals, [run]).nats[..., 0]
+    own, count = left(truth), run.rows * sum(1 / np.max([f.state.noise.inflation for f in rivals], axis=0))
+    assert seen[0, 1] == pytest.approx(0.5 * (left(other) - own) / (1 + own / count), rel=1e-6)
+    assert (own > 1.0) == bare  # a hot body without a sensor: no rival knows where it starts
     assert (np.diagonal(seen) == 0).all()
+
+
+def test_a_rival_begins_where_the_sensors_say() -> None:
+    rivals = list(tied().values())
+    model = _Model.of(rivals[0], menu(rivals[0].machine, rivals[0].batches, ["rpm"])[:2], ())
+    sensor = rivals[0].problem.network.readings[0]
+    warmer = {n: v + 1.5 for n, v in model.first.items()}
+    for r in range(2):
+        before, after = (-sensor.noise * model.foretold(first)[r][0] for first in (model.first, warmer))
+        assert before == pytest.approx(model.first["t_shaft"][r], abs=1e-3)
+        assert after - before == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_new_sensor_tells_nothing_of_a_constant() -> None:
+    """Its own error is one more unknown: the rows' covariance is I + offset offsetᵀ."""
+    rng = np.random.default_rng(0)
+    rows, offset = rng.standard_normal((7, 3)), rng.uniform(1, 2, (7, 1))
+    white = _floating(rows, offset)
+    np.testing.assert_allclose(white.T @ white, rows.T @ np.linalg.inv(np.eye(7) + offset @ offset.T) @ rows)
+    np.testing.assert_array_equal(_floating(rows, 0 * offset), rows)
 
 
 def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
