@@ -38,8 +38,8 @@ def log_diagnosis(
     """Track one diagnosis and give back the run's id.
 
     Metrics: ``left_out_rms_before/z_um``, ``left_out_rms_after/z_um`` and ``noise_floor/z_um`` by channel, findings,
-    probability (of the first finding), batches, batches_improved, seconds. Tags: verdict, mechanism, where, simulated,
-    drafted. The batches are dataset inputs, `files` (name -> path) artifacts.
+    probability (of the first one), batches, left_out_batches, left_out_batches_improved, seconds. Tags: verdict,
+    mechanism, where, simulated, drafted. The batches are dataset inputs, `files` (name -> path) artifacts.
 
     Raises:
         WorkError: the store does not answer.
@@ -92,7 +92,8 @@ def _metrics(d: Diagnosis) -> dict[str, float]:
         for key, value in values.items()
         if value is not None
     }
-    told |= {"findings": len(f.findings), "batches": f.fit.batches, "batches_improved": f.fit.batches_improved}
+    told |= {"findings": len(f.findings), "batches": len(f.batches)}
+    told |= {"left_out_batches": f.fit.batches, "left_out_batches_improved": f.fit.batches_improved}
     if f.seconds is not None:
         told["seconds"] = f.seconds
     if f.findings:

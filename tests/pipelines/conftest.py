@@ -1,14 +1,16 @@
-"""One tracking store and one compiled sample machine for all tests of this folder: making them takes seconds."""
+"""One tracking store, server of flows and compiled sample machine for all tests of this folder: each takes seconds."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from data.machine import load_machine
+from pipelines import settings as settings_module
 from twin.compile import compile_network, expanded
 from twin.network import Network
 from twin.schema import twin_part
@@ -39,6 +41,25 @@ def store(store_home: Path) -> Iterator[object]:
         os.environ["THERMODRIFT_HOME"] = before
     tracking.open_store(settings)
     yield settings
+
+
+@pytest.fixture(scope="session")
+def flows(store: object, store_home: Path) -> Iterator[ModuleType]:
+    """The flows on one temporary server for all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THERMODRIFT_HOME", str(store_home))
+        patch.delenv("PREFECT_API_URL", raising=False)
+        settings_module.configure_environment()
+        from prefect.server.api.server import SubprocessASGIServer
+
+        from pipelines import flows as module
+
+        patch.setattr(module, "RETRY_DELAY_S", 0.01)
+        server = module.start_server()
+        assert server is not None
+        server.join()
+        yield module
+        SubprocessASGIServer().stop()
 
 
 @pytest.fixture(scope="session")

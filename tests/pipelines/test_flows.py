@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
@@ -16,32 +15,12 @@ from small_year import write_machine, write_year
 
 from data.errors import InputError, WorkError
 from models.crossing import Plan
-from pipelines import settings as settings_module
 from pipelines import training
 from pipelines.caller import RETRIES, DirectCaller
 from pipelines.request import TrainRequest
 
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
 SMALL = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
-
-
-@pytest.fixture(scope="session")
-def flows(store: Any, store_home: Path) -> Iterator[ModuleType]:
-    """The flows on one temporary server for all tests of this file."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("THERMODRIFT_HOME", str(store_home))
-        patch.delenv("PREFECT_API_URL", raising=False)
-        settings_module.configure_environment()
-        from prefect.server.api.server import SubprocessASGIServer
-
-        from pipelines import flows as module
-
-        patch.setattr(module, "RETRY_DELAY_S", 0.01)
-        server = module.start_server()
-        assert server is not None
-        server.join()
-        yield module
-        SubprocessASGIServer().stop()
 
 
 @pytest.fixture(scope="module")
