@@ -17,9 +17,14 @@ TOLERANCE, STEPS = 1e-2, 40
 
 
 def baseline(
-    machine: Machine, part: TwinPart, batches: Sequence[Batch], progress: Callable[[str, int, int], None] | None = None
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    progress: Callable[[str, int, int], None] | None = None,
+    runs: int = 0,
 ) -> Fitted:
-    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it.
+    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it; `runs` that they
+    come from, where they are blocks of fewer.
 
     Raises:
         InputError: batches of another machine, twice the same, or that cannot be simulated.
@@ -43,4 +48,4 @@ def baseline(
             progress("baseline", steps, 0)
 
     state, _ = settled(problem, reweight=True, tolerance=TOLERANCE, max_iterations=STEPS, progress=told)
-    return Fitted(machine, part, tuple(batches), problem, state)
+    return Fitted(machine, part, tuple(batches), problem, state, runs or len(batches))

@@ -66,7 +66,7 @@ def found_of(
         windows=windows,
         rms=tuple(rms),
         separates=separates,
-        caps=caps(len(final.batches)),
+        caps=caps(final.runs),
         evidence={
             "gain_nats": best.tried.gain,
             "threshold_nats": done.threshold,

@@ -30,6 +30,7 @@ class Fitted:
     batches: tuple[Batch, ...]
     problem: CalibrationProblem
     state: State
+    runs: int = 0  # that the batches come from, where they are blocks of fewer
 
     @property
     def x(self) -> Array:

@@ -1,4 +1,4 @@
-"""Which of many terms predict batches left out: greedy, a term at a time, every fold from one Gram matrix.
+"""Which of many terms predict batches left out: a term more at a time, every fold from one Gram matrix.
 
 Parameters and nuisances are projected out of the terms' rows (Frisch and Waugh 1933), so that no smoothing of a
 reconstruction bends a coefficient.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,48 +50,62 @@ class LeftOutTerms:
             pull.append(gram[:q, -1] - shadow.T @ (gram[q:-1, -1] - self.z))
         return np.stack(own), np.stack(pull)
 
-    def _prior(self, at: NDArray[np.int64]) -> Array:
-        return np.diag(FLAT * self.grams.sum(axis=0)[at, at] + 1e-300)
+    @cached_property
+    def _flat(self) -> Array:
+        """Prior information (Q,) of every coefficient."""
+        return FLAT * np.diagonal(self.grams.sum(axis=0))[: self.count] + 1e-300
+
+    def gains(self, sets: NDArray[np.int64]) -> Array:
+        """Left-out log scores (S,) of sets of terms (S, k) less that of none, nats, summed over batches."""
+        own, pull = self._folds
+        information = own[:, sets[:, :, None], sets[:, None, :]] + self._flat[sets][..., None] * np.eye(sets.shape[1])
+        seen = pull[:, sets]
+        found = np.linalg.solve(information, seen[..., None])[..., 0]
+        log = 0.5 * ((seen * found).sum(axis=-1) - np.linalg.slogdet(information)[1])
+        return np.asarray((log[0] - log[1:]).sum(axis=0))
 
     def gain(self, terms: Sequence[int]) -> float:
-        """Left-out log score of the terms less that of none, nats, summed over batches."""
-        own, pull = self._folds
-        at = np.asarray(terms, np.int64)
-        if not len(at):
-            return 0.0
-        information = own[:, at[:, None], at] + self._prior(at)
-        found = np.linalg.solve(information, pull[:, at, None])[..., 0]
-        log = 0.5 * ((pull[:, at] * found).sum(axis=1) - np.linalg.slogdet(information)[1])
-        return float(np.sum(log[0] - log[1:]))
+        """That of one set."""
+        return float(self.gains(np.array([terms], np.int64))[0]) if len(terms) else 0.0
 
     def chosen(self, allowed: Sequence[int], most: int = MOST) -> list[int]:
-        """Terms taken one after the other, each then tried against the others, while every step gains enough."""
+        """The best terms while every further one gains enough: one, the best pair, then what goes best with those.
+
+        All pairs are tried, since a difference of two temperatures shows in neither alone.
+        """
         terms: list[int] = []
         gain = 0.0
-        while len(terms) < most:
-            trial = self._best([*terms, -1], len(terms), allowed)
-            for k in range(len(trial) - 1):
-                trial = self._best(trial, k, allowed)
+        trial: list[int] = []
+        for size in range(1, min(most, len(allowed)) + 1):
+            trial = self._pair(allowed) if size == 2 else self._extended(trial, allowed)
             reached = self.gain(trial)
-            if len(set(trial)) < len(trial) or reached < gain + max(LEAST, SHARE * gain):
-                break
-            terms, gain = trial, reached
+            if reached >= gain + (size - len(terms)) * max(LEAST, SHARE * gain):
+                terms, gain = trial, reached
         return terms
 
+    def _pair(self, allowed: Sequence[int]) -> list[int]:
+        sets = np.array(list(combinations(allowed, 2)), np.int64)
+        return [int(q) for q in sets[self.gains(sets).argmax()]]
+
+    def _extended(self, terms: Sequence[int], allowed: Sequence[int]) -> list[int]:
+        """With one more term, then each exchanged for a better one; the earlier of equals."""
+        out = self._best([*terms, -1], len(terms), allowed)
+        for k in range(len(out) - 1):
+            out = self._best(out, k, allowed)
+        return out
+
     def _best(self, terms: Sequence[int], k: int, allowed: Sequence[int]) -> list[int]:
-        """The terms with the k-th exchanged for the best; the earlier of equals."""
+        """The terms with the k-th exchanged for the best."""
         others = [*terms[:k], *terms[k + 1 :]]
         free = [q for q in allowed if q not in others]
-        if not free:
-            return list(terms)
-        best = max(free, key=lambda q: self.gain([*others, q]))
+        best = free[int(self.gains(np.array([[*others, q] for q in free], np.int64)).argmax())]
         return [*terms[:k], best, *terms[k + 1 :]]
 
     def coefficients(self, terms: Sequence[int]) -> tuple[Array, Array]:
         """Values and covariance (k, k) from all batches."""
         own, pull = self._folds
         at = np.asarray(terms, np.int64)
-        covariance = np.linalg.inv(own[0][at[:, None], at] + self._prior(at))
+        covariance = np.linalg.inv(own[0][at[:, None], at] + np.diag(self._flat[at]))
         return covariance @ pull[0, at], covariance
 
     def explained(self, terms: Sequence[int]) -> tuple[float, int]:
@@ -105,8 +120,7 @@ class LeftOutTerms:
         """Every batch's squared residual (B,) predicted by all others."""
         q = self.count
         at = np.r_[np.asarray(terms, np.int64), np.arange(q, q + len(self.z))]
-        prior = np.eye(len(at))
-        prior[: len(terms), : len(terms)] = self._prior(at[: len(terms)])
+        prior = np.diag(np.r_[self._flat[at[: len(terms)]], np.ones(len(self.z))])
         centre = np.r_[np.zeros(len(terms)), self.z]
         total, out = self.grams.sum(axis=0), []
         for gram in self.grams:

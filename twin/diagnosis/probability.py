@@ -42,7 +42,7 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())
     weight /= weight.sum()
-    most = MOST.get(len(done.before.batches), 0.99)
+    most = MOST.get(done.before.runs or len(done.before.batches), 0.99)
     weight[:-2] *= min(1.0, most / max(weight[:-2].max(initial=0.0), 1e-12))
     best = done.best
     out = [

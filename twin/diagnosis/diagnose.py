@@ -1,0 +1,260 @@
+"""What physics did the simulation leave out? From a machine file and its recordings to a diagnosis."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from twin.calibration.identifiability import Interval, intervals90
+from twin.calibration.least_squares import result
+from twin.diagnosis import tables as made
+from twin.diagnosis.baseline import TOLERANCE, baseline
+from twin.diagnosis.changes import changed_parts, with_deviations
+from twin.diagnosis.conclude import caps, found_of, rms_of, verdict_of
+from twin.diagnosis.diagnosis import Diagnosis
+from twin.diagnosis.draft import drafted_part
+from twin.diagnosis.findings import (
+    DetectionLimit,
+    Finding,
+    Findings,
+    FitSummary,
+    LeftOutRms,
+    NextExperiment,
+    Place,
+    Refinement,
+)
+from twin.diagnosis.fitted import Fitted, settle
+from twin.diagnosis.found import Found, Rms, place_words
+from twin.diagnosis.leftover import Leftover, leftover
+from twin.diagnosis.limits import limits
+from twin.diagnosis.parts_of_batches import enough_batches
+from twin.diagnosis.prediction import LeftOutRows, left_out_rows
+from twin.diagnosis.search import Round, Search, search
+from twin.diagnosis.settling import settling_run
+from twin.diagnosis.statement import finding_of, verdict_statement
+from twin.diagnosis.where_when import Located, locate
+from twin.diagnosis.workers import Workers
+from twin.schema import TwinPart, twin_part
+
+Progress = Callable[[str, int, int], None]
+
+
+def diagnose(
+    machine: Machine,
+    batches: Sequence[Batch],
+    *,
+    seed: int = 0,
+    processes: int = 1,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Locate, name, model and show what recordings have and the machine file's twin lacks.
+
+    Without a twin part the simplest network that the recordings support is drafted first. `processes` side by side for
+    refits; results do not depend on it. `cache` keeps the structural null by data and machine file.
+
+    Raises:
+        InputError: batches or a machine file that cannot be used; WorkError: the model fails at the priors' means.
+    """
+    begun = time.perf_counter()
+    tell = progress or (lambda step, n, of: None)
+    with Workers(processes) as workers:
+        words: list[str] = []
+        drafted = machine.twin is None
+        if drafted:
+            draft = drafted_part(machine, batches, progress=lambda what, n, of: tell("draft", n, of))
+            part = draft.part
+            words += draft.words
+        else:
+            part = twin_part(machine)
+        runs = len(batches)
+        batches, remarks = enough_batches(batches)
+        words += remarks
+        done = search(baseline(machine, part, batches, tell, runs), seed, workers, tell)
+    final = settle(done.final) if done.accepted else done.final
+    done = Search(done.baseline, final, done.rounds)
+    tell("left out", 0, 0)
+    before, after = left_out_rows(done.baseline), left_out_rows(final)
+    located = _located(done.baseline, batches, words, tell)
+    left = leftover(done, batches, tell)
+    return _diagnosis(
+        machine, part, batches, done, before, after, located, left, tuple(words), drafted, time.perf_counter() - begun
+    )
+
+
+def _located(fitted: Fitted, batches: Sequence[Batch], words: list[str], tell: Progress) -> Located | None:
+    """The map of what the recalibrated baseline cannot explain."""
+    try:
+        return locate(fitted.problem, fitted.x, fitted.state.nuisance, batches, progress=tell)
+    except (InputError, WorkError) as error:
+        words.append(f"no map of where and when: {error}")
+        return None
+
+
+def _diagnosis(
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    done: Search,
+    before: LeftOutRows,
+    after: LeftOutRows,
+    located: Located | None,
+    left: Leftover | None,
+    words: tuple[str, ...],
+    drafted: bool,
+    seconds: float,
+) -> Diagnosis:
+    final = left.fitted if left is not None and left.fitted is not None else done.final
+    if final is not done.final:
+        after = left_out_rows(final)
+    named = [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
+    fit = result(final.problem, final.state, TOLERANCE, "")
+    intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
+    rms_table = made.rms_table(before, after, final)
+    rms = rms_of(rms_table, final)
+    part_after = with_deviations(final)
+    run = settling_run(done, named)
+    separates = run.words if run is not None else ""
+    found = [_found(done, r, part_after, intervals, rms_table, separates) for r in named]
+    if left is not None:
+        found.append(left.found(part_after, intervals, rms, caps(final.runs)))
+    found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
+    verdict = verdict_of(done, [f for f in found if f.mechanism not in ("free_flux", "free_shift")], left is not None)
+    last = done.rounds[-1]
+    table = limits(last.before, last.screen, last.threshold)
+    told = _limits_told(table)
+    findings = tuple(finding_of(f) for f in found)
+    better = int((_per_batch(rms_table, final, "after") < _per_batch(rms_table, final, "before")).sum()) if found else 0
+    statement = verdict_statement(
+        verdict, found, rms, told, separates, [place_words(_where(n), part_after) for n in told]
+    )
+    everything = made.empty_tables() | {
+        "rms": rms_table,
+        "series": made.series_table(before, after, final),
+        "acf": made.acf_table(before, after, final),
+        "candidates": made.candidates_table(done.rounds),
+        "steps": made.steps_table(done.rounds),
+        "refinements": refinements(done),
+        "limits": table,
+        "null": made.null_table(last.null),
+    }
+    if located is not None:
+        everything["map"] = located.map
+    if left is not None:
+        everything["flux"] = left.flux
+    return Diagnosis(
+        machine=machine,
+        findings=Findings(
+            machine=machine.machine,
+            batches=tuple(b.batch_id for b in batches),
+            verdict=verdict,
+            findings=findings,
+            fit=_summary(rms, better, len(batches)),
+            detection_limits=told,
+            next_experiment=_next(run),
+            seconds=round(seconds, 1),
+            statement=statement,
+            simulated=any(b.simulated for b in batches),
+            drafted=drafted,
+            remarks=words,
+            refinements=tuple(
+                Refinement(what=str(r.what), why=str(r.why), before=float(r.before), after=float(r.after))
+                for r in everything["refinements"].itertuples()
+            ),
+        ),
+        part_before=done.baseline.part,
+        part_after=part_after,
+        simulated=any(b.simulated for b in batches),
+        drafted=drafted,
+        words=words,
+        tables=everything,
+        network=final.problem.network,
+        values={i.name: i.value for i in intervals.values()},
+        intervals=tuple(intervals.values()),
+        added=changed_parts(part, part_after),
+        notes=_notes(findings, batches, seconds),
+        plan_text=run.plan_text if run is not None else None,
+    )
+
+
+def _found(
+    done: Search,
+    r: Round,
+    part: TwinPart,
+    intervals: dict[str, Interval],
+    table: pd.DataFrame,
+    separates: str,
+) -> Found:
+    """A finding with the errors before and after all that was found; its own gain stands in the evidence."""
+    return found_of(done, r, part, intervals, rms_of(table, done.final), separates)
+
+
+def _per_batch(table: pd.DataFrame, fitted: Fitted, column: str) -> pd.Series:
+    """By batch the mean over channels of log rms, noise taken in."""
+    level = np.hypot(table[column], table["floor"])
+    return np.log(level).groupby(table["batch"]).mean()
+
+
+def refinements(done: Search) -> pd.DataFrame:
+    """What was cut finer before and between findings, with the left-out log score before and after, in nats."""
+    rows = [
+        (r.best.candidate.words, "the left-out error of its sensor was far above the noise", 0.0, r.best.gain)
+        for r in done.accepted
+        if r.best is not None and r.best.candidate.mechanism == "coarse_network"
+    ]
+    return pd.DataFrame(rows, columns=["what", "why", "before", "after"])
+
+
+def _limits_told(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
+    """Every candidate's limit; nan where no amplitude within bounds would have been seen."""
+    return tuple(
+        DetectionLimit(
+            mechanism=row.mechanism, where=Place(kind=row.kind, name=row.name), words=row.words,
+            limit=None if not np.isfinite(row.limit) else float(row.limit), unit=row.unit,
+            absorbed=float(row.absorbed), absorbed_by=row.absorbed_by,
+        )
+        for row in table.itertuples(index=False)
+    )  # fmt: skip
+
+
+def _where(limit: DetectionLimit):  # type: ignore[no-untyped-def]
+    from twin.diagnosis.candidate import Where
+
+    return Where(limit.where.kind, limit.where.name)
+
+
+def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
+    return FitSummary(
+        left_out_rms=LeftOutRms(
+            before={r.key: r.before for r in rms},
+            after={r.key: r.after for r in rms},
+            noise_floor={r.key: r.noise for r in rms},
+        ),
+        batches_improved=better,
+        batches=n,
+    )
+
+
+def _next(run) -> NextExperiment | None:  # type: ignore[no-untyped-def]
+    if run is None:
+        return None
+    return NextExperiment(
+        separates=tuple(run.separates), run=run.words, hours=run.hours, file="next_run.yml" if run.plan_text else None
+    )
+
+
+def _notes(findings: Sequence[Finding], batches: Sequence[Batch], seconds: float) -> dict[str, str]:
+    """Comments of a machine file on what was found."""
+    return {
+        f.name: f"found by a diagnosis of {len(batches)} runs, probability {f.probability:.2f}; "
+        f"{f.evidence.get('gain_nats', 0.0):.0f} nats of left-out score"
+        for f in findings
+        if f.name
+    }

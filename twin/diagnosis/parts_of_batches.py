@@ -1,0 +1,57 @@
+"""Too few batches to leave one out: each is cut into runs of its own, and confidence is capped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from data.batch import Batch
+
+ENOUGH = 4
+SHORTEST_ROWS = 24
+
+
+def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
+    """The batches, or, of fewer than four, blocks of them in time; and what is to be said of that.
+
+    A block starts where its sensors stand: bodies without one start as the network at rest says, within the prior.
+    """
+    if len(batches) >= ENOUGH:
+        return list(batches), ()
+    each = int(np.ceil(ENOUGH / max(1, len(batches))))
+    out: list[Batch] = []
+    for batch in batches:
+        n = max(1, min(each, batch.n_rows // SHORTEST_ROWS))
+        out += _cut(batch, n)
+    words = (
+        f"{len(batches)} run{'s' if len(batches) != 1 else ''} only: cut into {len(out)} blocks that are left out in "
+        "turn; blocks of one run share its weather and its state, so no probability above 0.9 is told",
+    )
+    return out, words
+
+
+def _cut(batch: Batch, n: int) -> list[Batch]:
+    if n == 1:
+        return [batch]
+    edges = np.linspace(0, batch.n_rows, n + 1).astype(int)
+    out = []
+    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        first_s = float(batch.time_s[a])
+        table = batch.table.iloc[a:b].reset_index(drop=True)
+        table["time_s"] = table["time_s"] - first_s
+        findings = tuple(
+            replace(
+                f,
+                start_s=None if f.start_s is None else f.start_s - first_s,
+                end_s=None if f.end_s is None else f.end_s - first_s,
+            )
+            for f in batch.findings
+        )
+        start = None if batch.start is None else batch.start + pd.Timedelta(seconds=first_s)
+        out.append(
+            replace(batch, batch_id=f"{batch.batch_id}_{k + 1}", table=table, start=start, findings=findings)
+        )
+    return out
