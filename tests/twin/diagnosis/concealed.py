@@ -88,10 +88,10 @@ def flux(body: str, driver: str | None = "coolant", **values: str) -> dict[str, 
                      **({"drivers": {"level": driver}} if driver else {})}}  # fmt: skip
 
 
-def shift(error: str, body: str = "head", driver: str = "coolant", **values: str) -> dict[str, Any]:
+def shift(error: str, body: str = "head", driver: str | None = "coolant", **values: str) -> dict[str, Any]:
     """Displacement of an error, of no listed mechanism."""
     return {"shift": {"law": "free_shift", "acts_on": error, "at": {"body": body}, "parameters": values,
-                      "drivers": {"level": driver}}}  # fmt: skip
+                      **({"drivers": {"level": driver}} if driver else {})}}  # fmt: skip
 
 
 def coolant(batch: Batch, k: int) -> Array:

@@ -73,6 +73,15 @@ def test_a_constant_is_told() -> None:
     assert size(out.part, "constant") == pytest.approx(25.0, rel=0.2)
 
 
+def test_a_tilt_is_told_as_the_difference_that_it_is() -> None:
+    """Neither body's rise alone shows it, and no single mechanism of free form states it."""
+    hot, cold = (shift("z", body, None, per_K=f"{g} um/K")["shift"] for body, g in (("column", 6.0), ("bed", -6.0)))
+    out = found(case({"hot": hot, "cold": cold}))
+    assert {c.term.name: round(c.value) for c in out.terms} == {"θ_column": 6, "θ_bed": -6}
+    assert out.part is None and 0 < out.part_gain < 0.9 * out.gain
+    assert "6.0 µm of z per K of column's rise" in out.words and "−6.0 µm of z per K of bed's rise" in out.words
+
+
 def test_nothing_to_reconstruct() -> None:
     given = case()
     with pytest.raises(InputError, match="reconstruct: nothing was found; give a place of missing heat"):
