@@ -53,6 +53,7 @@ def convert(text: str | float, unit: str) -> float:
         ) from None
 
 
+@lru_cache(maxsize=4096)
 def same_dimension(one: str, other: str) -> bool:
     """Whether two units measure the same kind of thing; rpm counts as 1/s, % as a number."""
     registry = unit_registry()

@@ -1,7 +1,8 @@
 """The rival "the network is too coarse here": a piece of its own around a sensor, with or without a neighbour's heat.
 
 A sensor in a big casting sees what is near it first. A local node of part of the casting's capacity behind a free
-conductance is the least refinement that can lag, and lead where a neighbour's heat enters through it.
+conductance is the least refinement that can lag, and lead where a neighbour's heat enters through it; a far one lets
+the sensor's body answer at once and settle slowly.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from twin.schema import Body, Link
 SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
-NEAR = "_near"
+NEAR, FAR = "_near", "_far"
+FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
 
 def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, worse: float = 9.0) -> list[Candidate]:
@@ -54,6 +56,24 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
         f"sensors.{channel}": sensor.model_copy(update={"at": near}),
     }
     where = Where("sensor", channel)
+    far = f"{channel}{FAR}"
+    if far not in part.bodies:
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_far",
+            f"a piece of the {body} far from {channel}",
+            parts={
+                f"bodies.{far}": Body(
+                    capacity=Value(value=f"{FAR_SHARE * capacity:.4g} J/K", spread=SPREAD),
+                    material=part.bodies[body].material,
+                    words=f"{part.bodies[body].words or body}, far from the sensor {channel}",
+                ),
+                f"links.{far}-{body}": Link(
+                    between=(far, body), conductance=Value(value=f"{leaves:.4g} W/K", spread=SPREAD)
+                ),
+            },
+        )
     words = f"a piece of the {body} of its own around {channel}"
     yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
     for key, link in part.links.items():

@@ -18,7 +18,7 @@ from twin.compile import compile_network
 from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.schema import TwinPart
 
-STEPS, TOLERANCE = 6, 0.05  # of a refit: a candidate's place in the ranking needs no more
+STEPS, TOLERANCE = 4, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
 @dataclass(frozen=True)

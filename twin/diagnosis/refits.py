@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.evidence import Evidence
-from twin.diagnosis.fitted import Fitted, refitted
+from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.priors import log_prior, start_values
 from twin.diagnosis.screen import Scored, alone
 
@@ -69,6 +69,18 @@ def refit(now: Fitted, base: Evidence, inflation: Array, s: Scored) -> Tried | N
         return None
     gain = float(after.base_score()[0] - base.base_score()[0])
     return Tried(s, gain, improved(base, after), 0, log_prior(s, fitted), fitted)
+
+
+def taken_on(base: Evidence, inflation: Array, t: Tried) -> Tried:
+    """The same, fitted on to its optimum."""
+    assert t.fitted is not None
+    try:
+        fitted = settle(t.fitted, steps=8, tolerance=0.03)
+        after = alone(fitted, inflation)
+    except (InputError, WorkError):
+        return t
+    gain = float(after.base_score()[0] - base.base_score()[0])
+    return replace(t, gain=gain, improved=improved(base, after), log_prior=log_prior(t.scored, fitted), fitted=fitted)
 
 
 def with_clusters(

@@ -13,7 +13,7 @@ from twin.diagnosis.acceptance import flipped_gains, gumbel, sign_p
 from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null, structural_null
-from twin.diagnosis.refits import Tried, refit, shortlist, with_clusters
+from twin.diagnosis.refits import Tried, refit, shortlist, taken_on, with_clusters
 from twin.diagnosis.screen import Scored, Screen, alone, proposed, screen
 from twin.diagnosis.slack import no_news
 from twin.diagnosis.workers import Workers
@@ -22,6 +22,8 @@ MOST_EFFECTS = 4
 IMPROVED = 0.75  # share of the left-out batches that must improve
 RESTARTS = 2  # of a round, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
+FINALISTS = 4  # of a round's refits that are taken on to their optimum
+FINER = 0.7  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
 
@@ -119,7 +121,10 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
         tell("refit", n + 1, len(work))
         if t is not None:
             tried.append(replace(t, cluster=numbers[n]))
-    tried = sorted([*tried, *with_clusters(tried, worth, clusters, chosen)], key=_order)
+    tried.sort(key=_order)
+    final = list(workers.map(partial(taken_on, base, inflation), tried[:FINALISTS]))
+    tried = sorted([*final, *tried[FINALISTS:]], key=_order)
+    tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=_order)])
     if not tried or tried[0].fitted is None:
         return Round(now, seen, tuple(tried), null.threshold(float(base.base_score()[0])), null, np.zeros(0), False)
     best = tried[0]
@@ -129,6 +134,12 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     n = len(now.batches)
     accepted = best.gain > threshold and best.improved >= IMPROVED * n
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
+
+
+def _coarse_first(tried: list[Tried]) -> list[Tried]:
+    """A finer network is the simpler explanation: physics goes first only where it gains clearly more."""
+    finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.gain > FINER * tried[0].gain > 0]
+    return finer[:1] + [t for t in tried if t not in finer[:1]]
 
 
 def _order(t: Tried) -> tuple[bool, float]:
