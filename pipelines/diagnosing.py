@@ -205,11 +205,15 @@ def _naming_plan(d: Diagnosis) -> Findings:
 def _diagnosed(
     machine: Machine, batches: list[Batch], seed: int, say: Say, done: Done | None, work: Diagnose | None
 ) -> Diagnosis:
+    last = ""
+
     def told(step: str, n: int, of: int) -> None:
+        nonlocal last
         if of and done is not None:
             done(step, n, of)
-        elif not of:
+        elif not of and step != last:
             say(step)
+            last = step
 
     work = work or library_diagnosis()
     cache = home() / "diagnosis_cache"

@@ -14,6 +14,7 @@ from pipelines.report import diagnosis_words as words
 from pipelines.report.diagnosis_extracts import by_channel
 from pipelines.report.words import count, number
 from twin.diagnosis.diagnosis import Diagnosis
+from twin.diagnosis.findings import Finding
 
 _WHAT = {
     REPORT: "the report, one page",
@@ -60,11 +61,18 @@ def print_outcome(outcome: DiagnosisOutcome) -> None:
 
 
 def sentences(d: Diagnosis) -> list[str]:
-    """A numbered sentence a finding with its probability; without any, what the verdict means here."""
+    """A sentence a finding with its probability, numbered; without any, what the verdict means here."""
     f = d.findings
-    out = [f"{k}. {x.statement} ({words.probability_words(x.probability)})" for k, x in enumerate(f.findings, 1)]
+    if f.findings:
+        return [f"{k}. {_with_probability(x)}" for k, x in enumerate(f.findings, 1)]
     lead = f.statement or words.below_headline(f.verdict, f.fit.batches, len(d.tables["limits"]))
-    return [lead, *out] if lead and lead not in [x.statement for x in f.findings] else out
+    return [lead] if lead else []
+
+
+def _with_probability(x: Finding) -> str:
+    """The statement, which says its probability itself where it is not sure."""
+    percent = words.probability_words(x.probability).replace(words.NARROW, " ")
+    return x.statement if percent in x.statement else f"{x.statement} ({percent})"
 
 
 def error_table(d: Diagnosis) -> Table:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from command import Call, Done, in_process
 from toy_diagnoser import NOTE, PLAN, Toy, write_machine, write_recordings
+from toy_diagnosis import toy_diagnosis
 
 from data.errors import WorkError
 from data.machine import load_machine
@@ -82,7 +83,7 @@ def test_a_finding_becomes_files_and_sentences(diagnose: Diagnosed, toy: Toy, gi
     lines = done.out.splitlines()
     assert lines[0] == f"{NAME}: diagnosis of 3 batches  (simulated recordings)"
     assert lines[1] == "The simulation left out one effect; with it only the noise remains."
-    assert lines[2].startswith("1. The bed loses heat to the floor, 10.2 W/K") and lines[2].endswith("(97\u202f%)")
+    assert lines[2].startswith("1. The bed loses heat to the floor, 10.2 W/K") and lines[2].endswith("(97 %)")
     z = next(line.split() for line in lines if line.split()[:2] == ["z", "µm"])
     rms = found.fit.left_out_rms
     assert z[2] == "12" and float(z[3]) == pytest.approx(rms.before["z_um"], abs=0.06)
@@ -124,7 +125,11 @@ def test_json_is_one_document(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> 
 
 def test_the_next_run_is_told(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> None:
     toy.verdict = "undecidable"
+    said = toy_diagnosis("undecidable").findings.findings[0]
+    named = said.model_copy(update={"statement": f"Perhaps (52 %) {said.statement}"})
+    toy.change = lambda d: replace(d, findings=d.findings.model_copy(update={"findings": (named,)}))
     lines = diagnose("--no-report").out.splitlines()
+    assert lines[2] == f"1. {named.statement}"  # it says its probability itself
     assert lines[1] == "Something is missing, but these recordings cannot tell what."
     assert (
         "next run: Night stop: 3 h of spindle at 4000 rpm, then everything off, doors shut, recorded for 9 h; 12 h"

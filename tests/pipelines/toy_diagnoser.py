@@ -39,6 +39,7 @@ class Toy:
     def __call__(self, machine: Machine, batches: Sequence[Batch], **given: Any) -> Diagnosis:
         self.calls.append({"machine": machine.machine, "batches": [b.batch_id for b in batches], **given})
         given["progress"]("baseline", 0, 0)
+        given["progress"]("baseline", 0, 0)
         given["progress"]("refit", 3, 8)
         d = toy_diagnosis(self.verdict)
         named = {"machine": machine.machine, "batches": tuple(b.batch_id for b in batches)}
