@@ -64,7 +64,7 @@ def held(folder: Path) -> dict[str, bytes]:
 
 
 def one_line(done: Done) -> str:
-    """The last line on standard error; there is no traceback and nothing on standard output."""
+    """The last line on standard error; nothing is on standard output."""
     assert "Traceback" not in done.err and done.out == ""
     return done.err.strip().splitlines()[-1].removeprefix("thermodrift: ")
 
@@ -96,8 +96,7 @@ def test_a_finding_becomes_files_and_sentences(diagnose: Diagnosed, toy: Toy, gi
 def test_the_new_machine_file_is_used_as_it_is(diagnose: Diagnosed, given: Path, tmp_path: Path) -> None:
     assert diagnose("--no-report").code == 0
     file = tmp_path / "out" / "machine.yml"
-    machine = load_machine(file)
-    network = compile_network(machine)
+    network = compile_network(machine := load_machine(file))
     name = "exposures.bed-floor_sink_bed.conductance"
     assert network.parameters[network.index(name)].value == 10.2
     calibrated = twin_part(machine).calibrated
@@ -129,12 +128,10 @@ def test_the_next_run_is_told(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> 
     named = said.model_copy(update={"statement": f"Perhaps (52 %) {said.statement}"})
     toy.change = lambda d: replace(d, findings=d.findings.model_copy(update={"findings": (named,)}))
     lines = diagnose("--no-report").out.splitlines()
-    assert lines[2] == f"1. {named.statement}"  # it says its probability itself
-    assert lines[1] == "Something is missing, but these recordings cannot tell what."
-    assert (
-        "next run: Night stop: 3 h of spindle at 4000 rpm, then everything off, doors shut, recorded for 9 h; 12 h"
-        in ("\n".join(lines))
-    )
+    told = ["Something is missing, but these recordings cannot tell what.", f"1. {named.statement}"]
+    assert lines[1:3] == told  # the sentence says its probability itself
+    run = next(line for line in lines if line.startswith("next run: "))
+    assert run.startswith("next run: Night stop: 3 h of spindle at 4000 rpm, then everything off") and "; 12 h" in run
     assert "note: Fewer than 4 batches: no probability above 80 % is stated." in lines
     assert f"{tmp_path / 'out' / 'next_run.yml'}: the next run's plan" in lines
 
@@ -184,8 +181,7 @@ def test_without_a_twin_part_the_drafted_network_is_the_machine_file(
     call: Call, toy: Toy, given: Path, tmp_path: Path
 ) -> None:
     file = write_machine(tmp_path / "bare.yml", "sample-bare", twin=False)
-    out = tmp_path / "out"
-    toy.verdict = "consistent"
+    out, toy.verdict = tmp_path / "out", "consistent"
     done = call("diagnose", "--machine", file, "--recordings", given / "in", "--out", out, "--no-report")
     assert done.code == 0, done.err
     assert (
@@ -283,7 +279,7 @@ def test_bad_input_is_one_line(
     (given / "lathe.yml").write_text(
         text.replace(f"machine: {NAME}", "machine: lathe").replace("timestamp, unit", "clock, unit"), encoding="utf-8"
     )
-    chosen = {"--machine": given / "m.yml", "--recordings": given / "in", "--out": tmp_path / "out"}
+    chosen: dict[str, object] = {"--machine": given / "m.yml", "--recordings": given / "in", "--out": tmp_path / "out"}
     chosen |= dict(zip(args[::2], (a.replace("{in}", str(given / "in")) for a in args[1::2]), strict=True))
     done = call("diagnose", *(part for pair in chosen.items() for part in pair))
     assert done.code == 2 and not toy.calls

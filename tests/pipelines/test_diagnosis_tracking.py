@@ -47,8 +47,8 @@ def test_a_run_says_what_was_found_from_what(logged: Any) -> None:
     for group, values in (("left_out_rms_before", rms.before), ("left_out_rms_after", rms.after),
                           ("noise_floor", rms.noise_floor)):  # fmt: skip
         assert values and {f"{group}/{k}": v for k, v in values.items()}.items() <= metrics.items()
-    wanted = {"findings": 2, "probability": 0.97, "batches": 12, "left_out_batches_improved": 10, "seconds": 24.3}
-    assert wanted.items() <= metrics.items()
+    figures = {"findings": 2, "probability": 0.97, "batches": 12, "left_out_batches_improved": 10, "seconds": 24.3}
+    assert figures.items() <= metrics.items()
 
 
 def test_the_files_and_the_batches_are_with_it(logged: Any, tmp_path: Path) -> None:
