@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -34,10 +34,10 @@ class Site:
     others: tuple[str, ...] = ()
 
 
-def candidates(machine: Machine, part: TwinPart) -> list[Candidate]:
+def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISMS) -> list[Candidate]:
     """All candidates for a machine, sorted by mechanism and place; those that the file has already are left out."""
     out: dict[str, Candidate] = {}
-    for key in MECHANISMS:
+    for key in keys:
         mechanism: type[Mechanism] = MECHANISMS[key]
         if not mechanism.proposable:
             continue

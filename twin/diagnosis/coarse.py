@@ -19,6 +19,7 @@ from twin.schema import Body, Link
 SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
+THROUGH = 2  # links of a body that heat may enter a piece through
 NEAR, FAR = "_near", "_far"
 FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
@@ -76,10 +77,10 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
         )
     words = f"a piece of the {body} of its own around {channel}"
     yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
-    for key, link in part.links.items():
-        ends = [place.partition("@")[0] for place in link.between]
-        if body not in ends:
-            continue
+    ranked = sorted(part.links, key=lambda k: -_conductance(fitted, k))  # heat comes through the best ones
+    for key in [k for k in ranked if body in _ends(part.links[k])][:THROUGH]:
+        link = part.links[key]
+        ends = _ends(link)
         moved = tuple(near if end == body else place for end, place in zip(ends, link.between, strict=True))
         other = ends[1 - ends.index(body)]
         yield Candidate(
@@ -89,3 +90,12 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             f"{words}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
         )
+
+
+def _ends(link: Link) -> list[str]:
+    return [place.partition("@")[0] for place in link.between]
+
+
+def _conductance(fitted: Fitted, key: str) -> float:
+    network = fitted.problem.network
+    return next((float(e.conductance(fitted.values)) for e in network.edges if e.name == key), 0.0)

@@ -18,7 +18,7 @@ from twin.compile import compile_network
 from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.schema import TwinPart
 
-STEPS, TOLERANCE = 4, 0.1  # of a refit: whether a candidate is in the running needs no more
+STEPS, TOLERANCE = 2, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,7 @@ def refitted(
 ) -> Fitted:
     """The same recordings fitted by a changed twin part, from the old fit; `at` gives values where to begin.
 
-    The noise is estimated again at the start and once more on the way, so that a channel which the old fit had given
-    up counts again.
+    The noise is estimated again before every step, so that a channel which the old fit had given up counts again.
 
     Raises:
         InputError: the part does not compile; WorkError: it cannot be simulated there.
@@ -76,17 +75,17 @@ def refitted(
     still = np.zeros(len(z))  # what each batch has of its own follows first: its steps are safe
     own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
     state = State.at(problem, z, own, old.state.noise)
-    for _ in range(2):
+    for _ in range(steps):
         state = with_noise(problem, state, noise_left(problem, state))
-        state = descend(problem, state, len(state.history) + (steps + 1) // 2, tolerance)
+        state = descend(problem, state, len(state.history) + 1, tolerance)
     state = with_noise(problem, state, noise_left(problem, state))
     return replace(old, part=part, problem=problem, state=state)
 
 
-def settle(fitted: Fitted, steps: int = 20, tolerance: float = 0.01) -> Fitted:
+def settle(fitted: Fitted, steps: int = 20, tolerance: float = 0.01, rounds: int = 4) -> Fitted:
     """The same fit taken on to its optimum, the noise estimated until it stands."""
     problem, state = fitted.problem, fitted.state
-    for _ in range(4):
+    for _ in range(rounds):
         state = descend(problem, state, len(state.history) + steps, tolerance)
         noise = noise_left(problem, state)
         change = noise.change(state.noise)

@@ -75,7 +75,7 @@ def taken_on(base: Evidence, inflation: Array, t: Tried) -> Tried:
     """The same, fitted on to its optimum."""
     assert t.fitted is not None
     try:
-        fitted = settle(t.fitted, steps=8, tolerance=0.03)
+        fitted = settle(t.fitted, steps=4, tolerance=0.05, rounds=2)
         after = alone(fitted, inflation)
     except (InputError, WorkError):
         return t

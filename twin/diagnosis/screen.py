@@ -17,7 +17,7 @@ from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.finite import differences
 from twin.diagnosis.fitted import Fitted
 from twin.diagnosis.rivals import rivals
-from twin.diagnosis.slack import slack
+from twin.diagnosis.slack import LOOSE, slack
 from twin.diagnosis.whitened import Whitened, whitened
 from twin.mechanisms import MECHANISMS
 
@@ -71,7 +71,7 @@ def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
 
 def alone(fitted: Fitted, inflation: Array) -> Evidence:
     """How well a fit predicts batches left out, with slack and no candidates; `inflation` (K,) of what is compared."""
-    every = proposed(fitted)
+    every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
     loose = slack(every, fitted.step_s)
     line = _Line.at(fitted, [c for c in every if c.name in loose], inflation)
     batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)

@@ -22,7 +22,7 @@ MOST_EFFECTS = 4
 IMPROVED = 0.75  # share of the left-out batches that must improve
 RESTARTS = 2  # of a round, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
-FINALISTS = 4  # of a round's refits that are taken on to their optimum
+FINALISTS, HOPEFUL = 5, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
 FINER = 0.7  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
@@ -122,8 +122,10 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
         if t is not None:
             tried.append(replace(t, cluster=numbers[n]))
     tried.sort(key=_order)
-    final = list(workers.map(partial(taken_on, base, inflation), tried[:FINALISTS]))
-    tried = sorted([*final, *tried[FINALISTS:]], key=_order)
+    least = HOPEFUL * null.threshold(float(base.base_score()[0]))
+    n_final = sum(t.gain > least for t in tried[:FINALISTS])
+    final = list(workers.map(partial(taken_on, base, inflation), tried[:n_final]))
+    tried = sorted([*final, *tried[n_final:]], key=_order)
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=_order)])
     if not tried or tried[0].fitted is None:
         return Round(now, seen, tuple(tried), null.threshold(float(base.base_score()[0])), null, np.zeros(0), False)

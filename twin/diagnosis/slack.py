@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from twin.diagnosis.candidate import Candidate
 
+LOOSE = ("sensor_place", "sensor_lag", "time_skew")
 PLACE = 0.1  # sd of the share of a neighbour's lead that a sensor sees
 LAG_S, LAG = 240.0, 1.5  # sd of a lag where the file states none; of the logarithm of one that it holds fixed
 SKEW = 0.1  # of the rows' step: a row is the mean about its time, which blurs a corner to both sides
@@ -31,4 +32,4 @@ def slack(proposed: Sequence[Candidate], step_s: float) -> dict[str, float]:
 
 def no_news(proposed: Sequence[Candidate]) -> set[str]:
     """Those of which any size is no more than a lumped network's own fault: never reported as found."""
-    return {n for n, sd in slack(proposed, 0.0).items() if sd > 0}
+    return {n for n, sd in slack(proposed, 1.0).items() if sd > 0}
