@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import binom
 
 from twin.calibration.fit_problem import Array
+from twin.calibration.identifiability import Z90
 from twin.diagnosis.evidence import Evidence
+
+if TYPE_CHECKING:
+    from twin.diagnosis.refits import Tried
 
 FLIPS = 60
 
@@ -35,3 +40,17 @@ def gumbel(gain: Array, share: float = 0.99) -> float:
 def sign_p(better: int, n: int) -> float:
     """Chance of so many improved batches if improving were a coin's toss (Fisher's sign test)."""
     return float(binom.sf(better - 1, n, 0.5))
+
+
+def stands_out(t: Tried) -> bool:
+    """Whether a signed amplitude's 90 % interval leaves out the value at which the candidate has no effect."""
+    if t.fitted is None or t.candidate.part is None:
+        return True
+    problem = t.fitted.problem
+    sd = np.sqrt(np.diag(t.fitted.state.arrow.covariance))
+    for amplitude, off in t.candidate.amplitudes.items():
+        name = f"mechanisms.{t.candidate.name}.{amplitude}"
+        for u, z, own in zip(problem.unknowns, t.fitted.state.z, sd, strict=True):
+            if u.name == name and u.scale == "linear" and abs(u.prior + u.spread * z - off) < Z90 * u.spread * own:
+                return False
+    return True

@@ -135,9 +135,7 @@ def _sleeping(network: Network, names: set[str]) -> Network:
         surroundings=tuple(replace(s, effects=tuple(map(put, s.effects))) for s in network.surroundings),
         readings=tuple(replace(r, effects=tuple(map(put, r.effects))) for r in network.readings),
         errors=tuple(
-            replace(e, effects=tuple(map(put, e.effects)), readings=tuple(map(put, e.readings)))
-            for e in network.errors
+            replace(e, effects=tuple(map(put, e.effects)), readings=tuple(map(put, e.readings))) for e in network.errors
         ),
         starts=tuple((put(law), cells) for law, cells in network.starts),
     )
-

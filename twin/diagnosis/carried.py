@@ -37,9 +37,7 @@ def on_network(
     return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
 
 
-def carried_nuisances(
-    old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]
-) -> list[Array]:
+def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
     """Each batch's own unknowns in the new network's order; what is new stands at its prior's mean, 0."""
     names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
     out = []

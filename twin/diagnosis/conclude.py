@@ -9,6 +9,7 @@ import pandas as pd
 
 from twin.calibration.identifiability import Interval
 from twin.diagnosis.activity import activity
+from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.changes import deviations
 from twin.diagnosis.findings import Verdict
 from twin.diagnosis.fitted import Fitted
@@ -20,7 +21,7 @@ from twin.diagnosis.unseen import unseen
 from twin.mechanisms import MECHANISMS
 from twin.schema import TwinPart
 
-SURE = 0.6  # below it the best explanation does not stand by itself
+SURE = 0.7  # below it the best explanation does not stand by itself
 
 
 def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
@@ -43,7 +44,8 @@ def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
 def found_of(
     search: Search, done: Round, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], separates: str
 ) -> Found:
-    """One accepted round as a finding; `intervals` of the final fit's parameters by network name."""
+    """One accepted round as a finding; `intervals` of the final fit's parameters by network name, `rms` of the left-out
+    batches before and after this effect."""
     every, _, _ = explanations(done)
     best = next(e for e in every if done.best is not None and e.tried is done.best)
     rest = [e for e in every if e.tried is not done.best]
@@ -51,12 +53,11 @@ def found_of(
     final = search.final
     parameters, was = _parameters(final, best, intervals)
     regime, windows = activity(final, c)
-    after = [r for r in search.rounds if r is not done]
     given = c.part
     return Found(
         mechanism=c.mechanism,
         where=c.where,
-        place=place_words(c.where, part),
+        place=_place_of(c, part),
         parameters=parameters,
         probability=best.probability,
         name=c.name if c.part is not None else "",
@@ -69,22 +70,29 @@ def found_of(
         caps=caps(final.runs),
         evidence={
             "gain_nats": best.tried.gain,
-            "threshold_nats": done.threshold,
+            "threshold_nats": float(done.threshold),
             "batches_improved": best.tried.improved,
             "batches": len(final.batches),
             "sign_test_p": done.sign_p,
             "absorbed_share": best.tried.scored.absorbed,
-            "round": len(search.rounds) - len(after),
+            "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
             **unseen(done.before, best.tried.fitted or final, done.before.state.noise.inflation),
         },
         was=was,
     )
 
 
+def _place_of(c: Candidate, part: TwinPart) -> str:
+    """The place in words; of a heat's size the heat's own."""
+    if c.change is not None and c.where.name in part.mechanisms:
+        return f"{MECHANISMS[part.mechanisms[c.where.name].law].words} ({c.where.name})"
+    return place_words(c.where, part)
+
+
 def _other(e: Explanation, part: TwinPart) -> Other:
     c = e.tried.candidate
     beside = beside_words(c.part, c.where, part) if c.part is not None else ""
-    return Other(c.mechanism, c.where, place_words(c.where, part), e.probability, beside, e.alike)
+    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, beside, e.alike)
 
 
 def _parameters(
@@ -98,7 +106,7 @@ def _parameters(
         if c.change.per_batch is not None:
             sd = deviations(final).get(name, float("nan"))
             n = len(final.batches)  # of a standard deviation from n batches: chi-square
-            return {name: Estimate(sd, "1", sd * (1 - 1.16 / np.sqrt(n)), sd * (1 + 1.16 / np.sqrt(n)))}, {}
+            return {"deviation": Estimate(sd, "1", sd * (1 - 1.16 / np.sqrt(n)), sd * (1 + 1.16 / np.sqrt(n)))}, {}
         found = intervals.get(name)
         was = {name: c.change.parameter.value}
         if found is None:

@@ -16,6 +16,7 @@ from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.diagnosis import tables as made
 from twin.diagnosis.baseline import TOLERANCE, baseline
+from twin.diagnosis.candidate import Where
 from twin.diagnosis.changes import changed_parts, with_deviations
 from twin.diagnosis.conclude import caps, found_of, rms_of, verdict_of
 from twin.diagnosis.diagnosis import Diagnosis
@@ -31,9 +32,10 @@ from twin.diagnosis.findings import (
     Refinement,
 )
 from twin.diagnosis.fitted import Fitted, settle
-from twin.diagnosis.found import Found, Rms, place_words
+from twin.diagnosis.found import Rms, place_words
 from twin.diagnosis.leftover import Leftover, leftover
 from twin.diagnosis.limits import limits
+from twin.diagnosis.next_experiment import Proposal
 from twin.diagnosis.parts_of_batches import enough_batches
 from twin.diagnosis.prediction import LeftOutRows, left_out_rows
 from twin.diagnosis.search import Round, Search, search
@@ -74,19 +76,24 @@ def diagnose(
             words += draft.words
         else:
             part = twin_part(machine)
-        runs = len(batches)
+        recordings = tuple(b.batch_id for b in batches)
         batches, remarks = enough_batches(batches)
         words += remarks
-        done = search(baseline(machine, part, batches, tell, runs), seed, workers, tell)
+        done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell)
     final = settle(done.final) if done.accepted else done.final
     done = Search(done.baseline, final, done.rounds)
     tell("left out", 0, 0)
-    before, after = left_out_rows(done.baseline), left_out_rows(final)
     located = _located(done.baseline, batches, words, tell)
     left = leftover(done, batches, tell)
     return _diagnosis(
-        machine, part, batches, done, before, after, located, left, tuple(words), drafted, time.perf_counter() - begun
+        machine, part, recordings, done, stages(done), located, left, tuple(words), drafted, time.perf_counter() - begun
     )
+
+
+def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
+    """Every fit of the search, from the baseline to the last, and what it leaves of the batches left out."""
+    fits = [r.before for r in done.accepted] + [done.final]
+    return [(f, left_out_rows(f)) for f in fits]
 
 
 def _located(fitted: Fitted, batches: Sequence[Batch], words: list[str], tell: Progress) -> Located | None:
@@ -101,10 +108,9 @@ def _located(fitted: Fitted, batches: Sequence[Batch], words: list[str], tell: P
 def _diagnosis(
     machine: Machine,
     part: TwinPart,
-    batches: Sequence[Batch],
+    batches: tuple[str, ...],
     done: Search,
-    before: LeftOutRows,
-    after: LeftOutRows,
+    steps: Sequence[tuple[Fitted, LeftOutRows]],
     located: Located | None,
     left: Leftover | None,
     words: tuple[str, ...],
@@ -112,8 +118,7 @@ def _diagnosis(
     seconds: float,
 ) -> Diagnosis:
     final = left.fitted if left is not None and left.fitted is not None else done.final
-    if final is not done.final:
-        after = left_out_rows(final)
+    before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
     named = [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
     fit = result(final.problem, final.state, TOLERANCE, "")
     intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
@@ -122,7 +127,12 @@ def _diagnosis(
     part_after = with_deviations(final)
     run = settling_run(done, named)
     separates = run.words if run is not None else ""
-    found = [_found(done, r, part_after, intervals, rms_table, separates) for r in named]
+    found = [
+        found_of(
+            done, r, part_after, intervals, rms_of(made.rms_table(*_around(done, r, steps), final), final), separates
+        )
+        for r in named
+    ]
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
@@ -153,15 +163,15 @@ def _diagnosis(
         machine=machine,
         findings=Findings(
             machine=machine.machine,
-            batches=tuple(b.batch_id for b in batches),
+            batches=batches,
             verdict=verdict,
             findings=findings,
-            fit=_summary(rms, better, len(batches)),
+            fit=_summary(rms, better, len(final.batches)),
             detection_limits=told,
             next_experiment=_next(run),
             seconds=round(seconds, 1),
             statement=statement,
-            simulated=any(b.simulated for b in batches),
+            simulated=any(b.simulated for b in final.batches),
             drafted=drafted,
             remarks=words,
             refinements=tuple(
@@ -171,7 +181,7 @@ def _diagnosis(
         ),
         part_before=done.baseline.part,
         part_after=part_after,
-        simulated=any(b.simulated for b in batches),
+        simulated=any(b.simulated for b in final.batches),
         drafted=drafted,
         words=words,
         tables=everything,
@@ -179,21 +189,15 @@ def _diagnosis(
         values={i.name: i.value for i in intervals.values()},
         intervals=tuple(intervals.values()),
         added=changed_parts(part, part_after),
-        notes=_notes(findings, batches, seconds),
+        notes=_notes(findings, len(batches)),
         plan_text=run.plan_text if run is not None else None,
     )
 
 
-def _found(
-    done: Search,
-    r: Round,
-    part: TwinPart,
-    intervals: dict[str, Interval],
-    table: pd.DataFrame,
-    separates: str,
-) -> Found:
-    """A finding with the errors before and after all that was found; its own gain stands in the evidence."""
-    return found_of(done, r, part, intervals, rms_of(table, done.final), separates)
+def _around(done: Search, r: Round, steps: Sequence[tuple[Fitted, LeftOutRows]]) -> tuple[LeftOutRows, LeftOutRows]:
+    """What is left of the batches left out before and after one accepted round."""
+    k = next(k for k, other in enumerate(done.accepted) if other is r)
+    return steps[k][1], steps[k + 1][1]
 
 
 def _per_batch(table: pd.DataFrame, fitted: Fitted, column: str) -> pd.Series:
@@ -224,9 +228,7 @@ def _limits_told(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
     )  # fmt: skip
 
 
-def _where(limit: DetectionLimit):  # type: ignore[no-untyped-def]
-    from twin.diagnosis.candidate import Where
-
+def _where(limit: DetectionLimit) -> Where:
     return Where(limit.where.kind, limit.where.name)
 
 
@@ -242,18 +244,18 @@ def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
     )
 
 
-def _next(run) -> NextExperiment | None:  # type: ignore[no-untyped-def]
-    if run is None:
+def _next(run: Proposal | None) -> NextExperiment | None:
+    if run is None or not run.words:
         return None
     return NextExperiment(
         separates=tuple(run.separates), run=run.words, hours=run.hours, file="next_run.yml" if run.plan_text else None
     )
 
 
-def _notes(findings: Sequence[Finding], batches: Sequence[Batch], seconds: float) -> dict[str, str]:
+def _notes(findings: Sequence[Finding], runs: int) -> dict[str, str]:
     """Comments of a machine file on what was found."""
     return {
-        f.name: f"found by a diagnosis of {len(batches)} runs, probability {f.probability:.2f}; "
+        f.name: f"found by a diagnosis of {runs} runs, probability {f.probability:.2f}; "
         f"{f.evidence.get('gain_nats', 0.0):.0f} nats of left-out score"
         for f in findings
         if f.name

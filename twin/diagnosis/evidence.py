@@ -148,7 +148,9 @@ class Evidence:
         z = cho_solve(self.factor, total)
         inside = [t - b.jacobian @ z for b, t in zip(self.batches, targets, strict=True)]
         own = np.stack([self._by_channel(b, e**2).T for b, e in zip(self.batches, inside, strict=True)], axis=1)
-        cross = np.stack([self._products(b, e, c) for b, e, c in zip(self.batches, inside, self.beyond, strict=True)], 1)
+        cross = np.stack(
+            [self._products(b, e, c) for b, e, c in zip(self.batches, inside, self.beyond, strict=True)], 1
+        )
         square = self._squares
         sums = own.sum(axis=1), cross.sum(axis=1), square.sum(axis=0)
         best = self._first_amplitude(*sums)

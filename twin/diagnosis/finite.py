@@ -13,7 +13,6 @@ from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.fitted import Fitted
 
 
-
 def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
     """By candidate the change (n_b,) of every batch's rows, in units of the given noise, at its usual values.
 

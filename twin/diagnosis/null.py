@@ -75,13 +75,13 @@ def structural_null(
             progress(k + 1, TWINS)
     z = np.zeros(evidence.batches[0].jacobian.shape[1])
     z[: len(fitted.state.z)] = fitted.state.z
-    shifted = [
-        np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)
-    ]
+    shifted = [np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)]
     gain = evidence.gains(shifted)[0][:, list(counts)].max(axis=1)
     squares = evidence.mean_squares(evidence.left_out(shifted))
     shape = (-1, len(SCALES))
-    return Null(gain.reshape(shape), evidence.base_score(shifted).reshape(shape), squares.reshape(*shape, squares.shape[1]))
+    return Null(
+        gain.reshape(shape), evidence.base_score(shifted).reshape(shape), squares.reshape(*shape, squares.shape[1])
+    )
 
 
 def _misfit(fitted: Fitted, base: list[Array], seed: int) -> list[Array]:

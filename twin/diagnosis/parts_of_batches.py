@@ -51,7 +51,5 @@ def _cut(batch: Batch, n: int) -> list[Batch]:
             for f in batch.findings
         )
         start = None if batch.start is None else batch.start + pd.Timedelta(seconds=first_s)
-        out.append(
-            replace(batch, batch_id=f"{batch.batch_id}_{k + 1}", table=table, start=start, findings=findings)
-        )
+        out.append(replace(batch, batch_id=f"{batch.batch_id}_{k + 1}", table=table, start=start, findings=findings))
     return out

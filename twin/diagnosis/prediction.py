@@ -33,9 +33,7 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
     problem, state = fitted.problem, fitted.state
     weight = state.noise.weight
     blocks = list(problem.linearise(fitted.x, state.nuisance))
-    rows = [
-        whitened(b, v, state.z, problem.unknowns, (), weight) for b, v in zip(blocks, state.nuisance, strict=True)
-    ]
+    rows = [whitened(b, v, state.z, problem.unknowns, (), weight) for b, v in zip(blocks, state.nuisance, strict=True)]
     own = [w.jacobian.T @ w.jacobian for w in rows]
     to = [w.jacobian.T @ w.target for w in rows]
     information, total = np.sum(own, axis=0) + np.eye(len(state.z)), np.sum(to, axis=0)

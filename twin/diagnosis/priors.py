@@ -39,10 +39,10 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
         at[f"mechanisms.{c.name}.{amplitude}"] = begin
     for name in c.shape:
         spec = mechanism.spec(name)
-        values[name] = Value(value=f"{spec.value:g} {spec.unit}", spread=_spread(spec), bounds=_bounds(spec))
+        values[name] = Value(value=_said(spec.value, spec.unit), spread=_spread(spec), bounds=_bounds(spec))
     if mechanism.off is None:
         values |= {
-            p.name: Value(value=f"{p.value:g} {p.unit}", spread=_spread(p), bounds=_bounds(p))
+            p.name: Value(value=_said(p.value, p.unit), spread=_spread(p), bounds=_bounds(p))
             for p in mechanism.parameters
             if p.value is not None and p.spread is not None
         }
@@ -54,31 +54,37 @@ def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:
         spread = max(3.0 * (spec.spread or 1.0), 2.0 * abs(begin - off))
         low, high = spec.low, spec.high
         begin = float(np.clip(begin, low, high))
-        return Value(value=f"{off:g} {spec.unit}", spread=f"{spread:.4g} {_delta(spec)}", bounds=_bounds(spec)), begin
+        return Value(value=_said(off, spec.unit), spread=_said(spread, _delta(spec)), bounds=_bounds(spec)), begin
     usual = spec.value or 1.0
     if spec.scale == "logit":
         begin = float(np.clip(begin, 0.005, 0.995))
         usual = float(np.clip(usual, 0.005, 0.995))
-        return Value(value=f"{usual:g} {spec.unit}", spread=max(WIDE, spec.spread or 0.0), bounds=_bounds(spec)), begin
+        return Value(value=_said(usual, spec.unit), spread=max(WIDE, spec.spread or 0.0), bounds=_bounds(spec)), begin
     low = max(spec.low, LEAST * usual)
     begin = float(np.clip(begin, max(low, LEAST * usual), spec.high))
     spread = max(WIDE, spec.spread or 0.0, abs(float(np.log(begin / usual))) / 2.0)
-    return Value(value=f"{usual:g} {spec.unit}", spread=spread, bounds=_bounds(spec)), begin
+    return Value(value=_said(usual, spec.unit), spread=spread, bounds=_bounds(spec)), begin
 
 
 def _spread(spec: Spec) -> str | float:
     spread = spec.spread if spec.spread is not None else 0.5
-    return f"{spread:g} {_delta(spec)}" if spec.scale == "linear" else spread
+    return _said(spread, _delta(spec)) if spec.scale == "linear" else spread
 
 
 def _delta(spec: Spec) -> str:
     return "K" if spec.unit == "degC" else spec.unit
 
 
-def _bounds(spec: Spec) -> tuple[str, str] | None:
+def _said(value: float | None, unit: str) -> str | float:
+    """As a machine file writes it."""
+    number = float(f"{value or 0.0:.5g}")
+    return number if unit == "1" else f"{number:g} {unit}"
+
+
+def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
     if not (np.isfinite(spec.low) and np.isfinite(spec.high)):
         return None
-    return f"{spec.low:g} {spec.unit}", f"{spec.high:g} {spec.unit}"
+    return _said(spec.low, spec.unit), _said(spec.high, spec.unit)
 
 
 def log_prior(s: Scored, fitted: Fitted | None) -> float:

@@ -95,7 +95,11 @@ class _Line:
         waking = sorted({j for js in found.amplitudes.values() for j in js})
         numbers = [j for j in waking if found.network.parameters[j].name not in own]
         at = {j: k for k, j in enumerate(found.network.free.tolist())}
-        loose = {numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every, fitted.step_s).items() if n in found.amplitudes}
+        loose = {
+            numbers.index(found.amplitudes[n][0]): sd
+            for n, sd in slack(every, fitted.step_s).items()
+            if n in found.amplitudes
+        }
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
         weight = 1.0 / (fitted.state.noise.factor**2 * inflation)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.acceptance import flipped_gains, gumbel, sign_p
+from twin.diagnosis.acceptance import flipped_gains, gumbel, sign_p, stands_out
 from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null, structural_null
@@ -59,9 +59,7 @@ class Search:
         return tuple(r for r in self.rounds if r.accepted)
 
 
-def search(
-    baseline: Fitted, seed: int = 0, workers: Workers | None = None, progress: Progress | None = None
-) -> Search:
+def search(baseline: Fitted, seed: int = 0, workers: Workers | None = None, progress: Progress | None = None) -> Search:
     """Forward until nothing more is accepted."""
     tell = progress or (lambda step, n, of: None)
     now, rounds = baseline, []
@@ -111,8 +109,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     base = alone(now, inflation)
     worth, clusters, chosen = shortlist(news, seen.evidence)
     coarse = [
-        Scored(c, 0.0, 0, 0.0, {}, 0.0, -1)
-        for c in coarse_candidates(now, base.mean_squares(base.left_out())[0])
+        Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, base.mean_squares(base.left_out())[0])
     ]
     work = [worth[k] for k in chosen] + coarse
     numbers = [clusters[k] for k in chosen] + [-1000 - k for k in range(len(coarse))]
@@ -134,7 +131,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
     threshold = max(null.threshold(float(after.base_score()[0])), gumbel(flipped))
     n = len(now.batches)
-    accepted = best.gain > threshold and best.improved >= IMPROVED * n
+    accepted = best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best)
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
 
 

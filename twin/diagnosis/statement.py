@@ -103,8 +103,15 @@ def verdict_statement(
 ) -> str:
     """The verdict in words. `limits`, the most telling first, with `places` (`place_words`) of each; `separates` is the
     run that would tell tied explanations apart."""
-    said = listed([effect_words(f) + ("" if f.mechanism in UNLISTED else _size(f)) for f in found])
-    hedge = _hedge(min((f.probability for f in found), default=1.0))
+    # of several effects each says by itself how sure it is
+    doubts = ["" if len(found) < 2 or f.probability > SURE else f" ({percent(f.probability)})" for f in found]
+    said = listed(
+        [
+            effect_words(f) + ("" if f.mechanism in UNLISTED else _size(f)) + doubt
+            for f, doubt in zip(found, doubts, strict=True)
+        ]
+    )
+    hedge = _hedge(found[0].probability) if len(found) == 1 else ""
     fall = falls(rms)
     if verdict == "consistent":
         return _consistent(rms, limits, places)
@@ -149,8 +156,7 @@ def _sentence(found: Found) -> str:
     if found.mechanism == "coarse_network":
         return f"the network is too coarse at {found.place}"
     if found.mechanism == "varies_between_runs":
-        share = Estimate(100 * e.value, "%", 100 * e.low, 100 * e.high) if e and e.unit == "1" else e
-        return f"{found.place} differs from run to run" + (f" by ±{amount(share)}" if share else "")
+        return f"{found.place} differs from run to run{f' by ±{_share(e)}' if e else ''}"
     if found.mechanism not in MECHANISMS or found.mechanism in UNLISTED:
         return ""
     thing = re.match(rf"({_THINGS[found.where.kind]}) that (.+)", MECHANISMS[found.mechanism].words)
@@ -158,6 +164,11 @@ def _sentence(found: Found) -> str:
         return ""
     place = f" between {found.place}" if found.where.kind == "link" else f" {found.place}"
     return f"the {thing[1]}{place} {thing[2]}{_in_brackets(found.beside)}{_when(found)}{_size(found)}"
+
+
+def _share(e: Estimate) -> str:
+    """A deviation in per cent."""
+    return amount(Estimate(100 * e.value, "%", 100 * e.low, 100 * e.high) if e.unit == "1" else e)
 
 
 def _noun(key: str, where: Where, place: str, beside: str = "") -> str:
@@ -199,6 +210,8 @@ def _size(found: Found) -> str:
     """``, 10 W/K (90 %: 9–12)``; a bare number, or one of several, with its parameter's name."""
     if found.size is not None:
         return f", {amount(found.size)}"
+    if found.mechanism == "varies_between_runs":
+        return "".join(f", by ±{_share(found.parameters[p])}" for p in found.main)
     named = len(found.main) > 1 or any(not spelt(found.parameters[p].unit) for p in found.main)
     said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
     return f", {listed(said)}" if said else ""

@@ -101,9 +101,11 @@ def _amplitude(amplitudes: dict[str, float], mechanism: str) -> tuple[float, str
         return float(np.exp(amplitudes["factor"])) if "factor" in amplitudes else np.nan, "1"
     name = max(amplitudes, key=lambda a: abs(amplitudes[a]))
     off = (MECHANISMS[mechanism].off or {}).get(name, 0.0)
-    return (off + amplitudes[name], MECHANISMS[mechanism].spec(name).unit) if name in (
-        MECHANISMS[mechanism].off or {}
-    ) else (amplitudes[name], "1")
+    return (
+        (off + amplitudes[name], MECHANISMS[mechanism].spec(name).unit)
+        if name in (MECHANISMS[mechanism].off or {})
+        else (amplitudes[name], "1")
+    )
 
 
 def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
