@@ -154,6 +154,9 @@ def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) 
         return linked(part, part.sensors[site.name].at.partition("@")[0])
     if role == "neighbour" and site.name in part.bodies:
         return linked(part, site.name)
+    if role == "unlinked":
+        later = list(part.bodies)[list(part.bodies).index(site.name) + 1 :]
+        return [name for name in later if name not in linked(part, site.name)]
     return list(part.bodies)
 
 

@@ -19,6 +19,7 @@ MECHANISMS = Registry(
         "radiation": "twin.mechanisms.convection:Radiation",
         "draught": "twin.mechanisms.convection:Draught",
         "joint_conductance": "twin.mechanisms.joints:JointConductance",
+        "heat_bridge": "twin.mechanisms.heat_bridge:HeatBridge",
         "jacket_chiller": "twin.mechanisms.fluids:JacketChiller",
         "cutting_fluid": "twin.mechanisms.fluids:CuttingFluid",
         "enclosure_air": "twin.mechanisms.surroundings:EnclosureAir",

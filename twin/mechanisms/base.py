@@ -26,8 +26,9 @@ Array = NDArray[Any]  # float64, or complex128 while a derivative is taken
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
 # Where a diagnosis looks for a port's temperature: at the place acted at, at each surrounding, at each body linked
-# with that place (of an error, with the port before it), at any other body, or where the heat acted on goes into.
-PortRole = Literal["itself", "surrounding", "neighbour", "body", "outlet"]
+# with that place (of an error, with the port before it), at any other body, at one without a link to that place (each
+# pair once), or where the heat acted on goes into.
+PortRole = Literal["itself", "surrounding", "neighbour", "body", "unlinked", "outlet"]
 SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
 
 

@@ -163,6 +163,7 @@ CASES: Mapping[str, Case] = {
         more={"surrounding_K": lambda q: np.where(_blows(q), -q.drop, 0.0 * K)},
     ),
     "joint_conductance": Case(lambda q: q.ratio ** q.closed[0]),
+    "heat_bridge": Case(None),
     "jacket_chiller": Case(_chiller, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
     "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body)),
     "enclosure_air": Case(None),

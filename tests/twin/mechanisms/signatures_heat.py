@@ -164,6 +164,16 @@ def floor_sink(m: Mechanism) -> None:
     assert into_W[0] == pytest.approx([65.0, -60.0]) and (into_W[1:] == 0).all()
 
 
+def heat_bridge(m: Mechanism) -> None:
+    network = network_with(m, at={"body": "first", "other": "third"})  # which the small machine does not link
+    first, third = network.cells.index("first"), network.cells.index("third")
+    G = network.conductance_W_per_K(network.values)
+    warm = np.zeros(3)
+    warm[third] = 10.0
+    assert (-G @ warm)[first] == pytest.approx(50.0)  # the one follows the other
+    assert network_with(m, at={"body": "third", "other": "first"}).values == pytest.approx(network.values)
+
+
 def cabinet_heat(m: Mechanism) -> None:
     assert "speed" not in m.drivers and heat(m) == 200.0  # without a driver it runs all the time
 
@@ -231,9 +241,9 @@ def _discharge() -> View:
 HEAT: Mapping[str, Callable[[Mechanism], None]] = {
     **{f.__name__: f for f in (
         bearing_viscous, bearing_load, viscosity_feedback, preload_feedback, motor_loss, belt_loss, rotating_convection,
-        natural_convection, radiation, draught, joint_conductance, jacket_chiller, cutting_fluid, enclosure_air,
-        stratification, floor_sink, cabinet_heat, hydraulic_unit, sun, cutting_heat, electrical_heat, ohmic_heat,
-        supply_sag, voltage_loss_heat, free_flux,
+        natural_convection, radiation, draught, joint_conductance, heat_bridge, jacket_chiller, cutting_fluid,
+        enclosure_air, stratification, floor_sink, cabinet_heat, hydraulic_unit, sun, cutting_heat, electrical_heat,
+        ohmic_heat, supply_sag, voltage_loss_heat, free_flux,
     )},
     "nut_friction": feed_friction(1000 * 2 * np.pi * 0.5 / 60),
     "screw_bearing": feed_friction(1000 * 2 * np.pi * 0.3 / 60),

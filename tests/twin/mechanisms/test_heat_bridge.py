@@ -1,0 +1,70 @@
+"""A link that the machine file lacks: what it may join, once a pair, and what it writes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from small_machine import machine_with
+
+from data.errors import InputError
+from data.machine import Machine
+from twin.compile import compile_network, expanded
+from twin.diagnosis.candidates import candidates
+from twin.mechanisms.heat_bridge import HeatBridge
+from twin.schema import twin_part
+
+ENDS = {"body": "first", "other": "third"}
+
+
+def machine(parameters: dict[str, Any] | None = None, **instance: Any) -> Machine:
+    return machine_with(HeatBridge(), parameters, **{"at": ENDS, **instance})
+
+
+def stated(given: Machine) -> dict[str, Any]:
+    assert given.twin is not None
+    return given.twin
+
+
+def test_it_is_proposed_once_for_every_pair_without_a_link() -> None:
+    bare = machine()
+    stated(bare)["mechanisms"].pop("tried")
+    (only,) = candidates(bare, twin_part(bare), ["heat_bridge"])
+    assert (only.name, only.where.name) == ("heat_bridge_first_third", "first")
+    assert only.part is not None and only.part.at == ENDS
+    assert candidates(machine(), twin_part(machine()), ["heat_bridge"]) == []  # it is there already
+
+
+def test_it_becomes_a_link_with_its_value_and_prior() -> None:
+    given = {"conductance": {"value": "3 mW/K", "spread": 0.7}}
+    part = expanded(twin_part(machine(parameters=given)))
+    assert part.links["tried"].between == ("first", "third") and "tried" not in part.mechanisms
+    network = compile_network(machine(parameters=given))
+    p = network.parameters[network.index("links.tried.conductance")]
+    assert (p.value, p.spread, p.low, p.high) == (0.003, 0.7, 0.0, 1e5)
+
+
+@pytest.mark.parametrize(
+    "given, line",
+    [
+        ({"at": "first"}, "mechanisms.tried.at: expected the two bodies that exchange heat, e.g. at: {body: bed"),
+        ({"at": {"body": "first"}}, "mechanisms.tried.at: expected the two bodies"),
+        ({"at": {"body": "first", "other": "thrid"}}, "links.tried.between: no body 'thrid'; did you mean 'third'?"),
+        ({"at": {"body": "first", "other": "first"}}, "links.tried.between: both ends are 'first'"),
+        (
+            {"parameters": {"conductanse": "1 W/K"}},
+            "mechanisms.tried.parameters: heat_bridge has no parameter 'conductanse'; did you mean 'conductance'?",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_one_clear_line(given: dict[str, Any], line: str) -> None:
+    with pytest.raises(InputError) as told:
+        compile_network(machine(**given))
+    assert str(told.value).startswith(f"machine small: twin.{line}") and "\n" not in str(told.value)
+
+
+def test_a_link_of_the_same_name() -> None:
+    taken = machine()
+    stated(taken)["links"]["tried"] = {"between": ["first", "third"], "conductance": "1 W/K"}
+    with pytest.raises(InputError, match=r"mechanisms\.tried: a link is called 'tried' already"):
+        compile_network(taken)
