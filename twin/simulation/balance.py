@@ -20,6 +20,8 @@ from twin.simulation.schedule import Drive, Schedule
 
 Array = NDArray[np.float64]
 
+LASTING = 64  # intervals of a regime; below it one more series costs less than one more block
+
 
 @dataclass(frozen=True)
 class Balance:
@@ -140,7 +142,8 @@ def _finer(
     number, first = distinct(
         inputs, [c for h in held for law in (h.law, *h.factors) for c in law.drivers.values()], regimes.of
     )
-    if len(first) > MOST:
+    short = len(first) > regimes.count and inputs.valid.sum() < LASTING * len(first)
+    if len(first) > MOST or short:
         held, number, first = [], *distinct(inputs, (), regimes.of)
     alike = regimes.of.ravel()[first]
     watts = np.zeros((len(values), len(first), network.n_cells))
