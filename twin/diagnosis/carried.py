@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +13,20 @@ from twin.calibration.problem import CalibrationProblem, Nuisances
 from twin.network import Network
 from twin.simulation.inputs import inputs_of
 
+_NO_PIECES: Mapping[str, str] = {}
+
 
 def on_network(
-    problem: CalibrationProblem, batches: Sequence[Batch], network: Network, free_starts: bool = False
+    problem: CalibrationProblem,
+    batches: Sequence[Batch],
+    network: Network,
+    free_starts: bool = False,
+    pieces: Mapping[str, str] = _NO_PIECES,
 ) -> CalibrationProblem:
     """The same recordings posed to a network with more bodies, laws or drivers.
 
     A new body starts as the one that it is linked with most strongly; with `free_starts` each batch may say otherwise.
+    `pieces` of a body, {piece: body}, start with it: a piece that started as it liked would be a store of its own.
     """
     inputs = inputs_of(network, list(batches)).refined(problem.inputs.every)
     start = np.full((problem.inputs.n_batches, network.n_cells), np.nan)
@@ -32,7 +39,9 @@ def on_network(
     for k, (name, cells) in enumerate(network.bodies.items()):
         if name not in problem.network.bodies:
             start[:, cells] = _beside(network, start, cells)[:, None]
-            if len(start_K) and not free_starts:
+            if len(start_K) and name in pieces:
+                start_K[list(network.bodies).index(pieces[name]), cells] = network.start_spread_K
+            if len(start_K) and (not free_starts or name in pieces):
                 start_K[k] = 0.0
     return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
 

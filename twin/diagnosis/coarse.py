@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from twin.diagnosis.candidate import Candidate, Where
-from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.fitted import FAR, NEAR, Fitted
 from twin.quantity import Value
 from twin.schema import Body, Link
 
@@ -20,7 +20,6 @@ SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
 THROUGH = 2  # links of a body that heat may enter a piece through
-NEAR, FAR = "_near", "_far"
 FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
 

@@ -18,6 +18,7 @@ from twin.compile import compile_network
 from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
 from twin.schema import TwinPart
 
+NEAR, FAR = "_near", "_far"  # how pieces of a body are called
 STEPS, TOLERANCE = 2, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
@@ -52,6 +53,18 @@ class Fitted:
         return np.bincount(np.concatenate(self.state.channels), minlength=len(self.problem.channels)).astype(float)
 
 
+def pieces_of(part: TwinPart) -> dict[str, str]:
+    """The bodies that are pieces of others around or far from a sensor, as a finer network states them."""
+    out = {}
+    for name in part.bodies:
+        for end in (NEAR, FAR):
+            if name.endswith(end):
+                ends = next((link.between for link in part.links.values() if link.between[0] == name), None)
+                if ends is not None:
+                    out[name] = ends[1]
+    return out
+
+
 def refitted(
     old: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = STEPS, tolerance: float = TOLERANCE
 ) -> Fitted:
@@ -63,7 +76,7 @@ def refitted(
         InputError: the part does not compile; WorkError: it cannot be simulated there.
     """
     network = compile_network(old.machine, part=part)
-    problem = on_network(old.problem, old.batches, network, free_starts=True)
+    problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
     z = carried_z(old.problem, problem, old.state.z)
     for k, u in enumerate(problem.unknowns):
         if at and u.name in at:

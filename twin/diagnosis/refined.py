@@ -12,9 +12,10 @@ import numpy as np
 
 from twin.network import Network
 from twin.quantity import Value
-from twin.schema import Body, MechanismPart, TwinPart
+from twin.schema import Body, ErrorChain, MechanismPart, TwinPart
 
 CELLS = 5
+MIDDLE = (0.25, 0.75)  # where a length's mean temperature stands
 BIOT = (0.03, 0.5)  # of a body: what leaves it per kelvin over what it conducts from end to end
 
 
@@ -43,8 +44,22 @@ def refined(part: TwinPart, network: Network, values: np.ndarray, seed: int) -> 
         for key, link in part.links.items()
     }
     sensors = {key: s.model_copy(update={"at": place(s.at)}) for key, s in part.sensors.items()}
+    errors = {key: _seen(chain, cut, rng) for key, chain in part.errors.items()}
     mechanisms = {key: _placed(m, cut, rng) for key, m in part.mechanisms.items()}
-    return part.model_copy(update={"bodies": bodies, "links": links, "sensors": sensors, "mechanisms": mechanisms})
+    return part.model_copy(
+        update={"bodies": bodies, "links": links, "sensors": sensors, "mechanisms": mechanisms, "errors": errors}
+    )
+
+
+def _seen(chain: ErrorChain, cut: set[str], rng: np.random.Generator) -> ErrorChain:
+    """An error whose lengths and levers end somewhere in a body and not evenly over it."""
+
+    def place(at: str) -> str:
+        return f"{at}@{rng.uniform(*MIDDLE):.3f}" if at in cut else at
+
+    links = tuple(c.model_copy(update={"body": place(c.body)}) for c in chain.chain)
+    tilts = tuple(t.model_copy(update={"hot": place(t.hot), "cold": place(t.cold)}) for t in chain.tilts)
+    return chain.model_copy(update={"chain": links, "tilts": tilts})
 
 
 def _placed(given: MechanismPart, cut: set[str], rng: np.random.Generator) -> MechanismPart:
