@@ -136,6 +136,8 @@ def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Sit
         places = [place for _, place in chosen]
         if len(set(places)) < len(places):
             continue
+        if mechanism.far_apart and _near(part, places):
+            continue
         if two_sides:
             if frozenset(places) in seen or places[1] not in linked(part, places[0]):
                 continue
@@ -158,6 +160,12 @@ def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) 
         later = list(part.bodies)[list(part.bodies).index(site.name) + 1 :]
         return [name for name in later if name not in linked(part, site.name)]
     return list(part.bodies)
+
+
+def _near(part: TwinPart, places: Sequence[str]) -> bool:
+    """Whether two bodies are linked or have a common neighbour."""
+    one, other = set(linked(part, places[0])), set(linked(part, places[-1]))
+    return bool(one & other) or places[-1] in one
 
 
 def linked(part: TwinPart, body: str) -> list[str]:

@@ -8,10 +8,12 @@ the sensor's body answer at once and settle slowly.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 
 from twin.diagnosis.candidate import Candidate, Where
+from twin.diagnosis.candidates import linked
 from twin.diagnosis.fitted import FAR, NEAR, Fitted
 from twin.quantity import Value
 from twin.schema import Body, Link
@@ -19,6 +21,7 @@ from twin.schema import Body, Link
 SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
+SHORTCUTS = 3  # from one neighbour to another, best conducting first
 THROUGH = 2  # links of a body that heat may enter a piece through
 FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
@@ -56,6 +59,7 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
         f"sensors.{channel}": sensor.model_copy(update={"at": near}),
     }
     where = Where("sensor", channel)
+    yield from _shortcuts(fitted, body, channel, where, leaves)
     far = f"{channel}{FAR}"
     if far not in part.bodies:
         yield Candidate(
@@ -88,6 +92,27 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             f"coarse_network_{channel}_{other}",
             f"{words}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
+        )
+
+
+def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: float) -> Iterator[Candidate]:
+    """Heat that crosses a body from one neighbour to another without warming all of it."""
+    part = fitted.part
+    near = sorted(linked(part, body), key=lambda b: -max(_conductance(fitted, k) for k in part.links
+                                                         if set(_ends(part.links[k])) == {b, body}))  # fmt: skip
+    for one, other in list(combinations(near, 2))[:SHORTCUTS]:
+        if other in linked(part, one):
+            continue
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_{one}_{other}",
+            f"heat that crosses the {body} from {one} to {other}",
+            parts={
+                f"links.{one}-{other}": Link(
+                    between=(one, other), conductance=Value(value=f"{0.1 * leaves:.4g} W/K", spread=1.5 * SPREAD)
+                )
+            },
         )
 
 

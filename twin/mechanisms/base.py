@@ -77,6 +77,7 @@ class Mechanism(ABC):
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
+    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one of it explains
     only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 
