@@ -43,14 +43,14 @@ def sign_p(better: int, n: int) -> float:
 
 
 def stands_out(t: Tried) -> bool:
-    """Whether a signed amplitude's 90 % interval leaves out the value at which the candidate has no effect."""
+    """Whether a signed amplitude's 90 % interval leaves out the value without an effect; of several, any one's."""
     if t.fitted is None or t.candidate.part is None:
         return True
-    problem = t.fitted.problem
     sd = np.sqrt(np.diag(t.fitted.state.arrow.covariance))
+    fitted = {u.name: (u, z, own) for u, z, own in zip(t.fitted.problem.unknowns, t.fitted.state.z, sd, strict=True)}
+    told = []
     for amplitude, off in t.candidate.amplitudes.items():
-        name = f"mechanisms.{t.candidate.name}.{amplitude}"
-        for u, z, own in zip(problem.unknowns, t.fitted.state.z, sd, strict=True):
-            if u.name == name and u.scale == "linear" and abs(u.prior + u.spread * z - off) < Z90 * u.spread * own:
-                return False
-    return True
+        if (found := fitted.get(f"mechanisms.{t.candidate.name}.{amplitude}")) is not None:
+            u, z, own = found
+            told.append(u.scale != "linear" or abs(u.prior + u.spread * z - off) >= Z90 * u.spread * own)
+    return not told or any(told)
