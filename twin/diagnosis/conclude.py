@@ -15,7 +15,7 @@ from twin.diagnosis.findings import Verdict
 from twin.diagnosis.fitted import Fitted
 from twin.diagnosis.found import Found, Other, Rms, beside_words, place_words
 from twin.diagnosis.honest_digits import Estimate
-from twin.diagnosis.probability import Explanation, explanations, told
+from twin.diagnosis.probability import Explanation, explanations, most_sure, told
 from twin.diagnosis.search import Round, Search
 from twin.diagnosis.unseen import unseen
 from twin.mechanisms import MECHANISMS
@@ -48,8 +48,9 @@ def found_of(
     batches before and after this effect."""
     every, _, _ = explanations(done)
     best = next(e for e in every if done.best is not None and e.tried is done.best)
-    rest = [e for e in every if e.tried is not done.best]
     c = best.tried.candidate
+    same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
+    rest = [e for e in every if e not in same]
     final = search.final
     parameters, was = _parameters(final, best, intervals)
     regime, windows = activity(final, c)
@@ -59,7 +60,7 @@ def found_of(
         where=c.where,
         place=_place_of(c, part),
         parameters=parameters,
-        probability=best.probability,
+        probability=min(sum(e.probability for e in same), most_sure(final.runs)),
         name=c.name if c.part is not None else "",
         beside=beside_words(given, c.where, part) if given is not None else "",
         others=tuple(_other(e, part) for e in told([best, *rest])),

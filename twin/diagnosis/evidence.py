@@ -88,10 +88,15 @@ class Evidence:
         return cho_factor(own + np.eye(self.batches[0].jacobian.shape[1]))
 
     @cached_property
+    def shadow(self) -> Array:
+        """By how much the parameters (p, C) would move for a unit of each column."""
+        cross = np.sum([b.jacobian.T @ b.columns for b in self.batches], axis=0)
+        return np.asarray(cho_solve(self.factor, cross))
+
+    @cached_property
     def beyond(self) -> list[Array]:
         """Every batch's columns (n, C) beyond what the parameters of the whole fit can do."""
-        shadow = cho_solve(self.factor, sum(b.jacobian.T @ b.columns for b in self.batches))
-        return [b.columns - b.jacobian @ shadow for b in self.batches]
+        return [b.columns - b.jacobian @ self.shadow for b in self.batches]
 
     @cached_property
     def _squares(self) -> Array:
@@ -116,10 +121,19 @@ class Evidence:
     def base_score(self, targets: Sequence[Array] | None = None) -> Array:
         """Log density (R,) of batches left out without any candidate, in nats up to a constant.
 
-        What the nuisances could do counts too, by the volume that they leave open (the determinant of a covariance).
+        What the nuisances could do counts too, by the volume that they leave open (the determinant of a covariance),
+        and so does how far the parameters must go from what the machine file says: a network that is bent to fit
+        predicts as well as the right one as long as nothing new happens.
         """
         volume = sum(float(np.sum(np.log1p(-b.damping))) for b in self.batches)
-        return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets)))) + volume
+        bent = -0.5 * np.sum(self._parameters(targets) ** 2, axis=0)
+        return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets)))) + volume + bent
+
+    def _parameters(self, targets: Sequence[Array] | None = None) -> Array:
+        """z (p, R) of the whole fit."""
+        targets = self.targets if targets is None else targets
+        total = np.sum([b.jacobian.T @ t for b, t in zip(self.batches, targets, strict=True)], axis=0)
+        return np.asarray(cho_solve(self.factor, total))
 
     def group_score(self, group: Sequence[int]) -> float:
         """Log density of some batches left out together, per batch, predicted by all others."""
@@ -144,8 +158,7 @@ class Evidence:
     def gains(self, targets: Sequence[Array] | None = None) -> tuple[Array, Array, Array]:
         """Of all columns one by one: gains (R, C) in nats, amplitudes (R, C), falls of batches' squares (R, B, C)."""
         targets = self.targets if targets is None else targets
-        total = sum(b.jacobian.T @ t for b, t in zip(self.batches, targets, strict=True))
-        z = cho_solve(self.factor, total)
+        z = self._parameters(targets)
         inside = [t - b.jacobian @ z for b, t in zip(self.batches, targets, strict=True)]
         own = np.stack([self._by_channel(b, e**2).T for b, e in zip(self.batches, inside, strict=True)], axis=1)
         cross = np.stack(
@@ -167,15 +180,16 @@ class Evidence:
             after += seen[..., None] + change
             falls[:, k] = -change.sum(axis=1)
         gain = self._of_squares(after) - self._of_squares(before[..., None])
-        return gain, self._amplitude(best, *sums, shrink=False), falls
+        kept = self._amplitude(best, *sums)  # the parameters move back by as much as the column takes over
+        relief = kept * (z.T @ self.shadow) - 0.5 * kept**2 * np.einsum("pc,pc->c", self.shadow, self.shadow)
+        return gain + relief, self._amplitude(best, *sums, shrink=False), falls
 
     def scores(self) -> Scores:
         """All columns one by one for the recordings."""
         gain, amplitude, falls = self.gains()
         inside = np.maximum(self._squares.sum(axis=(0, 1)), TINY)
         every = sum(np.einsum("nc,nc->c", b.columns, b.columns) for b in self.batches)
-        total = sum(b.jacobian.T @ b.target for b in self.batches)
-        z = cho_solve(self.factor, total)
+        z = self._parameters()[:, 0]
         along = sum(
             c.T @ (b.target - b.jacobian @ z) for b, c in zip(self.batches, self.beyond, strict=True)
         )  # fmt: skip

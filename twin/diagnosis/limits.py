@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import cho_solve
 
 from twin.diagnosis.diagnosis import COLUMNS
 from twin.diagnosis.fitted import Fitted
@@ -21,7 +20,7 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
     threshold (the local power of a score test, Cox and Hinkley 1974, §9.3).
     """
     evidence = seen.evidence
-    shadow = cho_solve(evidence.factor, sum(b.jacobian.T @ b.columns for b in evidence.batches))
+    shadow = evidence.shadow
     own = np.sqrt(sum(np.einsum("np,np->p", b.jacobian, b.jacobian) for b in evidence.batches))
     names = [u.name for u in fitted.problem.unknowns]
     rows = []

@@ -22,6 +22,11 @@ class Explanation:
     alike: bool
 
 
+def most_sure(runs: int) -> float:
+    """The highest probability that so many runs allow."""
+    return MOST.get(runs, 0.99)
+
+
 def temperature(done: Round) -> float:
     """Nats of score that count as one: what structure alone scatters by, at least 1."""
     typical = done.null.typical(float(np.median(done.null.density))) if done.null.gain.size else np.zeros(1)
@@ -42,7 +47,7 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())
     weight /= weight.sum()
-    most = MOST.get(done.before.runs or len(done.before.batches), 0.99)
+    most = most_sure(done.before.runs or len(done.before.batches))
     weight[:-2] *= min(1.0, most / max(weight[:-2].max(initial=0.0), 1e-12))
     best = done.best
     out = [
