@@ -31,6 +31,11 @@ def flipped_gains(evidence: Evidence, after: Evidence, alarm: Sequence[int], see
     return np.asarray(evidence.gains(targets)[0][:, list(alarm)].max(axis=1))
 
 
+def flipped_threshold(gains: Array, batches: int) -> float:
+    """The gain that flipped signs exceed once in a hundred; of few batches, with few patterns, their largest."""
+    return float(gains.max()) if 2**batches <= FLIPS else gumbel(gains)
+
+
 def gumbel(gain: Array, share: float = 0.99) -> float:
     """The quantile of a largest value by a Gumbel distribution of the same mean and spread (Gumbel 1958)."""
     scale = float(np.std(gain, ddof=1)) * np.sqrt(6.0) / np.pi

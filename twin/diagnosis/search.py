@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.acceptance import flipped_gains, gumbel, sign_p, stands_out
+from twin.diagnosis.acceptance import flipped_gains, flipped_threshold, sign_p, stands_out
 from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null, structural_null
@@ -132,7 +132,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     best = tried[0]
     after = alone(tried[0].fitted, inflation)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
-    threshold = max(null.threshold(float(after.base_score()[0])), gumbel(flipped), LEAST)
+    threshold = max(null.threshold(float(after.base_score()[0])), flipped_threshold(flipped, len(now.batches)), LEAST)
     n = len(now.batches)
     accepted = best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best)
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
