@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
@@ -57,7 +58,7 @@ def _at(
             kind = KIND[target]
             where = Where(kind, site.outlets[0] if target == "heat" and site.outlets else site.name)
             also = [*site.others, *drivers.values(), *(place for role, place in ports.items() if place != site.name)]
-            name = "_".join([mechanism.key, site.name.replace("-", "_"), *also]).replace("@", "_").replace(".", "_")
+            name = re.sub(r"\W", "_", "_".join([mechanism.key, site.name, *also]))
             into = target in ("node", "start")
             yield Candidate(
                 mechanism.key,
@@ -184,9 +185,9 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
         if c.part.into is not None:
             if c.part.into in _outlets(given):
                 return True
-        elif set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at):
-            return True
-        elif c.part.acts_on is None and given.at == c.part.at:
+        elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at)) or (
+            c.part.acts_on is None and given.at == c.part.at
+        ):
             return True
     sensor = part.sensors.get(str(c.part.acts_on))
     own = {"sensor_lag": "lag", "sensor_bonding": "bonding", "sensor_offset": "offset"}.get(c.mechanism)

@@ -117,7 +117,7 @@ def _parameters(
     mechanism = MECHANISMS.get(c.mechanism) if c.mechanism in MECHANISMS else None
     for spec in mechanism.parameters if mechanism else ():
         at = _network_name(final, c.name, spec.name, c.where.name)
-        if at in intervals:
+        if at is not None and at in intervals:
             i = intervals[at]
             out[spec.name] = Estimate(i.value, i.unit, i.low, i.high)
         elif at is not None:

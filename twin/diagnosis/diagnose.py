@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ import pandas as pd
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from twin.calibration.identifiability import Interval, intervals90
+from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
 from twin.diagnosis import tables as made
 from twin.diagnosis.baseline import TOLERANCE, baseline
@@ -141,7 +142,7 @@ def _diagnosis(
     table = limits(last.before, last.screen, last.threshold)
     told = _limits_told(table)
     findings = tuple(finding_of(f) for f in found)
-    better = int((_per_batch(rms_table, final, "after") < _per_batch(rms_table, final, "before")).sum()) if found else 0
+    better = int((_per_batch(rms_table, "after") < _per_batch(rms_table, "before")).sum()) if found else 0
     statement = verdict_statement(
         verdict, found, rms, told, separates, [place_words(_where(n), part_after) for n in told]
     )
@@ -175,8 +176,8 @@ def _diagnosis(
             drafted=drafted,
             remarks=words,
             refinements=tuple(
-                Refinement(what=str(r.what), why=str(r.why), before=float(r.before), after=float(r.after))
-                for r in everything["refinements"].itertuples()
+                Refinement(what=what, why=why, before=b, after=a)
+                for what, why, b, a in rows_of(everything["refinements"])
             ),
         ),
         part_before=done.baseline.part,
@@ -200,10 +201,10 @@ def _around(done: Search, r: Round, steps: Sequence[tuple[Fitted, LeftOutRows]])
     return steps[k][1], steps[k + 1][1]
 
 
-def _per_batch(table: pd.DataFrame, fitted: Fitted, column: str) -> pd.Series:
+def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
     """By batch the mean over channels of log rms, noise taken in."""
-    level = np.hypot(table[column], table["floor"])
-    return np.log(level).groupby(table["batch"]).mean()
+    level = pd.Series(np.log(np.hypot(table[column].to_numpy(float), table["floor"].to_numpy(float))))
+    return level.groupby(table["batch"].to_numpy()).mean()
 
 
 def refinements(done: Search) -> pd.DataFrame:
@@ -220,12 +221,16 @@ def _limits_told(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
     """Every candidate's limit; nan where no amplitude within bounds would have been seen."""
     return tuple(
         DetectionLimit(
-            mechanism=row.mechanism, where=Place(kind=row.kind, name=row.name), words=row.words,
-            limit=None if not np.isfinite(row.limit) else float(row.limit), unit=row.unit,
-            absorbed=float(row.absorbed), absorbed_by=row.absorbed_by,
+            mechanism=mechanism, where=Place(kind=kind, name=name), words=words,
+            limit=float(limit) if np.isfinite(limit) else None, unit=unit, absorbed=float(absorbed), absorbed_by=by,
         )
-        for row in table.itertuples(index=False)
+        for mechanism, kind, name, words, limit, unit, absorbed, by in rows_of(table)
     )  # fmt: skip
+
+
+def rows_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """The table's rows as plain tuples."""
+    return list(table.itertuples(index=False, name=None))
 
 
 def _where(limit: DetectionLimit) -> Where:

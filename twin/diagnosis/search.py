@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -84,7 +84,7 @@ def search(baseline: Fitted, seed: int = 0, workers: Workers | None = None, prog
 
 
 def _fair_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress) -> Round:
-    """A round whose baseline is as good as its best candidate's fit without the candidate: no gain by a better start."""
+    """A round whose baseline fits as well as its best candidate's fit without the candidate: no gain by a start."""
     for _ in range(RESTARTS + 1):
         done = one_round(now, null, seed, workers, tell)
         if not done.accepted or done.best is None or done.best.fitted is None:
@@ -116,7 +116,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     ]
     work = [worth[k] for k in chosen] + coarse
     numbers = [clusters[k] for k in chosen] + [-1000 - k for k in range(len(coarse))]
-    tried = []
+    tried: list[Tried] = []
     for n, t in enumerate(workers.map(partial(refit, now, base, inflation), work)):
         tell("refit", n + 1, len(work))
         if t is not None:

@@ -59,7 +59,7 @@ def series_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.
 def acf_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:
     """Autocorrelation of the left-out errors, pooled over batches."""
     problem = fitted.problem
-    rows = []
+    rows: list[tuple[str, float, float, float]] = []
     for c, name in enumerate(problem.channels):
         first, step_s = _acf(before.error, fitted, c)
         second, _ = _acf(after.error, fitted, c)
@@ -83,7 +83,7 @@ def _acf(errors: Sequence[Array], fitted: Fitted, channel: int) -> tuple[Array, 
 
 def candidates_table(rounds: Sequence[Round]) -> pd.DataFrame:
     """All that was tried in full or in its cluster, round by round, the likeliest first."""
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for done in rounds:
         n = len(done.before.batches)
         for e in explanations(done)[0]:
