@@ -105,27 +105,54 @@ def assemble(
     p = len(z)
     spread = np.array([u.spread for u in unknowns])
     prior = 1.0 / np.sqrt(max(1, len(nuisance)))
-    total = np.zeros((0, p + 1))
+    total = np.zeros((p, p + 1))  # Gram matrices of what every batch says of the parameters, summed
+    large = np.zeros((0, p + 1))  # and as a triangle, of those whose Gram matrices would lose the prior
     corners = []
     for block, current in zip(blocks, nuisance, strict=True):
         n, q = block.nuisance.shape
         row = np.sqrt(weight[block.channel])[:, None]
-        system = np.zeros((n + q + p, q + p + 1))
-        np.multiply(row, block.nuisance, out=system[:n, :q])
-        np.multiply(block.jacobian, spread, out=system[:n, q:-1])
-        system[:n, q:-1] *= row
-        np.multiply(row[:, 0], block.residual, out=system[:n, -1])
-        diagonal = np.arange(q + p)
-        system[n + diagonal, diagonal] = np.concatenate([np.ones(q), np.full(p, prior)])
-        system[n:, -1] = -np.concatenate([current, prior * z])
+        system = np.empty((n, q + p + 1))
+        np.multiply(row, block.nuisance, out=system[:, :q])
+        np.multiply(block.jacobian, spread, out=system[:, q:-1])
+        system[:, q:-1] *= row
+        np.multiply(row[:, 0], block.residual, out=system[:, -1])
+        own = np.concatenate([np.ones(q), np.full(p, prior)])
+        aim = -np.concatenate([current, prior * z])
         gram = system.T @ system
+        gram[np.arange(q + p), np.arange(q + p)] += own**2
+        gram[:-1, -1] += own * aim
         if not np.isfinite(gram.trace()):
             raise WorkError(_not_finite(block, unknowns))
-        root, target = triangle(system, gram)
-        corners.append(Corner(root[:q, :q].copy(), root[:q, q:].copy(), target[:q].copy()))
-        total = np.vstack([total, np.column_stack([root[q:, q:], target[q:]])])
-        total = np.column_stack(triangle(total, total.T @ total))
-    return Arrow(total[:, :-1], total[:, -1], tuple(corners))
+        kept = _without_nuisances(gram, q)
+        if kept is None:
+            both = np.vstack([system, np.column_stack([np.diag(own), aim])])
+            root, target = triangle(both, both.T @ both)
+            corner = Corner(root[:q, :q].copy(), root[:q, q:].copy(), target[:q].copy())
+            large = np.vstack([large, np.column_stack([root[q:, q:], target[q:]])])
+            large = np.column_stack(triangle(large, large.T @ large))
+        else:
+            corner, left = kept
+            total += left
+        corners.append(corner)
+    if total.any():  # regular: every batch brings its share of the prior
+        root = lapack.dpotrf(total[:, :p], lower=0, clean=1)[0]
+        rows = np.column_stack([root, _solve(root, total[:, p], transposed=True)])
+        if not len(large):
+            return Arrow(root, rows[:, p], tuple(corners))
+        large = np.vstack([large, rows])
+    return Arrow(*triangle(large, large.T @ large), tuple(corners))
+
+
+def _without_nuisances(gram: Array, q: int) -> tuple[Corner, Array] | None:
+    """The corner of a Gram matrix (q + p + 1 square) and what it leaves (p, p + 1); None where rounding forbids it."""
+    if gram.diagonal()[:-1].max(initial=0.0) >= GRAM_LIMIT:
+        return None
+    corner, failed = lapack.dpotrf(gram[:q, :q], lower=0, clean=1) if q else (np.zeros((0, 0)), 0)
+    if failed:
+        return None
+    beside = _solve(corner, gram[:q, q:], transposed=True)
+    left = gram[q:-1, q:] - beside[:, :-1].T @ beside
+    return Corner(corner, beside[:, :-1], beside[:, -1]), left
 
 
 def triangle(system: Array, gram: Array) -> tuple[Array, Array]:
