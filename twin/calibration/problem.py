@@ -143,7 +143,7 @@ class CalibrationProblem:
 
         The last point's blocks are kept, since a new noise asks for them again, where they are small.
         """
-        key = np.concatenate([x, *nuisance]).tobytes()
+        key = _key(x, nuisance)
         if key not in self._last:
             self._last.clear()
             blocks = self._linearised(x, nuisance)
@@ -170,6 +170,9 @@ class CalibrationProblem:
 
     def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
         """(measured − simulated) / noise of every batch, (n_b,) each."""
+        kept = self._last.get(_key(x, nuisance))
+        if kept is not None:
+            return [block.residual for block in kept]
         start, offset = self.own(nuisance)
         simulation = simulate(self.network, self.values_at(x), self.own_heat(nuisance), start, offsets_K=offset)
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
@@ -252,6 +255,10 @@ class CalibrationProblem:
     def _first_samples(self, m: Measured) -> Array:
         """What the errors' first samples do to the whitened rows, (n_b, usable error channels)."""
         return FIRST_SAMPLE * (m.channel[:, None] == m.usable_errors)
+
+
+def _key(x: Array, nuisance: Sequence[Array]) -> bytes:
+    return np.concatenate([x, *nuisance]).tobytes()
 
 
 def unknown(p: Parameter) -> Unknown:
