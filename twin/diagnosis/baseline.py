@@ -8,12 +8,14 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
 from twin.calibration.least_squares import settled
+from twin.calibration.measured import EVERY_S
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.diagnosis.fitted import Fitted
 from twin.schema import TwinPart
 
 TOLERANCE, STEPS = 1e-2, 40
+ROWS = 60  # of a usual batch, at least: a run of ten minutes is no less a run than one of six hours
 
 
 def baseline(
@@ -38,7 +40,7 @@ def baseline(
             )
         if ids.count(batch.batch_id) > 1:
             raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
-    problem = CalibrationProblem.of(compile_network(machine, part=part), batches)
+    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
     steps = 0
 
     def told(_: str) -> None:
@@ -49,3 +51,9 @@ def baseline(
 
     state, _ = settled(problem, reweight=True, tolerance=TOLERANCE, max_iterations=STEPS, progress=told)
     return Fitted(machine, part, tuple(batches), problem, state, runs or len(batches))
+
+
+def spacing_s(batches: Sequence[Batch]) -> float:
+    """Seconds from one row that is looked at to the next."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches)
+    return min(EVERY_S, lengths[len(lengths) // 2] / ROWS) or EVERY_S
