@@ -71,10 +71,10 @@ def probability_words(probability: float) -> str:
 
 
 def headline(verdict: str, probabilities: Sequence[float]) -> str:
-    """The verdict as one line for the shop floor, never more certain than the least probable of its findings."""
-    n, least = len(probabilities), min(probabilities, default=1.0)
-    the = "The" if least >= SURE else "Most likely the" if least >= LIKELY else "Perhaps the"
-    effects = "one effect" if n == 1 else f"{_spelled(n)} effects"
+    """The verdict as one line for the shop floor, as certain as its surest finding; the others may be fewer."""
+    n, most, least = len(probabilities), max(probabilities, default=1.0), min(probabilities, default=1.0)
+    the = "The" if most >= SURE else "Most likely the" if most >= LIKELY else "Perhaps the"
+    effects = "one effect" if n == 1 else f"{'up to ' if least < SURE else ''}{_spelled(n)} effects"
     return {
         "consistent": "Consistent: the remaining error is the noise.",
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",

@@ -12,6 +12,7 @@ from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value
 
 WIDE = 1.5  # least spread of an amplitude's logarithm: machines differ by more than their handbook values
+FREEDOM = 2.0  # nats of each parameter that shapes an effect beside its size
 LEAST = 1e-3  # of the usual value: where a fit of a positive amplitude begins at the lowest
 
 
@@ -88,11 +89,16 @@ def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
 
 
 def log_prior(s: Scored, fitted: Fitted | None) -> float:
-    """Log density of an amplitude's size about the usual one, 0 at best; signed amplitudes by their usual spread."""
+    """Log density of an amplitude's size about the usual one, 0 at best; signed amplitudes by their usual spread.
+
+    What has more freedom costs more: a pump that always runs is a cabinet (a nat for each decade of a sample, Schwarz
+    1978).
+    """
     c = s.candidate
     if c.mechanism not in MECHANISMS:
         return 0.0
     mechanism = MECHANISMS[c.mechanism]
+    freedom = -FREEDOM * len(c.shape)
     out = 0.0
     for amplitude, off in (mechanism.off or {}).items():
         spec = mechanism.spec(amplitude)
@@ -104,4 +110,4 @@ def log_prior(s: Scored, fitted: Fitted | None) -> float:
             out = min(out, -0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
         elif spec.scale == "linear" and spec.spread:
             out = min(out, -0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
-    return out
+    return out + freedom
