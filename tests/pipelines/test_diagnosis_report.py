@@ -82,7 +82,8 @@ def test_a_finding_is_told_with_place_time_probability_and_what_else_it_may_be()
 
 
 def test_no_headline_or_probability_is_more_certain_than_the_finding() -> None:
-    assert headline("explained", [0.97, 0.7]).startswith("Most likely the simulation left out two effects; with them")
+    assert headline("explained", [0.97, 0.7]).startswith("The simulation left out up to two effects; with them only")
+    assert headline("explained", [0.8, 0.7]).startswith("Most likely the simulation left out up to two effects; with")
     assert headline("partly_explained", [0.4]).startswith("Perhaps the simulation left out one effect; something else")
     assert [likelihood(p) for p in (1.0, 0.95, 0.9, 0.66, 0.5, 0.33, 0.1, 0.0)] == [
         "virtually certain", "extremely likely", "very likely", "likely", "more likely than not",
