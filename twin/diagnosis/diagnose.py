@@ -67,6 +67,7 @@ def diagnose(
         InputError: batches or a machine file that cannot be used; WorkError: the model fails at the priors' means.
     """
     begun = time.perf_counter()
+    batches = sorted(batches, key=lambda b: b.batch_id)  # what is drawn for each must not depend on their order
     tell = progress or (lambda step, n, of: None)
     with Workers(processes) as workers:
         words: list[str] = []
