@@ -87,7 +87,7 @@ def _with(part: TwinPart, candidates: Sequence[Candidate]) -> TwinPart:
         first = members[0]
         assert first.part is not None
         mechanism = MECHANISMS[first.mechanism]
-        values = {k: Value(value=v) for k, v in mechanism.ghost.items()}
+        values = {**first.part.parameters, **{k: Value(value=v) for k, v in mechanism.ghost.items()}}
         for amplitude, off in first.amplitudes.items():
             near = mechanism.spec(amplitude).scale == "logit" and off <= 0
             values[amplitude] = Value(value=NEARLY_OFF if near else off, source=f"{MARK}{name}.{amplitude}")

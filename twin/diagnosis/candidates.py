@@ -12,7 +12,7 @@ from twin.compiling.scope import several
 from twin.diagnosis.candidate import Candidate, Kind, Where
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, PortRole, Target
-from twin.quantity import same_dimension
+from twin.quantity import Value, same_dimension
 from twin.schema import MechanismPart, TwinPart
 
 KIND: Mapping[Target, Kind] = {
@@ -71,11 +71,19 @@ def _at(
                     into=site.name if into and "expand" not in mechanism.effects() else None,
                     acts_on=None if into else (site.name, *site.others) if site.others else site.name,
                     drivers=drivers or None,
+                    parameters=_levels(machine, mechanism, drivers),
                 ),
                 dict(mechanism.off or {}),
                 mechanism.shape,
                 mechanism.fault,
             )
+
+
+def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:
+    """The level at which an effect is stated, of a driver in its channel's own unit: the top of the channel's range."""
+    tops = [c.range[1] for c in (machine.channels[name] for name in drivers.values()) if c.range]
+    stated = [s for s in mechanism.parameters if s.name == "rated" and s.unit == "1" and tops]
+    return {s.name: Value(value=min(tops[0], s.high)) for s in stated if tops[0] > s.low}
 
 
 def _words(mechanism: type[Mechanism], site: Site, also: Sequence[str]) -> str:
