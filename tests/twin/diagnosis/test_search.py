@@ -1,0 +1,155 @@
+"""The search on two bodies: what is concealed is found with its size, and nothing is found where nothing is."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from data.batch import Batch
+from tests.twin.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
+from tests.twin.recordings import drawn, empty_batches, recorded
+from twin.calibration.identifiability import Interval, intervals90
+from twin.calibration.least_squares import result
+from twin.compile import compile_network
+from twin.diagnosis.screen import proposed
+from twin.diagnosis.search import IMPROVED, LEAST, Round, Search, one_round, search
+from twin.diagnosis.slack import no_news
+from twin.diagnosis.workers import Workers
+
+COUNT = 8
+COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}
+SCATTER = np.array([0.8, 1.25, 1.0, 0.7, 1.1, 1.4, 0.9, 1.05])
+
+
+@cache
+def found(case: str) -> Search:
+    return search(fitted(two_bodies(), recordings(case)))
+
+
+def recordings(case: str) -> list[Batch]:
+    known = two_bodies()
+    if case == "scatter":
+        return scattered()
+    hidden: dict[str, Any] = {
+        "nothing": {}, "floor": {"a": COLD}, "drift": {"a": DRIFT}, "floor and shift": {"a": COLD, "b": SHIFT},
+    }[case]  # fmt: skip
+    return runs(known, hidden, 6 if case == "floor" else COUNT)
+
+
+def scattered() -> list[Batch]:
+    """Runs whose belts differ."""
+    known, out = two_bodies(), []
+    network = compile_network(known)
+    values = drawn(network, np.random.default_rng(1))
+    for k, (batch, factor) in enumerate(zip(empty_batches(known, COUNT), SCATTER, strict=True)):
+        own = values.copy()
+        own[network.index("mechanisms.belt.power")] *= factor
+        out += recorded(known, [batch], own, seed=10 + k)
+    return out
+
+
+def names(done: Search) -> list[str]:
+    return [r.best.candidate.name for r in done.accepted if r.best is not None]
+
+
+def told(done: Search) -> dict[str, Interval]:
+    fit = result(done.final.problem, done.final.state, 0.01, "")
+    return {i.name: i for i in intervals90(fit, done.final.problem.unknowns)}
+
+
+def test_a_cold_floor_is_found_with_its_size() -> None:
+    done = found("floor")
+    assert names(done) == ["floor_sink_head_room"]
+    interval = told(done)["exposures.head-floor_sink_head_room.conductance"]
+    assert interval.low < 8.0 < interval.high
+    assert interval.value == pytest.approx(8.0, rel=0.05)
+
+
+def test_what_is_accepted_clears_every_bar() -> None:
+    for r in found("floor and shift").accepted:
+        assert r.best is not None
+        assert r.best.gain > r.threshold >= LEAST
+        assert r.best.improved >= IMPROVED * COUNT
+        assert r.threshold >= r.null.threshold(0.0) or r.threshold >= r.flipped.max()
+        assert r.sign_p < 0.2
+
+
+def test_where_nothing_is_missing_nothing_is_accepted() -> None:
+    done = found("nothing")
+    assert len(done.rounds) == 1 and not done.accepted
+    assert done.final.part == done.baseline.part == fitted(two_bodies(), recordings("nothing")).part
+    assert done.final.state.noise.factor.max() < 1.2
+
+
+@pytest.mark.parametrize("seed", range(2, 6))
+def test_nor_with_other_values_and_noise(seed: int) -> None:
+    done = search(fitted(two_bodies(), runs(two_bodies(), count=4, seed=seed)))
+    assert not done.accepted
+
+
+def test_a_drifting_sensor_is_the_sensors_fault() -> None:
+    done = found("drift")
+    assert names(done) == ["sensor_drift_t_head"]
+    (r,) = done.accepted
+    assert r.best is not None and r.best.candidate.fault and not r.best.candidate.physics
+    interval = told(done)["mechanisms.sensor_drift_t_head.rate"]
+    assert interval.low < 0.3 < interval.high and interval.high - interval.low < 0.03
+
+
+def test_friction_that_differs_from_run_to_run_is_told_as_that() -> None:
+    done = found("scatter")
+    (r,) = done.accepted
+    assert r.best is not None and r.best.candidate.mechanism == "varies_between_runs"
+    assert r.best.candidate.words == "a value that differs from run to run: mechanisms.belt.power"
+    assert not r.best.candidate.physics
+    own = done.final.problem.nuisances
+    assert done.final.problem.network.parameters[own.parameters[0]].name == "mechanisms.belt.power"
+    sizes = np.exp([own.deviation[0] * v[own.shared - 1] for v in done.final.state.nuisance])
+    np.testing.assert_allclose(sizes / sizes[2], SCATTER, rtol=0.1)
+
+
+def test_two_effects_at_once_are_both_found() -> None:
+    done = found("floor and shift")
+    assert sorted(names(done)) == ["floor_sink_head_room", "speed_shift_z_rpm"]
+    intervals = told(done)
+    assert intervals["exposures.head-floor_sink_head_room.conductance"].value == pytest.approx(8.0, rel=0.05)
+    assert intervals["mechanisms.speed_shift_z_rpm.shift"].value == pytest.approx(6.0, rel=0.05)
+    assert [r.accepted for r in done.rounds] == [True, True, False]
+    assert done.final.state.noise.factor.max() < 1.2
+
+
+def test_the_best_is_first_and_slack_is_no_news() -> None:
+    for case in ("floor", "scatter"):
+        for r in found(case).rounds:
+            full = [t for t in r.tried if t.fitted is not None and t.candidate.mechanism != "coarse_network"]
+            order = [t.gain + t.log_prior for t in full]
+            assert order == sorted(order, reverse=True)
+            assert not {t.candidate.name for t in r.tried} & no_news(proposed(r.before))
+
+
+@cache
+def first_round(seed: int, processes: int = 1, again: bool = False) -> Round:
+    with Workers(processes) as workers:
+        return one_round(found("drift").baseline, None, seed, workers, lambda *_: None)
+
+
+def gains(r: Round) -> dict[str, float]:
+    return {t.candidate.name: t.gain for t in r.tried}
+
+
+def test_the_same_seed_gives_the_same_and_another_only_another_null() -> None:
+    one, same, other = first_round(0), first_round(0, again=True), first_round(1)
+    assert list(gains(one).items()) == list(gains(same).items()) == list(gains(other).items())
+    np.testing.assert_array_equal(one.null.gain, same.null.gain)
+    np.testing.assert_array_equal(one.flipped, same.flipped)
+    assert not np.array_equal(one.null.gain, other.null.gain)
+
+
+def test_processes_do_not_matter() -> None:
+    one, two = first_round(0), first_round(0, processes=2)
+    assert list(gains(one)) == list(gains(two))
+    assert gains(one) == pytest.approx(gains(two), rel=1e-9)
+    assert two.accepted and two.threshold == pytest.approx(one.threshold)
