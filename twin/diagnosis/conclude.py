@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from twin.calibration.identifiability import Interval
+from twin.calibration.identifiability import Z90, Interval
 from twin.diagnosis.activity import activity
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.changes import deviations
@@ -46,13 +46,13 @@ def found_of(
 ) -> Found:
     """One accepted round as a finding; `intervals` of the final fit's parameters by network name, `rms` of the left-out
     batches before and after this effect."""
-    every, _, _ = explanations(done)
+    every, nothing, unlisted = explanations(done)
     best = next(e for e in every if done.best is not None and e.tried is done.best)
     c = best.tried.candidate
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
     final = search.final
-    parameters, was = _parameters(final, best, intervals)
+    parameters, was = _parameters(final, best, intervals, done)
     regime, windows = activity(final, c)
     given = c.part
     return Found(
@@ -76,6 +76,8 @@ def found_of(
             "batches": len(final.batches),
             "sign_test_p": done.sign_p,
             "absorbed_share": best.tried.scored.absorbed,
+            "probability_nothing": nothing,
+            "probability_unlisted": unlisted,
             "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
             **unseen(done.before, best.tried.fitted or final, done.before.state.noise.inflation),
         },
@@ -97,7 +99,7 @@ def _other(e: Explanation, part: TwinPart) -> Other:
 
 
 def _parameters(
-    final: Fitted, best: Explanation, intervals: Mapping[str, Interval]
+    final: Fitted, best: Explanation, intervals: Mapping[str, Interval], done: Round
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
     """Fitted values of what was found, in their units, and those that the machine file had."""
     c = best.tried.candidate
@@ -118,12 +120,25 @@ def _parameters(
     for spec in mechanism.parameters if mechanism else ():
         at = _network_name(final, c.name, spec.name, c.where.name)
         if at is not None and at in intervals:
-            i = intervals[at]
-            out[spec.name] = Estimate(i.value, i.unit, i.low, i.high)
+            out[spec.name] = _widened(intervals[at], spec.name, done)
         elif at is not None:
             p = network.parameters[network.index(at)]
             out[spec.name] = Estimate(p.value, p.unit)
     return out, {}
+
+
+def _widened(i: Interval, parameter: str, done: Round) -> Estimate:
+    """The interval of an amplitude, as wide as refined machines scatter it: a lumped network does not know better."""
+    best = done.best
+    if best is None or parameter not in best.candidate.amplitudes:
+        return Estimate(i.value, i.unit, i.low, i.high)
+    density = float(np.median(done.null.density))
+    sd = Z90 * done.null.amplitude_sd(best.candidate.name, density)
+    if i.low > 0 and i.value > 0:
+        up = float(np.hypot(np.log(i.high / i.value), sd / i.value))
+        return Estimate(i.value, i.unit, i.value * float(np.exp(-up)), i.value * float(np.exp(up)))
+    half = float(np.hypot((i.high - i.low) / 2.0, sd))
+    return Estimate(i.value, i.unit, i.value - half, i.value + half)
 
 
 def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:

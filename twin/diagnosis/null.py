@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.errors import InputError, WorkError
 from twin.calibration.descent import x_of
@@ -24,11 +25,14 @@ SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the misfit of each
 @dataclass(frozen=True)
 class Null:
     """Recordings of T refined machines with the misfit at S scales: largest gain of any candidate (T, S) in nats, the
-    log density of batches left out (T, S) before any candidate, and their mean squares (T, S, K)."""
+    log density of batches left out (T, S) before any candidate, their mean squares (T, S, K), and the amplitudes
+    (T, S, C) that the candidates `names` would be given where none is there."""
 
     gain: Array
     density: Array
     mean_squares: Array
+    amplitude: Array
+    names: tuple[str, ...] = ()
 
     def threshold(self, density: float, share: float = 0.99) -> float:
         """The gain that structure alone exceeds in 1 - share of the cases, where it may leave as much as `density` says.
@@ -43,22 +47,33 @@ class Null:
 
     def typical(self, density: float) -> Array:
         """The largest gain (T,) of each machine at that misfit."""
+        return np.asarray(self.gain[np.arange(len(self.gain)), self._scale(density)])
+
+    def amplitude_sd(self, name: str, density: float) -> float:
+        """How far structure and noise alone scatter a candidate's amplitude; 0 where that is not known."""
+        if name not in self.names or len(self.gain) < 2:
+            return 0.0
+        own = self.amplitude[np.arange(len(self.gain)), self._scale(density), self.names.index(name)]
+        return float(np.sqrt(np.mean(own**2)))
+
+    def _scale(self, density: float) -> NDArray[np.int64]:
+        """Of each machine (T,) the largest misfit that predicts left-out batches no worse."""
         allowed = self.density >= density
-        last = np.where(allowed.any(axis=1), allowed.shape[1] - 1 - np.argmax(allowed[:, ::-1], axis=1), 0)
-        return np.asarray(self.gain[np.arange(len(self.gain)), last])
+        last = allowed.shape[1] - 1 - np.argmax(allowed[:, ::-1], axis=1)
+        return np.where(allowed.any(axis=1), last, 0)
 
 
 def structural_null(
     fitted: Fitted,
     evidence: Evidence,
-    counts: Sequence[int],
+    counts: Mapping[str, int],
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Null:
     """Refined machines driven as the recordings were, their left-out gains by the same evidence in one step each.
 
-    Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers the
-    columns whose gain would be an alarm.
+    Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers, by
+    candidate, the columns whose gain would be an alarm.
     """
     rng = np.random.default_rng(seed)
     base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
@@ -76,11 +91,16 @@ def structural_null(
     z = np.zeros(evidence.batches[0].jacobian.shape[1])
     z[: len(fitted.state.z)] = fitted.state.z
     shifted = [np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)]
-    gain = evidence.gains(shifted)[0][:, list(counts)].max(axis=1)
+    gain, amplitude, _ = evidence.gains(shifted)
+    columns = list(counts.values())
     squares = evidence.mean_squares(evidence.left_out(shifted))
     shape = (-1, len(SCALES))
     return Null(
-        gain.reshape(shape), evidence.base_score(shifted).reshape(shape), squares.reshape(*shape, squares.shape[1])
+        gain[:, columns].max(axis=1, initial=0.0).reshape(shape),
+        evidence.base_score(shifted).reshape(shape),
+        squares.reshape(*shape, squares.shape[1]),
+        amplitude[:, columns].reshape(*shape, len(columns)),
+        tuple(counts),
     )
 
 

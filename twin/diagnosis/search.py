@@ -14,6 +14,7 @@ from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null, structural_null
 from twin.diagnosis.refits import Tried, refit, shortlist, taken_on, with_clusters
+from twin.diagnosis.revise import second_thoughts
 from twin.diagnosis.screen import Scored, Screen, alone, proposed, screen
 from twin.diagnosis.slack import no_news
 from twin.diagnosis.workers import Workers
@@ -26,6 +27,7 @@ IMPROVED = 0.75  # share of the left-out batches that must improve
 RESTARTS = 2  # of a round, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
 FINALISTS, HOPEFUL = 5, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
+SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
@@ -51,25 +53,33 @@ class Round:
 
 @dataclass(frozen=True)
 class Search:
-    """All rounds; the last one accepted nothing, or there were as many as allowed."""
+    """All rounds; the last one accepted nothing, or there were as many as allowed. `dropped` are rounds whose effect
+    was needless once the later ones were in."""
 
     baseline: Fitted
     final: Fitted
     rounds: tuple[Round, ...]
+    dropped: tuple[int, ...] = ()
 
     @property
     def accepted(self) -> tuple[Round, ...]:
-        return tuple(r for r in self.rounds if r.accepted)
+        return tuple(r for k, r in enumerate(self.rounds) if r.accepted and k not in self.dropped)
 
 
 def search(baseline: Fitted, seed: int = 0, workers: Workers | None = None, progress: Progress | None = None) -> Search:
-    """Forward until nothing more is accepted."""
+    """Forward until nothing more is accepted, then second thoughts."""
     tell = progress or (lambda step, n, of: None)
+    workers = workers or Workers()
+    return revised(_forward(baseline, seed, workers, tell), workers, tell)
+
+
+def _forward(baseline: Fitted, seed: int, workers: Workers, tell: Progress) -> Search:
+    """One effect after the other."""
     now, rounds = baseline, []
     null: Null | None = None
     effects = 0
     while True:
-        done = _fair_round(now, null, seed, workers or Workers(), tell)
+        done = _fair_round(now, null, seed, workers, tell)
         null = done.null
         rounds.append(done)
         if not rounds[:-1]:
@@ -81,6 +91,36 @@ def search(baseline: Fitted, seed: int = 0, workers: Workers | None = None, prog
         effects += done.best.candidate.mechanism != "coarse_network"
         if effects >= MOST_EFFECTS or len(rounds) >= 2 * MOST_EFFECTS:
             return Search(baseline, now, tuple(rounds))
+
+
+def revised(done: Search, workers: Workers, tell: Progress) -> Search:
+    """Effects dropped or swapped for their rivals, one at a time, as long as the batches left out agree."""
+    for _ in range(MOST_EFFECTS):
+        rounds = [k for k, r in enumerate(done.rounds) if r.accepted and k not in done.dropped]
+        if len(rounds) < 2:
+            return done
+        tell("second thoughts", 0, 0)
+        effects = [t for k in rounds if (t := done.rounds[k].best) is not None]
+        rivals = [[t for t in done.rounds[k].tried[1:] if _rival(t, e)] for k, e in zip(rounds, effects, strict=True)]
+        change = second_thoughts(done.final, effects, rivals, done.baseline.part, LEAST, workers)
+        if change is None:
+            return done
+        at = rounds[change.effect]
+        final = settle(change.fitted)
+        if change.rival is None:
+            done = replace(done, final=final, dropped=(*done.dropped, at))
+            continue
+        r = done.rounds[at]
+        first = replace(change.rival, fitted=final, gain=effects[change.effect].gain - change.loss)
+        tried = (first, *(t for t in r.tried if t is not change.rival))
+        rest = (*done.rounds[:at], replace(r, tried=tried), *done.rounds[at + 1 :])
+        done = replace(done, final=final, rounds=rest)
+    return done
+
+
+def _rival(t: Tried, e: Tried) -> bool:
+    """Whether it is near enough to the accepted effect to be tried in its place."""
+    return t.candidate.part is not None and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
 
 
 def _fair_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress) -> Round:
@@ -105,9 +145,10 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     seen = screen(now, every)
     loose = no_news(every)
     news = [s for s in seen.scored if s.candidate.name not in loose]
-    alarm = [s.column for s in news if s.column >= 0]
+    columns = {s.candidate.name: s.column for s in news if s.column >= 0}
+    alarm = list(columns.values())
     if null is None:
-        null = structural_null(now, seen.evidence, alarm, seed, lambda n, of: tell("structural null", n, of))
+        null = structural_null(now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     inflation = now.state.noise.inflation
     base = alone(now, inflation)
     worth, clusters, chosen = shortlist(news, seen.evidence)

@@ -10,7 +10,8 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Workers:
