@@ -161,12 +161,28 @@ class CalibrationProblem:
         )
 
     def _linearised(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
-        free = len(self.unknowns) + self.nuisances.shared
-        per_batch = free * len(self.channels) * (self.inputs.time_s.shape[1] - 1) // self.inputs.every
+        for part in self._together(len(self.unknowns) + self.nuisances.shared):
+            yield from self.only(part)._blocks(x, [nuisance[b] for b in part])
+
+    def columns(self, x: Array, nuisance: Sequence[Array], numbers: Sequence[int]) -> Iterator[Array]:
+        """Derivatives (n_b, k) of every batch's whitened rows by the fitting coordinates of k numbered parameters."""
+        for part in self._together(len(numbers)):
+            some = self.only(part)
+            own = [nuisance[b] for b in part]
+            start, offset = some.own(own)
+            _, *slopes = sensitivities(
+                self.network, self.values_at(x), some.own_heat(own), start, numbers, offsets_K=offset
+            )
+            slope = np.concatenate(slopes, axis=-1)
+            for b, m in enumerate(some.measured):
+                yield (m.of(slope[:, b]) / self.noise[m.channel]).T
+
+    def _together(self, columns: int) -> Iterator[list[int]]:
+        """Numbers of the batches whose derivatives by so many unknowns are held at once."""
+        per_batch = columns * len(self.channels) * (self.inputs.time_s.shape[1] - 1) // self.inputs.every
         together = max(1, MOST_NUMBERS // max(1, per_batch))
         for first in range(0, len(self.measured), together):
-            part = list(range(first, min(first + together, len(self.measured))))
-            yield from self.only(part)._blocks(x, [nuisance[b] for b in part])
+            yield list(range(first, min(first + together, len(self.measured))))
 
     def residuals(self, x: Array, nuisance: Sequence[Array]) -> list[Array]:
         """(measured − simulated) / noise of every batch, (n_b,) each."""

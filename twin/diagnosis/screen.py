@@ -9,6 +9,7 @@ import numpy as np
 
 from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
+from twin.calibration.problem import unknown
 from twin.diagnosis.asleep import Asleep, asleep
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.candidates import candidates
@@ -94,7 +95,6 @@ class _Line:
         own = {u.name: k for k, u in enumerate(fitted.problem.unknowns)}
         waking = sorted({j for js in found.amplitudes.values() for j in js})
         numbers = [j for j in waking if found.network.parameters[j].name not in own]
-        at = {j: k for k, j in enumerate(found.network.free.tolist())}
         loose = {
             numbers.index(found.amplitudes[n][0]): sd
             for n, sd in slack(every, fitted.step_s).items()
@@ -103,9 +103,15 @@ class _Line:
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
         weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+        more = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
+        every_unknown = (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers))
+        columns = range(len(own), len(every_unknown))
+        blocks = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), more, strict=True)  # kept from the fit
         batches = tuple(
-            whitened(block, v, fitted.state.z, problem.unknowns, [at[j] for j in numbers], weight).with_slack(loose)
-            for block, v in zip(problem.linearise(x_of(problem.unknowns, z), nuisance), nuisance, strict=True)
+            whitened(
+                replace(b, jacobian=np.hstack([b.jacobian, m])), v, fitted.state.z, every_unknown, columns, weight
+            ).with_slack(loose)
+            for (b, m), v in zip(blocks, fitted.state.nuisance, strict=True)
         )
         return cls(found, batches, numbers, own)
 
