@@ -169,7 +169,8 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     tried = sorted([*final, *tried[n_final:]], key=_order)
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=_order)])
     if not tried or tried[0].fitted is None:
-        return Round(now, seen, tuple(tried), null.threshold(float(base.base_score()[0])), null, np.zeros(0), False)
+        least = max(null.threshold(float(base.base_score()[0])), LEAST)
+        return Round(now, seen, tuple(tried), least, null, np.zeros(0), False)
     best = tried[0]
     after = alone(tried[0].fitted, inflation)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
