@@ -19,7 +19,7 @@ from twin.diagnosis.fitted import Fitted
 from twin.diagnosis.refined import refined
 
 TWINS = 10  # refined machines
-SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the misfit of each
+SCALES = (0.1, 0.3, 1.0, 2.0, 4.0)  # of the misfit of each: real castings are finer than bars of five cells
 
 
 @dataclass(frozen=True)
