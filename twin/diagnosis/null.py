@@ -49,6 +49,11 @@ class Null:
         """The largest gain (T,) of each machine at that misfit."""
         return np.asarray(self.gain[np.arange(len(self.gain)), self._scale(density)])
 
+    @property
+    def temperature(self) -> float:
+        """Nats of score that count as one: what structure alone scatters by, at least 1."""
+        return float(max(1.0, np.median(self.typical(float(np.median(self.density)))) / 2.0)) if self.gain.size else 1.0
+
     def amplitude_sd(self, name: str, density: float) -> float:
         """How far structure and noise alone scatter a candidate's amplitude; 0 where that is not known."""
         if name not in self.names or len(self.gain) < 2:

@@ -27,12 +27,6 @@ def most_sure(runs: int) -> float:
     return MOST.get(runs, 0.99)
 
 
-def temperature(done: Round) -> float:
-    """Nats of score that count as one: what structure alone scatters by, at least 1."""
-    typical = done.null.typical(float(np.median(done.null.density))) if done.null.gain.size else np.zeros(1)
-    return float(max(1.0, np.median(typical) / 2.0))
-
-
 def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the likeliest first; then of nothing, and of something that is not listed.
 
@@ -40,8 +34,8 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     alone makes decide nothing. Nothing is as likely as what only just reaches the threshold; the unlisted as a
     candidate that gains what noise still leaves to be gained, halved for each that is listed and fits.
     """
-    t = temperature(done)
-    scores = np.array([x.gain + x.log_prior for x in done.tried]) / t
+    t = done.null.temperature
+    scores = np.array([x.standing(t) for x in done.tried])
     nothing = done.threshold / t
     unlisted = (scores.max(initial=nothing)) - np.log(50.0)
     every = np.append(scores, [nothing, unlisted])

@@ -39,6 +39,10 @@ class Tried:
     def candidate(self) -> Candidate:
         return self.scored.candidate
 
+    def standing(self, temperature: float) -> float:
+        """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
+        return self.gain / temperature + self.log_prior
+
 
 def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
     """What is worth a look, its clusters, and the numbers of those to refit, one of each cluster.

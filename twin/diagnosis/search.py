@@ -149,6 +149,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     alarm = list(columns.values())
     if null is None:
         null = structural_null(now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
+    order = _order(null.temperature)
     inflation = now.state.noise.inflation
     base = alone(now, inflation)
     worth, clusters, chosen = shortlist(news, seen.evidence)
@@ -162,12 +163,12 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
         tell("refit", n + 1, len(work))
         if t is not None:
             tried.append(replace(t, cluster=numbers[n]))
-    tried.sort(key=_order)
+    tried.sort(key=order)
     least = HOPEFUL * null.threshold(float(base.base_score()[0]))
     n_final = sum(t.gain > least for t in tried[:FINALISTS])
     final = list(workers.map(partial(taken_on, base, inflation), tried[:n_final]))
-    tried = sorted([*final, *tried[n_final:]], key=_order)
-    tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=_order)])
+    tried = sorted([*final, *tried[n_final:]], key=order)
+    tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
         least = max(null.threshold(float(base.base_score()[0])), LEAST)
         return Round(now, seen, tuple(tried), least, null, np.zeros(0), False)
@@ -186,6 +187,6 @@ def _coarse_first(tried: list[Tried]) -> list[Tried]:
     return finer[:1] + [t for t in tried if t not in finer[:1]]
 
 
-def _order(t: Tried) -> tuple[bool, float]:
-    """Refits first, then by gain and plausible size."""
-    return t.fitted is None, -(t.gain + t.log_prior)
+def _order(temperature: float) -> Callable[[Tried], tuple[bool, float]]:
+    """Refits first, then by what is left-out and plausible."""
+    return lambda t: (t.fitted is None, -t.standing(temperature))

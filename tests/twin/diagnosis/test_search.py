@@ -125,7 +125,7 @@ def test_the_best_is_first_and_slack_is_no_news() -> None:
     for case in ("floor", "scatter"):
         for r in found(case).rounds:
             full = [t for t in r.tried if t.fitted is not None and t.candidate.mechanism != "coarse_network"]
-            order = [t.gain + t.log_prior for t in full]
+            order = [t.standing(r.null.temperature) for t in full]
             assert order == sorted(order, reverse=True)
             assert not {t.candidate.name for t in r.tried} & no_news(proposed(r.before))
 
