@@ -12,8 +12,12 @@ import pytest
 import signatures_heat
 import test_mechanisms as promises
 import test_what_a_diagnosis_needs as needs
+from small_machine import BODIES, machine_with
 
+from twin.diagnosis.asleep import asleep
+from twin.diagnosis.candidates import candidates
 from twin.mechanisms import MECHANISMS
+from twin.schema import twin_part
 
 KEY = "wiper_friction"
 
@@ -46,3 +50,15 @@ def test_the_example_passes(example):
 def test_the_line_in_the_docs_is_how_lines_look(example):
     assert '"wiper_friction": "twin.mechanisms.wipers:WiperFriction",' in example
     assert MECHANISMS[KEY].key == KEY
+
+
+def test_a_diagnosis_considers_it(example):
+    machine = machine_with(MECHANISMS[KEY]())  # it is at work in the first body already
+    part = twin_part(machine)
+    proposed = candidates(machine, part, [KEY])
+    assert [c.name for c in proposed] == [f"{KEY}_{body}_feed_driver" for body in sorted(BODIES[1:])]
+    assert [c.words for c in proposed[:1]] == [f"friction of the wipers: {sorted(BODIES[1:])[0]} (feed_driver)"]
+    found = asleep(machine, part, proposed)
+    assert not found.left_out and set(found.amplitudes) == {c.name for c in proposed}
+    every = candidates(machine, part)
+    assert {c.name for c in proposed} < {c.name for c in every}
