@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def diagnose(
         words += remarks
         done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell)
     final = settle(done.final) if done.accepted else done.final
-    done = Search(done.baseline, final, done.rounds)
+    done = replace(done, final=final)
     tell("left out", 0, 0)
     located = _located(done.baseline, batches, words, tell)
     left = leftover(done, batches, tell)
