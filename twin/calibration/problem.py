@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,10 @@ class CalibrationProblem:
         return cls(
             network, inputs, tuple(measured(network, batches, every_s, channels)), start_degC[0], Nuisances.of(network)
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the last point's blocks, which are long and quickly made anew."""
+        return {**self.__dict__, "_last": {}}
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -107,7 +107,9 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
         "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
         "surrounding": part.surroundings,
     }  # fmt: skip
-    chosen = combinations(groups[target], mechanism.together)
+    chosen = list(combinations(groups[target], mechanism.together))
+    if target == "error" and mechanism.all_errors and len(groups[target]) > 1:
+        chosen.append(tuple(groups[target]))
     return [Site(kind, first, others=tuple(others)) for first, *others in chosen]
 
 

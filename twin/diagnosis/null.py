@@ -51,8 +51,9 @@ class Null:
 
     @property
     def temperature(self) -> float:
-        """Nats of score that count as one: what structure alone scatters by, at least 1."""
-        return float(max(1.0, np.median(self.typical(float(np.median(self.density)))) / 2.0)) if self.gain.size else 1.0
+        """Nats of score that count as one when explanations are compared: a share of what structure alone gains."""
+        typical = self.typical(float(np.median(self.density)))
+        return float(np.clip(np.median(typical) / 4.0, 1.0, 3.0)) if self.gain.size else 1.0
 
     def amplitude_sd(self, name: str, density: float) -> float:
         """How far structure and noise alone scatter a candidate's amplitude; 0 where that is not known."""

@@ -19,6 +19,7 @@ BEST, KINDS = 5, 14  # refits of a round: the best of all, and with the best of 
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80
+SHAPED = 5.0  # nats in the screen that each parameter beside the size must be worth
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
 
     A baseline bent far by what it lacks shows little in the screen, so every mechanism may send its best.
     """
-    worth = [s for s in news if s.gain > WORTH][:LOOKED_AT]
+    worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
     clusters = _clusters(worth, evidence)
     chosen: list[int] = []
     seen: set[str] = set()
@@ -61,6 +62,11 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
             chosen.append(k)
             seen.add(s.candidate.mechanism)
     return worth, clusters, chosen
+
+
+def _promise(s: Scored) -> tuple[float, str]:
+    """Best first; of those that gain alike the one with the least freedom speaks for its cluster."""
+    return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
 
 
 def refit(now: Fitted, base: Evidence, inflation: Array, s: Scored) -> Tried | None:

@@ -85,6 +85,7 @@ class TimeSkew(Mechanism):
     """A channel whose clock is ahead or behind: it shows now what happens `delay` later (earlier, if negative)."""
 
     key = "time_skew"
+    all_errors = True
     words = "clock of a channel against the others"
     equation = "y_m(t) = y(t + delay)"
     source = "Taylor expansion: residual = delay · dy/dt; linear interpolation between samples"

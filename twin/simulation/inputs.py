@@ -47,6 +47,10 @@ class Inputs:
     times: Mapping[str, Array] = field(default_factory=dict)
     kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is worked out once: its keys hold for this process alone."""
+        return {**{k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}, "kept": {}}
+
     @cached_property
     def dt_s(self) -> Array:
         """Interval lengths (B, M)."""
