@@ -118,13 +118,14 @@ def test_the_score_is_the_log_density_of_refits(given: list[Block], seen: Eviden
         volume -= 0.5 * np.linalg.slogdet(covariance(b))[1]
     means = squares / (B * np.array(ROWS) * WEIGHT)
     np.testing.assert_allclose(seen.mean_squares(seen.left_out())[0], means)
-    assert seen.base_score()[0] == pytest.approx(-0.5 * COUNT @ np.log(np.maximum(means, 1.0)) + volume)
+    bent = -0.5 * float(np.sum(refit_without(given, set())[0] ** 2))  # how far from what the machine file says
+    assert seen.base_score()[0] == pytest.approx(-0.5 * COUNT @ np.log(np.maximum(means, 1.0)) + volume + bent)
 
 
 def test_noise_below_the_given_is_not_rewarded(given: list[Block]) -> None:
-    quiet = [replace(b, residual=0.01 * b.residual) for b in given]
-    quieter = [replace(b, residual=0.001 * b.residual) for b in given]
-    assert evidence_of(quiet).base_score()[0] == evidence_of(quieter).base_score()[0]
+    quiet, quieter = (evidence_of([replace(b, residual=share * b.residual) for b in given]) for share in (0.01, 0.001))
+    assert (quiet.mean_squares(quiet.left_out()) > 50 * quieter.mean_squares(quieter.left_out())).all()
+    assert quiet.base_score()[0] == pytest.approx(quieter.base_score()[0], abs=0.01)
 
 
 def test_a_group_left_out_is_predicted_by_all_others(given: list[Block], seen: Evidence) -> None:
