@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
@@ -50,6 +51,7 @@ from twin.schema import TwinPart, twin_part
 Progress = Callable[[str, int, int], None]
 
 
+@threadpool_limits.wrap(limits=1)  # small matrices: more threads cost time, and results must not depend on them
 def diagnose(
     machine: Machine,
     batches: Sequence[Batch],
