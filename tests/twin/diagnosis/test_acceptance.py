@@ -17,14 +17,14 @@ from twin.diagnosis.screen import Scored, alone, proposed, screen
 
 
 def test_the_quantile_of_a_gumbel_distribution() -> None:
-    sample = gumbel_r.rvs(loc=3.0, scale=2.0, size=20000, random_state=0)
+    sample = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=20000, random_state=0))
     for share in (0.5, 0.99):
         assert gumbel(sample, share) == pytest.approx(gumbel_r.ppf(share, loc=3.0, scale=2.0), rel=0.03)
     assert gumbel(sample) == gumbel(sample, 0.99)
 
 
 def test_few_batches_have_few_patterns_of_signs() -> None:
-    gains = gumbel_r.rvs(loc=3.0, scale=2.0, size=FLIPS, random_state=1)
+    gains = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=FLIPS, random_state=1))
     assert flipped_threshold(gains, 4) == gains.max()
     assert flipped_threshold(gains, 8) == gumbel(gains) > np.median(gains)
 

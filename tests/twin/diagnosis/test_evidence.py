@@ -15,7 +15,7 @@ from twin.diagnosis.whitened import whitened
 
 Array = NDArray[np.float64]
 B, ROWS, P, C, Q = 5, (40, 30, 25), 3, 4, 2  # batches, rows of each channel, parameters, columns, nuisances
-CHANNEL = np.repeat(np.arange(len(ROWS)), ROWS)
+CHANNEL: NDArray[np.int64] = np.repeat(np.arange(len(ROWS)), ROWS)
 UNKNOWNS = tuple(Unknown(f"p{k}", "W", 0.0, 0.5 + 0.5 * k, scale="linear") for k in range(P)) + tuple(
     Unknown(f"g{k}", "W", 0.0, 1.0, scale="linear") for k in range(C)
 )
@@ -26,7 +26,7 @@ TRUE = 0.6  # amplitude of the first column
 FAR = 50.0  # bounds of an amplitude
 
 
-def blocks(seed: int = 0, rows: Array = CHANNEL, size: float = 1.0, true: float = TRUE) -> list[Block]:
+def blocks(seed: int = 0, rows: NDArray[np.int64] = CHANNEL, size: float = 1.0, true: float = TRUE) -> list[Block]:
     """Linear recordings: z drawn once, nuisances in every batch, the first column at work; residuals at z = 0."""
     rng = np.random.default_rng(seed)
     z = rng.standard_normal(P)
@@ -174,8 +174,8 @@ def joint_fit(given: list[Block], column: int, without: int | None = None) -> tu
             rows.append(root(b) @ both)
             aims.append(root(b) @ b.residual)
     stacked = np.vstack(rows)
-    z = np.linalg.lstsq(stacked, np.concatenate(aims), rcond=None)[0]
-    return z, np.sqrt(np.diag(np.linalg.inv(stacked.T @ stacked)))
+    z = np.asarray(np.linalg.lstsq(stacked, np.concatenate(aims), rcond=None)[0], float)
+    return z, np.asarray(np.sqrt(np.diag(np.linalg.inv(stacked.T @ stacked))), float)
 
 
 def test_amplitudes_are_those_of_least_squares() -> None:
@@ -192,13 +192,13 @@ def test_gains_are_those_of_refits_with_one_column_more() -> None:
     given = one_channel()
     seen = evidence_of(given)
     scores = seen.scores()
-    before, after, better = 0.0, 0.0, 0
+    before, after, better = np.float64(0.0), np.float64(0.0), 0
     for k, b in enumerate(given):
         left = refit_without(given, {k})[1][0]
         z, _ = joint_fit(given, 0, without=k)
         both = np.column_stack([b.jacobian[:, :P], b.jacobian[:, P]])
         right = root(b) @ (b.residual - both @ z)
-        before, after = before + left @ left, after + right @ right
+        before, after = before + np.sum(left**2), after + np.sum(right**2)
         better += int(right @ right < left @ left)
         assert scores.by_batch[k, 0] == pytest.approx(left @ left - right @ right, rel=0.02)
     n = COUNT[0]

@@ -121,12 +121,14 @@ def own_start_estimated(done: Fitted, k: int, values: Array) -> Array:
     """Measured less simulated of batch k (n_k,) at these parameter values, its own unknowns at their best."""
     one, network = done.problem.only([k]), done.problem.network
     x = np.array([float(network.parameters[j].to_x(values[j])) for j in network.free])
-    own = np.zeros(done.problem.nuisance_sizes[k])
+    own: Array = np.zeros(done.problem.nuisance_sizes[k])
     for _ in range(5):
         (block,) = one.linearise(x, [own])
         weight = done.state.noise.weight[block.channel]
         normal = (block.nuisance.T * weight) @ block.nuisance + np.eye(len(own))
-        own = np.linalg.solve(normal, (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own))
+        own = np.asarray(
+            np.linalg.solve(normal, (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own)), float
+        )
     return one.residuals(x, [own])[0] * done.problem.noise[done.problem.measured[k].channel]
 
 
