@@ -84,7 +84,7 @@ def diagnose(
         recordings = tuple(b.batch_id for b in batches)
         batches, remarks = enough_batches(batches)
         words += remarks
-        done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell)
+        done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
     final = settle(done.final) if done.accepted else done.final
     done = replace(done, final=final)
     tell("left out", 0, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from twin.calibration.fit_problem import Array
 from twin.diagnosis.acceptance import flipped_gains, flipped_threshold, sign_p, stands_out
 from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
-from twin.diagnosis.null import Null, structural_null
+from twin.diagnosis.null import Null
+from twin.diagnosis.null_cache import cached_null
 from twin.diagnosis.refits import Tried, refit, shortlist, taken_on, with_clusters
 from twin.diagnosis.revise import second_thoughts
 from twin.diagnosis.screen import Scored, Screen, alone, proposed, screen
@@ -66,20 +68,26 @@ class Search:
         return tuple(r for k, r in enumerate(self.rounds) if r.accepted and k not in self.dropped)
 
 
-def search(baseline: Fitted, seed: int = 0, workers: Workers | None = None, progress: Progress | None = None) -> Search:
-    """Forward until nothing more is accepted, then second thoughts."""
+def search(
+    baseline: Fitted,
+    seed: int = 0,
+    workers: Workers | None = None,
+    progress: Progress | None = None,
+    cache: Path | None = None,
+) -> Search:
+    """Forward until nothing more is accepted, then second thoughts; `cache` is a folder that keeps structural nulls."""
     tell = progress or (lambda step, n, of: None)
     workers = workers or Workers()
-    return revised(_forward(baseline, seed, workers, tell), workers, tell)
+    return revised(_forward(baseline, seed, workers, tell, cache), workers, tell)
 
 
-def _forward(baseline: Fitted, seed: int, workers: Workers, tell: Progress) -> Search:
+def _forward(baseline: Fitted, seed: int, workers: Workers, tell: Progress, cache: Path | None) -> Search:
     """One effect after the other."""
     now, rounds = baseline, []
     null: Null | None = None
     effects = 0
     while True:
-        done = _fair_round(now, null, seed, workers, tell)
+        done = _fair_round(now, null, seed, workers, tell, cache)
         null = done.null
         rounds.append(done)
         if not rounds[:-1]:
@@ -123,10 +131,12 @@ def _rival(t: Tried, e: Tried) -> bool:
     return t.candidate.part is not None and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
 
 
-def _fair_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress) -> Round:
+def _fair_round(
+    now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress, cache: Path | None
+) -> Round:
     """A round whose baseline fits as well as its best candidate's fit without the candidate: no gain by a start."""
     for _ in range(RESTARTS + 1):
-        done = one_round(now, null, seed, workers, tell)
+        done = one_round(now, null, seed, workers, tell, cache)
         if not done.accepted or done.best is None or done.best.fitted is None:
             return done
         tell("fair baseline", 0, 0)
@@ -135,10 +145,12 @@ def _fair_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tel
         if alone(back, inflation).base_score()[0] < alone(now, inflation).base_score()[0] + BETTER:
             return done
         now, null = back, None
-    return one_round(now, null, seed, workers, tell)
+    return one_round(now, null, seed, workers, tell, cache)
 
 
-def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress) -> Round:
+def one_round(
+    now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress, cache: Path | None = None
+) -> Round:
     """Screen, cluster, refit, score, decide."""
     every = proposed(now)
     tell("screen", 0, 0)
@@ -148,7 +160,7 @@ def one_round(now: Fitted, null: Null | None, seed: int, workers: Workers, tell:
     columns = {s.candidate.name: s.column for s in news if s.column >= 0}
     alarm = list(columns.values())
     if null is None:
-        null = structural_null(now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
+        null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
     inflation = now.state.noise.inflation
     base = alone(now, inflation)
