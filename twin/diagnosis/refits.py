@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data.errors import InputError, WorkError
-from twin.calibration.fit_problem import Array
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.fitted import Fitted, refitted, settle
@@ -69,28 +68,35 @@ def _promise(s: Scored) -> tuple[float, str]:
     return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
 
 
-def refit(now: Fitted, base: Evidence, inflation: Array, s: Scored) -> Tried | None:
+def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
     try:
-        fitted = refitted(now, s.candidate.applied(now.part, values), at)
-        after = alone(fitted, inflation)
+        return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), at)))
     except (InputError, WorkError):
         return None
-    gain = float(after.base_score()[0] - base.base_score()[0])
-    return Tried(s, gain, improved(base, after), 0, log_prior(s, fitted), fitted)
 
 
-def taken_on(base: Evidence, inflation: Array, t: Tried) -> Tried:
+def taken_on(now: Fitted, t: Tried) -> Tried:
     """The same, fitted on to its optimum."""
     assert t.fitted is not None
     try:
-        fitted = settle(t.fitted, steps=4, tolerance=0.05, rounds=2)
-        after = alone(fitted, inflation)
+        return judged(now, replace(t, fitted=settle(t.fitted, steps=4, tolerance=0.05, rounds=2)))
     except (InputError, WorkError):
         return t
-    gain = float(after.base_score()[0] - base.base_score()[0])
-    return replace(t, gain=gain, improved=improved(base, after), log_prior=log_prior(t.scored, fitted), fitted=fitted)
+
+
+def judged(now: Fitted, t: Tried) -> Tried:
+    """A refit with its gain over the fit before.
+
+    Rows that repeat each other count once, for both as in the fit that leaves the whiter residuals: a missing effect
+    makes those of the other repeat themselves (as `twin.calibration.annealing.likelier`).
+    """
+    assert t.fitted is not None
+    inflation = np.minimum(now.state.noise.inflation, t.fitted.state.noise.inflation)
+    before, after = alone(now, inflation), alone(t.fitted, inflation)
+    gain = float(after.base_score()[0] - before.base_score()[0])
+    return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
 
 
 def with_clusters(

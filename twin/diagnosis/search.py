@@ -171,14 +171,14 @@ def one_round(
     work = [worth[k] for k in chosen] + coarse
     numbers = [clusters[k] for k in chosen] + [-1000 - k for k in range(len(coarse))]
     tried: list[Tried] = []
-    for n, t in enumerate(workers.map(partial(refit, now, base, inflation), work)):
+    for n, t in enumerate(workers.map(partial(refit, now), work)):
         tell("refit", n + 1, len(work))
         if t is not None:
             tried.append(replace(t, cluster=numbers[n]))
     tried.sort(key=order)
     least = HOPEFUL * null.threshold(float(base.base_score()[0]))
     n_final = sum(t.gain > least for t in tried[:FINALISTS])
-    final = list(workers.map(partial(taken_on, base, inflation), tried[:n_final]))
+    final = list(workers.map(partial(taken_on, now), tried[:n_final]))
     tried = sorted([*final, *tried[n_final:]], key=order)
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:

@@ -9,7 +9,6 @@ from twin.diagnosis.fitted import Fitted
 from twin.diagnosis.next_experiment import Proposal, next_experiment
 from twin.diagnosis.probability import explanations
 from twin.diagnosis.refits import Tried, refit
-from twin.diagnosis.screen import alone
 from twin.diagnosis.search import Round, Search
 
 CLEAR = 0.9  # above it nothing needs to be told apart
@@ -38,6 +37,5 @@ def settling_run(done: Search, named: Sequence[Round]) -> Proposal | None:
 
 
 def _refitted(r: Round, t: Tried) -> Fitted | None:
-    inflation = r.before.state.noise.inflation
-    done = refit(r.before, alone(r.before, inflation), inflation, t.scored)
+    done = refit(r.before, t.scored)
     return None if done is None else done.fitted

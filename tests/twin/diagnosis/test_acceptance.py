@@ -63,8 +63,7 @@ def drift(rate: str) -> Tried:
     hidden = {"own": {**DRIFT, "parameters": {"rate": rate}}}
     done = fitted(known, runs(known, hidden, count=4))
     c = next(c for c in proposed(done) if c.name == "sensor_drift_t_head")
-    inflation = done.state.noise.inflation
-    tried = refit(done, alone(done, inflation), inflation, Scored(c, 1.0, 4, 0.0, {"rate": 0.0}, 0.01, 0))
+    tried = refit(done, Scored(c, 1.0, 4, 0.0, {"rate": 0.0}, 0.01, 0))
     assert tried is not None
     return tried
 
