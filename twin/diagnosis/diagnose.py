@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from data.machine import Machine
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
 from twin.diagnosis import tables as made
-from twin.diagnosis.baseline import TOLERANCE, baseline
+from twin.diagnosis.baseline import TOLERANCE, baseline, check
 from twin.diagnosis.candidate import Where
 from twin.diagnosis.changes import changed_parts, with_deviations
 from twin.diagnosis.conclude import caps, found_of, rms_of, verdict_of
@@ -70,6 +71,7 @@ def diagnose(
         InputError: batches or a machine file that cannot be used; WorkError: the model fails at the priors' means.
     """
     begun = time.perf_counter()
+    check(machine, batches)
     batches = sorted(batches, key=lambda b: b.batch_id)  # what is drawn for each must not depend on their order
     tell = progress or (lambda step, n, of: None)
     with Workers(processes) as workers:
@@ -85,13 +87,27 @@ def diagnose(
         batches, remarks = enough_batches(batches)
         words += remarks
         done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
-    final = settle(done.final) if done.accepted else done.final
-    done = replace(done, final=final)
-    tell("left out", 0, 0)
-    located = _located(done.baseline, batches, words, tell)
-    left = leftover(done, batches, tell)
+        final = settle(done.final) if done.accepted else done.final
+        done = replace(done, final=final)
+        tell("left out", 0, 0)
+        first = None if final is done.baseline else workers.beside(partial(_map_of, done.baseline, batches))
+        located = _located(final, batches, tell)
+        left = leftover(done, batches, located) if isinstance(located, Located) else None
+        mapped = first() if first is not None else located.map if isinstance(located, Located) else located
+    if isinstance(mapped, str):
+        words.append(f"no map of where and when: {mapped}")
+    mapped_table = None if isinstance(mapped, str) else mapped
     return _diagnosis(
-        machine, part, recordings, done, stages(done), located, left, tuple(words), drafted, time.perf_counter() - begun
+        machine,
+        part,
+        recordings,
+        done,
+        stages(done),
+        mapped_table,
+        left,
+        tuple(words),
+        drafted,
+        time.perf_counter() - begun,
     )
 
 
@@ -101,13 +117,17 @@ def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
     return [(f, left_out_rows(f)) for f in fits]
 
 
-def _located(fitted: Fitted, batches: Sequence[Batch], words: list[str], tell: Progress) -> Located | None:
-    """The map of what the recalibrated baseline cannot explain."""
+def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = None) -> Located | str:
+    """The map of what a fit cannot explain, or why there is none."""
     try:
         return locate(fitted.problem, fitted.x, fitted.state.nuisance, batches, progress=tell)
     except (InputError, WorkError) as error:
-        words.append(f"no map of where and when: {error}")
-        return None
+        return str(error)
+
+
+def _map_of(fitted: Fitted, batches: Sequence[Batch]) -> pd.DataFrame | str:
+    located = _located(fitted, batches)
+    return located if isinstance(located, str) else located.map
 
 
 def _diagnosis(
@@ -116,7 +136,7 @@ def _diagnosis(
     batches: tuple[str, ...],
     done: Search,
     steps: Sequence[tuple[Fitted, LeftOutRows]],
-    located: Located | None,
+    mapped: pd.DataFrame | None,
     left: Leftover | None,
     words: tuple[str, ...],
     drafted: bool,
@@ -160,8 +180,8 @@ def _diagnosis(
         "limits": table,
         "null": made.null_table(last.null),
     }
-    if located is not None:
-        everything["map"] = located.map
+    if mapped is not None:
+        everything["map"] = mapped
     if left is not None:
         everything["flux"] = left.flux
     return Diagnosis(

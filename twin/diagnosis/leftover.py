@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,12 @@ from twin.diagnosis.candidate import Where
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.found import Found as Told
 from twin.diagnosis.found import Rms, place_words
-from twin.diagnosis.honest_digits import Estimate
+from twin.diagnosis.honest_digits import Estimate, listed
 from twin.diagnosis.reconstruct import Reconstruction, reconstruct
 from twin.diagnosis.refits import improved
 from twin.diagnosis.screen import alone
 from twin.diagnosis.search import IMPROVED, Search
-from twin.diagnosis.where_when import Found, Located, locate
+from twin.diagnosis.where_when import Found, Located
 from twin.schema import TwinPart
 
 UNLISTED_SHARE = 0.3  # of the left-out misfit that terms must explain
@@ -68,7 +68,7 @@ class Leftover:
             parameters=own,
             probability=min(0.95, self.terms.improved / self.terms.batches),
             name=self.name if self.fitted is not None else "",
-            beside=self.terms.words,
+            beside=f"it follows {listed([c.term.name for c in self.terms.terms])}",
             regime="at times" if windows else "always",
             windows=windows,
             rms=tuple(rms),
@@ -81,22 +81,17 @@ class Leftover:
                 "explained_share": self.terms.explained,
                 "follows": self.terms.words,
             },
-            size=Estimate(mean, self.place.unit),
+            size=None if self.fitted is not None else Estimate(mean, self.place.unit),
         )
 
 
-def leftover(
-    done: Search, batches: Sequence[Batch], progress: Callable[[str, int, int], None] | None = None
-) -> Leftover | None:
+def leftover(done: Search, batches: Sequence[Batch], located: Located) -> Leftover | None:
     """The strongest place where something regular is left, or None: noise, or what follows nothing known.
 
-    What it follows must predict batches left out as well as a listed mechanism would have to.
+    `located` is of the search's final fit. What it follows must predict batches left out as well as a listed mechanism
+    would have to.
     """
     now, last = done.final, done.rounds[-1]
-    try:
-        located = locate(now.problem, now.x, now.state.nuisance, batches, progress=progress)
-    except (InputError, WorkError):
-        return None
     for place in located.found:
         if place.kind == "sensor":
             continue

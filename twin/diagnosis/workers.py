@@ -52,6 +52,10 @@ class Workers:
         self._sent += 1
         return self._pool.map(partial(_do, path), items)
 
+    def beside(self, work: Callable[[], R]) -> Callable[[], R]:
+        """Work begun in another process while this one goes on; what is returned waits for it."""
+        return work if self._pool is None else self._pool.submit(work).result
+
 
 def _do(path: Path, item: Any) -> Any:
     return _work(path)(item)
