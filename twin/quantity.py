@@ -90,7 +90,8 @@ class Value(BaseModel):
     `spread` is the prior's standard deviation: of the logarithm for positive parameters (0.5 is about a factor 1.6),
     of the value itself, with a unit, for signed ones. A spread frees the parameter; `free: false` holds it all the
     same. `bounds` in the parameter's unit. `per_batch`, on the size of a heat, is how much it differs from run to run:
-    the sd of its logarithm; each batch of a calibration has a deviation of its own, a prediction none. A calibrated file keeps the prior's centre in `prior` and says how sure the value is in `interval90`.
+    the sd of its logarithm; each batch of a calibration has a deviation of its own, a prediction none. A calibrated
+    file keeps the prior's centre in `prior` and says how sure the value is in `interval90`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -228,7 +229,7 @@ def _deviation(path: str, key: str, spec: Spec, given: str | float | None) -> fl
     except ValueError as error:
         raise ValueError(f"{path}.{key}: {error}") from None
     if out <= 0:
-        raise ValueError(f"{path}.{key}: got {given!r}, expected a number above 0 (or leave it out to fix it)")
+        raise ValueError(f"{path}.{key}: got {given!r}, expected a number above 0 (or leave it out)")
     return out
 
 

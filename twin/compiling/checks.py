@@ -22,6 +22,22 @@ def problems(network: Network, part: TwinPart) -> Iterator[str]:
     yield from _islands(network)
     yield from _open_chains(part)
     yield from _pointless(part)
+    yield from _varying(network)
+
+
+def _varying(network: Network) -> Iterator[str]:
+    """Only a number that a heat is proportional to can differ from run to run."""
+    sizes = {
+        law.parameters[name]
+        for law in (h.law for h in network.heats)
+        for name in law.mechanism.off or {}
+        if name in law.parameters and law.mechanism.spec(name).scale == "log"
+    }
+    for j, p in enumerate(network.parameters):
+        if p.per_batch > 0 and j not in sizes:
+            example = next((network.parameters[k].name for k in sorted(sizes)), "mechanisms.NAME.heat")
+            only = "only the size of a heat may differ from run to run"
+            yield f"{p.name}.per_batch: {only}, e.g. {example}; leave it out"
 
 
 def _islands(network: Network) -> Iterator[str]:

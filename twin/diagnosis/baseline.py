@@ -18,6 +18,20 @@ TOLERANCE, STEPS = 1e-2, 40
 ROWS = 60  # of a usual batch, at least: a run of ten minutes is no less a run than one of six hours
 
 
+def check(machine: Machine, batches: Sequence[Batch]) -> None:
+    """Raises InputError: no batches, one of another machine, or the same twice."""
+    if not batches:
+        raise InputError(f"machine {machine.machine}: no batches to diagnose; give recordings")
+    ids = [b.batch_id for b in batches]
+    for batch in batches:
+        if batch.machine != machine.machine:
+            raise InputError(
+                f"batch {batch.batch_id}: is of machine {batch.machine!r}, expected {machine.machine!r}; leave it out"
+            )
+        if ids.count(batch.batch_id) > 1:
+            raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
+
+
 def baseline(
     machine: Machine,
     part: TwinPart,
@@ -32,14 +46,7 @@ def baseline(
         InputError: batches of another machine, twice the same, or that cannot be simulated.
         WorkError: the model fails at the priors' means.
     """
-    ids = [b.batch_id for b in batches]
-    for batch in batches:
-        if batch.machine != machine.machine:
-            raise InputError(
-                f"batch {batch.batch_id}: is of machine {batch.machine!r}, expected {machine.machine!r}; leave it out"
-            )
-        if ids.count(batch.batch_id) > 1:
-            raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
+    check(machine, batches)
     problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
     steps = 0
 

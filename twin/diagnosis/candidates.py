@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 from data.machine import Machine
@@ -38,6 +38,7 @@ class Site:
 def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISMS) -> list[Candidate]:
     """All candidates for a machine, sorted by mechanism and place; those that the file has already are left out."""
     out: dict[str, Candidate] = {}
+    taken = {*part.mechanisms, *part.bodies, *part.surroundings, *part.links}
     for key in keys:
         mechanism: type[Mechanism] = MECHANISMS[key]
         if not mechanism.proposable:
@@ -46,7 +47,10 @@ def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISM
             for site in _sites(part, mechanism, target):
                 for c in _at(machine, part, mechanism, target, site):
                     if _fits(machine, mechanism, c) and not _there_already(part, c):
-                        out.setdefault(c.name, c)
+                        name = c.name
+                        while name in out or name in taken:  # names of places may run into each other
+                            name += "_"
+                        out[name] = replace(c, name=name)
     return [out[name] for name in sorted(out)]
 
 

@@ -1,4 +1,4 @@
-"""How probable each explanation is, from left-out scores: the candidates of a round, nothing, and what is not listed."""
+"""How probable each explanation is: the candidates of a round, nothing, and what is not listed."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the likeliest first; then of nothing, and of something that is not listed.
 
     A tempered posterior over left-out scores (pseudo-Bayes, Geisser and Eddy 1979): differences below what structure
-    alone makes decide nothing. Nothing is as likely as what only just reaches the threshold; the unlisted as a
-    candidate that gains what noise still leaves to be gained, halved for each that is listed and fits.
+    alone makes decide nothing. Nothing is as likely as what only just reaches the threshold; what is
+    not listed as one in fifty of the best that is.
     """
     t = done.null.temperature
     scores = np.array([x.standing(t) for x in done.tried])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data.errors import InputError, WorkError
+from twin.calibration.fit_problem import Array
 from twin.diagnosis.candidate import Candidate
 from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.fitted import Fitted, refitted, settle
@@ -86,17 +87,26 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
         return t
 
 
-def judged(now: Fitted, t: Tried) -> Tried:
+def judged(now: Fitted, t: Tried, inflation: Array | None = None) -> Tried:
     """A refit with its gain over the fit before.
 
     Rows that repeat each other count once, for both as in the fit that leaves the whiter residuals: a missing effect
-    makes those of the other repeat themselves (as `twin.calibration.annealing.likelier`).
+    makes those of the other repeat themselves (as `twin.calibration.annealing.likelier`). `inflation` (K,) says
+    otherwise.
     """
     assert t.fitted is not None
-    inflation = np.minimum(now.state.noise.inflation, t.fitted.state.noise.inflation)
+    if inflation is None:
+        inflation = np.minimum(now.state.noise.inflation, t.fitted.state.noise.inflation)
     before, after = alone(now, inflation), alone(t.fitted, inflation)
     gain = float(after.base_score()[0] - before.base_score()[0])
     return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
+
+
+def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
+    """All with rows counted alike, as in the whitest of them: else the whiter would win by the count."""
+    whitest = [now.state.noise.inflation, *(t.fitted.state.noise.inflation for t in finalists if t.fitted)]
+    inflation = np.min(whitest, axis=0)
+    return [judged(now, t, inflation) for t in finalists]
 
 
 def with_clusters(
@@ -109,7 +119,7 @@ def with_clusters(
         if k not in chosen and clusters[k] in best_in:
             like = best_in[clusters[k]]
             gain = like.gain - max(0.0, like.scored.gain - s.gain)
-            out.append(Tried(s, gain, s.improved, clusters[k], log_prior(s, None)))
+            out.append(Tried(s, gain, s.improved, clusters[k], log_prior(s, like.fitted)))
     return out
 
 

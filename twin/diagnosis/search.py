@@ -15,7 +15,7 @@ from twin.diagnosis.coarse import coarse_candidates
 from twin.diagnosis.fitted import Fitted, refitted, settle
 from twin.diagnosis.null import Null
 from twin.diagnosis.null_cache import cached_null
-from twin.diagnosis.refits import Tried, refit, shortlist, taken_on, with_clusters
+from twin.diagnosis.refits import Tried, compared, refit, shortlist, taken_on, with_clusters
 from twin.diagnosis.revise import second_thoughts
 from twin.diagnosis.screen import Scored, Screen, alone, proposed, screen
 from twin.diagnosis.slack import no_news
@@ -178,7 +178,7 @@ def one_round(
     tried.sort(key=order)
     least = HOPEFUL * null.threshold(float(base.base_score()[0]))
     n_final = sum(t.gain > least for t in tried[:FINALISTS])
-    final = list(workers.map(partial(taken_on, now), tried[:n_final]))
+    final = compared(now, list(workers.map(partial(taken_on, now), tried[:n_final])))
     tried = sorted([*final, *tried[n_final:]], key=order)
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:

@@ -223,7 +223,7 @@ def test_the_same_run_twice() -> None:
 
 
 def test_no_runs_at_all() -> None:
-    with pytest.raises(InputError, match="machine two_bodies: no batches to simulate; name at least one"):
+    with pytest.raises(InputError, match="machine two_bodies: no batches to diagnose; give recordings"):
         diagnose(two_bodies(), [])
 
 
