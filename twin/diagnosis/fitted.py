@@ -70,6 +70,8 @@ def refitted(
 ) -> Fitted:
     """The same recordings fitted by a changed twin part, from the old fit; `at` gives values where to begin.
 
+    What is new begins otherwise at its value in the part, which is its prior's centre where that is not stated.
+
     The noise is estimated again before every step, so that a channel which the old fit had given up counts again.
 
     Raises:
@@ -78,10 +80,14 @@ def refitted(
     network = compile_network(old.machine, part=part)
     problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
     z = carried_z(old.problem, problem, old.state.z)
+    known = {u.name for u in old.problem.unknowns}
     for k, u in enumerate(problem.unknowns):
-        if at and u.name in at:
-            p = network.parameters[network.index(u.name)]
-            z[k] = (float(p.to_x(at[u.name])) - u.prior) / u.spread
+        p = network.parameters[network.index(u.name)]
+        begin = at.get(u.name) if at else None
+        if begin is None and u.name not in known:
+            begin = p.value
+        if begin is not None:
+            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
     z = np.clip(z, *z_bounds(problem.unknowns))
     nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
     state = State.at(problem, z, nuisance, old.state.noise)

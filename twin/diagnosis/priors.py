@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.machine_size import at_size, size_of
 from twin.diagnosis.screen import Scored
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value
@@ -33,11 +34,15 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
     mechanism = MECHANISMS[c.mechanism]
     values: dict[str, Value] = {}
     at: dict[str, float] = {}
+    size = size_of(now)
     for amplitude, off in (mechanism.off or {}).items():
-        spec = mechanism.spec(amplitude)
+        spec = at_size(mechanism.spec(amplitude), size)
         begin = off + s.amplitudes.get(amplitude, 0.0)
         values[amplitude], begin = _free(spec, off, begin)
         at[f"mechanisms.{c.name}.{amplitude}"] = begin
+        if "expand" in mechanism.effects():  # it stands elsewhere in the network, under another name
+            usual = values[amplitude].value
+            values[amplitude] = values[amplitude].model_copy(update={"value": _said(begin, spec.unit), "prior": usual})
     for name in c.shape:
         spec = mechanism.spec(name)
         values[name] = Value(value=_said(spec.value, spec.unit), spread=_spread(spec), bounds=_bounds(spec))
@@ -99,9 +104,10 @@ def log_prior(s: Scored, fitted: Fitted | None) -> float:
         return 0.0
     mechanism = MECHANISMS[c.mechanism]
     freedom = -FREEDOM * len(c.shape)
+    size = size_of(fitted) if fitted is not None else 1.0
     out = 0.0
     for amplitude, off in (mechanism.off or {}).items():
-        spec = mechanism.spec(amplitude)
+        spec = at_size(mechanism.spec(amplitude), size)
         value = off + s.amplitudes.get(amplitude, 0.0)
         name = f"mechanisms.{c.name}.{amplitude}"
         if fitted is not None and any(p.name == name for p in fitted.problem.network.parameters):
