@@ -11,7 +11,7 @@ from data.batch import Batch
 from twin.calibration.fit_problem import Array
 from twin.calibration.problem import CalibrationProblem, Nuisances
 from twin.network import Network
-from twin.simulation.inputs import inputs_of
+from twin.simulation.inputs import Inputs, inputs_of
 
 _NO_PIECES: Mapping[str, str] = {}
 
@@ -28,7 +28,9 @@ def on_network(
     A new body starts as the one that it is linked with most strongly; with `free_starts` each batch may say otherwise.
     `pieces` of a body, {piece: body}, start with it: a piece that started as it liked would be a store of its own.
     """
-    inputs = inputs_of(network, list(batches)).refined(problem.inputs.every)
+    inputs = problem.inputs
+    if not _drives(inputs, network):
+        inputs = inputs_of(network, list(batches)).refined(inputs.every)
     start = np.full((problem.inputs.n_batches, network.n_cells), np.nan)
     nuisances = Nuisances.of(network)
     start_K = nuisances.start_K.copy()
@@ -44,6 +46,14 @@ def on_network(
             if len(start_K) and (not free_starts or name in pieces):
                 start_K[k] = 0.0
     return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
+
+
+def _drives(inputs: Inputs, network: Network) -> bool:
+    """Whether inputs of another network hold all that drives this one: what was worked out of them serves again."""
+    recorded = {s.channel for s in network.surroundings if s.channel}
+    first = {*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)}
+    drivers = set(network.drivers) <= set(inputs.drivers)
+    return drivers and recorded == set(inputs.recorded) and first <= set(inputs.first)
 
 
 def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
