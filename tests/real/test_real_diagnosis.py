@@ -1,0 +1,206 @@
+"""Diagnoses of real recordings: what is taken from a machine file that is known to fit comes back, or is not claimed.
+
+The board's effects hide each other: what its neighbour conducts to a heater, the common supply takes from it. No single
+one gains enough to be claimed from four short runs, so the order is that of forward refits, each beside the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from data.batch import Batch
+from data.checks import check_batch, check_machine
+from data.machine import Machine, load_machine
+from data.recording import read_batches, recording_files
+from twin.diagnosis.baseline import baseline
+from twin.diagnosis.diagnose import diagnose
+from twin.diagnosis.diagnosis import Diagnosis
+from twin.diagnosis.draft import drafted_part
+from twin.diagnosis.fitted import Fitted, settle
+from twin.diagnosis.refits import refit
+from twin.diagnosis.screen import proposed, screen
+from twin.diagnosis.where_when import Found, Located, locate
+from twin.quantity import Value
+from twin.schema import twin_part
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
+OF_THE_BOARD = ("heat_bridge_heater1_heater2", "supply_sag_heat1_heater2", "supply_sag_heat2_heater1")
+OF_NO_BOARD = ("cutting_fluid", "jacket_chiller", "natural_convection", "radiation")
+
+
+@cache
+def recorded(name: str, folder: str, step_s: float) -> tuple[Machine, tuple[Batch, ...]]:
+    """Machine file on a grid of `step_s` and every run in the folder."""
+    if not (DATA / folder).is_dir():
+        pytest.skip(f"no ../shared/data/{folder}")
+    given = load_machine(ROOT / "machines" / f"{name}.yml")
+    machine = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
+    files, _ = recording_files(DATA / folder, machine)
+    found = [b for f in files for b in read_batches(f, machine)]
+    return machine, tuple(check_machine([b.with_findings(check_batch(b, machine)) for b in found], machine))
+
+
+def with_twin(machine: Machine, **parts: Any) -> Machine:
+    assert machine.twin is not None
+    return machine.model_copy(update={"twin": {**machine.twin, **parts}})
+
+
+def bare_board(machine: Machine) -> Machine:
+    """Two bodies that know nothing of each other, and sensors that show them at once."""
+    twin = machine.twin or {}
+    return with_twin(
+        machine,
+        links={},
+        mechanisms={n: m for n, m in twin["mechanisms"].items() if m["law"] != "supply_sag"},
+        sensors={n: {"at": s["at"], "noise": s["noise"]} for n, s in twin["sensors"].items()},
+    )
+
+
+def bare_cell(machine: Machine) -> Machine:
+    """Joule heat and thermal expansion."""
+    twin = machine.twin or {}
+    joule = {
+        "law": "ohmic_heat", "drivers": {"current": "current"}, "at": "core", "into": "core",
+        "parameters": {"resistance": {"value": "25 mohm", "spread": 0.7}},
+    }  # fmt: skip
+    growth = {"chain": [{"body": "can", "gain": {"value": "10 um/m/K", "spread": "20 um/m/K"}}], "noise": "1.1 um/m"}
+    mechanisms = {"heat": joule, "loss": twin["mechanisms"]["loss"]}
+    return with_twin(machine, mechanisms=mechanisms, errors={"hoop_strain": growth})
+
+
+@cache
+def board() -> Fitted:
+    machine, batches = recorded("tclab_board", "tclab", 2.0)
+    bare = bare_board(machine)
+    return baseline(bare, twin_part(bare), batches)
+
+
+@cache
+def forward(steps: int) -> tuple[list[str], Fitted]:
+    """Names in the order in which they add most to the score of runs left out, and the last fit."""
+    now, names = board(), []
+    for _ in range(steps):
+        every = {s.candidate.name: s for s in screen(now, proposed(now)).scored}
+        wanted = [s for n, s in every.items() if n in OF_THE_BOARD or s.candidate.mechanism in OF_NO_BOARD]
+        tried = [t for s in wanted if (t := refit(now, s)) is not None and t.fitted is not None]
+        best = max(tried, key=lambda t: t.gain)
+        assert best.fitted is not None
+        names.append(best.candidate.name)
+        now = settle(best.fitted)
+    return names, now
+
+
+def value(fitted: Fitted, ending: str) -> float:
+    return float(fitted.values[next(k for k, p in enumerate(fitted.problem.network.parameters) if ending in p.name)])
+
+
+def test_a_run_of_ten_minutes_is_looked_at_sixty_times() -> None:
+    rows = [np.bincount(m.channel) for m in board().problem.measured]
+    assert all((r >= 55).all() and (r <= 70).all() for r in rows)
+
+
+def test_the_board_comes_back_in_the_order_of_what_it_matters() -> None:
+    names, fitted = forward(3)
+    assert names == ["supply_sag_heat1_heater2", "heat_bridge_heater1_heater2", "supply_sag_heat2_heater1"]
+    assert 0.001 < value(fitted, "heat_bridge_heater1_heater2.conductance") < 0.01  # W/K; 6 mW/K where lags are known
+    assert 0.15 < value(fitted, "supply_sag_heat1_heater2.sag") < 0.4
+    assert 0.15 < value(fitted, "supply_sag_heat2_heater1.sag") < 0.6
+
+
+def test_of_the_board_nothing_is_claimed_that_boards_do_not_have() -> None:
+    machine, batches = recorded("tclab_board", "tclab", 2.0)
+    found = diagnose(bare_board(machine), list(batches))
+    claimed = {f.mechanism for f in found.findings.findings}
+    assert claimed <= {"heat_bridge", "supply_sag", "varies_between_runs", "sensor_lag", "free_flux"}
+    assert all(f.probability <= 0.9 for f in found.findings.findings)  # four runs
+
+
+@pytest.mark.xfail(strict=True, reason="no single effect of the board gains enough, and what is left passes for noise")
+def test_thirty_times_the_noise_is_not_called_noise() -> None:
+    machine, batches = recorded("tclab_board", "tclab", 2.0)
+    found = diagnose(bare_board(machine), list(batches)).findings
+    left = found.fit.left_out_rms
+    assert left.after["temperature2_K"] < 5.0 * left.noise_floor["temperature2_K"] or found.verdict != "consistent"
+
+
+def diagnosed_cell(*rates: str) -> Diagnosis:
+    machine, batches = recorded("cell_30q", "cell_30q", 10.0)
+    return diagnose(bare_cell(machine), [b for b in batches if b.batch_id[-2:] in rates])
+
+
+def test_the_cell_lacks_its_lost_voltage_and_its_charge_and_both_hold_at_rates_left_out() -> None:
+    """As far as they do: at 4C the can is 0.3 K off, thirty times its noise, and the strain 15 um/m."""
+    found = diagnosed_cell("1C", "2C", "3C", "4C")
+    named = {(f.mechanism, f.where.name) for f in found.findings.findings}
+    assert named == {("charge_strain", "hoop_strain"), ("voltage_loss_heat", "core")}
+    rms = found.tables["rms"].set_index(["channel", "batch"])
+    can, strain = rms.loc["can"], rms.loc["hoop_strain"]
+    assert (can["after"] < 0.4 * can["before"]).all() and can["after"].max() < 0.45  # K
+    assert (strain["after"] < 0.2 * strain["before"]).all() and strain["after"].max() < 20.0  # um/m
+    assert can["after"].idxmax() == strain["after"].idxmax() == "Q30_S001_4C"
+
+
+def test_two_rates_are_too_few_to_be_sure_and_it_says_so() -> None:
+    found = diagnosed_cell("2C", "4C")
+    assert found.words and "2 runs only" in found.words[0]
+    assert all(f.probability <= 0.9 for f in found.findings.findings)
+    assert found.findings.batches == ("Q30_S001_2C", "Q30_S001_4C")
+
+
+@cache
+def spindle_without_its_speed() -> tuple[Located, Mapping[str, tuple[np.ndarray, np.ndarray]]]:
+    """Located by a network whose structure the speed helped to draft, without that heat; and the speed by run."""
+    machine, batches = recorded("spindle_fl", "spindle_fl", 60.0)
+    part = drafted_part(machine.model_copy(update={"twin": None}), batches, max_bodies=3).part
+    first = next(iter(part.bodies))  # without a known heat one capacity sets the scale
+    capacity = part.bodies[first].capacity
+    assert capacity is not None
+    held = part.bodies[first].model_copy(update={"capacity": Value(value=capacity.value)})
+    part = part.model_copy(update={"mechanisms": {}, "bodies": {**part.bodies, first: held}})
+    blind = machine.model_copy(
+        update={"channels": {n: c for n, c in machine.channels.items() if n != "spindle_rpm"}, "twin": None}
+    )
+    blind = blind.model_copy(update={"recording": blind.recording.model_copy(update={"split": None})})
+    seen = [
+        replace(
+            b,
+            channels={n: c for n, c in b.channels.items() if n != "spindle_rpm"},
+            table=b.table.drop(columns=["spindle_rpm"]),
+        )
+        for b in batches
+    ]
+    fitted = baseline(blind, part, seen)
+    return locate(fitted.problem, fitted.x, fitted.state.nuisance, seen), {
+        b.batch_id: (b.time_s, b.values("spindle_rpm")) for b in batches
+    }
+
+
+def beside_speed(
+    located: Located, found: Found, speed: Mapping[str, tuple[np.ndarray, np.ndarray]]
+) -> list[np.ndarray]:
+    """By run (2, K): the speed's mean about every knot and the reconstructed series there."""
+    out = []
+    for k, (time_s, rpm) in enumerate(speed.values()):
+        hats = located.point.hats.at(time_s)
+        covered = hats.sum(axis=0) > 0.3 * hats.sum(axis=0).max()
+        mean = (hats.T @ rpm)[covered] / hats.sum(axis=0)[covered]
+        out.append(np.array([mean, found.series.mean[k][covered]]))
+    return out
+
+
+def test_the_withheld_speed_is_found_as_heat_that_follows_it() -> None:
+    located, speed = spindle_without_its_speed()
+    heat = next(f for f in located.found if f.kind == "heat")
+    pairs = beside_speed(located, heat, speed)
+    together = np.hstack(pairs)
+    assert together.shape[1] > 80
+    assert np.corrcoef(together)[0, 1] > 0.8
+    assert min(np.corrcoef(p)[0, 1] for p in pairs) > 0.7  # within every run as well
