@@ -21,8 +21,8 @@ from twin.schema import Body, Link
 SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
-SHORTCUTS = 3  # from one neighbour to another, best conducting first
-THROUGH = 2  # links of a body that heat may enter a piece through
+SHORTCUTS = 1  # from one neighbour to another, the best conducting two
+THROUGH = 1  # links of a body that heat may enter a piece through, the best conducting
 FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
 
