@@ -26,13 +26,17 @@ def stated(given: Machine) -> dict[str, Any]:
     return given.twin
 
 
-def test_it_is_proposed_once_for_every_pair_without_a_link() -> None:
+def test_it_is_proposed_once_for_every_pair_without_a_link_or_a_common_neighbour() -> None:
     bare = machine()
-    stated(bare)["mechanisms"].pop("tried")
+    bridge = stated(bare)["mechanisms"].pop("tried")
+    assert candidates(bare, twin_part(bare), ["heat_bridge"]) == []  # first and third: a bridge would pass by second
+    stated(bare)["bodies"]["fourth"] = {"capacity": "5 kJ/K", "material": "steel"}
+    stated(bare)["links"]["third-fourth"] = "6 W/K"
     (only,) = candidates(bare, twin_part(bare), ["heat_bridge"])
-    assert (only.name, only.where.name) == ("heat_bridge_first_third", "first")
-    assert only.part is not None and only.part.at == ENDS
-    assert candidates(machine(), twin_part(machine()), ["heat_bridge"]) == []  # it is there already
+    assert (only.name, only.where.name) == ("heat_bridge_first_fourth", "first")
+    assert only.part is not None and only.part.at == {"body": "first", "other": "fourth"}
+    stated(bare)["mechanisms"]["there"] = {**bridge, "at": only.part.at}
+    assert candidates(bare, twin_part(bare), ["heat_bridge"]) == []
 
 
 def test_it_becomes_a_link_with_its_value_and_prior() -> None:
