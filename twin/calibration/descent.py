@@ -82,7 +82,8 @@ class State:
 
 def x_of(unknowns: Sequence[Unknown], z: Array) -> Array:
     """Fitting coordinates x (p,) at z (p,), never outside the bounds by rounding."""
-    return np.array([np.clip(u.prior + u.spread * v, u.low, u.high) for u, v in zip(unknowns, z, strict=True)])
+    prior, spread, low, high = np.array([(u.prior, u.spread, u.low, u.high) for u in unknowns]).reshape(-1, 4).T
+    return np.clip(prior + spread * z, low, high)
 
 
 def z_bounds(unknowns: Sequence[Unknown]) -> tuple[Array, Array]:

@@ -33,11 +33,11 @@ class Fitted:
     state: State
     runs: int = 0  # that the batches come from, where they are blocks of fewer
 
-    @property
+    @cached_property
     def x(self) -> Array:
         return x_of(self.problem.unknowns, self.state.z)
 
-    @property
+    @cached_property
     def values(self) -> Array:
         """Parameter values (n,) of the network."""
         return self.problem.values_at(self.x)

@@ -26,7 +26,8 @@ SHAPED = 5.0  # nats in the screen that each parameter beside the size must be w
 class Tried:
     """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
 
-    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size.
+    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size. `alike` is the
+    gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the threshold.
     """
 
     scored: Scored
@@ -35,6 +36,7 @@ class Tried:
     cluster: int
     log_prior: float
     fitted: Fitted | None = None
+    alike: float | None = None
 
     @property
     def candidate(self) -> Candidate:
@@ -42,7 +44,7 @@ class Tried:
 
     def standing(self, temperature: float) -> float:
         """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
-        return self.gain / temperature + self.log_prior
+        return (self.gain if self.alike is None else self.alike) / temperature + self.log_prior
 
 
 def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
@@ -103,10 +105,10 @@ def judged(now: Fitted, t: Tried, inflation: Array | None = None) -> Tried:
 
 
 def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
-    """All with rows counted alike, as in the whitest of them: else the whiter would win by the count."""
+    """All with their gains where rows count alike, as in the whitest of them: else the whiter would win by the count."""
     whitest = [now.state.noise.inflation, *(t.fitted.state.noise.inflation for t in finalists if t.fitted)]
     inflation = np.min(whitest, axis=0)
-    return [judged(now, t, inflation) for t in finalists]
+    return [replace(t, alike=judged(now, t, inflation).gain) for t in finalists]
 
 
 def with_clusters(
