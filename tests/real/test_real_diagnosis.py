@@ -123,7 +123,6 @@ def test_of_the_board_nothing_is_claimed_that_boards_do_not_have() -> None:
     assert all(f.probability <= 0.9 for f in found.findings.findings)  # four runs
 
 
-@pytest.mark.xfail(strict=True, reason="no single effect of the board gains enough, and what is left passes for noise")
 def test_thirty_times_the_noise_is_not_called_noise() -> None:
     machine, batches = recorded("tclab_board", "tclab", 2.0)
     found = diagnose(bare_board(machine), list(batches)).findings

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.batch import Batch
 from twin.calibration.fit_problem import Array
@@ -79,7 +80,7 @@ def _names(problem: CalibrationProblem) -> list[str]:
     return bodies + air + varying
 
 
-def _beside(network: Network, start: Array, cells: Array) -> Array:
+def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
     """The start temperature (B,) of the known cell that new ones are linked with most strongly."""
     conductance = -network.conductance_W_per_K(network.values)[cells].sum(axis=0)
     conductance[np.isnan(start[0])] = -np.inf

@@ -16,11 +16,14 @@ from twin.diagnosis.fitted import Fitted
 from twin.diagnosis.found import Found, Other, Rms, beside_words, place_words
 from twin.diagnosis.honest_digits import Estimate
 from twin.diagnosis.probability import Explanation, explanations, most_sure, told
+from twin.diagnosis.screen import alone
 from twin.diagnosis.search import Round, Search
 from twin.diagnosis.unseen import unseen
 from twin.mechanisms import MECHANISMS
 from twin.schema import TwinPart
 
+REST = 3.0  # times what structure leaves: beyond it something is left, whatever it is
+AS_IT_IS = 2  # the scale of a refined machine's misfit that is its own
 SURE = 0.7  # below it the best explanation does not stand by itself
 
 
@@ -130,7 +133,7 @@ def _parameters(
 def _widened(i: Interval, parameter: str, done: Round) -> Estimate:
     """The interval of an amplitude, as wide as refined machines scatter it: a lumped network does not know better."""
     best = done.best
-    if best is None or parameter not in best.candidate.amplitudes:
+    if best is None or list(best.candidate.amplitudes) != [parameter]:  # several trade with each other
         return Estimate(i.value, i.unit, i.low, i.high)
     density = float(np.median(done.null.density))
     sd = Z90 * done.null.amplitude_sd(best.candidate.name, density)
@@ -164,10 +167,19 @@ def caps(n: int) -> tuple[str, ...]:
     return () if n >= 6 else (f"{n} runs only",)
 
 
-def verdict_of(search: Search, found: Sequence[Found], more: bool) -> Verdict:
-    """`more`: what is left over follows something that no listed mechanism is."""
+def remainder(search: Search) -> float:
+    """Left-out errors after all that was found over what structure alone leaves, the median over channels."""
+    final, null = search.final, search.rounds[-1].null
+    left = alone(final, final.state.noise.inflation)
+    seen = left.mean_squares(left.left_out())[0]
+    structure = np.median(null.mean_squares[:, AS_IT_IS], axis=0)
+    return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
+
+
+def verdict_of(found: Sequence[Found], more: bool, rest: float) -> Verdict:
+    """`more`: what is left over follows something that no listed mechanism is; `rest`: `remainder`."""
     if not found:
-        return "unlisted" if more else "consistent"
+        return "unlisted" if more else "undecidable" if rest > REST else "consistent"
     if found[0].probability < SURE and found[0].tied:
         return "undecidable"
-    return "partly_explained" if more else "explained"
+    return "partly_explained" if more or rest > REST else "explained"

@@ -22,7 +22,7 @@ from twin.diagnosis import tables as made
 from twin.diagnosis.baseline import TOLERANCE, baseline, check
 from twin.diagnosis.candidate import Where
 from twin.diagnosis.changes import changed_parts, with_deviations
-from twin.diagnosis.conclude import caps, found_of, rms_of, verdict_of
+from twin.diagnosis.conclude import REST, caps, found_of, remainder, rms_of, verdict_of
 from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.draft import drafted_part
 from twin.diagnosis.findings import (
@@ -36,7 +36,7 @@ from twin.diagnosis.findings import (
     Refinement,
 )
 from twin.diagnosis.fitted import Fitted, settle
-from twin.diagnosis.found import Rms, place_words
+from twin.diagnosis.found import UNLISTED, Rms, place_words
 from twin.diagnosis.leftover import Leftover, leftover
 from twin.diagnosis.limits import limits
 from twin.diagnosis.next_experiment import Proposal
@@ -161,7 +161,13 @@ def _diagnosis(
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    verdict = verdict_of(done, [f for f in found if f.mechanism not in ("free_flux", "free_shift")], left is not None)
+    rest = remainder(done)
+    listed = [f for f in found if f.mechanism not in UNLISTED]
+    verdict = verdict_of(listed, left is not None, rest)
+    if rest > REST:
+        words += (
+            f"left-out errors are {rest:.1f} times what a coarse network alone would leave (median over channels)",
+        )
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
     told = _limits_told(table)

@@ -115,7 +115,7 @@ class Evidence:
 
     def mean_squares(self, left: Sequence[Array]) -> Array:
         """Left-out mean squares (R, K) in units of the given noise's variance; nan where a channel has no rows."""
-        total = sum(self._by_channel(b, e**2) for b, e in zip(self.batches, left, strict=True)).T
+        total = np.sum([self._by_channel(b, e**2) for b, e in zip(self.batches, left, strict=True)], axis=0).T
         return np.asarray(np.where(self.rows > 0, total / np.maximum(self._least, TINY), np.nan))
 
     def base_score(self, targets: Sequence[Array] | None = None) -> Array:
@@ -140,7 +140,7 @@ class Evidence:
         chosen = set(group)
         rest = [b for k, b in enumerate(self.batches) if k not in chosen]
         own = sum(b.jacobian.T @ b.jacobian for b in rest) + np.eye(self.batches[0].jacobian.shape[1])
-        z = cho_solve(cho_factor(own), sum(b.jacobian.T @ b.target for b in rest))
+        z = cho_solve(cho_factor(own), np.sum([b.jacobian.T @ b.target for b in rest], axis=0))
         square, least = np.zeros(len(self.rows)), np.zeros(len(self.rows))
         for k in group:
             b = self.batches[k]

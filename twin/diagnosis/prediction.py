@@ -46,7 +46,7 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
         moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
         scaled = block.nuisance * w.scale[:, None]
         normal = scaled.T @ scaled + np.eye(scaled.shape[1])
-        nuisance = np.linalg.solve(normal, scaled.T @ (moved * w.scale))
+        nuisance: Array = np.asarray(np.linalg.solve(normal, scaled.T @ (moved * w.scale)), float)
         one = problem.only([k])
         residual = one.residuals(x_of(problem.unknowns, z), [nuisance])[0]
         m = problem.measured[k]

@@ -143,7 +143,7 @@ def _clusters(worth: Sequence[Scored], evidence: Evidence) -> list[int]:
     like = evidence.likeness(columns) if columns else np.zeros((0, 0))
     place = {c: k for k, c in enumerate(columns)}
     heads: list[int] = []
-    out = []
+    out: list[int] = []
     for s in worth:
         if s.column < 0:
             out.append(-1 - len(out))

@@ -23,8 +23,8 @@ from twin.diagnosis.workers import Workers
 
 MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
-# refined twin has gave up to 22.
-LEAST = 25.0
+# refined twin has gave up to 35.
+LEAST = 40.0
 IMPROVED = 0.75  # share of the left-out batches that must improve
 RESTARTS = 2  # of a round, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
