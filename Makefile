@@ -23,6 +23,7 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks.twin
 	$(BIN)/python -m benchmarks.calibration
 	$(BIN)/python -m benchmarks.twin_families
+	$(BIN)/python -m benchmarks.diagnosis
 
 clean:
 	rm -rf .venv var .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -199,7 +199,7 @@ class Evidence:
         )  # fmt: skip
 
     def own_gain(self, columns: Sequence[Array]) -> float:
-        """What it gains, in nats, that each batch has one more unknown of its own of prior N(0, 1), B columns (n_b,)."""
+        """What it gains, in nats, that each batch has one more unknown of its own, of prior N(0, 1); B columns."""
         batches = tuple(b.with_own(c) for b, c in zip(self.batches, columns, strict=True))
         own = replace(self, batches=batches, low=self.low[:0], high=self.high[:0])
         return float(own.base_score()[0] - self.base_score()[0])

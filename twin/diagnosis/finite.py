@@ -25,10 +25,8 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
         if c.amplitudes or c.part is None:
             continue
         try:
-            if c.mechanism == "sensor_swap":
-                change = _exchanged(fitted, c, before)
-            else:
-                change = _difference(fitted, c, before)
+            of = _exchanged if c.mechanism == "sensor_swap" else _difference
+            change = of(fitted, c, before)
         except (InputError, WorkError) as error:
             left_out[c.name] = str(error)
             continue

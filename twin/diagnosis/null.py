@@ -35,10 +35,10 @@ class Null:
     names: tuple[str, ...] = ()
 
     def threshold(self, density: float, share: float = 0.99) -> float:
-        """The gain that structure alone exceeds in 1 - share of the cases, where it may leave as much as `density` says.
+        """The gain that structure alone exceeds in 1 - share of the cases, where it leaves no more than `density` says.
 
-        Of each machine counts the largest misfit that predicts left-out batches no worse. As
-        there are few, a Gumbel distribution goes through their mean and spread.
+        Of each machine counts the largest misfit that predicts left-out batches no worse. As there are few, a Gumbel
+        distribution goes through their mean and spread.
         """
         gain = self.typical(density)
         if len(gain) < 2:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -38,7 +39,7 @@ def _cut(batch: Batch, n: int) -> list[Batch]:
         return [batch]
     edges = np.linspace(0, batch.n_rows, n + 1).astype(int)
     out = []
-    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (a, b) in enumerate(pairwise(edges)):
         first_s = float(batch.time_s[a])
         table = batch.table.iloc[a:b].reset_index(drop=True)
         table["time_s"] = table["time_s"] - first_s

@@ -105,7 +105,7 @@ def judged(now: Fitted, t: Tried, inflation: Array | None = None) -> Tried:
 
 
 def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
-    """All with their gains where rows count alike, as in the whitest of them: else the whiter would win by the count."""
+    """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
     whitest = [now.state.noise.inflation, *(t.fitted.state.noise.inflation for t in finalists if t.fitted)]
     inflation = np.min(whitest, axis=0)
     return [replace(t, alike=judged(now, t, inflation).gain) for t in finalists]

@@ -78,7 +78,7 @@ class Mechanism(ABC):
     together: ClassVar[int] = 1  # how many targets one instance acts on
     all_errors: ClassVar[bool] = False  # True: one instrument shows all errors, so it may act on all of them together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
-    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one of it explains
+    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one explains
     only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 
