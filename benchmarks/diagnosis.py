@@ -25,15 +25,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from twin.calibration.descent import State
-from twin.diagnosis.rounds.baseline import baseline
-from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.diagnose import diagnose
+from twin.diagnosis.places.where_when import locate
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import TWINS, structural_null
 from twin.diagnosis.rounds.refits import refit, shortlist
-from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
-from twin.diagnosis.places.where_when import locate
 from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
 from twin.plants.plant import Case, draw
 from twin.schema import twin_part
 

@@ -22,8 +22,8 @@ from pipelines.settings import Settings, home
 from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.findings import Findings, as_json
-from twin.diagnosis.machine_file import diagnosed_text, drafted_text
+from twin.diagnosis.telling.findings import Findings, as_json
+from twin.diagnosis.writing.machine_file import diagnosed_text, drafted_text
 
 Say = Callable[[str], None]
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"

@@ -14,7 +14,7 @@ from pipelines.report import diagnosis_words as words
 from pipelines.report.diagnosis_extracts import by_channel
 from pipelines.report.words import count, number
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.findings import Finding
+from twin.diagnosis.telling.findings import Finding
 
 _WHAT = {
     REPORT: "the report, one page",

@@ -15,7 +15,7 @@ from pipelines.report.diagnosis_parts import Part, diagnosis_parts
 from pipelines.report.words import number
 from pipelines.report.write import template_environment
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.findings import Finding
+from twin.diagnosis.telling.findings import Finding
 
 _MOST_FIGURES, _TELLING = 3, 0.1  # a change by the noise floor
 _DRAFTED = (

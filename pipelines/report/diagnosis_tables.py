@@ -12,7 +12,7 @@ from pipelines.report.diagnosis_words import UNITS, probability_words, where_wor
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.twin_tables import quantity
 from pipelines.report.words import NOTHING, between, number, percent
-from twin.diagnosis.findings import Finding, FoundParameter
+from twin.diagnosis.telling.findings import Finding, FoundParameter
 
 _MOST_CANDIDATES, _MOST_CHANNELS = 12, 10
 

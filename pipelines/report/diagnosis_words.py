@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipelines.report.words import count, listed, number
-from twin.diagnosis.findings import NextExperiment
-from twin.diagnosis.statement import LIKELY, SURE
+from twin.diagnosis.telling.findings import NextExperiment
+from twin.diagnosis.telling.statement import LIKELY, SURE
 
 # Mastrandrea et al. 2010, IPCC guidance note on uncertainties, table 1: lower bound of the probability, its words.
 _LIKELIHOOD = (

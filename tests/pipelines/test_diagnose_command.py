@@ -19,7 +19,7 @@ from data.machine import load_machine
 from pipelines import diagnosing
 from twin.compile import compile_network
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.findings import read_findings
+from twin.diagnosis.telling.findings import read_findings
 from twin.schema import twin_part
 
 NAME = "sample-diagnosed"

@@ -15,7 +15,7 @@ from models.crossing import Plan
 from pipelines import diagnosing, training
 from pipelines.diagnosis_tracking import diagnoses
 from pipelines.request import TrainRequest
-from twin.diagnosis.findings import read_findings
+from twin.diagnosis.telling.findings import read_findings
 
 SMALL = Plan(("none",), ("zero",), ("leave-batch-out",))
 

@@ -21,7 +21,7 @@ from pipelines.report import diagnosis_tables
 from pipelines.report.diagnosis_report import diagnosis_page, write_diagnosis_report
 from pipelines.report.diagnosis_words import GLOSSARY, METHOD, headline, likelihood, probability_words
 from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
-from twin.diagnosis.findings import Findings
+from twin.diagnosis.telling.findings import Findings
 
 VERDICTS = {
     "consistent": ("consistent", "Consistent: the remaining error is the noise."),

@@ -11,7 +11,7 @@ import pandas as pd
 
 from data.machine import Machine, load_machine
 from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
-from twin.diagnosis.findings import Findings, rms_key
+from twin.diagnosis.telling.findings import Findings, rms_key
 from twin.schema import TwinPart, twin_part
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"

@@ -19,14 +19,14 @@ from data.batch import Batch
 from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
-from twin.diagnosis.baseline import baseline
 from twin.diagnosis.diagnose import diagnose
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.draft import drafted_part
-from twin.diagnosis.fitted import Fitted, settle
-from twin.diagnosis.refits import refit
-from twin.diagnosis.screen import proposed, screen
-from twin.diagnosis.where_when import Found, Located, locate
+from twin.diagnosis.drafting.draft import drafted_part
+from twin.diagnosis.places.where_when import Found, Located, locate
+from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.fitted import Fitted, settle
+from twin.diagnosis.rounds.refits import refit
+from twin.diagnosis.scoring.screen import proposed, screen
 from twin.quantity import Value
 from twin.schema import twin_part
 

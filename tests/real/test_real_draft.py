@@ -15,8 +15,8 @@ from data.recording import read_batches, recording_files
 from twin.calibration.left_out import free_running_rms
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.diagnosis.draft import Drafted, drafted_part
-from twin.diagnosis.drafting_rows import rows_of
+from twin.diagnosis.drafting.draft import Drafted, drafted_part
+from twin.diagnosis.drafting.rows import rows_of
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

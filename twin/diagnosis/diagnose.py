@@ -18,14 +18,23 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
-from twin.diagnosis import tables as made
-from twin.diagnosis.baseline import TOLERANCE, baseline, check
-from twin.diagnosis.candidate import Where
-from twin.diagnosis.changes import changed_parts, with_deviations
-from twin.diagnosis.conclude import REST, caps, found_of, remainder, rms_of, verdict_of
 from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.draft import drafted_part
-from twin.diagnosis.findings import (
+from twin.diagnosis.drafting.draft import drafted_part
+from twin.diagnosis.next_run.next_experiment import Proposal
+from twin.diagnosis.next_run.settling import settling_run
+from twin.diagnosis.places.leftover import Leftover, leftover
+from twin.diagnosis.places.where_when import Located, locate
+from twin.diagnosis.proposals.candidate import Where
+from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
+from twin.diagnosis.rounds.fitted import Fitted, settle
+from twin.diagnosis.rounds.parts_of_batches import enough_batches
+from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
+from twin.diagnosis.rounds.search import Round, Search, search
+from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.scoring.limits import limits
+from twin.diagnosis.telling import tables as made
+from twin.diagnosis.telling.conclude import REST, caps, found_of, remainder, rms_of, verdict_of
+from twin.diagnosis.telling.findings import (
     DetectionLimit,
     Finding,
     Findings,
@@ -35,18 +44,9 @@ from twin.diagnosis.findings import (
     Place,
     Refinement,
 )
-from twin.diagnosis.fitted import Fitted, settle
-from twin.diagnosis.found import UNLISTED, Rms, place_words
-from twin.diagnosis.leftover import Leftover, leftover
-from twin.diagnosis.limits import limits
-from twin.diagnosis.next_experiment import Proposal
-from twin.diagnosis.parts_of_batches import enough_batches
-from twin.diagnosis.prediction import LeftOutRows, left_out_rows
-from twin.diagnosis.search import Round, Search, search
-from twin.diagnosis.settling import settling_run
-from twin.diagnosis.statement import finding_of, verdict_statement
-from twin.diagnosis.where_when import Located, locate
-from twin.diagnosis.workers import Workers
+from twin.diagnosis.telling.found import UNLISTED, Rms, place_words
+from twin.diagnosis.telling.statement import finding_of, verdict_statement
+from twin.diagnosis.writing.changes import changed_parts, with_deviations
 from twin.schema import TwinPart, twin_part
 
 Progress = Callable[[str, int, int], None]

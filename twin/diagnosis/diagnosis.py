@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from data.machine import Machine
 from twin.calibration.identifiability import Interval
-from twin.diagnosis.findings import Findings
+from twin.diagnosis.telling.findings import Findings
 from twin.network import Network
 from twin.schema import TwinPart
 
@@ -39,7 +39,7 @@ class Diagnosis:
     the recordings come from a simulation. `drafted`: the machine file had no twin part. `words` are remarks: what was
     refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
 
-    For the machine file, as `twin.diagnosis.machine_file.diagnosed_text` takes them: `network` of `part_after`, fitted
+    For the machine file, as `twin.diagnosis.writing.machine_file.diagnosed_text` takes them: `network` of `part_after`, fitted
     `values` and `intervals` of its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the
     next run as a run plan (YAML), None where there is none.
     """

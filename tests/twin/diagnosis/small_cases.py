@@ -14,8 +14,8 @@ from data.machine import Machine
 from tests.twin.machines import TWO_BODIES, machine
 from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.compile import compile_network
-from twin.diagnosis.baseline import baseline
-from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.fitted import Fitted
 from twin.schema import twin_part
 
 FLOOR = {"law": "floor_sink", "at": {"body": "head", "room": "room"}, "into": "head"}

@@ -10,10 +10,10 @@ from scipy.stats import binomtest, gumbel_r
 
 from tests.twin.diagnosis.small_cases import DRIFT, consistent, fitted, runs, two_bodies
 from twin.calibration.identifiability import Z90
-from twin.diagnosis.acceptance import FLIPS, flipped_gains, flipped_threshold, gumbel, sign_p, stands_out
-from twin.diagnosis.fitted import Fitted
-from twin.diagnosis.refits import Tried, refit
-from twin.diagnosis.screen import Scored, alone, proposed, screen
+from twin.diagnosis.rounds.acceptance import FLIPS, flipped_gains, flipped_threshold, gumbel, sign_p, stands_out
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.refits import Tried, refit
+from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 
 
 def test_the_quantile_of_a_gumbel_distribution() -> None:

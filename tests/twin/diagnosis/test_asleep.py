@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from data.machine import Machine
 from tests.twin.diagnosis.small_cases import driven, equipped, four_bodies, two_bodies
 from twin.compile import compile_network
-from twin.diagnosis.asleep import asleep
-from twin.diagnosis.candidate import Candidate, Where
-from twin.diagnosis.candidates import candidates
+from twin.diagnosis.proposals.candidate import Candidate, Where
+from twin.diagnosis.proposals.candidates import candidates
+from twin.diagnosis.scoring.asleep import asleep
 from twin.mechanisms import MECHANISMS
 from twin.network import Network
 from twin.quantity import Value

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from data.machine import Machine
-from twin.diagnosis.asleep import asleep
-from twin.diagnosis.candidates import candidates
+from twin.diagnosis.proposals.candidates import candidates
+from twin.diagnosis.scoring.asleep import asleep
 from twin.schema import twin_part
 
 

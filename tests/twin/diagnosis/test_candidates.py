@@ -15,10 +15,10 @@ from data.machine import Machine, load_machine, parse_machine
 from data.registry import Registry
 from tests.twin.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network
-from twin.diagnosis.candidate import Candidate
-from twin.diagnosis.candidates import candidates, linked
-from twin.diagnosis.rivals import rivals
-from twin.diagnosis.search import search
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.candidates import candidates, linked
+from twin.diagnosis.proposals.rivals import rivals
+from twin.diagnosis.rounds.search import search
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Array, Mechanism, View
 from twin.quantity import Spec

@@ -13,8 +13,8 @@ from tests.twin.diagnosis.small_cases import fitted, runs, two_bodies
 from twin.calibration.descent import x_of
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
-from twin.diagnosis.fitted import Fitted, refitted
+from twin.diagnosis.rounds.fitted import Fitted, refitted
+from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
 from twin.quantity import Value
 from twin.schema import Body, Link, MechanismPart, TwinPart
 

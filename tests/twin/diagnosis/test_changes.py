@@ -9,8 +9,8 @@ import pytest
 
 from tests.twin.diagnosis.small_cases import FLOOR, fitted, runs, two_bodies
 from twin.compile import compile_network
-from twin.diagnosis.changes import changed_parts, deviations, with_deviations
-from twin.diagnosis.fitted import Fitted
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.writing.changes import changed_parts, deviations, with_deviations
 from twin.quantity import Value
 from twin.schema import Body, MechanismPart, TwinPart, twin_part
 

@@ -20,7 +20,7 @@ from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.compile import compile_network
 from twin.diagnosis.diagnose import diagnose
 from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
-from twin.diagnosis.findings import Findings
+from twin.diagnosis.telling.findings import Findings
 from twin.schema import twin_part
 
 LAMP = {"law": "cabinet_heat", "into": "shaft", "parameters": {"heat": "100 W"}}

@@ -21,9 +21,9 @@ from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
 from twin.calibration import calibrate
 from twin.compile import compile_network
-from twin.diagnosis.draft import Drafted, drafted_part
-from twin.diagnosis.drafting_guess import Balance, guess
-from twin.diagnosis.drafting_heats import plain_names
+from twin.diagnosis.drafting.draft import Drafted, drafted_part
+from twin.diagnosis.drafting.guess import Balance, guess
+from twin.diagnosis.drafting.heats import plain_names
 from twin.schema import TwinPart
 
 ROOT = Path(__file__).parents[3]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from twin.calibration.fit_problem import Block, Unknown
-from twin.diagnosis.evidence import Evidence
-from twin.diagnosis.whitened import whitened
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.whitened import whitened
 
 Array = NDArray[np.float64]
 B, ROWS, P, C, Q = 5, (40, 30, 25), 3, 4, 2  # batches, rows of each channel, parameters, columns, nuisances

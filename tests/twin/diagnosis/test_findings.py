@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from data.errors import InputError
-from twin.diagnosis.findings import Findings, as_json, read_findings, rms_key
+from twin.diagnosis.telling.findings import Findings, as_json, read_findings, rms_key
 
 BED = {"kind": "node", "name": "bed"}
 RAW: dict[str, Any] = {

@@ -13,9 +13,9 @@ from tests.twin.diagnosis.small_cases import FLOOR, cold_floor, consistent, fitt
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
 from twin.calibration.left_out import LeftOut, leave_batch_out
-from twin.diagnosis.coarse import coarse_candidates
-from twin.diagnosis.fitted import Fitted, pieces_of, refitted, settle
-from twin.diagnosis.prediction import LeftOutRows, left_out_rows
+from twin.diagnosis.proposals.coarse import coarse_candidates
+from twin.diagnosis.rounds.fitted import Fitted, pieces_of, refitted, settle
+from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
 from twin.quantity import Value
 from twin.schema import MechanismPart, TwinPart
 

@@ -9,10 +9,10 @@ from tests.twin.diagnosis.concealed import CHAIN, Case, case, coolant, empty, fl
 from tests.twin.machines import machine
 from twin.calibration.fit_noise import Noise
 from twin.compile import compile_network
-from twin.diagnosis.fit_rows import FitRows
-from twin.diagnosis.forced import ForcedNetwork, Hats
-from twin.diagnosis.place_search import Held, PlaceSearch
-from twin.diagnosis.point import Point
+from twin.diagnosis.places.fit_rows import FitRows
+from twin.diagnosis.places.forced import ForcedNetwork, Hats
+from twin.diagnosis.places.place_search import Held, PlaceSearch
+from twin.diagnosis.places.point import Point
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
 

@@ -12,9 +12,9 @@ import pytest
 
 from tests.twin.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
 from twin.diagnosis.diagnosis import COLUMNS
-from twin.diagnosis.limits import SURE, limits
-from twin.diagnosis.refits import WORTH
-from twin.diagnosis.screen import Scored, Screen, proposed, screen
+from twin.diagnosis.rounds.refits import WORTH
+from twin.diagnosis.scoring.limits import SURE, limits
+from twin.diagnosis.scoring.screen import Scored, Screen, proposed, screen
 from twin.mechanisms import MECHANISMS
 
 THRESHOLD = 25.0

@@ -17,9 +17,9 @@ from twin.calibration.calibrated_file import Origin, calibrated_text
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network
 from twin.compiling.own_paths import own_paths
-from twin.diagnosis import machine_file
-from twin.diagnosis.machine_file import diagnosed_text, drafted_text
-from twin.diagnosis.yaml_entry import with_comment, with_entry
+from twin.diagnosis.writing import machine_file
+from twin.diagnosis.writing.machine_file import diagnosed_text, drafted_text
+from twin.diagnosis.writing.yaml_entry import with_comment, with_entry
 from twin.network import Network
 from twin.quantity import Value
 from twin.schema import Body, Link, MechanismPart, Sensor, TwinPart, twin_part

@@ -9,11 +9,11 @@ import pytest
 
 from tests.twin.diagnosis.small_cases import FLOOR, cold_floor, four_bodies
 from twin.compile import compile_network
-from twin.diagnosis.candidates import candidates
-from twin.diagnosis.fitted import Fitted, refitted
-from twin.diagnosis.machine_size import TYPICAL_W_PER_K, at_size, size_of
-from twin.diagnosis.priors import log_prior, start_values
-from twin.diagnosis.screen import Scored
+from twin.diagnosis.proposals.candidates import candidates
+from twin.diagnosis.proposals.machine_size import TYPICAL_W_PER_K, at_size, size_of
+from twin.diagnosis.proposals.priors import log_prior, start_values
+from twin.diagnosis.rounds.fitted import Fitted, refitted
+from twin.diagnosis.scoring.screen import Scored
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Value, convert
 from twin.schema import MechanismPart, twin_part

@@ -21,10 +21,10 @@ from tests.twin.recordings import empty_batches, recorded
 from twin.calibration.least_squares import settled
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.diagnosis.fitted import Fitted
-from twin.diagnosis.foreseen import _floating, _Model, begun, foreseen
-from twin.diagnosis.menu import Run, menu
-from twin.diagnosis.next_experiment import COLUMNS, SETTLES, TELLS, Proposal, next_experiment
+from twin.diagnosis.next_run.foreseen import _floating, _Model, begun, foreseen
+from twin.diagnosis.next_run.menu import Run, menu
+from twin.diagnosis.next_run.next_experiment import COLUMNS, SETTLES, TELLS, Proposal, next_experiment
+from twin.diagnosis.rounds.fitted import Fitted
 from twin.run_plan import RunPlan, load_run_plan
 from twin.run_plan.stages import Stage
 from twin.schema import twin_part

@@ -11,11 +11,11 @@ import pytest
 from tests.twin.diagnosis.small_cases import consistent, fitted, four_bodies, runs
 from twin.calibration.descent import x_of
 from twin.compile import compile_network
-from twin.diagnosis.carried import carried_nuisances, carried_z, on_network
-from twin.diagnosis.fitted import Fitted
-from twin.diagnosis.null import SCALES, TWINS, Null, structural_null
-from twin.diagnosis.refined import CELLS, refined
-from twin.diagnosis.screen import Screen, proposed, screen
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.null import SCALES, TWINS, Null, structural_null
+from twin.diagnosis.rounds.refined import CELLS, refined
+from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.scoring.screen import Screen, proposed, screen
 
 
 @cache

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import twin.diagnosis.null_cache as null_cache
+import twin.diagnosis.rounds.null_cache as null_cache
 from tests.twin.diagnosis.small_cases import consistent
-from twin.diagnosis.evidence import Evidence
-from twin.diagnosis.fitted import Fitted
-from twin.diagnosis.null import Null, structural_null
-from twin.diagnosis.null_cache import MOST, cached_null
-from twin.diagnosis.screen import proposed, screen
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.null import Null, structural_null
+from twin.diagnosis.rounds.null_cache import MOST, cached_null
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.screen import proposed, screen
 
 
 @cache

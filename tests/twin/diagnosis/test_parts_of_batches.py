@@ -10,7 +10,7 @@ import pytest
 
 from data.batch import Batch, Finding
 from tests.twin.diagnosis.small_cases import runs, two_bodies
-from twin.diagnosis.parts_of_batches import ENOUGH, SHORTEST_ROWS, enough_batches
+from twin.diagnosis.rounds.parts_of_batches import ENOUGH, SHORTEST_ROWS, enough_batches
 
 
 def some(count: int) -> list[Batch]:

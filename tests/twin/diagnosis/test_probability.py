@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin.diagnosis.null import Null
-from twin.diagnosis.probability import LEAST, MOST, explanations, most_sure, told
-from twin.diagnosis.refits import Tried
-from twin.diagnosis.search import Round
+from twin.diagnosis.rounds.null import Null
+from twin.diagnosis.rounds.probability import LEAST, MOST, explanations, most_sure, told
+from twin.diagnosis.rounds.refits import Tried
+from twin.diagnosis.rounds.search import Round
 
 THRESHOLD = 10.0
 

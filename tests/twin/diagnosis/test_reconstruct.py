@@ -12,9 +12,9 @@ from tests.twin.diagnosis.concealed import Case, calibrated, case, flux, shift
 from twin.calibration.least_squares import fit
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.diagnosis.left_out_terms import LeftOutTerms
-from twin.diagnosis.reconstruct import Reconstruction, reconstruct
-from twin.diagnosis.where_when import locate
+from twin.diagnosis.places.left_out_terms import LeftOutTerms
+from twin.diagnosis.places.reconstruct import Reconstruction, reconstruct
+from twin.diagnosis.places.where_when import locate
 from twin.schema import MechanismPart, twin_part
 
 

@@ -14,10 +14,10 @@ from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
-from twin.diagnosis.screen import proposed
-from twin.diagnosis.search import IMPROVED, LEAST, Round, Search, one_round, search
-from twin.diagnosis.slack import no_news
-from twin.diagnosis.workers import Workers
+from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search, one_round, search
+from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.scoring.screen import proposed
 
 COUNT = 8
 COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}

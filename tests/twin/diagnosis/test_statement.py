@@ -14,12 +14,12 @@ from typing import ClassVar
 import pytest
 
 from data.machine import load_machine
-from twin.diagnosis.candidate import Kind, Where
-from twin.diagnosis.equation import equation_with_numbers
-from twin.diagnosis.findings import DetectionLimit, Place
-from twin.diagnosis.found import Found, Other, Rms, beside_words, place_words
-from twin.diagnosis.honest_digits import Estimate, amount, as_given, few, percent
-from twin.diagnosis.statement import claim_words, falls, finding_of, statement, verdict_statement
+from twin.diagnosis.proposals.candidate import Kind, Where
+from twin.diagnosis.telling.equation import equation_with_numbers
+from twin.diagnosis.telling.findings import DetectionLimit, Place
+from twin.diagnosis.telling.found import Found, Other, Rms, beside_words, place_words
+from twin.diagnosis.telling.honest_digits import Estimate, amount, as_given, few, percent
+from twin.diagnosis.telling.statement import claim_words, falls, finding_of, statement, verdict_statement
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, Target
 from twin.quantity import Spec

@@ -8,7 +8,7 @@ import pytest
 
 from tests.twin.diagnosis.small_cases import equipped, four_bodies, two_bodies
 from twin.compile import compile_network
-from twin.diagnosis.values_of_part import with_value
+from twin.diagnosis.proposals.values_of_part import with_value
 from twin.quantity import Parameter
 from twin.schema import TwinPart, twin_part
 
@@ -85,7 +85,7 @@ def test_what_no_file_states_cannot_be_changed_there() -> None:
 
 
 def test_a_wrong_parameter_of_every_rival_can_be_freed() -> None:
-    from twin.diagnosis.rivals import rivals
+    from twin.diagnosis.proposals.rivals import rivals
 
     for machine in (MACHINE, four_bodies(), equipped()):
         network, part = compile_network(machine), twin_part(machine)

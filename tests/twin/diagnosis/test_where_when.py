@@ -12,8 +12,8 @@ import pytest
 from data.errors import InputError
 from tests.twin.diagnosis.concealed import BODIES, Case, calibrated, case, coolant, flux, shift
 from twin.diagnosis.diagnosis import COLUMNS
-from twin.diagnosis.regimes import regimes_of
-from twin.diagnosis.where_when import RANKING, Located, locate
+from twin.diagnosis.places.regimes import regimes_of
+from twin.diagnosis.places.where_when import RANKING, Located, locate
 
 WATTS = 30.0
 

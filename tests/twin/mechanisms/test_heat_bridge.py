@@ -10,7 +10,7 @@ from small_machine import machine_with
 from data.errors import InputError
 from data.machine import Machine
 from twin.compile import compile_network, expanded
-from twin.diagnosis.candidates import candidates
+from twin.diagnosis.proposals.candidates import candidates
 from twin.mechanisms.heat_bridge import HeatBridge
 from twin.schema import twin_part
 

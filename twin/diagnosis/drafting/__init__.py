@@ -1,0 +1,1 @@
+"""The simplest network that recordings support, where a machine file has no twin part."""

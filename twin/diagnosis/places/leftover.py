@@ -1,0 +1,126 @@
+"""What is left over after the search: does it follow something that no listed mechanism is?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from twin.calibration.identifiability import Interval
+from twin.diagnosis.places.reconstruct import Reconstruction, reconstruct
+from twin.diagnosis.places.where_when import Found, Located
+from twin.diagnosis.proposals.candidate import Where
+from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
+from twin.diagnosis.rounds.refits import improved
+from twin.diagnosis.rounds.search import IMPROVED, Search
+from twin.diagnosis.scoring.screen import alone
+from twin.diagnosis.telling.found import Found as Told
+from twin.diagnosis.telling.found import Rms, place_words
+from twin.diagnosis.telling.honest_digits import Estimate, listed
+from twin.schema import TwinPart
+
+UNLISTED_SHARE = 0.3  # of the left-out misfit that terms must explain
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """An effect of no listed mechanism: its place and series, what it follows, and the network with it, if it can be
+    stated; `gain` in nats on batches left out, against `threshold`."""
+
+    located: Located
+    place: Found
+    terms: Reconstruction
+    gain: float
+    threshold: float
+    fitted: Fitted | None
+
+    @property
+    def flux(self) -> pd.DataFrame:
+        return self.located.flux
+
+    @property
+    def name(self) -> str:
+        return f"unlisted_{self.terms.place}"
+
+    def found(
+        self, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], caps: tuple[str, ...]
+    ) -> Told:
+        """As a finding: the words "no listed mechanism", the regression, the watts."""
+        heat = self.terms.kind == "heat"
+        where = Where("node" if heat else "error", self.terms.place)
+        own = {c.term.name: Estimate(c.value, c.unit, c.value - 1.64 * c.sd, c.value + 1.64 * c.sd)
+               for c in self.terms.terms}  # fmt: skip
+        if self.fitted is not None:
+            head = f"mechanisms.{self.name}."
+            stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
+            own = {n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()} or own
+        series = self.place.series.mean
+        mean = float(np.sqrt(np.mean(series**2)))
+        windows = tuple(self.located.windows(self.place))
+        return Told(
+            mechanism="free_flux" if heat else "free_shift",
+            where=where,
+            place=place_words(where, part),
+            parameters=own,
+            probability=min(0.95, self.terms.improved / self.terms.batches),
+            name=self.name if self.fitted is not None else "",
+            beside=f"it follows {listed([c.term.name for c in self.terms.terms])}",
+            regime="at times" if windows else "always",
+            windows=windows,
+            rms=tuple(rms),
+            caps=caps,
+            evidence={
+                "gain_nats": self.gain,
+                "threshold_nats": self.threshold,
+                "batches_improved": self.terms.improved,
+                "batches": self.terms.batches,
+                "explained_share": self.terms.explained,
+                "follows": self.terms.words,
+            },
+            size=None if self.fitted is not None else Estimate(mean, self.place.unit),
+        )
+
+
+def leftover(done: Search, batches: Sequence[Batch], located: Located) -> Leftover | None:
+    """The strongest place where something regular is left, or None: noise, or what follows nothing known.
+
+    `located` is of the search's final fit. What it follows must predict batches left out as well as a listed mechanism
+    would have to.
+    """
+    now, last = done.final, done.rounds[-1]
+    for place in located.found:
+        if place.kind == "sensor":
+            continue
+        try:
+            terms = reconstruct(located, batches, place)
+        except (InputError, WorkError):
+            continue
+        if not terms.terms or terms.explained < UNLISTED_SHARE or terms.improved < IMPROVED * len(batches):
+            continue
+        threshold = last.threshold
+        stated = _stated(now, terms)
+        if stated is None:
+            continue
+        fitted, gain, better = stated
+        if gain > threshold and better >= IMPROVED * len(batches):
+            return Leftover(located, place, terms, gain, threshold, fitted)
+    return None
+
+
+def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, int] | None:
+    """The network with the effect as a free-form mechanism, refitted, and its gain; None where no form states it."""
+    if terms.part is None:
+        return None
+    name = f"unlisted_{terms.place}"
+    part = now.part.model_copy(update={"mechanisms": {**now.part.mechanisms, name: terms.part}})
+    inflation = now.state.noise.inflation
+    try:
+        fitted = settle(refitted(now, part))
+        before, after = alone(now, inflation), alone(fitted, inflation)
+    except (InputError, WorkError):
+        return None
+    return fitted, float(after.base_score()[0] - before.base_score()[0]), improved(before, after)

@@ -1,0 +1,125 @@
+"""The rival "the network is too coarse here": a piece of its own around a sensor, with or without a neighbour's heat.
+
+A sensor in a big casting sees what is near it first. A local node of part of the casting's capacity behind a free
+conductance is the least refinement that can lag, and lead where a neighbour's heat enters through it; a far one lets
+the sensor's body answer at once and settle slowly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+from twin.diagnosis.proposals.candidate import Candidate, Where
+from twin.diagnosis.proposals.candidates import linked
+from twin.diagnosis.rounds.fitted import FAR, NEAR, Fitted
+from twin.quantity import Value
+from twin.schema import Body, Link
+
+SHARE = 0.15  # of the body's capacity
+STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
+SPREAD = 1.0  # of the logarithm of both
+SHORTCUTS = 1  # from one neighbour to another, the best conducting two
+THROUGH = 1  # links of a body that heat may enter a piece through, the best conducting
+FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
+
+
+def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, worse: float = 9.0) -> list[Candidate]:
+    """Refinements at the sensors whose left-out mean square (in units of the given noise's) is `worse` and largest."""
+    names = [r.channel for r in fitted.problem.network.readings]
+    ranked = sorted(range(len(names)), key=lambda k: -np.nan_to_num(mean_squares[k]))
+    out = []
+    for k in ranked[:most]:
+        if mean_squares[k] > worse:
+            out += list(_of_sensor(fitted, names[k]))
+    return out
+
+
+def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
+    part, network = fitted.part, fitted.problem.network
+    sensor = part.sensors[channel]
+    body = sensor.at.partition("@")[0]
+    near = f"{channel}{NEAR}"
+    if near in part.bodies or part.bodies[body].shape != "lump":
+        return
+    cell = int(network.bodies[body][0])
+    capacity = float(network.capacity_J_per_K(fitted.values)[cell])
+    leaves = float(network.conductance_W_per_K(fitted.values)[cell, cell])
+    piece = {
+        f"bodies.{near}": Body(
+            capacity=Value(value=f"{SHARE * capacity:.4g} J/K", spread=SPREAD),
+            material=part.bodies[body].material,
+            words=f"{part.bodies[body].words or body}, near the sensor {channel}",
+        ),
+        f"links.{near}-{body}": Link(
+            between=(near, body), conductance=Value(value=f"{STIFF * leaves:.4g} W/K", spread=SPREAD)
+        ),
+        f"sensors.{channel}": sensor.model_copy(update={"at": near}),
+    }
+    where = Where("sensor", channel)
+    yield from _shortcuts(fitted, body, channel, where, leaves)
+    far = f"{channel}{FAR}"
+    if far not in part.bodies:
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_far",
+            f"a piece of the {body} far from {channel}",
+            parts={
+                f"bodies.{far}": Body(
+                    capacity=Value(value=f"{FAR_SHARE * capacity:.4g} J/K", spread=SPREAD),
+                    material=part.bodies[body].material,
+                    words=f"{part.bodies[body].words or body}, far from the sensor {channel}",
+                ),
+                f"links.{far}-{body}": Link(
+                    between=(far, body), conductance=Value(value=f"{leaves:.4g} W/K", spread=SPREAD)
+                ),
+            },
+        )
+    words = f"a piece of the {body} of its own around {channel}"
+    yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
+    ranked = sorted(part.links, key=lambda k: -_conductance(fitted, k))  # heat comes through the best ones
+    for key in [k for k in ranked if body in _ends(part.links[k])][:THROUGH]:
+        link = part.links[key]
+        ends = _ends(link)
+        moved = tuple(near if end == body else place for end, place in zip(ends, link.between, strict=True))
+        other = ends[1 - ends.index(body)]
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_{other}",
+            f"{words}, through which the heat of {other} enters",
+            parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
+        )
+
+
+def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: float) -> Iterator[Candidate]:
+    """Heat that crosses a body from one neighbour to another without warming all of it."""
+    part = fitted.part
+    near = sorted(linked(part, body), key=lambda b: -max(_conductance(fitted, k) for k in part.links
+                                                         if set(_ends(part.links[k])) == {b, body}))  # fmt: skip
+    for one, other in list(combinations(near, 2))[:SHORTCUTS]:
+        if other in linked(part, one):
+            continue
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_{one}_{other}",
+            f"heat that crosses the {body} from {one} to {other}",
+            parts={
+                f"links.{one}-{other}": Link(
+                    between=(one, other), conductance=Value(value=f"{0.1 * leaves:.4g} W/K", spread=1.5 * SPREAD)
+                )
+            },
+        )
+
+
+def _ends(link: Link) -> list[str]:
+    return [place.partition("@")[0] for place in link.between]
+
+
+def _conductance(fitted: Fitted, key: str) -> float:
+    network = fitted.problem.network
+    return next((float(e.conductance(fitted.values)) for e in network.edges if e.name == key), 0.0)

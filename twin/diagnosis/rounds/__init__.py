@@ -1,0 +1,1 @@
+"""Fits, refits and rounds: which candidates are accepted, against what chance and structure alone would gain."""

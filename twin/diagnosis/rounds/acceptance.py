@@ -1,0 +1,61 @@
+"""When a gain counts: more than structure alone makes, more than residuals of random sign make, in most batches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import binom
+
+from twin.calibration.fit_problem import Array
+from twin.calibration.identifiability import Z90
+from twin.diagnosis.scoring.evidence import Evidence
+
+if TYPE_CHECKING:
+    from twin.diagnosis.rounds.refits import Tried
+
+FLIPS = 60
+
+
+def flipped_gains(evidence: Evidence, after: Evidence, alarm: Sequence[int], seed: int) -> Array:
+    """Largest gains (FLIPS,) when what the best candidate leaves over takes a random sign in every batch.
+
+    What agrees between batches is gone, what varies stays: the wild cluster bootstrap with the effect in the model
+    (Cameron, Gelbach and Miller 2008), over the whole family of candidates (Westfall and Young 1993).
+    """
+    left = after.left_out()
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(len(left), FLIPS))
+    scale = np.sqrt(evidence.weight / after.weight)
+    targets = [e * scale[b.channel][:, None] * s for b, e, s in zip(evidence.batches, left, signs, strict=True)]
+    return np.asarray(evidence.gains(targets)[0][:, list(alarm)].max(axis=1))
+
+
+def flipped_threshold(gains: Array, batches: int) -> float:
+    """The gain that flipped signs exceed once in a hundred; of few batches, with few patterns, their largest."""
+    return float(gains.max()) if 2**batches <= FLIPS else gumbel(gains)
+
+
+def gumbel(gain: Array, share: float = 0.99) -> float:
+    """The quantile of a largest value by a Gumbel distribution of the same mean and spread (Gumbel 1958)."""
+    scale = float(np.std(gain, ddof=1)) * np.sqrt(6.0) / np.pi
+    return float(np.mean(gain)) - scale * (np.euler_gamma + float(np.log(-np.log(share))))
+
+
+def sign_p(better: int, n: int) -> float:
+    """Chance of so many improved batches if improving were a coin's toss (Fisher's sign test)."""
+    return float(binom.sf(better - 1, n, 0.5))
+
+
+def stands_out(t: Tried) -> bool:
+    """Whether a signed amplitude's 90 % interval leaves out the value without an effect; of several, any one's."""
+    if t.fitted is None or t.candidate.part is None:
+        return True
+    sd = np.sqrt(np.diag(t.fitted.state.arrow.covariance))
+    fitted = {u.name: (u, z, own) for u, z, own in zip(t.fitted.problem.unknowns, t.fitted.state.z, sd, strict=True)}
+    told = []
+    for amplitude, off in t.candidate.amplitudes.items():
+        if (found := fitted.get(f"mechanisms.{t.candidate.name}.{amplitude}")) is not None:
+            u, z, own = found
+            told.append(u.scale != "linear" or abs(u.prior + u.spread * z - off) >= Z90 * u.spread * own)
+    return not told or any(told)

@@ -1,0 +1,66 @@
+"""A fair baseline: the machine file at its best recalibration, before anything is said to be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from twin.calibration.least_squares import settled
+from twin.calibration.measured import EVERY_S
+from twin.calibration.problem import CalibrationProblem
+from twin.compile import compile_network
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.schema import TwinPart
+
+TOLERANCE, STEPS = 1e-2, 40
+ROWS = 60  # of a usual batch, at least: a run of ten minutes is no less a run than one of six hours
+
+
+def check(machine: Machine, batches: Sequence[Batch]) -> None:
+    """Raises InputError: no batches, one of another machine, or the same twice."""
+    if not batches:
+        raise InputError(f"machine {machine.machine}: no batches to diagnose; give recordings")
+    ids = [b.batch_id for b in batches]
+    for batch in batches:
+        if batch.machine != machine.machine:
+            raise InputError(
+                f"batch {batch.batch_id}: is of machine {batch.machine!r}, expected {machine.machine!r}; leave it out"
+            )
+        if ids.count(batch.batch_id) > 1:
+            raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
+
+
+def baseline(
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    progress: Callable[[str, int, int], None] | None = None,
+    runs: int = 0,
+) -> Fitted:
+    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it; `runs` that they
+    come from, where they are blocks of fewer.
+
+    Raises:
+        InputError: batches of another machine, twice the same, or that cannot be simulated.
+        WorkError: the model fails at the priors' means.
+    """
+    check(machine, batches)
+    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
+    steps = 0
+
+    def told(_: str) -> None:
+        nonlocal steps
+        steps += 1
+        if progress:
+            progress("baseline", steps, 0)
+
+    state, _ = settled(problem, reweight=True, tolerance=TOLERANCE, max_iterations=STEPS, progress=told)
+    return Fitted(machine, part, tuple(batches), problem, state, runs or len(batches))
+
+
+def spacing_s(batches: Sequence[Batch]) -> float:
+    """Seconds from one row that is looked at to the next."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # none: told where they are simulated
+    return min(EVERY_S, lengths[len(lengths) // 2] / ROWS) or EVERY_S

@@ -1,0 +1,119 @@
+"""The structural null: what the whole search would find where nothing is missing but a finer network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.errors import InputError, WorkError
+from twin.calibration.descent import x_of
+from twin.calibration.fit_problem import Array
+from twin.compile import compile_network
+from twin.diagnosis.rounds.acceptance import gumbel
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.refined import refined
+from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.scoring.evidence import Evidence
+
+TWINS = 10  # refined machines
+SCALES = (0.1, 0.3, 1.0, 2.0, 4.0)  # of the misfit of each: real castings are finer than bars of five cells
+
+
+@dataclass(frozen=True)
+class Null:
+    """Recordings of T refined machines with the misfit at S scales: largest gain of any candidate (T, S) in nats, the
+    log density of batches left out (T, S) before any candidate, their mean squares (T, S, K), and the amplitudes
+    (T, S, C) that the candidates `names` would be given where none is there."""
+
+    gain: Array
+    density: Array
+    mean_squares: Array
+    amplitude: Array
+    names: tuple[str, ...] = ()
+
+    def threshold(self, density: float, share: float = 0.99) -> float:
+        """The gain that structure alone exceeds in 1 - share of the cases, where it leaves no more than `density` says.
+
+        Of each machine counts the largest misfit that predicts left-out batches no worse. As there are few, a Gumbel
+        distribution goes through their mean and spread.
+        """
+        gain = self.typical(density)
+        if len(gain) < 2:
+            return float("inf")
+        return max(gumbel(gain, share), float(gain.max()))
+
+    def typical(self, density: float) -> Array:
+        """The largest gain (T,) of each machine at that misfit."""
+        return np.asarray(self.gain[np.arange(len(self.gain)), self._scale(density)])
+
+    @property
+    def temperature(self) -> float:
+        """Nats of score that count as one when explanations are compared: a share of what structure alone gains."""
+        typical = self.typical(float(np.median(self.density)))
+        return float(np.clip(np.median(typical) / 4.0, 1.0, 3.0)) if self.gain.size else 1.0
+
+    def amplitude_sd(self, name: str, density: float) -> float:
+        """How far structure and noise alone scatter a candidate's amplitude; 0 where that is not known."""
+        if name not in self.names or len(self.gain) < 2:
+            return 0.0
+        own = self.amplitude[np.arange(len(self.gain)), self._scale(density), self.names.index(name)]
+        return float(np.sqrt(np.mean(own**2)))
+
+    def _scale(self, density: float) -> NDArray[np.int64]:
+        """Of each machine (T,) the largest misfit that predicts left-out batches no worse."""
+        allowed = self.density >= density
+        last = allowed.shape[1] - 1 - np.argmax(allowed[:, ::-1], axis=1)
+        return np.where(allowed.any(axis=1), last, 0)
+
+
+def structural_null(
+    fitted: Fitted,
+    evidence: Evidence,
+    counts: Mapping[str, int],
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Null:
+    """Refined machines driven as the recordings were, their left-out gains by the same evidence in one step each.
+
+    Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers, by
+    candidate, the columns whose gain would be an alarm.
+    """
+    rng = np.random.default_rng(seed)
+    base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
+    targets: list[list[Array]] = [[] for _ in base]
+    for k in range(TWINS):
+        try:
+            rows = _misfit(fitted, base, seed + k)
+        except (InputError, WorkError):
+            continue  # a draw that no machine has
+        for b, (whitened, misfit) in enumerate(zip(evidence.batches, rows, strict=True)):
+            noise = rng.standard_normal(len(misfit))
+            targets[b] += [whitened.of(scale * misfit + noise) for scale in SCALES]
+        if progress:
+            progress(k + 1, TWINS)
+    z = np.zeros(evidence.batches[0].jacobian.shape[1])
+    z[: len(fitted.state.z)] = fitted.state.z
+    shifted = [np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)]
+    gain, amplitude, _ = evidence.gains(shifted)
+    columns = list(counts.values())
+    squares = evidence.mean_squares(evidence.left_out(shifted))
+    shape = (-1, len(SCALES))
+    return Null(
+        gain[:, columns].max(axis=1, initial=0.0).reshape(shape),
+        evidence.base_score(shifted).reshape(shape),
+        squares.reshape(*shape, squares.shape[1]),
+        amplitude[:, columns].reshape(*shape, len(columns)),
+        tuple(counts),
+    )
+
+
+def _misfit(fitted: Fitted, base: list[Array], seed: int) -> list[Array]:
+    """What a refined machine shows beyond the fitted one, (n_b,) per batch in units of the given noise."""
+    part = refined(fitted.part, fitted.problem.network, fitted.values, seed)
+    problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
+    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
+    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
+    return [b - a for b, a in zip(base, after, strict=True)]

@@ -1,0 +1,157 @@
+"""Full refits of the candidates that a screen thinks worth it, and their gains on batches left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data.errors import InputError, WorkError
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.priors import log_prior, start_values
+from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.screen import Scored, alone
+
+BEST, KINDS = 5, 12  # refits of a round: the best of all, and with the best of every other mechanism
+LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
+WORTH = 0.5  # nats in the screen that are worth a refit
+LOOKED_AT = 80
+SHAPED = 5.0  # nats in the screen that each parameter beside the size must be worth
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
+
+    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size. `alike` is the
+    gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the threshold.
+    """
+
+    scored: Scored
+    gain: float
+    improved: int
+    cluster: int
+    log_prior: float
+    fitted: Fitted | None = None
+    alike: float | None = None
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.scored.candidate
+
+    def standing(self, temperature: float) -> float:
+        """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
+        return (self.gain if self.alike is None else self.alike) / temperature + self.log_prior
+
+
+def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
+    """What is worth a look, its clusters, and the numbers of those to refit, one of each cluster.
+
+    A baseline bent far by what it lacks shows little in the screen, so every mechanism may send its best.
+    """
+    worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
+    clusters = _clusters(worth, evidence)
+    chosen: list[int] = []
+    seen: set[str] = set()
+    for k, s in enumerate(worth):
+        if len(chosen) >= KINDS:
+            break
+        new = s.candidate.mechanism not in seen
+        if (len(chosen) < BEST or new) and not any(clusters[k] == clusters[j] for j in chosen):
+            chosen.append(k)
+            seen.add(s.candidate.mechanism)
+    return worth, clusters, chosen
+
+
+def _promise(s: Scored) -> tuple[float, str]:
+    """Best first; of those that gain alike the one with the least freedom speaks for its cluster."""
+    return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
+
+
+def refit(now: Fitted, s: Scored) -> Tried | None:
+    """One candidate in full; None where it cannot be simulated."""
+    values, at = start_values(s, now)
+    try:
+        return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), at)))
+    except (InputError, WorkError):
+        return None
+
+
+def taken_on(now: Fitted, t: Tried) -> Tried:
+    """The same, fitted on to its optimum."""
+    assert t.fitted is not None
+    try:
+        return judged(now, replace(t, fitted=settle(t.fitted, steps=4, tolerance=0.05, rounds=2)))
+    except (InputError, WorkError):
+        return t
+
+
+def judged(now: Fitted, t: Tried, inflation: Array | None = None) -> Tried:
+    """A refit with its gain over the fit before.
+
+    Rows that repeat each other count once, for both as in the fit that leaves the whiter residuals: a missing effect
+    makes those of the other repeat themselves (as `twin.calibration.annealing.likelier`). `inflation` (K,) says
+    otherwise.
+    """
+    assert t.fitted is not None
+    if inflation is None:
+        inflation = np.minimum(now.state.noise.inflation, t.fitted.state.noise.inflation)
+    before, after = alone(now, inflation), alone(t.fitted, inflation)
+    gain = float(after.base_score()[0] - before.base_score()[0])
+    return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
+
+
+def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
+    """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
+    whitest = [now.state.noise.inflation, *(t.fitted.state.noise.inflation for t in finalists if t.fitted)]
+    inflation = np.min(whitest, axis=0)
+    return [replace(t, alike=judged(now, t, inflation).gain) for t in finalists]
+
+
+def with_clusters(
+    done: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]
+) -> list[Tried]:
+    """The others of each refitted cluster, as much worse as the screen says."""
+    best_in = {t.cluster: t for t in done}
+    out = []
+    for k, s in enumerate(worth):
+        if k not in chosen and clusters[k] in best_in:
+            like = best_in[clusters[k]]
+            gain = like.gain - max(0.0, like.scored.gain - s.gain)
+            out.append(Tried(s, gain, s.improved, clusters[k], log_prior(s, like.fitted)))
+    return out
+
+
+def improved(before: Evidence, after: Evidence) -> int:
+    """Left-out batches whose squares fall, each channel in units of what is left of it afterwards."""
+    left, right = before.left_out(), after.left_out()
+    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), 1.0)
+    count = 0
+    for b, a, e, f in zip(before.batches, after.batches, left, right, strict=True):
+        old = (e[:, 0] ** 2 / (before.weight * unit)[b.channel] / before.rows[b.channel]) @ before.count[b.channel]
+        new = (f[:, 0] ** 2 / (after.weight * unit)[a.channel] / after.rows[a.channel]) @ after.count[a.channel]
+        count += int(new < old)
+    return count
+
+
+def _clusters(worth: Sequence[Scored], evidence: Evidence) -> list[int]:
+    """A number for every candidate, the same for those whose signatures agree with the first of their cluster."""
+    columns = [s.column for s in worth if s.column >= 0]
+    like = evidence.likeness(columns) if columns else np.zeros((0, 0))
+    place = {c: k for k, c in enumerate(columns)}
+    heads: list[int] = []
+    out: list[int] = []
+    for s in worth:
+        if s.column < 0:
+            out.append(-1 - len(out))
+            continue
+        k = place[s.column]
+        head = next((h for h in heads if like[k, place[h]] > LIKE), None)
+        if head is None:
+            heads.append(s.column)
+            head = s.column
+        out.append(heads.index(head))
+    return out

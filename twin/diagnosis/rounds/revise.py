@@ -1,0 +1,94 @@
+"""Second thoughts: with all effects in, is each still needed, and is its likeliest rival not the better one?
+
+Forward steps can name a substitute that a later effect makes needless (Efroymson 1960): deletion and swaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from data.errors import InputError, WorkError
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.priors import start_values
+from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
+from twin.diagnosis.rounds.refits import Tried
+from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.scoring.screen import alone
+from twin.schema import TwinPart
+
+RIVALS = 2  # of each effect that are tried in its place
+BETTER = 3.0  # nats by which a rival must fit better beside all others
+
+
+@dataclass(frozen=True)
+class Second:
+    """An effect taken out, or replaced: how much worse the batches left out are predicted, in nats."""
+
+    effect: int
+    rival: Tried | None
+    loss: float
+    fitted: Fitted
+
+
+@dataclass(frozen=True)
+class _Work:
+    effect: int
+    part: TwinPart
+    rival: Tried | None
+    at: dict[str, float]
+
+
+def second_thoughts(
+    final: Fitted, effects: list[Tried], rivals: list[list[Tried]], original: TwinPart, least: float, workers: Workers
+) -> Second | None:
+    """The best change of the set of effects, or None: an effect dropped whose loss is below `least` nats, or a rival
+    in its place that gains. Effects and rivals as the rounds tried them."""
+    work = []
+    for k, t in enumerate(effects):
+        rest = without(final.part, t.candidate, original)
+        work.append(_Work(k, rest, None, {}))
+        for r in rivals[k][:RIVALS]:
+            values, at = start_values(r.scored, final)
+            try:
+                work.append(_Work(k, r.candidate.applied(rest, values), r, dict(at)))
+            except (ValueError, KeyError):
+                continue
+    inflation = final.state.noise.inflation
+    score = float(alone(final, inflation).base_score()[0])
+    done = [s for s in workers.map(partial(_changed, final, inflation, score), work) if s is not None]
+    drops = [s for s in done if s.rival is None and s.loss < least]
+    swaps = [s for s in done if s.rival is not None and s.loss < -BETTER]
+    return min([*drops, *swaps], key=lambda s: s.loss, default=None)
+
+
+def _changed(final: Fitted, inflation: Array, score: float, w: _Work) -> Second | None:
+    try:
+        fitted = settle(refitted(final, w.part, w.at), steps=4, tolerance=0.05, rounds=2)
+        loss = score - float(alone(fitted, inflation).base_score()[0])
+    except (InputError, WorkError):
+        return None
+    return Second(w.effect, w.rival, loss, fitted)
+
+
+def without(part: TwinPart, c: Candidate, original: TwinPart) -> TwinPart:
+    """The twin part as it would be had this candidate not been accepted."""
+    if c.part is not None:
+        return part.model_copy(update={"mechanisms": {k: m for k, m in part.mechanisms.items() if k != c.name}})
+    if c.change is not None:
+        group, name = c.change.parameter.name.split(".")[:2]
+        members = dict(getattr(part, group))
+        if name in getattr(original, group):
+            members[name] = getattr(original, group)[name]
+        return part.model_copy(update={group: members})
+    out = part
+    for path in c.parts:
+        group, _, name = path.partition(".")
+        members = dict(getattr(out, group))
+        if name in getattr(original, group):
+            members[name] = getattr(original, group)[name]
+        else:
+            members.pop(name, None)
+        out = out.model_copy(update={group: members})
+    return out

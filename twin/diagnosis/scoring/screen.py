@@ -1,0 +1,166 @@
+"""The screen: every candidate's signature and left-out score from one linearisation at the baseline's best fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin.calibration.descent import x_of
+from twin.calibration.fit_problem import Array
+from twin.calibration.problem import unknown
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.candidates import candidates
+from twin.diagnosis.proposals.rivals import rivals
+from twin.diagnosis.proposals.slack import LOOSE, slack
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.scoring.asleep import Asleep, asleep
+from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.finite import differences
+from twin.diagnosis.scoring.whitened import Whitened, whitened
+from twin.mechanisms import MECHANISMS
+
+FACTOR = 3.0  # bounds of the logarithm of a value that is doubted
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
+
+    `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
+    recalibration takes.
+    """
+
+    candidate: Candidate
+    gain: float
+    improved: int
+    absorbed: float
+    amplitudes: dict[str, float]
+    sd: float
+    column: int
+
+
+@dataclass(frozen=True)
+class Screen:
+    """All candidates that have a signature, best first, the evidence and the reasons of those left out."""
+
+    scored: tuple[Scored, ...]
+    evidence: Evidence
+    left_out: dict[str, str]
+
+
+def proposed(fitted: Fitted) -> list[Candidate]:
+    """All mechanisms at all places, and the rivals that doubt the file's values."""
+    return candidates(fitted.machine, fitted.part) + rivals(fitted.problem.network)
+
+
+def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
+    """The evidence for all candidates that can be switched off or whose value may be doubted."""
+    line = _Line.at(fitted, every, fitted.state.noise.inflation)
+    finite, refused = differences(fitted, every)
+    batches = tuple(
+        replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
+        for k, b in enumerate(line.batches)
+    )
+    low, high = _bounds(line, every)
+    low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
+    evidence = _evidence(fitted, batches, fitted.state.noise.inflation, low, high)
+    return Screen(tuple(_scored(line, every, list(finite), evidence)), evidence, {**line.found.left_out, **refused})
+
+
+def alone(fitted: Fitted, inflation: Array) -> Evidence:
+    """How well a fit predicts batches left out, with slack and no candidates; `inflation` (K,) of what is compared."""
+    every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
+    loose = slack(every, fitted.step_s)
+    line = _Line.at(fitted, [c for c in every if c.name in loose], inflation)
+    batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
+    return _evidence(fitted, batches, inflation, np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A linearisation with candidates asleep: whitened batches, and the parameter number of every column."""
+
+    found: Asleep
+    batches: tuple[Whitened, ...]
+    numbers: list[int]
+    own: dict[str, int]  # parameters that the fit has already, by name
+
+    @classmethod
+    def at(cls, fitted: Fitted, every: Sequence[Candidate], inflation: Array) -> _Line:
+        found = asleep(fitted.machine, fitted.part, every)
+        problem = on_network(fitted.problem, fitted.batches, found.network)
+        own = {u.name: k for k, u in enumerate(fitted.problem.unknowns)}
+        waking = sorted({j for js in found.amplitudes.values() for j in js})
+        numbers = [j for j in waking if found.network.parameters[j].name not in own]
+        loose = {
+            numbers.index(found.amplitudes[n][0]): sd
+            for n, sd in slack(every, fitted.step_s).items()
+            if n in found.amplitudes
+        }
+        z = carried_z(fitted.problem, problem, fitted.state.z)
+        nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
+        weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+        more = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
+        every_unknown = (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers))
+        columns = range(len(own), len(every_unknown))
+        blocks = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), more, strict=True)  # kept from the fit
+        batches = tuple(
+            whitened(
+                replace(b, jacobian=np.hstack([b.jacobian, m])), v, fitted.state.z, every_unknown, columns, weight
+            ).with_slack(loose)
+            for (b, m), v in zip(blocks, fitted.state.nuisance, strict=True)
+        )
+        return cls(found, batches, numbers, own)
+
+
+def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], inflation: Array, low: Array, high: Array) -> Evidence:
+    weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+    return Evidence(batches, fitted.rows, fitted.rows / inflation, weight, low, high)
+
+
+def _bounds(line: _Line, every: Sequence[Candidate]) -> tuple[Array, Array]:
+    """Of every column's amplitude, less the value at which it is off."""
+    low, high = np.full(len(line.numbers), -FACTOR), np.full(len(line.numbers), FACTOR)
+    place = {j: c for c, j in enumerate(line.numbers)}
+    for c in every:
+        for amplitude, j in zip(c.amplitudes, line.found.amplitudes.get(c.name, ()), strict=False):
+            spec, off = MECHANISMS[c.mechanism].spec(amplitude), c.amplitudes[amplitude]
+            low[place[j]], high[place[j]] = spec.low - off, spec.high - off
+    return low, high
+
+
+def _scored(line: _Line, every: Sequence[Candidate], finite: Sequence[str], evidence: Evidence) -> list[Scored]:
+    scores = evidence.scores()
+    place = {j: c for c, j in enumerate(line.numbers)}
+    out = []
+    for c in every:
+        if c.name not in line.found.amplitudes and c.name not in finite:
+            continue
+        if c.change is not None and c.change.per_batch is not None:
+            out.append(Scored(c, _varying(line, place, evidence, c), len(evidence.batches), 0.0, {}, 0.0, -1))
+            continue
+        columns = [place[j] for j in line.found.amplitudes.get(c.name, ())]
+        columns = columns or [len(line.numbers) + finite.index(c.name)]
+        best = max(columns, key=lambda k: scores.gain[k])
+        amplitudes = dict(zip(c.amplitudes or ("factor",), scores.amplitude[columns].tolist(), strict=False))
+        out.append(
+            Scored(
+                c, float(scores.gain[best]), int(scores.improved[best]), float(scores.absorbed[best]), amplitudes,
+                float(scores.sd[best]), best,
+            )
+        )  # fmt: skip
+    return sorted(out, key=lambda s: (-s.gain, s.candidate.name))
+
+
+def _varying(line: _Line, place: Mapping[int, int], evidence: Evidence, c: Candidate) -> float:
+    """What it gains that a value differs from run to run."""
+    assert c.change is not None and c.change.per_batch is not None
+    (j,) = line.found.amplitudes[c.name]
+    p = line.found.network.parameters[j]
+    if j in place:
+        return evidence.own_gain([b.columns[:, place[j]] * c.change.per_batch for b in evidence.batches])
+    k = line.own[p.name]
+    return evidence.own_gain([b.jacobian[:, k] * c.change.per_batch / p.spread for b in evidence.batches])

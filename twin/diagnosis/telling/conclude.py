@@ -1,0 +1,185 @@
+"""From the search to findings: what was found where, when, how large, how sure, and what would tell ties apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from twin.calibration.identifiability import Z90, Interval
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure, told
+from twin.diagnosis.rounds.search import Round, Search
+from twin.diagnosis.scoring.screen import alone
+from twin.diagnosis.scoring.unseen import unseen
+from twin.diagnosis.telling.activity import activity
+from twin.diagnosis.telling.findings import Verdict
+from twin.diagnosis.telling.found import Found, Other, Rms, beside_words, place_words
+from twin.diagnosis.telling.honest_digits import Estimate
+from twin.diagnosis.writing.changes import deviations
+from twin.mechanisms import MECHANISMS
+from twin.schema import TwinPart
+
+REST = 3.0  # times what structure leaves: beyond it something is left, whatever it is
+AS_IT_IS = 2  # the scale of a refined machine's misfit that is its own
+SURE = 0.7  # below it the best explanation does not stand by itself
+
+
+def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
+    """Root mean squares over all left-out rows by channel, errors first."""
+    errors = {e.channel for e in fitted.problem.network.errors}
+    out = []
+    for channel, rows in table.groupby("channel", sort=False):
+        n = rows["rows"].to_numpy(float)
+
+        def pooled(column: str, rows: pd.DataFrame = rows, n: np.ndarray = n) -> float:
+            return float(np.sqrt(np.average(rows[column].to_numpy(float) ** 2, weights=n)))
+
+        unit = str(rows["unit"].iloc[0])
+        out.append(
+            Rms(str(channel), unit, pooled("before"), pooled("after"), pooled("floor"), sensor=channel not in errors)
+        )
+    return tuple(sorted(out, key=lambda r: (r.sensor, -r.before / max(r.after, 1e-12))))
+
+
+def found_of(
+    search: Search, done: Round, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], separates: str
+) -> Found:
+    """One accepted round as a finding; `intervals` of the final fit's parameters by network name, `rms` of the left-out
+    batches before and after this effect."""
+    every, nothing, unlisted = explanations(done)
+    best = next(e for e in every if done.best is not None and e.tried is done.best)
+    c = best.tried.candidate
+    same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
+    rest = [e for e in every if e not in same]
+    final = search.final
+    parameters, was = _parameters(final, best, intervals, done)
+    regime, windows = activity(final, c)
+    given = c.part
+    return Found(
+        mechanism=c.mechanism,
+        where=c.where,
+        place=_place_of(c, part),
+        parameters=parameters,
+        probability=min(sum(e.probability for e in same), most_sure(final.runs)),
+        name=c.name if c.part is not None else "",
+        beside=beside_words(given, c.where, part) if given is not None else "",
+        others=tuple(_other(e, part) for e in told([best, *rest])),
+        regime=regime,
+        windows=windows,
+        rms=tuple(rms),
+        separates=separates,
+        caps=caps(final.runs),
+        evidence={
+            "gain_nats": best.tried.gain,
+            "threshold_nats": float(done.threshold),
+            "batches_improved": best.tried.improved,
+            "batches": len(final.batches),
+            "sign_test_p": done.sign_p,
+            "absorbed_share": best.tried.scored.absorbed,
+            "probability_nothing": nothing,
+            "probability_unlisted": unlisted,
+            "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
+            **unseen(done.before, best.tried.fitted or final, done.before.state.noise.inflation),
+        },
+        was=was,
+    )
+
+
+def _place_of(c: Candidate, part: TwinPart) -> str:
+    """The place in words; of a heat's size the heat's own."""
+    if c.change is not None and c.where.name in part.mechanisms:
+        return f"{MECHANISMS[part.mechanisms[c.where.name].law].words} ({c.where.name})"
+    return place_words(c.where, part)
+
+
+def _other(e: Explanation, part: TwinPart) -> Other:
+    c = e.tried.candidate
+    beside = beside_words(c.part, c.where, part) if c.part is not None else ""
+    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, beside, e.alike)
+
+
+def _parameters(
+    final: Fitted, best: Explanation, intervals: Mapping[str, Interval], done: Round
+) -> tuple[dict[str, Estimate], dict[str, float]]:
+    """Fitted values of what was found, in their units, and those that the machine file had."""
+    c = best.tried.candidate
+    network = final.problem.network
+    if c.change is not None:
+        name = c.change.parameter.name
+        if c.change.per_batch is not None:
+            sd = deviations(final).get(name, float("nan"))
+            n = len(final.batches)  # of a standard deviation from n batches: chi-square
+            return {"deviation": Estimate(sd, "1", sd * (1 - 1.16 / np.sqrt(n)), sd * (1 + 1.16 / np.sqrt(n)))}, {}
+        found = intervals.get(name)
+        was = {name: c.change.parameter.value}
+        if found is None:
+            return {}, was
+        return {name: Estimate(found.value, found.unit, found.low, found.high)}, was
+    out: dict[str, Estimate] = {}
+    mechanism = MECHANISMS.get(c.mechanism) if c.mechanism in MECHANISMS else None
+    for spec in mechanism.parameters if mechanism else ():
+        at = _network_name(final, c.name, spec.name, c.where.name)
+        if at is not None and at in intervals:
+            out[spec.name] = _widened(intervals[at], spec.name, done)
+        elif at is not None:
+            p = network.parameters[network.index(at)]
+            out[spec.name] = Estimate(p.value, p.unit)
+    return out, {}
+
+
+def _widened(i: Interval, parameter: str, done: Round) -> Estimate:
+    """The interval of an amplitude, as wide as refined machines scatter it: a lumped network does not know better."""
+    best = done.best
+    if best is None or list(best.candidate.amplitudes) != [parameter]:  # several trade with each other
+        return Estimate(i.value, i.unit, i.low, i.high)
+    density = float(np.median(done.null.density))
+    sd = Z90 * done.null.amplitude_sd(best.candidate.name, density)
+    if i.low > 0 and i.value > 0:
+        up = float(np.hypot(np.log(i.high / i.value), sd / i.value))
+        return Estimate(i.value, i.unit, i.value * float(np.exp(-up)), i.value * float(np.exp(up)))
+    half = float(np.hypot((i.high - i.low) / 2.0, sd))
+    return Estimate(i.value, i.unit, i.value - half, i.value + half)
+
+
+def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:
+    """Where a mechanism's parameter stands in the network: by its instance, or in what a structural one wrote."""
+    names = [p.name for p in final.problem.network.parameters]
+    plain = f"mechanisms.{instance}.{parameter}"
+    if plain in names:
+        return plain
+    ends = [n for n in names if n.endswith(f".{parameter}") and instance in n]
+    if ends:
+        return ends[0]
+    if parameter == "temperature":
+        return next((n for n in names if n == f"surroundings.{instance}.value"), None)
+    if parameter == "gain":  # a link or tilt at the end of an error's chain
+        own = [n for n in names if n.startswith(f"errors.{place}.") and n.endswith(".gain")]
+        kept = {p.name for p in final.problem.network.parameters if p.free}
+        return next((n for n in reversed(own) if n in kept), None)
+    return None
+
+
+def caps(n: int) -> tuple[str, ...]:
+    """What keeps a probability from being higher."""
+    return () if n >= 6 else (f"{n} runs only",)
+
+
+def remainder(search: Search) -> float:
+    """Left-out errors after all that was found over what structure alone leaves, the median over channels."""
+    final, null = search.final, search.rounds[-1].null
+    left = alone(final, final.state.noise.inflation)
+    seen = left.mean_squares(left.left_out())[0]
+    structure = np.median(null.mean_squares[:, AS_IT_IS], axis=0)
+    return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
+
+
+def verdict_of(found: Sequence[Found], more: bool, rest: float) -> Verdict:
+    """`more`: what is left over follows something that no listed mechanism is; `rest`: `remainder`."""
+    if not found:
+        return "unlisted" if more else "undecidable" if rest > REST else "consistent"
+    if found[0].probability < SURE and found[0].tied:
+        return "undecidable"
+    return "partly_explained" if more or rest > REST else "explained"

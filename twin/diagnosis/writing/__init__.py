@@ -1,0 +1,1 @@
+"""The machine file with what was found in it."""
