@@ -38,7 +38,7 @@ METHOD = (
 )
 
 GLOSSARY = (
-    ("left out", "Fit on the other runs, predict this one, free-running from its first reading."),
+    ("left out", "Fit on the other runs, predict this one; of it only the start is estimated, within its prior."),
     ("rms", "Root mean square of recorded − simulated over a left-out run, or over the rows of all of them. "
      "Displacements count from their first sample."),
     ("before, after", "The refined and recalibrated simulation without and with what was found."),
