@@ -103,7 +103,7 @@ def calibrate(
         WorkError: the fit did not converge, or the model is not finite.
     """
     begun = time.perf_counter()
-    _check(machine, batches)
+    check_batches(machine, batches)
     network = compile_network(machine)
     problem = CalibrationProblem.of(network, batches, every_s, channels, max_gap_s)
     say = (lambda text: progress(text, 0, 0)) if progress else None
@@ -133,7 +133,8 @@ def calibrate(
     )
 
 
-def _check(machine: Machine, batches: Sequence[Batch]) -> None:
+def check_batches(machine: Machine, batches: Sequence[Batch]) -> None:
+    """Raises InputError: a batch of another machine, or given twice."""
     ids = [b.batch_id for b in batches]
     for batch in batches:
         if batch.machine != machine.machine:

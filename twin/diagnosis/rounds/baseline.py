@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
+from twin.calibration.estimate import check_batches
 from twin.calibration.least_squares import settled
 from twin.calibration.measured import EVERY_S
 from twin.calibration.problem import CalibrationProblem
@@ -22,14 +23,7 @@ def check(machine: Machine, batches: Sequence[Batch]) -> None:
     """Raises InputError: no batches, one of another machine, or the same twice."""
     if not batches:
         raise InputError(f"machine {machine.machine}: no batches to diagnose; give recordings")
-    ids = [b.batch_id for b in batches]
-    for batch in batches:
-        if batch.machine != machine.machine:
-            raise InputError(
-                f"batch {batch.batch_id}: is of machine {batch.machine!r}, expected {machine.machine!r}; leave it out"
-            )
-        if ids.count(batch.batch_id) > 1:
-            raise InputError(f"batch {batch.batch_id}: given {ids.count(batch.batch_id)} times; give it once")
+    check_batches(machine, batches)
 
 
 def baseline(
