@@ -39,9 +39,9 @@ class Diagnosis:
     the recordings come from a simulation. `drafted`: the machine file had no twin part. `words` are remarks: what was
     refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
 
-    For the machine file, as `diagnosed_text` takes them: `network` of `part_after`, fitted `values` and `intervals` of its
-    free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the next run as a run plan (YAML), None
-    where there is none.
+    For the machine file, as `diagnosed_text` takes them: `network` of `part_after`, fitted `values` and `intervals` of
+    its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the next run as a run plan (YAML),
+    None where there is none.
     """
 
     machine: Machine
