@@ -40,7 +40,7 @@ class Diagnosis:
     refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
 
     For the machine file, as `diagnosed_text` takes them: `network` of `part_after`, fitted `values` and `intervals` of
-    its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the next run as a run plan (YAML),
+    its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the next run as a run plan,
     None where there is none.
     """
 
