@@ -27,7 +27,7 @@ from twin.compile import compile_network, expanded
 from twin.diagnosis.diagnosis import Diagnosis
 from twin.views.overview import overview
 
-_MOST_LIMITS = 12
+_MOST_LIMITS = 30
 
 
 @dataclass(frozen=True)
@@ -163,8 +163,13 @@ def _limits(d: Diagnosis, pictures: bool) -> Part | None:
     table = d.tables["limits"]
     if not len(table):
         return None
-    first, rest = table[:_MOST_LIMITS], table[_MOST_LIMITS:]
-    notes = ("A smaller effect may be there: these recordings would not show it.",)
+    own_best = table[table["limit"].notna()].drop_duplicates("mechanism")[:_MOST_LIMITS]
+    first = own_best if len(own_best) else table[:_MOST_LIMITS]
+    rest = table.drop(first.index)
+    notes = (
+        "Of each mechanism the place where least would have been seen; the others below.",
+        "A smaller effect may be there: these recordings would not show it.",
+    )
     folded = (tables.limits(rest, d.simulated),) if len(rest) else ()
     own = (tables.limits(first, d.simulated),)
     return Part("limits", "Limits", "What could not be seen", tables=own, notes=notes, folded=folded)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipelines.report.diagnosis_words import UNITS, probability_words, where_words
+from pipelines.report.diagnosis_words import UNITS, probability_words
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.twin_tables import quantity
 from pipelines.report.words import NOTHING, between, number, percent
@@ -29,7 +29,6 @@ def candidates(table: pd.DataFrame, simulated: bool, accepted: frozenset[tuple[s
         Row(
             (
                 str(r["words"]),
-                where_words(str(r["kind"]), place(r)),
                 number(float(r["gain"]), 0 if abs(float(r["gain"])) >= 9.95 else 1, sign=True),
                 f"{int(r['improved'])} of {int(r['batches'])}",
                 _amplitude(float(r["amplitude"]), str(r["unit"])),
@@ -42,7 +41,7 @@ def candidates(table: pd.DataFrame, simulated: bool, accepted: frozenset[tuple[s
         for r in shown.to_dict("records")
     ]
     columns = (
-        Column("what may be missing", kind="wide"), Column("where"), Column("gain", "nats, left out", "number"),
+        Column("what may be missing", kind="wide"), Column("gain", "nats, left out", "number"),
         Column("runs better", "left out", "number"), Column("size", kind="number"),
         Column("absorbed", "by recalibrating", "number"), Column("probability", kind="number"),
         Column("cluster", kind="number"),
@@ -131,7 +130,6 @@ def limits(table: pd.DataFrame, simulated: bool) -> Table:
         Row(
             (
                 str(r["words"]),
-                where_words(str(r["kind"]), place(r)),
                 _amplitude(float(r["limit"]), str(r["unit"])),
                 percent(float(r["absorbed"])),
                 str(r["absorbed_by"] or NOTHING),
@@ -140,7 +138,7 @@ def limits(table: pd.DataFrame, simulated: bool) -> Table:
         for r in table.to_dict("records")
     ]
     columns = (
-        Column("effect", kind="wide"), Column("where"), Column("least that would be seen", kind="number"),
+        Column("effect", kind="wide"), Column("least that would be seen", kind="number"),
         Column("absorbed", "by recalibrating", "number"), Column("mostly by"),
     )  # fmt: skip
     return Table("Detection limits", columns, tuple(rows), simulated)
