@@ -89,8 +89,9 @@ def candidates_table(rounds: Sequence[Round]) -> pd.DataFrame:
         for e in explanations(done)[0]:
             s, c = e.tried.scored, e.tried.candidate
             amplitude, unit = _amplitude(e.tried.scored.amplitudes, c.mechanism)
+            gain = e.tried.gain if e.tried.alike is None else e.tried.alike  # as they were compared
             rows.append(
-                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.words, e.tried.cluster, e.tried.gain,
+                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.words, e.tried.cluster, gain,
                  e.tried.improved, n, s.absorbed, amplitude, unit, e.probability)
             )  # fmt: skip
     return pd.DataFrame(rows, columns=list(COLUMNS["candidates"]))
