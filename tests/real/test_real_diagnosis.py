@@ -9,16 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
-from data.batch import Batch
-from data.checks import check_batch, check_machine
-from data.machine import Machine, load_machine
-from data.recording import read_batches, recording_files
+from data.machine import Machine
+from tests.real.recorded import recorded
 from twin.diagnosis.diagnose import diagnose
 from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.drafting.draft import drafted_part
@@ -30,22 +26,8 @@ from twin.diagnosis.scoring.screen import proposed, screen
 from twin.quantity import Value
 from twin.schema import twin_part
 
-ROOT = Path(__file__).parents[2]
-DATA = ROOT.parent / "shared" / "data"
 OF_THE_BOARD = ("heat_bridge_heater1_heater2", "supply_sag_heat1_heater2", "supply_sag_heat2_heater1")
 OF_NO_BOARD = ("cutting_fluid", "jacket_chiller", "natural_convection", "radiation")
-
-
-@cache
-def recorded(name: str, folder: str, step_s: float) -> tuple[Machine, tuple[Batch, ...]]:
-    """Machine file on a grid of `step_s` and every run in the folder."""
-    if not (DATA / folder).is_dir():
-        pytest.skip(f"no ../shared/data/{folder}")
-    given = load_machine(ROOT / "machines" / f"{name}.yml")
-    machine = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
-    files, _ = recording_files(DATA / folder, machine)
-    found = [b for f in files for b in read_batches(f, machine)]
-    return machine, tuple(check_machine([b.with_findings(check_batch(b, machine)) for b in found], machine))
 
 
 def with_twin(machine: Machine, **parts: Any) -> Machine:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,30 +11,15 @@ import pytest
 from numpy.typing import ArrayLike
 
 from data.batch import Batch
-from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
-from data.recording import read_batches, recording_files
+from tests.real.recorded import ROOT, recorded
 from twin.calibration import calibrate
 from twin.calibration.left_out import leave_batch_out
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 
-ROOT = Path(__file__).parents[2]
-DATA = ROOT.parent / "shared" / "data"
 EVERY_S = 10.0
 ALIKE = ("energy_balance_mimo", "mimo2_data")  # finest readings, and boards that differ least
-
-
-@cache
-def recorded(name: str, folder: str, step_s: float) -> tuple[Machine, list[Batch]]:
-    """Machine file on a grid of `step_s` and every run in the folder."""
-    if not (DATA / folder).is_dir():
-        pytest.skip(f"no ../shared/data/{folder}")
-    given = load_machine(ROOT / "machines" / f"{name}.yml")
-    machine = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
-    files, _ = recording_files(DATA / folder, machine)
-    found = [b for f in files for b in read_batches(f, machine)]
-    return machine, check_machine([b.with_findings(check_batch(b, machine)) for b in found], machine)
 
 
 def board() -> tuple[Machine, list[Batch]]:

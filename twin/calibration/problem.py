@@ -207,14 +207,17 @@ class CalibrationProblem:
         laws = [h.law for h in self.network.heats if not h.asleep]
         return [tuple(w.name for w in laws if k in w.parameters.values()) for k in self.nuisances.parameters]
 
+    def own_deviations(self, nuisance: Sequence[Array]) -> Array:
+        """By how much each batch's own parameters (B, varying) stand off, in fitting coordinates."""
+        first = self.nuisances.shared - len(self.nuisances.parameters)
+        return np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
+
     def own_heat(self, nuisance: Sequence[Array]) -> Inputs:
         """The inputs with each batch's own size of the heats that differ from run to run."""
         if not self._heats:
             return self.inputs
-        first = self.nuisances.shared - len(self._heats)
-        own = np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
         times: dict[str, Array] = {}
-        for names, deviation in zip(self._heats, own.T, strict=True):
+        for names, deviation in zip(self._heats, self.own_deviations(nuisance).T, strict=True):
             for name in names:
                 times[name] = times.get(name, 1.0) * np.exp(deviation)
         return self.inputs.with_times(times)

@@ -43,7 +43,7 @@ def test_heat_goes_into_every_body_that_has_not_got_it() -> None:
     assert "guide_friction_column_feed" not in names(four_bodies(), "guide_friction")
     (found,) = (c for c in of(four_bodies(), "floor_sink") if c.where.name == "bed")
     assert found.part is not None and found.part.at == {"body": "bed", "room": "room"}
-    assert found.where.kind == "node" and found.physics
+    assert found.where.kind == "node" and not found.fault
 
 
 def test_the_same_law_by_another_driver_is_news() -> None:
@@ -122,7 +122,7 @@ def test_swaps_come_in_pairs() -> None:
         "sensor_swap_t_head_t_bed", "sensor_swap_t_spindle_t_bed", "sensor_swap_t_spindle_t_head",
     ]  # fmt: skip
     assert all(c.part is not None and isinstance(c.part.acts_on, tuple) and len(c.part.acts_on) == 2 for c in swaps)
-    assert all(c.fault and not c.physics for c in swaps)
+    assert all(c.fault for c in swaps)
 
 
 def test_what_goes_to_an_error_fits_its_unit() -> None:

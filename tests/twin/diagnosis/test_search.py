@@ -94,7 +94,7 @@ def test_a_drifting_sensor_is_the_sensors_fault() -> None:
     done = found("drift")
     assert names(done) == ["sensor_drift_t_head"]
     (r,) = done.accepted
-    assert r.best is not None and r.best.candidate.fault and not r.best.candidate.physics
+    assert r.best is not None and r.best.candidate.fault
     interval = told(done)["mechanisms.sensor_drift_t_head.rate"]
     assert interval.low < 0.3 < interval.high and interval.high - interval.low < 0.03
 
@@ -104,7 +104,6 @@ def test_friction_that_differs_from_run_to_run_is_told_as_that() -> None:
     (r,) = done.accepted
     assert r.best is not None and r.best.candidate.mechanism == "varies_between_runs"
     assert r.best.candidate.words == "a value that differs from run to run: mechanisms.belt.power"
-    assert not r.best.candidate.physics
     own = done.final.problem.nuisances
     assert done.final.problem.network.parameters[own.parameters[0]].name == "mechanisms.belt.power"
     sizes = np.exp([own.deviation[0] * v[own.shared - 1] for v in done.final.state.nuisance])

@@ -17,7 +17,6 @@ from scipy.optimize import nnls
 Array = NDArray[np.float64]
 
 LONGEST, SHORTEST = 20.0, 3.0  # time constants: in durations of a part, and in rows
-LEAST_HEAT = 0.02  # of all heat of a driver: below it a body counts as not heated
 SOFT = 0.3  # weight of "all capacities alike" against what a link says of two
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from twin.diagnosis.proposals.values_of_part import with_value
+from twin.diagnosis.proposals.values_of_part import with_parts, with_value
 from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
 
@@ -53,11 +53,6 @@ class Candidate:
     change: Change | None = None
     parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
 
-    @property
-    def physics(self) -> bool:
-        """Whether it would be physics of the machine that was left out."""
-        return self.mechanism not in RIVALS and not self.fault
-
     def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
         """The twin part with this candidate in it; `values` replace its parameters' own.
 
@@ -68,14 +63,9 @@ class Candidate:
             new = {"spread": self.change.spread, "per_batch": self.change.per_batch}
             return with_value(part, self.change.parameter, **{k: v for k, v in new.items() if v is not None})
         if self.parts:
-            groups = {path.partition(".")[0] for path in self.parts}
-            own = {g: dict(getattr(part, g)) for g in groups}
-            for path, new_part in self.parts.items():
-                group, _, name = path.partition(".")
-                own[group][name] = new_part
-            return part.model_copy(update=own)
+            return with_parts(part, self.parts)
         assert self.part is not None
         if self.name in part.mechanisms:
             raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")
         given = self.part.model_copy(update={"parameters": {**self.part.parameters, **(values or {})}})
-        return part.model_copy(update={"mechanisms": {**part.mechanisms, self.name: given}})
+        return with_parts(part, {f"mechanisms.{self.name}": given})

@@ -8,9 +8,11 @@ the sensor's body answer at once and settle slowly.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import combinations
 
 import numpy as np
+from pydantic import BaseModel
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.candidates import linked
@@ -47,15 +49,9 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
     cell = int(network.bodies[body][0])
     capacity = float(network.capacity_J_per_K(fitted.values)[cell])
     leaves = float(network.conductance_W_per_K(fitted.values)[cell, cell])
+    own = partial(_piece, part.bodies[body], body, f"the sensor {channel}")
     piece = {
-        f"bodies.{near}": Body(
-            capacity=Value(value=f"{SHARE * capacity:.4g} J/K", spread=SPREAD),
-            material=part.bodies[body].material,
-            words=f"{part.bodies[body].words or body}, near the sensor {channel}",
-        ),
-        f"links.{near}-{body}": Link(
-            between=(near, body), conductance=Value(value=f"{STIFF * leaves:.4g} W/K", spread=SPREAD)
-        ),
+        **own(near, "near", SHARE * capacity, STIFF * leaves),
         f"sensors.{channel}": sensor.model_copy(update={"at": near}),
     }
     where = Where("sensor", channel)
@@ -67,16 +63,7 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             where,
             f"coarse_network_{channel}_far",
             f"a piece of the {body} far from {channel}",
-            parts={
-                f"bodies.{far}": Body(
-                    capacity=Value(value=f"{FAR_SHARE * capacity:.4g} J/K", spread=SPREAD),
-                    material=part.bodies[body].material,
-                    words=f"{part.bodies[body].words or body}, far from the sensor {channel}",
-                ),
-                f"links.{far}-{body}": Link(
-                    between=(far, body), conductance=Value(value=f"{leaves:.4g} W/K", spread=SPREAD)
-                ),
-            },
+            parts=own(far, "far from", FAR_SHARE * capacity, leaves),
         )
     words = f"a piece of the {body} of its own around {channel}"
     yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
@@ -93,6 +80,22 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             f"{words}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
         )
+
+
+def _piece(
+    whole: Body, body: str, sensor: str, name: str, where: str, capacity_J_per_K: float, conductance_W_per_K: float
+) -> dict[str, BaseModel]:
+    """A body of its own, `where` ("near") the sensor, and its link to the rest."""
+    return {
+        f"bodies.{name}": Body(
+            capacity=Value(value=f"{capacity_J_per_K:.4g} J/K", spread=SPREAD),
+            material=whole.material,
+            words=f"{whole.words or body}, {where} {sensor}",
+        ),
+        f"links.{name}-{body}": Link(
+            between=(name, body), conductance=Value(value=f"{conductance_W_per_K:.4g} W/K", spread=SPREAD)
+        ),
+    }
 
 
 def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: float) -> Iterator[Candidate]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -10,7 +11,21 @@ from pydantic import BaseModel
 from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
 
+PLACES = ("materials", "surroundings", "bodies", "links", "exposures", "mechanisms", "sensors", "errors")  # by name
 _INDEX = re.compile(r"^(\w+)\[(\d+)\]$")
+
+
+def with_parts(part: TwinPart, parts: Mapping[str, BaseModel | None]) -> TwinPart:
+    """The part with others in it by path ("bodies.bed"), new or in place of what was there; None takes one out."""
+    update: dict[str, dict[str, Any]] = {}
+    for path, given in parts.items():
+        group, name = path.split(".", 1)
+        members = update.setdefault(group, dict(getattr(part, group)))
+        if given is None:
+            members.pop(name, None)
+        else:
+            members[name] = given
+    return part.model_copy(update=update)
 
 
 def with_value(part: TwinPart, parameter: Parameter, **changes: Any) -> TwinPart:

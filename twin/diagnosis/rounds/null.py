@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError, WorkError
-from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
-from twin.compile import compile_network
 from twin.diagnosis.rounds.acceptance import gumbel
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.refined import refined
-from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.finite import difference
 
 TWINS = 10  # refined machines
 SCALES = (0.1, 0.3, 1.0, 2.0, 4.0)  # of the misfit of each: real castings are finer than bars of five cells
@@ -86,7 +84,8 @@ def structural_null(
     targets: list[list[Array]] = [[] for _ in base]
     for k in range(TWINS):
         try:
-            rows = _misfit(fitted, base, seed + k)
+            part = refined(fitted.part, fitted.problem.network, fitted.values, seed + k)
+            rows = difference(fitted, part, base)
         except (InputError, WorkError):
             continue  # a draw that no machine has
         for b, (whitened, misfit) in enumerate(zip(evidence.batches, rows, strict=True)):
@@ -108,12 +107,3 @@ def structural_null(
         amplitude[:, columns].reshape(*shape, len(columns)),
         tuple(counts),
     )
-
-
-def _misfit(fitted: Fitted, base: list[Array], seed: int) -> list[Array]:
-    """What a refined machine shows beyond the fitted one, (n_b,) per batch in units of the given noise."""
-    part = refined(fitted.part, fitted.problem.network, fitted.values, seed)
-    problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
-    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
-    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
-    return [b - a for b, a in zip(base, after, strict=True)]

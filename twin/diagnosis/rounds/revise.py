@@ -8,10 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
+from pydantic import BaseModel
+
 from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import start_values
+from twin.diagnosis.proposals.values_of_part import with_parts
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.workers import Workers
@@ -75,20 +78,15 @@ def _changed(final: Fitted, inflation: Array, score: float, w: _Work) -> Second 
 def without(part: TwinPart, c: Candidate, original: TwinPart) -> TwinPart:
     """The twin part as it would be had this candidate not been accepted."""
     if c.part is not None:
-        return part.model_copy(update={"mechanisms": {k: m for k, m in part.mechanisms.items() if k != c.name}})
+        return with_parts(part, {f"mechanisms.{c.name}": None})
     if c.change is not None:
         group, name = c.change.parameter.name.split(".")[:2]
-        members = dict(getattr(part, group))
-        if name in getattr(original, group):
-            members[name] = getattr(original, group)[name]
-        return part.model_copy(update={group: members})
-    out = part
-    for path in c.parts:
-        group, _, name = path.partition(".")
-        members = dict(getattr(out, group))
-        if name in getattr(original, group):
-            members[name] = getattr(original, group)[name]
-        else:
-            members.pop(name, None)
-        out = out.model_copy(update={group: members})
-    return out
+        known = getattr(original, group)
+        return with_parts(part, {f"{group}.{name}": known[name]} if name in known else {})
+    return with_parts(part, {path: _part_at(original, path) for path in c.parts})
+
+
+def _part_at(part: TwinPart, path: str) -> BaseModel | None:
+    group, name = path.split(".", 1)
+    found: BaseModel | None = getattr(part, group).get(name)
+    return found

@@ -204,16 +204,6 @@ class Evidence:
         own = replace(self, batches=batches, low=self.low[:0], high=self.high[:0])
         return float(own.base_score()[0] - self.base_score()[0])
 
-    def flipped(self, flips: int, seed: int = 0) -> Array:
-        """The largest gain (flips,) of any column when every batch's left-out residual takes a random sign.
-
-        What agrees from batch to batch is gone, what varies between them stays: the wild cluster bootstrap (Cameron,
-        Gelbach and Miller 2008), over the whole family of candidates (Westfall and Young 1993).
-        """
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(len(self.batches), flips))
-        targets = [e * s for e, s in zip(self.left_out(), signs, strict=True)]
-        return np.asarray(self.gains(targets)[0].max(axis=1))
-
     def likeness(self, columns: Sequence[int]) -> Array:
         """|cos| (k, k) between columns once the shared parameters are projected out."""
         gram = sum(c[:, list(columns)].T @ c[:, list(columns)] for c in self.beyond)

@@ -11,6 +11,7 @@ from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.schema import TwinPart
 
 
 def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
@@ -25,8 +26,8 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
         if c.amplitudes or c.part is None:
             continue
         try:
-            of = _exchanged if c.mechanism == "sensor_swap" else _difference
-            change = of(fitted, c, before)
+            swap = c.mechanism == "sensor_swap"
+            change = _exchanged(fitted, c, before) if swap else difference(fitted, c.applied(fitted.part), before)
         except (InputError, WorkError) as error:
             left_out[c.name] = str(error)
             continue
@@ -35,9 +36,13 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
     return out, left_out
 
 
-def _difference(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array]:
-    network = compile_network(fitted.machine, part=c.applied(fitted.part))
-    problem = on_network(fitted.problem, fitted.batches, network)
+def difference(fitted: Fitted, part: TwinPart, before: Sequence[Array]) -> list[Array]:
+    """What a changed twin part shows beyond the fit whose residuals are `before`, (n_b,) of every batch.
+
+    Raises:
+        InputError, WorkError: the part does not compile or cannot be simulated.
+    """
+    problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
     x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
     after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
     return [b - a for b, a in zip(before, after, strict=True)]

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import BaseModel
 
-from twin.diagnosis.proposals.values_of_part import with_value
+from twin.diagnosis.proposals.values_of_part import PLACES, with_value
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.schema import TwinPart
-
-GROUPS = ("materials", "surroundings", "bodies", "links", "exposures", "mechanisms", "sensors", "errors")
 
 
 def with_deviations(fitted: Fitted) -> TwinPart:
@@ -25,19 +23,15 @@ def with_deviations(fitted: Fitted) -> TwinPart:
 
 def deviations(fitted: Fitted) -> dict[str, float]:
     """By parameter that differs from run to run the sd of its logarithm over the batches."""
-    nuisances = fitted.problem.nuisances
-    if not len(nuisances.parameters):
-        return {}
-    first = nuisances.shared - len(nuisances.parameters)
-    own = np.array([v[first : nuisances.shared] for v in fitted.state.nuisance]) * nuisances.deviation
-    names = [fitted.problem.network.parameters[k].name for k in nuisances.parameters]
+    own = fitted.problem.own_deviations(fitted.state.nuisance)
+    names = [fitted.problem.network.parameters[k].name for k in fitted.problem.nuisances.parameters]
     return dict(zip(names, np.sqrt(np.mean(own**2, axis=0)).tolist(), strict=True))
 
 
 def changed_parts(before: TwinPart, after: TwinPart) -> Mapping[str, BaseModel]:
     """By path ("mechanisms.floor_sink_bed") what `after` states that `before` does not, or states otherwise."""
     out = {}
-    for group in GROUPS:
+    for group in PLACES:
         old = getattr(before, group)
         for name, given in getattr(after, group).items():
             if name not in old or old[name] != given:

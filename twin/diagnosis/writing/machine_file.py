@@ -19,6 +19,7 @@ from twin.calibration.identifiability import Interval
 from twin.calibration.rewrite import Update, with_calibrated, with_values
 from twin.compile import compile_network
 from twin.compiling.own_paths import own_paths
+from twin.diagnosis.proposals.values_of_part import with_parts
 from twin.diagnosis.writing.short_yaml import DIGITS, flow, part_plain, plain, tidied
 from twin.diagnosis.writing.yaml_entry import entry_at, is_flow, steps_of, with_comment, with_entry
 from twin.network import Network
@@ -129,13 +130,11 @@ def _updates(
 
 
 def _with_parts(old: TwinPart, parts: Mapping[str, BaseModel]) -> TwinPart:
-    update: dict[str, dict[str, Any]] = {}
-    for path, given in parts.items():
-        group, name = path.split(".", 1)
+    for path in parts:
+        group = path.partition(".")[0]
         if group not in GROUPS or not isinstance(getattr(old, group), Mapping):
             raise ValueError(f"{path}: no part of a twin is called {group!r}; {closest(group, GROUPS)}")
-        update.setdefault(group, dict(getattr(old, group)))[name] = given
-    return old.model_copy(update=update)
+    return with_parts(old, parts)
 
 
 def _filled(
