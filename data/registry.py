@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from data.errors import InputError, closest
+
+Effort = Literal["quick", "complete", "on_request"]
+"""When a member takes part: in every crossing, in the complete one, or only where it is named."""
 
 
 class Registry(Mapping[str, Any]):

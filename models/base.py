@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.batch import Batch
+from data.errors import InputError
 from data.machine import Machine
+from data.registry import Effort
 from features.design import Design
 
 Array = NDArray[np.float64]
@@ -36,7 +38,8 @@ class Family(ABC):
     rowwise: ClassVar[bool] = True  # a prediction at a row needs that row alone (sklearn's checks apply)
     needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
     shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work
-    on_request: ClassVar[bool] = False  # True: slow, so the grid takes it only where it is named
+    effort: ClassVar[Effort] = "complete"  # which crossings take it unless it is named
+    tells_sd: ClassVar[bool] = False  # True: `sd_um` says how sure a prediction is
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
 
     def __init__(self) -> None:
@@ -63,10 +66,27 @@ class Family(ABC):
         """One fitted copy per fold (a fold is the training batches' indices), equal to `fit_design` fold by fold."""
         return [self.fit_design(design, fold) for fold in folds]
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
-        """Predictions (n, F) of F fitted copies on every row of the design, equal to `predict_design` one by one."""
-        everything = range(design.n_batches)
-        return np.column_stack([np.concatenate(f.predict_design(design, everything)) for f in fitted])
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
+        """Predictions (n, F) of F fitted copies on the design's rows, equal to `predict_design` one by one.
+
+        `wanted` names each copy's batches, None all of them; what stands on other rows is not to be read.
+        """
+        out = np.full((len(design.time_s), len(fitted)), np.nan)
+        for column, f in enumerate(fitted):
+            batches = range(design.n_batches) if wanted is None else wanted[column]
+            for k, predicted in zip(batches, f.predict_design(design, batches), strict=True):
+                out[design.rows(k), column] = predicted
+        return out
+
+    def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Predictive standard deviation (n_k,) of a recorded value about the prediction, for families that tell it.
+
+        Raises:
+            InputError: the family, or this choice of its options, has none.
+        """
+        raise InputError(f"family {self.key}: tells no predictive sd; choose one that does, e.g. gaussian_process")
 
     def fit(
         self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str, machine: Machine | None = None

@@ -31,6 +31,7 @@ class BP(Family):
     key = "bp"
     words = "BP neural network, Levenberg–Marquardt"
     source = "Hagan and Menhaj 1994"
+    effort = "quick"
     closed_form = False
     rank = 70
 

@@ -33,19 +33,20 @@ Inputs = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to cross. `families` empty: all that suit the machine and are quick enough not to wait for a request.
+    """What to cross. Selectors or families not named: the quick ones, or with `complete` all that need no name.
 
     `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all.
     """
 
-    selectors: tuple[str, ...] = tuple(SELECTORS)
+    selectors: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
     protocols: tuple[str, ...] = tuple(PROTOCOLS)
     n_tsps: tuple[int, ...] | None = None
     iterative_n_tsps: tuple[int, ...] = (2, 4)
+    complete: bool = False
 
     def suited(self, machine: Machine | None) -> Plan:
-        """The plan with its families by name.
+        """The plan with its selectors and families by name.
 
         Raises:
             InputError: a family that the plan names needs a twin part, and the machine file has none.
@@ -57,7 +58,13 @@ class Plan:
                     f"family {key} needs the twin part of the machine file; add 'twin' to the file of "
                     f"{machine.machine if machine else 'the machine'}, or leave the family out"
                 )
-        return replace(self, families=self.families or tuple(_usual_families(has_twin)))
+        taken = ("quick", "complete") if self.complete else ("quick",)
+        suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
+        return replace(
+            self,
+            selectors=self.selectors or tuple(s for s in SELECTORS if SELECTORS[s].effort in taken),
+            families=self.families or tuple(f for f in suitable if FAMILIES[f].effort in taken),
+        )
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""
@@ -65,11 +72,6 @@ class Plan:
         if not family.closed_form:
             wanted = (*(n for n in self.iterative_n_tsps if n in wanted), wanted[-1])
         return tuple(dict.fromkeys(n for n in wanted if n <= n_inputs))
-
-
-def _usual_families(has_twin: bool) -> list[str]:
-    found = [(key, FAMILIES[key]) for key in FAMILIES]
-    return [key for key, family in found if not family.on_request and (has_twin or not family.needs_twin)]
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
     """
+    plan = plan.suited(machine)
     kept = with_target(batches, target)
     lost = [(target, f"batch {b.batch_id} is left out: no usable {target}") for b in batches if b not in kept]
     if len(kept) < 2:

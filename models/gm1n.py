@@ -43,6 +43,7 @@ class GM1N(Family):
     key = "gm1n"
     words = "grey model GM(1,N), free-running"
     source = "Deng 1989"
+    effort = "quick"
     rowwise = False
     rank = 30
 
@@ -97,7 +98,9 @@ class GM1N(Family):
         rows = self._respond(design, [self], batches)[:, 0]
         return [rows[design.rows(k)] for k in batches]
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         return self._respond(design, fitted, range(design.n_batches))
 
     def n_parameters(self) -> int:

@@ -238,7 +238,9 @@ class Linear(Family):
         coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
         return [design.x[design.rows(k)] @ coef + intercept for k in batches]
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
         out: Array = design.x @ coef + np.array([f.fitted["intercept_um"] for f in fitted])
         return out

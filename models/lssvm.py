@@ -43,6 +43,7 @@ class LSSVM(Family):
     key = "lssvm"
     words = "least-squares support vector machine, RBF and linear kernel"
     source = "Suykens et al. 2002"
+    effort = "quick"
     closed_form = False
     rank = 60
 
@@ -97,7 +98,9 @@ class LSSVM(Family):
             out.append(np.concatenate([*parts, np.empty(0)]) + f["bias"])
         return out
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         """Models that share σ share the kernel of their united support rows."""
         out = np.empty((len(design.x), len(fitted)))
         by_kernel: dict[tuple[float, bytes], list[int]] = {}

@@ -24,6 +24,7 @@ class MeanCurve(Family):
     key = "mean_curve"
     words = "mean error curve of the training batches over the time since the start"
     source = "baseline"
+    effort = "quick"
     uses_inputs = False
     rank = 1
 

@@ -15,6 +15,7 @@ from features.grey import synthetic_degree
 from models.result import SCORES
 
 Array = NDArray[np.float64]
+_SIDE_OF_90 = 1.6449  # standard deviations: a normal value lies within them nine times in ten
 
 
 def batch_scores(y_um: Array, predicted_um: Array) -> dict[str, Array]:
@@ -44,6 +45,24 @@ def batch_scores(y_um: Array, predicted_um: Array) -> dict[str, Array]:
         for name, values in _scores(y, p).items():
             out[name][which] = values
     return out
+
+
+def coverage(y_um: Array, predicted_um: Array, sd_um: Array) -> dict[str, Array]:
+    """How sure C models say they are on one batch, and how right they are in that.
+
+    Args:
+        y_um: recorded error (n,). predicted_um, sd_um: predictions and their stated standard deviations (n, C).
+
+    Returns:
+        per name in `CERTAINTY` an array (C,): the share of finite rows with |y − p| ≤ 1.645 sd, and the mean sd in µm.
+        NaN without such a row.
+    """
+    away = np.abs(y_um[:, None] - predicted_um)
+    known = np.isfinite(away) & np.isfinite(sd_um)
+    n = known.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inside = (away <= _SIDE_OF_90 * sd_um) & known
+        return {"coverage90": inside.sum(axis=0) / n, "sd_um": np.where(known, sd_um, 0.0).sum(axis=0) / n}
 
 
 def _scores(y: Array, p: Array) -> dict[str, Array]:

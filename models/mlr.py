@@ -21,6 +21,7 @@ class MLR(Linear):
     key = "mlr"
     words = "multiple linear regression: least squares on all chosen inputs"
     source = "Legendre (1805); minimum norm by singular values: Golub and Kahan (1965)"
+    effort = "quick"
     rank = 10
 
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:

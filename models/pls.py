@@ -24,6 +24,7 @@ class PLS(Tuned):
     key = "pls"
     words = "partial least squares, number of components by leave-batch-out inside the training batches"
     source = "Wold, Martens and Wold (1983); from cross-products: de Jong and ter Braak (1994)"
+    effort = "quick"
     rank = 14
 
     def __init__(self, max_components: int = 10) -> None:

@@ -12,6 +12,8 @@ import pandas as pd
 CELL_KEYS = ["protocol", "selector", "family", "n_tsp"]
 SCORES = ["S_um", "max_abs_um", "bias_um", "p95_abs_um", "rmse_um", "compensation_effect", "eta", "grey_degree"]
 
+CERTAINTY = ["coverage90", "sd_um"]
+
 
 @dataclass(frozen=True)
 class GridResult:
@@ -20,11 +22,13 @@ class GridResult:
     - `batches`: batch_id, start, digest, version, source, simulated, n_rows, speed_rpm, start_ambient_degC, season.
     - `scores`: one row per protocol, selector, family, n_tsp, fold and tested batch_id with the columns `SCORES`
       (µm, or a ratio), fit_S_um (the fold's training batches) and n_rows. For train-on-one a row is a fold
-      (fold = the training batch), batch_id "*", S_um the mean and S_std_um the std over the other batches.
+      (fold = the training batch), batch_id "*", S_um the mean and S_std_um the std over the other batches. `CERTAINTY`:
+      coverage90, the share of rows inside the stated 90 % interval, and sd_um, the mean stated standard deviation in
+      µm; NaN for families that state none.
     - `cells`: one row per protocol, selector, family, n_tsp: S_mean_um, S_std_um, the means of the other scores
-      (max_abs_um: the largest), fit_S_um, n_batches, n_parameters, rank (smaller is simpler), tsp_stability
-      (mean Jaccard similarity of the chosen sets over folds, 1 = always the same), inputs (the set chosen from all
-      batches, joined by "|"), n_inputs, simulated.
+      (max_abs_um: the largest), `CERTAINTY`, fit_S_um, n_batches, n_parameters, rank (smaller is simpler),
+      tsp_stability (mean Jaccard similarity of the chosen sets over folds, 1 = always the same), inputs (the set
+      chosen from all batches, joined by "|"), n_inputs, simulated.
     - `subsets`: protocol, selector, n_tsp, fold, inputs ("|"-joined): which points every fold chose.
     - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um and one float32 column per
       "selector|family|n_tsp" with the left-out prediction in µm.

@@ -37,6 +37,7 @@ class ThermalExponential(Family):
     key = "thermal_exponential"
     words = "exponential warm-up driven by spindle speed or time alone"
     source = "Newton's law of cooling; Golub and Pereyra 1973"
+    effort = "quick"
     uses_inputs = False
     rowwise = False
     rank = 5

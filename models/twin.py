@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from data.registry import Effort
 from features.design import Design
 from models.base import Array, Family, Plain
 from models.batchwise import too_few_rows
@@ -38,6 +39,7 @@ class Twin(Family):
     key = "twin"
     words = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
     source = "machine file; Mayr et al. (2012), CIRP Annals 61(2), sec. 4; MAP least squares, Tarantola (2005), ch. 3"
+    effort: ClassVar[Effort] = "quick"
     uses_inputs = False
     rowwise = False
     needs_twin = True
@@ -89,7 +91,9 @@ class Twin(Family):
         run = TwinRun.of(self.network, [design.batches[k] for k in batches])
         return np.split(self._simulated(run, [self])[0][0], np.cumsum(run.n_rows)[:-1])
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         run = run_of(design, fitted[0].fitted["machine"])
         return self._simulated(run, fitted)[0].T
 

@@ -34,7 +34,7 @@ class TwinKalman(Twin):
     source = "Kalman (1960); Gelb (1974), sec. 6.1, linearised about the simulation"
     uses_inputs = True
     closed_form = False
-    on_request = True
+    effort = "on_request"
     rank = 40
 
     def __init__(
@@ -61,7 +61,9 @@ class TwinKalman(Twin):
         run = TwinRun.of(self.network, [design.batches[k] for k in batches])
         return self._error_um(run)
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         run = run_of(design, fitted[0].fitted["machine"])
         return np.column_stack([np.concatenate(f._error_um(run)) for f in fitted])
 

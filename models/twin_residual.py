@@ -35,6 +35,7 @@ class TwinResidual(Twin):
     key = "twin_residual"
     words = "physics twin plus a regression of its residual on the sensors"
     source = "Kennedy and O'Hagan (2001), eq. 4, a discrepancy beside a calibrated model; Hoerl and Kennard (1970)"
+    effort = "quick"
     uses_inputs = True
     closed_form = False
     rank = 35
@@ -72,7 +73,9 @@ class TwinResidual(Twin):
         total = self._total(some, TwinRun.of(self.network, some.batches), [self])[:, 0]
         return [total[some.rows(k)] for k in range(some.n_batches)]
 
-    def predict_folds(self, design: Design, fitted: Sequence[Self]) -> Array:
+    def predict_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
+    ) -> Array:
         return self._total(design, run_of(design, fitted[0].fitted["machine"]), fitted)
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:

@@ -17,6 +17,7 @@ class Zero(Family):
     key = "zero"
     words = "no model: predicts zero error"
     source = "baseline"
+    effort = "quick"
     uses_inputs = False
     rank = 0
 

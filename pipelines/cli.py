@@ -95,8 +95,9 @@ def train(
     machine: MachineFile,
     recordings: Annotated[list[Path] | None, typer.Option(help="files or folders to ingest first")] = None,
     channels: Annotated[str, typer.Option(help="error channels, comma separated; default: all")] = "",
-    selectors: Annotated[str, typer.Option(help="selectors, comma separated; default: all")] = "",
-    families: Annotated[str, typer.Option(help="model families, comma separated; default: what suits it")] = "",
+    selectors: Annotated[str, typer.Option(help="selectors, comma separated; default: the quick ones")] = "",
+    families: Annotated[str, typer.Option(help="model families, comma separated; default: the quick ones")] = "",
+    complete: Annotated[bool, typer.Option("--complete", help="cross every selector with every family")] = False,
     protocols: Annotated[str, typer.Option(help="protocols, comma separated; default: all")] = "",
     report: Annotated[Path | None, typer.Option(help="where the report goes")] = None,
     promote: Annotated[bool, typer.Option(help="promote the best cell")] = True,
@@ -112,13 +113,13 @@ def train(
     from pipelines.request import TrainRequest, check_request
 
     settings = settings_module.load()
-    chosen = (
-        names(selectors, SELECTORS, "selector"),
-        names(families, FAMILIES, "family") if families else (),  # none: what suits the machine
+    plan = Plan(
+        names(selectors, SELECTORS, "selector") if selectors else (),
+        names(families, FAMILIES, "family") if families else (),
         names(protocols, PROTOCOLS, "protocol"),
+        complete=complete,
     )
-    targets = split(channels)
-    request = TrainRequest(machine, tuple(recordings or ()), targets, Plan(*chosen), report, promote)
+    request = TrainRequest(machine, tuple(recordings or ()), split(channels), plan, report, promote)
     check_request(request, settings)  # before anything is started
     server = None
     if not direct:

@@ -183,7 +183,8 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
 
 def _track(results: dict[str, GridResult], plan: Plan, settings: Settings, say: Say, target: str) -> str:
     result = results[target]
-    params = {name: ", ".join(map(str, value)) if value else "all" for name, value in asdict(plan).items()}
+    named = {name: value for name, value in asdict(plan).items() if name != "complete"}  # its members stand there
+    params = {name: ", ".join(map(str, value)) if value else "all" for name, value in named.items()}
     return tracking.log_training(result, settings, figures=figure_pngs(result), params=params, say=say)
 
 

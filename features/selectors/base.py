@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from data.batch import Batch
+from data.registry import Effort
 from features.design import Design
 from features.rises import temperature_inputs
 
@@ -21,6 +22,7 @@ class Selector(ABC):
     words: ClassVar[str]
     source: ClassVar[str]
     takes_n_tsp: ClassVar[bool] = True  # False: the selector decides itself (or keeps all)
+    effort: ClassVar[Effort] = "complete"  # which crossings take it unless it is named
 
     @abstractmethod
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:

@@ -20,6 +20,7 @@ class Correlation(Selector):
     key = "correlation"
     words = "largest |correlation| with the error"
     source = "K. Pearson (1895), Proc. R. Soc. 58, 240–242"
+    effort = "quick"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

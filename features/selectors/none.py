@@ -14,6 +14,7 @@ class NoSelection(Selector):
     key = "none"
     words = "all inputs"
     source = "baseline"
+    effort = "quick"
     takes_n_tsp = False
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
