@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
+from features.nets import Nets
 from models.base import Array, Family
 from models.batchwise import too_few_rows
-from models.nets import Nets
 
 _STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit spread
@@ -102,7 +102,7 @@ class BP(Family):
         return stacks
 
     def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
-        from models.levenberg_marquardt import train  # here alone: a trained model predicts without torch
+        from features.levenberg_marquardt import train  # here alone: a trained model predicts without torch
 
         n, p, starts = max(len(r) for r in rows), len(design.inputs), self.starts
         x_t, y, known = np.zeros((len(rows), p, n)), np.zeros((len(rows), n)), np.zeros((len(rows), n))

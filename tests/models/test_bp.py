@@ -11,9 +11,9 @@ from threadpoolctl import threadpool_limits
 
 from data.errors import InputError
 from features.design import Design
+from features.levenberg_marquardt import jacobian, outputs, train
+from features.nets import Nets
 from models.bp import BP
-from models.levenberg_marquardt import jacobian, outputs, train
-from models.nets import Nets
 
 
 def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:

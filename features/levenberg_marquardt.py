@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from models.nets import Nets
+from features.nets import Nets
 
 Array = NDArray[np.float64]
 
