@@ -67,18 +67,14 @@ class Family(ABC):
         return [self.fit_design(design, fold) for fold in folds]
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
-        """Predictions (n, F) of F fitted copies on the design's rows, equal to `predict_design` one by one.
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        """For each of F fitted copies the predictions (n_k,) of its batches `wanted[f]`, as `predict_design` gives."""
+        return [f.predict_design(design, batches) for f, batches in zip(fitted, wanted, strict=True)]
 
-        `wanted` names each copy's batches, None all of them; what stands on other rows is not to be read.
-        """
-        out = np.full((len(design.time_s), len(fitted)), np.nan)
-        for column, f in enumerate(fitted):
-            batches = range(design.n_batches) if wanted is None else wanted[column]
-            for k, predicted in zip(batches, f.predict_design(design, batches), strict=True):
-                out[design.rows(k), column] = predicted
-        return out
+    def fitting_S_um(self, design: Design, fitted: Sequence[Self], trained: Sequence[Sequence[int]]) -> Array | None:
+        """Mean S (F,) of each copy on its batches `trained[f]` where it can be had without rows; None: predict them."""
+        return None
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value about the prediction, for families that tell it.

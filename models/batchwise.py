@@ -28,6 +28,11 @@ def unpadded(design: Design, values: Array) -> Array:
     return values[at_batch, at_row]
 
 
+def by_batch(design: Design, columns: Array, wanted: Sequence[Sequence[int]]) -> list[list[Array]]:
+    """Columns (n, F) of all rows cut to the batches that each of them is wanted for."""
+    return [[columns[design.rows(k), f] for k in batches] for f, batches in enumerate(wanted)]
+
+
 def steps_s(design: Design) -> Array:
     """Sampling step of every batch, s, (K,); NaN for a batch of one row."""
     out = np.full(design.n_batches, np.nan)

@@ -12,7 +12,7 @@ from data.errors import InputError, closest
 from features.design import Design
 from features.rises import hold_last
 from models.base import Array, Family, Plain
-from models.batchwise import padded, steps_s, too_few_rows, unpadded
+from models.batchwise import by_batch, padded, steps_s, too_few_rows, unpadded
 
 RESPONSES = ("difference", "whitening")
 _A_HIGHEST = 2.0  # beyond it the recursion's pole (1 − a/2)/(1 + a/2) is negative: the prediction would zigzag
@@ -99,9 +99,10 @@ class GM1N(Family):
         return [rows[design.rows(k)] for k in batches]
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
-        return self._respond(design, fitted, range(design.n_batches))
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        asked = sorted({k for batches in wanted for k in batches})
+        return by_batch(design, self._respond(design, fitted, asked), wanted)
 
     def n_parameters(self) -> int:
         return 1 + len(self.inputs)

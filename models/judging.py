@@ -13,24 +13,26 @@ from numpy.typing import NDArray
 from data.errors import InputError
 from features.design import Design
 from models.base import Family
-from models.metrics import batch_scores, coverage
+from models.metrics import batch_scores, coverage, residual_std_um
 from models.protocols import Fold
 from models.result import CERTAINTY, SCORES
 
 Array = NDArray[np.float64]
 Inputs = tuple[str, ...]
-_COLUMNS_AT_ONCE_BYTES = 128 * 2**20
-_FITTED_ON = 4  # training batches that an iterative family's fitting accuracy is taken from
+_AT_ONCE_BYTES = 128 * 2**20
+_FITTED_ON, _FITTED_ON_ITERATIVE = 100, 4  # training batches, evenly chosen, that fitting accuracy is taken from
 
 
 @dataclass(frozen=True)
 class _Column:
-    """Predictions (n,) of one fitted model on a design's rows, and where it tells them their standard deviations."""
+    """One fitted model's predictions and, where it tells them, their standard deviations: by batch, (n_k,)."""
 
     inputs: Inputs
     fold: int
-    predicted_um: Array
-    sd_um: Array | None
+    predicted_um: dict[int, Array]
+    sd_um: dict[int, Array]
+    fitting_S_um: float | None
+    n_parameters: int
 
 
 @dataclass
@@ -39,7 +41,7 @@ class Judged:
 
     column: dict[tuple[Inputs, int], int]
     tested: dict[str, Array]  # score -> (columns, K), NaN where a batch is not tested
-    fit_S_um: Array  # (columns,), over the training batches, of an iterative family over four of them
+    fit_S_um: Array  # (columns,), over the training batches, at most 100 of them, 4 of an iterative family
     kept: dict[int, Array]  # column -> prediction on the fold's tested rows
     n_parameters: int
     failures: list[str]
@@ -52,68 +54,56 @@ class Judged:
         total = sum(len(which) for _, which in needed)
         tested = {name: np.full((total, design.n_batches), np.nan) for name in [*SCORES, *CERTAINTY, "n_rows"]}
         out = cls({}, tested, np.full(total, np.nan), {}, 0, [])
+        most = _FITTED_ON if family.closed_form else _FITTED_ON_ITERATIVE
+        trained = [f.train[:: -(-len(f.train) // most)] for f in folds]
         pending: list[_Column] = []
-        budget = max(1, _COLUMNS_AT_ONCE_BYTES // (8 * max(1, len(design.y_um))))
-        trained = [f.train if family.closed_form else f.train[:: -(-len(f.train) // _FITTED_ON)] for f in folds]
+        waiting = 0
         for sub, which in needed:
             try:
-                fitted = family.fit_folds(sub, [folds[i].train for i in which])
-                predicted = family.predict_folds(sub, fitted, [(*folds[i].test, *trained[i]) for i in which])
-                sd_um = [
-                    _sd_um(sub, f, folds[i].test) if f.tells_sd else None for f, i in zip(fitted, which, strict=True)
-                ]
+                columns = _columns(sub, family, which, folds, trained)
             except InputError as error:
                 out.failures.append(f"{len(sub.inputs)} points: {error}")
                 continue
-            out.n_parameters = max(out.n_parameters, fitted[0].n_parameters())
-            pending += [_Column(sub.inputs, i, predicted[:, c], sd_um[c]) for c, i in enumerate(which)]
-            if len(pending) >= budget:
+            out.n_parameters = max(out.n_parameters, columns[0].n_parameters)
+            pending += columns
+            waiting += sum(p.nbytes for c in columns for p in c.predicted_um.values())
+            if waiting > _AT_ONCE_BYTES:
                 out._judge(design, folds, trained, pending)
-                pending = []
+                pending, waiting = [], 0
         out._judge(design, folds, trained, pending)
         return out
 
     def _judge(
-        self, design: Design, folds: Sequence[Fold], trained: Sequence[Sequence[int]], pending: list[_Column]
+        self, design: Design, folds: Sequence[Fold], trained: Sequence[Sequence[int]], pending: Sequence[_Column]
     ) -> None:
-        if not pending:
-            return
         first = len(self.column)
-        predicted = np.column_stack([p.predicted_um for p in pending])
-        fold_of = np.array([p.fold for p in pending])
-        told = np.array([p.sd_um is not None for p in pending])
-        in_test = np.zeros((len(folds), design.n_batches), bool)
-        in_train = np.zeros_like(in_test)
-        for i, fold in enumerate(folds):
-            in_test[i, list(fold.test)] = True
-            in_train[i, list(trained[i])] = True
-            if len(fold.test) == 1:
-                rows = design.rows(fold.test[0])
-                self.kept |= {first + int(c): predicted[rows, c] for c in np.flatnonzero(fold_of == i)}
-        S_all = np.full((len(pending), design.n_batches), np.nan)
-        for k in range(design.n_batches):
-            rows = design.rows(k)
-            y, p = design.y_um[rows], predicted[rows]
-            e = y[:, None] - p
-            ok = np.isfinite(e)
-            n = ok.sum(axis=0)
-            e = np.where(ok, e, 0.0)
-            sse = np.einsum("ij,ij->j", e, e)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                S_all[:, k] = np.where(n > 1, np.sqrt(sse / (n - 1)), np.nan)
-            tests = in_test[fold_of, k]
-            columns = np.flatnonzero(tests)
-            if len(columns):
-                for name, values in batch_scores(y, p[:, columns]).items():
-                    self.tested[name][first + columns, k] = values
-            sure = np.flatnonzero(tests & told)
-            if len(sure):
-                sd_um = np.column_stack([pending[c].sd_um[rows] for c in sure])  # type: ignore[index]
-                for name, values in coverage(y, p[:, sure], sd_um).items():
-                    self.tested[name][first + sure, k] = values
-        self.fit_S_um[first : first + len(pending)] = _masked_mean(S_all, in_train[fold_of])
-        for offset, column in enumerate(pending):
-            self.column[column.inputs, column.fold] = first + offset
+        fit_S: list[list[float]] = [[] for _ in pending]
+        asked: dict[int, list[int]] = {}
+        for c, column in enumerate(pending):
+            for k in column.predicted_um:
+                asked.setdefault(k, []).append(c)
+            if len(folds[column.fold].test) == 1:
+                self.kept[first + c] = column.predicted_um[folds[column.fold].test[0]]
+        for k, columns in asked.items():
+            y = design.y_um[design.rows(k)]
+            tests = [c for c in columns if k in folds[pending[c].fold].test]
+            fits = [c for c in columns if pending[c].fitting_S_um is None and k in trained[pending[c].fold]]
+            if tests:
+                at = first + np.array(tests)
+                for name, values in batch_scores(y, _stacked(pending, tests, k)).items():
+                    self.tested[name][at, k] = values
+            if sure := [c for c in tests if pending[c].sd_um]:
+                sd_um = np.column_stack([pending[c].sd_um[k] for c in sure])
+                for name, values in coverage(y, _stacked(pending, sure, k), sd_um).items():
+                    self.tested[name][first + np.array(sure), k] = values
+            if fits:
+                for c, S_um in zip(fits, residual_std_um(y[:, None] - _stacked(pending, fits, k)), strict=True):
+                    fit_S[c].append(S_um)
+        for c, column in enumerate(pending):
+            own = [S_um for S_um in fit_S[c] if np.isfinite(S_um)]
+            fitted = column.fitting_S_um
+            self.fit_S_um[first + c] = fitted if fitted is not None else sum(own) / max(1, len(own))
+            self.column[column.inputs, column.fold] = first + c
 
     def left_out(self, design: Design, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         """Every batch's prediction by the fold that left it out, on all rows of the design, µm."""
@@ -123,18 +113,26 @@ class Judged:
         return out
 
 
-def _sd_um(design: Design, fitted: Family, batches: Sequence[int]) -> Array:
-    """Stated standard deviations (n,) on the rows of some batches, NaN on others."""
-    out = np.full(len(design.y_um), np.nan)
-    for k, sd_um in zip(batches, fitted.sd_um(design, batches), strict=True):
-        out[design.rows(k)] = sd_um
+def _columns(
+    design: Design, family: Family, which: Sequence[int], folds: Sequence[Fold], trained: Sequence[Sequence[int]]
+) -> list[_Column]:
+    """The family fitted on one set of inputs for some of the folds, with its predictions on what they test."""
+    fitted = family.fit_folds(design, [folds[i].train for i in which])
+    own_S_um = family.fitting_S_um(design, fitted, [trained[i] for i in which])
+    wanted = [folds[i].test if own_S_um is not None else tuple({*folds[i].test, *trained[i]}) for i in which]
+    predicted = family.predict_folds(design, fitted, wanted)
+    out = []
+    for c, (i, model) in enumerate(zip(which, fitted, strict=True)):
+        test = folds[i].test
+        sd_um = dict(zip(test, model.sd_um(design, test), strict=True)) if model.tells_sd else {}
+        fitting = None if own_S_um is None else float(own_S_um[c])
+        by_batch = dict(zip(wanted[c], predicted[c], strict=True))
+        out.append(_Column(design.inputs, i, by_batch, sd_um, fitting, model.n_parameters()))
     return out
 
 
-def _masked_mean(values: Array, where: NDArray[np.bool_]) -> Array:
-    ok = where & np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.where(ok, values, 0.0).sum(axis=1) / np.maximum(ok.sum(axis=1), 1)
+def _stacked(pending: Sequence[_Column], columns: Sequence[int], k: int) -> Array:
+    return np.column_stack([pending[c].predicted_um[k] for c in columns])
 
 
 def score_table(

@@ -239,11 +239,40 @@ class Linear(Family):
         return [design.x[design.rows(k)] @ coef + intercept for k in batches]
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
         coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
-        out: Array = design.x @ coef + np.array([f.fitted["intercept_um"] for f in fitted])
-        return out
+        intercept = np.array([f.fitted["intercept_um"] for f in fitted])
+        copies: dict[int, list[int]] = {}
+        for f, batches in enumerate(wanted):
+            for k in batches:
+                copies.setdefault(k, []).append(f)
+        found: dict[tuple[int, int], Array] = {}
+        for k, some in copies.items():
+            predicted = design.x[design.rows(k)] @ coef[:, some] + intercept[some]
+            found |= {(f, k): predicted[:, c] for c, f in enumerate(some)}
+        return [[found[f, k] for k in batches] for f, batches in enumerate(wanted)]
+
+    def fitting_S_um(self, design: Design, fitted: Sequence[Self], trained: Sequence[Sequence[int]]) -> Array:
+        """From the batches' sums alone."""
+        moments = design.moments
+        blocks = Blocks.of(moments)
+        block = np.concatenate([np.asarray(batches, np.int64) for batches in trained])
+        which = np.repeat(np.arange(len(fitted)), [len(batches) for batches in trained])
+        S_um = np.empty(len(block))
+        step = max(1, _AT_ONCE // len(design.inputs) ** 2)
+        for start in range(0, len(block), step):
+            some = slice(start, start + step)
+            k, beta = block[some], np.stack([fitted[f].fitted["coef_um_per_K"] for f in which[some]])
+            offset = np.array([fitted[f].fitted["intercept_um"] for f in which[some]])
+            bias = blocks.mean_y[k] + moments.shift_y - offset
+            bias = bias - np.einsum("vj,vj->v", blocks.mean_x[k] + moments.shift_x, beta)
+            sse = blocks.yy[k] - 2.0 * np.einsum("vj,vj->v", blocks.xy[k], beta)
+            sse += np.einsum("vj,vj->v", beta, (blocks.xx[k] @ beta[:, :, None])[..., 0]) + blocks.count[k] * bias**2
+            S_um[some] = np.sqrt(np.maximum(sse, 0.0) / np.maximum(blocks.count[k] - 1.0, 1.0))
+        usable = np.bincount(which, moments.count[block] > 1, len(fitted))
+        total = np.bincount(which, np.where(moments.count[block] > 1, S_um, 0.0), len(fitted))
+        return np.asarray(total / np.maximum(usable, 1.0))
 
     def n_parameters(self) -> int:
         """Coefficients and intercept."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family, inner_groups
-from models.batchwise import too_few_rows
+from models.batchwise import by_batch, too_few_rows
 from models.bordered import Bordered, Kernel
 
 Rows = NDArray[np.int64]
@@ -99,10 +99,11 @@ class LSSVM(Family):
         return out
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
         """Models that share σ share the kernel of their united support rows."""
         out = np.empty((len(design.x), len(fitted)))
+        asked = np.flatnonzero(np.isin(design.group, sorted({k for batches in wanted for k in batches})))
         by_kernel: dict[tuple[float, bytes], list[int]] = {}
         for f, m in enumerate(fitted):
             by_kernel.setdefault((m.fitted["sigma"], np.asarray(m.fitted["scale"]).tobytes()), []).append(f)
@@ -114,10 +115,11 @@ class LSSVM(Family):
                 np.add.at(alpha[:, c], place[c], m.fitted["alpha"])
             scale = np.asarray(models[0].fitted["scale"], float)
             bias = np.array([m.fitted["bias"] for m in models])
-            for start in range(0, len(out), _ROWS_AT_ONCE):
-                some = slice(start, start + _ROWS_AT_ONCE)
-                out[some, members] = kernel(design.x[some] / scale, support, sigma, self.linear) @ alpha + bias
-        return out
+            for start in range(0, len(asked), _ROWS_AT_ONCE):
+                some = asked[start : start + _ROWS_AT_ONCE]
+                values = kernel(design.x[some] / scale, support, sigma, self.linear) @ alpha + bias
+                out[some[:, None], members] = values
+        return by_batch(design, out, wanted)
 
     def n_parameters(self) -> int:
         return int(np.size(self.fitted["alpha"])) + 3

@@ -8,6 +8,8 @@ eta = 1 − mean|e|/mean|y| (coupled-lathe study); grey synthetic relational deg
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,7 +95,9 @@ def _quantile95(values: Array) -> Array:
     return part[low] + (position - low) * (part[high] - part[low])
 
 
-def residual_std_um(error_um: Array) -> float:
-    """S of one residual series (n,), NaN left out; NaN below 2 rows."""
-    e = error_um[np.isfinite(error_um)]
-    return float(np.sqrt(e @ e / (len(e) - 1))) if len(e) > 1 else float("nan")
+def residual_std_um(error_um: Array) -> Any:
+    """S of a residual series (n,), or of C of them (n, C) → (C,); NaN left out, and NaN below 2 rows."""
+    known = np.isfinite(error_um)
+    n, e = known.sum(axis=0), np.where(known, error_um, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(n > 1, np.sqrt((e * e).sum(axis=0) / (n - 1)), np.nan)[()]

@@ -14,7 +14,7 @@ from data.machine import Machine
 from data.registry import Effort
 from features.design import Design
 from models.base import Array, Family, Plain
-from models.batchwise import too_few_rows
+from models.batchwise import by_batch, too_few_rows
 from models.recent import Recent
 from models.twin_folds import Calibrated, Calibrations
 from models.twin_run import TwinRun
@@ -92,10 +92,10 @@ class Twin(Family):
         return np.split(self._simulated(run, [self])[0][0], np.cumsum(run.n_rows)[:-1])
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
         run = run_of(design, fitted[0].fitted["machine"])
-        return self._simulated(run, fitted)[0].T
+        return by_batch(design, self._simulated(run, fitted)[0].T, wanted)
 
     def n_parameters(self) -> int:
         """Free parameters of the network and one start per body."""

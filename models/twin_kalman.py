@@ -62,10 +62,11 @@ class TwinKalman(Twin):
         return self._error_um(run)
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
         run = run_of(design, fitted[0].fitted["machine"])
-        return np.column_stack([np.concatenate(f._error_um(run)) for f in fitted])
+        every = [f._error_um(run) for f in fitted]
+        return [[errors[k] for k in batches] for errors, batches in zip(every, wanted, strict=True)]
 
     def filtered(self, batches: Sequence[Batch]) -> Filtered | None:
         """All that the filter knows of batches that can be simulated; None where there is none."""

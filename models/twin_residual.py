@@ -11,6 +11,7 @@ import numpy as np
 from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family, Plain
+from models.batchwise import by_batch
 from models.gaussian_process import GaussianProcess
 from models.ridge import Ridge
 from models.twin import Twin, run_of
@@ -74,9 +75,9 @@ class TwinResidual(Twin):
         return [total[some.rows(k)] for k in range(some.n_batches)]
 
     def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]] | None = None
-    ) -> Array:
-        return self._total(design, run_of(design, fitted[0].fitted["machine"]), fitted)
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        return by_batch(design, self._total(design, run_of(design, fitted[0].fitted["machine"]), fitted), wanted)
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value about the prediction, for `residual` "gp".

@@ -12,6 +12,7 @@ from data.machine import parse_machine
 from features.design import Design
 from models import FAMILIES
 from models.base import Family, family_from_plain
+from models.metrics import residual_std_um
 
 INPUTS = ("front", "column", "bed")
 N = 72
@@ -150,8 +151,16 @@ def test_folds_at_once_are_the_folds_one_by_one(key, design, fitted):
         want = b.predict_design(design, [4])[0]
         got = a.predict_design(design, [4])[0]
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * max(1.0, np.abs(want).max()))
-    columns = fitted.predict_folds(design, together)
-    np.testing.assert_allclose(columns[design.rows(4), 0], together[0].predict_design(design, [4])[0], atol=1e-6)
+    (first,), (_, second) = fitted.predict_folds(design, together, [[4], [0, 4]])
+    np.testing.assert_allclose(first, together[0].predict_design(design, [4])[0], atol=1e-6)
+    np.testing.assert_allclose(second, together[1].predict_design(design, [4])[0], atol=1e-6)
+
+
+def test_fitting_accuracy_without_rows_is_that_of_the_predictions(key, design, fitted):
+    S_um = fitted.fitting_S_um(design, [fitted], [[0, 2]])
+    if S_um is not None:
+        own = [design.y_um[design.rows(k)] - fitted.predict_design(design, [k])[0] for k in (0, 2)]
+        assert S_um.shape == (1,) and S_um[0] == pytest.approx(np.mean([residual_std_um(e) for e in own]), rel=1e-8)
 
 
 def test_one_batch_is_enough(key, design):

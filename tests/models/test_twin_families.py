@@ -89,8 +89,8 @@ def test_folds_at_once_are_the_folds_one_by_one(family):
         out = folds[0][0] if fold else 0
         got, want = (m.predict_design(given, [out])[0] for m in (together[fold], alone))
         np.testing.assert_allclose(got, want, atol=0.02)  # µm, of 20 to 40
-    columns = together[0].predict_folds(given, together)
-    np.testing.assert_allclose(columns[given.rows(3), 1], together[1].predict_design(given, [3])[0], atol=1e-6)
+    got = together[0].predict_folds(given, together, [[3]] * len(together))[1][0]
+    np.testing.assert_allclose(got, together[1].predict_design(given, [3])[0], atol=1e-6)
 
 
 def test_where_a_fit_begins_does_not_matter_even_where_the_beginning_saw_a_spoilt_batch():
