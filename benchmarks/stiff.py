@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from data import sample_machine as sample
+from data import thermal_machine as laws
 from twin.simulation.inputs import Inputs
 
 Array = NDArray[np.float64]
@@ -59,11 +60,11 @@ class Plain:
         shaft, parts = sample.NODE["shaft"], []
         for bearing in sample.BEARINGS:
             j = sample.NODE[bearing.housing]
-            viscous = 1.047e-4 * rpm * bearing.count * sample.LUBRICATION_F0 * 1e-7 * bearing.mean_diameter_mm**3 / 2
-            at_40 = viscous * max(sample.VISCOSITY_40_MM2_PER_S * rpm, 2000.0) ** (2 / 3)
+            viscous = 1.047e-4 * rpm * bearing.count * laws.LUBRICATION_F0 * 1e-7 * bearing.mean_diameter_mm**3 / 2
+            at_40 = viscous * max(laws.VISCOSITY_40_MM2_PER_S * rpm, 2000.0) ** (2 / 3)
             fixed[[j, shaft]] -= at_40 / self.capacity[[j, shaft]]
-            parts.append((j, viscous, sample.VISCOSITY_40_MM2_PER_S * rpm))
-        shaft_C, b = self.capacity[shaft], sample.VISCOSITY_SLOPE_PER_K
+            parts.append((j, viscous, laws.VISCOSITY_40_MM2_PER_S * rpm))
+        shaft_C, b = self.capacity[shaft], laws.VISCOSITY_SLOPE_PER_K
 
         def dependent(t: float, y: Array) -> Array:
             k = min(int(t / step_s), last)

@@ -1,19 +1,17 @@
 """The sample machine: a simulated vertical machining centre as a thermal network of 14 nodes.
 
-Heat balance of node i, with T in degC:
-``C_i dT_i/dt = sum_j G_ij (T_j - T_i) + G_room,i (T_room - T_i) + G_floor,i (T_floor - T_i) + q_i(n, T)``.
 The numbers stand in the tables below with their units; typical of the class, none was measured on a machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
+
+from data.thermal_machine import BearingSet, SpeedHeat, ThermalMachine
 
 Array = NDArray[np.float64]
 
@@ -40,29 +38,15 @@ ROOM_W_PER_K: Mapping[str, float] = MappingProxyType(
 )
 FLOOR_W_PER_K: Mapping[str, float] = MappingProxyType({"bed": 10})
 
-# Rotating convection, Nu ~ Re^(2/3): these links to the air are multiplied by 1 + 3.5 x^(2/3), x = n / 6000 rpm.
 ROTATING: tuple[tuple[str, str], ...] = (("shaft", "air"), ("mandrel", "air"))
-ROTATING_GAIN, RATED_RPM = 3.5, 6000.0
-
-
-@dataclass(frozen=True)
-class BearingSet:
-    """`count` equal angular-contact bearings in one housing; half of their heat goes into the shaft."""
-
-    housing: str
-    count: int
-    mean_diameter_mm: float
-    preload_N: float
-    static_capacity_N: float
-
+RATED_RPM = 6000.0
 
 # Preloads and capacities make the load part 10-25 % of the viscous moment, the usual share.
 BEARINGS = (BearingSet("front", 3, 77.5, 800.0, 26e3), BearingSet("rear", 2, 70.0, 600.0, 22e3))
-LUBRICATION_F0 = 1.0  # grease
-VISCOSITY_40_MM2_PER_S, VISCOSITY_SLOPE_PER_K = 22.0, 0.035
-LOAD_Z, LOAD_Y = 0.001, 0.33
-MOTOR_W = (40.0, 110.0, 80.0)  # a + b x + c x², only while the spindle runs
-BELT_W, BELT_EXPONENT = 70.0, 1.5  # on the rear housing, where the pulley sits
+HEATS = (
+    SpeedHeat("motor", ((40.0, 0.0), (110.0, 1.0), (80.0, 2.0))),
+    SpeedHeat("rear", ((70.0, 1.5),)),  # the belt, at the rear housing, where the pulley sits
+)
 AUXILIARIES_W = 60.0  # into the enclosure's air, always
 
 STEEL_UM_PER_M_K, IRON_UM_PER_M_K = 11.5, 10.8
@@ -84,47 +68,12 @@ SPEED_SHIFT_UM = 4.0  # at 6000 rpm, proportional to n²
 
 def network(speed_rpm: float) -> tuple[Array, Array, Array]:
     """Rates of the network at one speed: A (14, 14) in 1/s, and room and floor gains (14,) in 1/s."""
-    x = speed_rpm / RATED_RPM
-    capacity = np.array([CAPACITY_J_PER_K[n] for n in NODES])
-    conductance = np.zeros((len(NODES), len(NODES)))
-    for (a, b), value in LINK_W_PER_K.items():
-        g = value * (1.0 + ROTATING_GAIN * x ** (2 / 3)) if (a, b) in ROTATING else value
-        i, j = NODE[a], NODE[b]
-        conductance[i, i] += g
-        conductance[j, j] += g
-        conductance[i, j] -= g
-        conductance[j, i] -= g
-    room = np.array([ROOM_W_PER_K.get(n, 0.0) for n in NODES])
-    floor = np.array([FLOOR_W_PER_K.get(n, 0.0) for n in NODES])
-    return -(conductance + np.diag(room + floor)) / capacity[:, None], room / capacity, floor / capacity
+    return machine().rates(speed_rpm)
 
 
-def bearing_heat_W(bearing: BearingSet, speed_rpm: Array, oil_degC: Array) -> Array:
-    """Friction heat of a bearing set, W.
-
-    Palmgren (1959): ``M0 = f0 1e-7 (nu n)^(2/3) dm³``, with ``nu n`` not below 2000, ``M1 = z (F/C0)^y F dm`` in
-    N mm, ``P = 1.047e-4 n (M0 + M1)``; the grease thins as ``nu = nu40 exp(-0.035 (T - 40))``.
-    """
-    viscosity = VISCOSITY_40_MM2_PER_S * np.exp(-VISCOSITY_SLOPE_PER_K * (oil_degC - 40.0))
-    viscous = LUBRICATION_F0 * 1e-7 * np.maximum(viscosity * speed_rpm, 2000.0) ** (2 / 3) * bearing.mean_diameter_mm**3
-    load = LOAD_Z * (bearing.preload_N / bearing.static_capacity_N) ** LOAD_Y * bearing.preload_N
-    moment_Nmm = viscous + load * bearing.mean_diameter_mm
-    return np.asarray(1.047e-4 * speed_rpm * bearing.count * moment_Nmm)
-
-
-def heat_W(node_degC: Array, speed_rpm: Array, friction: Array, auxiliaries_W: float = AUXILIARIES_W) -> Array:
+def heat_W(node_degC: Array, speed_rpm: Array, friction: Array) -> Array:
     """Heat into every node (B, 14), W, from temperatures (B, 14), speed (B,) and the friction factor (B,)."""
-    x = speed_rpm / RATED_RPM
-    heat = np.zeros_like(node_degC)
-    heat[:, NODE["air"]] = auxiliaries_W
-    heat[:, NODE["motor"]] = np.where(x > 0, MOTOR_W[0] + MOTOR_W[1] * x + MOTOR_W[2] * x**2, 0.0)
-    heat[:, NODE["rear"]] = BELT_W * x**BELT_EXPONENT
-    for bearing in BEARINGS:
-        oil = (node_degC[:, NODE[bearing.housing]] + node_degC[:, NODE["shaft"]]) / 2
-        half = friction * bearing_heat_W(bearing, speed_rpm, oil) / 2
-        heat[:, NODE[bearing.housing]] += half
-        heat[:, NODE["shaft"]] += half
-    return heat
+    return machine().heat_W(node_degC, speed_rpm, friction)
 
 
 def simulate(
@@ -136,30 +85,8 @@ def simulate(
     step_s: float = 10.0,
     auxiliaries_W: float = AUXILIARIES_W,
 ) -> Array:
-    """Node temperatures (S + 1, B, 14) of B batches at once.
-
-    speed and room (S, B) hold during each step, floor (B,), start (B, 14), friction (B,). Conduction and convection
-    are exact (matrix exponential per speed); heat that depends on temperature holds for one step, at most 10 s.
-    """
-    capacity = np.array([CAPACITY_J_PER_K[n] for n in NODES])
-    speeds, which = np.unique(speed_rpm, return_inverse=True)
-    which = which.reshape(speed_rpm.shape)
-    n = len(NODES)
-    free, forced = np.empty((len(speeds), n, n)), np.empty((len(speeds), n, n))
-    for k, speed in enumerate(speeds):
-        rates, room_rate, floor_rate = network(float(speed))
-        free[k] = expm(rates * step_s)
-        forced[k] = np.linalg.solve(rates, free[k] - np.eye(n))
-    out = np.empty((len(speed_rpm) + 1, *start_degC.shape))
-    out[0] = start_degC
-    floor_gain = floor_degC[:, None] * floor_rate
-    for s in range(len(speed_rpm)):
-        gain = room_degC[s][:, None] * room_rate + floor_gain
-        gain += heat_W(out[s], speed_rpm[s], friction, auxiliaries_W) / capacity
-        # einsum, not matmul: no BLAS, so the sum does not depend on its threads
-        out[s + 1] = np.einsum("bij,bj->bi", free[which[s]], out[s])
-        out[s + 1] += np.einsum("bij,bj->bi", forced[which[s]], gain)
-    return out
+    """Node temperatures (S + 1, B, 14) of B batches at once, as `ThermalMachine.simulate`."""
+    return machine(auxiliaries_W).simulate(speed_rpm, room_degC, floor_degC, start_degC, friction, step_s)
 
 
 def chain_um(
@@ -192,3 +119,21 @@ def displacement_um(rise_K: Array, speed_rpm: Array) -> dict[str, Array]:
         "y": chain_um(Y_CHAIN, rise_K) - tilt_um_per_m * COLUMN_HEIGHT_M / 2,
         "z": chain_um(Z_CHAIN, rise_K) - tilt_um_per_m * HEAD_REACH_M + SPEED_SHIFT_UM * (speed_rpm / RATED_RPM) ** 2,
     }
+
+
+def machine(auxiliaries_W: float = AUXILIARIES_W) -> ThermalMachine:
+    """The sample machine as data; its error is linear in the rises, so a unit rise of each node tells all of it."""
+    unit = displacement_um(np.eye(len(NODES)), np.zeros(len(NODES)))
+    return ThermalMachine(
+        capacity_J_per_K=CAPACITY_J_PER_K,
+        link_W_per_K=LINK_W_PER_K,
+        room_W_per_K=ROOM_W_PER_K,
+        floor_W_per_K=FLOOR_W_PER_K,
+        bearings=BEARINGS,
+        heats=HEATS,
+        always_W={"air": auxiliaries_W},
+        um_per_K={c: {n: float(v) for n, v in zip(NODES, um, strict=True) if v} for c, um in unit.items()},
+        rotating=ROTATING,
+        speed_shift_um={"z": SPEED_SHIFT_UM},
+        rated_rpm=RATED_RPM,
+    )

@@ -77,6 +77,11 @@ def test_same_seed_same_bytes_on_any_number_of_threads(tmp_path: Path) -> None:
     assert digest(paths) != digest(write_sample_year(tmp_path / "c", 4, 4))
 
 
+def test_the_year_of_seed_0_stays_the_same_to_the_byte(year: list[Path]) -> None:
+    content = hashlib.sha256(b"".join(p.read_bytes() for p in year)).hexdigest()
+    assert content == "e93baac5646da2dcdfe127b03571b7818edcc0fbc4f621c88c077af837269566"
+
+
 def test_one_start_ambient_per_season_and_speed() -> None:
     plans = plan_year(0)
     ambient = np.array([p.start_degC for p in plans])

@@ -12,6 +12,7 @@ import yaml
 from data import sample_machine as truth
 from data.errors import InputError
 from data.machine import load_machine, parse_machine
+from data.thermal_machine import ROTATING_GAIN
 from tests.twin.machines import TWO_BODIES, machine
 from twin.compile import compile_network
 from twin.network import Network
@@ -40,7 +41,7 @@ def test_the_sample_machine_file_is_the_sample_machine(sample: Network) -> None:
 def test_speed_dependent_convection_multiplies_the_named_exposures(sample: Network) -> None:
     order = [sample.cells.index(n) for n in truth.NODES]
     rates, _, _ = truth.network(4000.0)
-    factor = np.array([1.0 + truth.ROTATING_GAIN * (4000.0 / truth.RATED_RPM) ** (2 / 3)])
+    factor = np.array([1.0 + ROTATING_GAIN * (4000.0 / truth.RATED_RPM) ** (2 / 3)])
     stiff = sample.conductance_W_per_K(sample.values, factor)[np.ix_(order, order)]
     capacity = sample.capacity_J_per_K(sample.values)[order]
     np.testing.assert_allclose(-stiff / capacity[:, None], rates, rtol=1e-12, atol=1e-18)
