@@ -10,13 +10,13 @@ from scipy.signal import lfilter
 
 from data.errors import InputError, closest
 from features.design import Design
+from features.grey_model import equations, least_squares
 from features.rises import hold_last
 from models.base import Array, Family, Plain
 from models.batchwise import by_batch, padded, steps_s, too_few_rows, unpadded
 
 RESPONSES = ("difference", "whitening")
 _A_HIGHEST = 2.0  # beyond it the recursion's pole (1 − a/2)/(1 + a/2) is negative: the prediction would zigzag
-_RCOND = 1e-4  # sums of sensors of 0.1 K: directions weaker than this are rounding, and wreck other batches
 
 
 class GM1N(Family):
@@ -66,7 +66,7 @@ class GM1N(Family):
         columns = len(design.inputs) + 2
         factors, counts = np.zeros((design.n_batches, columns, columns)), np.zeros(design.n_batches, int)
         for k in sorted({k for fold in folds for k in fold}):
-            rows = _equations(design, k)
+            rows = equations(design, k)
             counts[k] = len(rows)
             r = np.linalg.qr(rows, mode="r")
             factors[k, : len(r)] = r
@@ -108,20 +108,13 @@ class GM1N(Family):
         return 1 + len(self.inputs)
 
     def _solve(self, triangle: Array, step_s: float) -> Plain:
-        """(a, b) from the R factor of [−z, X¹ | x1⁰] by a truncated SVD of its columns scaled to unit norm."""
-        norm = np.linalg.norm(triangle[:, :-1], axis=0)
-        norm[norm == 0] = 1.0
-        left, right = triangle[:, :-1] / norm, triangle[:, -1]
-        solution, _, _, singular = np.linalg.lstsq(left, right, rcond=_RCOND)
-        a, b = float(solution[0] / norm[0]), solution[1:] / norm[1:]
+        """(a, b) from the R factor of [−z, X¹ | x1⁰], a inside its bounds."""
+        fit = least_squares(triangle)
         lowest = min(step_s / (3600.0 * self.slowest_h), _A_HIGHEST)
-        bound = "none" if lowest <= a <= _A_HIGHEST else ("lowest" if a < lowest else "highest")
+        bound = "none" if lowest <= fit.a <= _A_HIGHEST else ("lowest" if fit.a < lowest else "highest")
         if bound != "none":
-            a = float(np.clip(a, lowest, _A_HIGHEST))
-            b = np.linalg.lstsq(left[:, 1:], right - a * triangle[:, 0], rcond=_RCOND)[0] / norm[1:]
-        least = singular[singular > 0]
-        condition = float(singular[0] / least[-1]) if len(least) else float("inf")
-        return {"a": a, "b": b, "step_s": step_s, "bound": bound, "condition": condition}
+            fit = least_squares(triangle, a=float(np.clip(fit.a, lowest, _A_HIGHEST)))
+        return {"a": fit.a, "b": fit.b, "step_s": step_s, "bound": bound, "condition": fit.condition}
 
     def _respond(self, design: Design, models: Sequence[Self], batches: Sequence[int]) -> Array:
         """Free run of every model on the given batches, (n, F); other rows are not to be read."""
@@ -167,21 +160,6 @@ def _bridged(design: Design, values: Array) -> Array:
         for j in range(values.shape[1]):
             out[design.rows(k), j] = hold_last(values[design.rows(k), j])
     return out
-
-
-def _equations(design: Design, k: int) -> Array:
-    """Rows [−z, x_i¹ | x1⁰] of one batch from its second row on, (m, p + 2), usable rows only."""
-    rows = design.rows(k)
-    usable, y_um = design.usable[rows], design.y_um[rows]
-    if usable.sum() < 2:
-        return np.empty((0, len(design.inputs) + 2))
-    n = np.arange(len(y_um))
-    known = np.isfinite(y_um)
-    y_um = np.interp(n, n[known], y_um[known])
-    cumulated = np.cumsum(y_um)
-    z = (cumulated[1:] + cumulated[:-1]) / 2.0
-    x = np.column_stack([hold_last(column) for column in design.x[rows].T]) if design.inputs else np.empty((len(n), 0))
-    return np.column_stack([-z, np.cumsum(x, axis=0)[1:], y_um[1:]])[usable[1:]]
 
 
 def _common_step(design: Design, train: Sequence[int], steps: Array) -> float:
