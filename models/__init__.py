@@ -16,6 +16,7 @@ FAMILIES = Registry(
         "pcr": "models.pcr:PCR",
         "pcr_lbo": "models.pcr:PCRByLeaveBatchOut",
         "pls": "models.pls:PLS",
+        "elastic_net": "models.elastic_net:ElasticNet",
         "bp": "models.bp:BP",
         "lssvm": "models.lssvm:LSSVM",
         "gm1n": "models.gm1n:GM1N",
