@@ -1,0 +1,10 @@
+"""The published studies that `thermodrift reproduce` repeats, one line each."""
+
+from data.registry import Registry
+
+STUDIES = Registry(
+    "study",
+    {
+        "year_round_pcr": "models.studies.year_round_pcr:YearRoundPCR",
+    },
+)

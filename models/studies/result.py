@@ -1,0 +1,102 @@
+"""What a study came to over its seeds: one tidy table, and from it figures with their spread and orderings counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from models.studies import STUDIES
+from models.studies.base import Study
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """`values`: one row per seed and figure with the columns study, seed, figure, value. All of it is simulated."""
+
+    study: type[Study]
+    seeds: tuple[int, ...]
+    values: pd.DataFrame
+
+    @classmethod
+    def of(cls, key: str, runs: Sequence[tuple[int, dict[str, float]]]) -> StudyResult:
+        """From (seed, figures) pairs."""
+        rows = [(key, seed, figure, value) for seed, figures in runs for figure, value in figures.items()]
+        table = pd.DataFrame(rows, columns=["study", "seed", "figure", "value"])
+        return cls(STUDIES[key], tuple(seed for seed, _ in runs), table)
+
+    @property
+    def wide(self) -> pd.DataFrame:
+        """A row per seed, a column per figure, in the study's order."""
+        table = self.values.pivot(index="seed", columns="figure", values="value")
+        return table.loc[list(self.seeds), [f.key for f in self.study.figures]]
+
+    def figures(self) -> pd.DataFrame:
+        """One row per figure: figure, words, unit, published (NaN: not printed), mean, sd (ddof 1), p5, p95, digits."""
+        wide = self.wide
+        rows = []
+        for f in self.study.figures:
+            values = wide[f.key].to_numpy(float)
+            values = values[np.isfinite(values)]
+            rows.append(
+                {
+                    "study": self.study.key,
+                    "figure": f.key,
+                    "words": f.words,
+                    "unit": f.unit,
+                    "published": np.nan if f.published is None else f.published,
+                    "mean": values.mean() if len(values) else np.nan,
+                    "sd": values.std(ddof=1) if len(values) > 1 else np.nan,
+                    "p5": np.quantile(values, 0.05) if len(values) else np.nan,
+                    "p95": np.quantile(values, 0.95) if len(values) else np.nan,
+                    "seeds": len(values),
+                    "digits": f.digits,
+                }
+            )
+        return pd.DataFrame(rows)
+
+    def orderings(self) -> pd.DataFrame:
+        """One row per ordering, evidence behind what it explains.
+
+        Columns: ordering, words, evidence_for, why (with the means), held (seeds), seeds, share, low and high (95 % by
+        Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`), published_gain and gain, the
+        mean of 1 − a/b over the seeds for the first pair.
+        """
+        wide = self.wide
+        said = {f.key: f"{wide[f.key].mean():.{f.digits}f}".replace("-", "−") for f in self.study.figures}
+        rows = []
+        for o in self.study.orderings:
+            names = list(dict.fromkeys(name for pair in o.less for name in pair))
+            known = wide[np.isfinite(wide[names].to_numpy(float)).all(axis=1)]
+            held, n = sum(o.holds(row) for row in known[names].to_dict("records")), len(known)
+            low, high = (0.0, 1.0) if n == 0 else binomtest(held, n).proportion_ci(CONFIDENCE, "exact")
+            a, b = o.less[0]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = 1 - known[a].to_numpy(float) / known[b].to_numpy(float)
+            rows.append(
+                {
+                    "study": self.study.key,
+                    "ordering": o.key,
+                    "words": o.words,
+                    "evidence_for": o.evidence_for,
+                    "why": o.why.format_map(said),
+                    "held": held,
+                    "seeds": n,
+                    "share": held / n if n else np.nan,
+                    "low": float(low),
+                    "high": float(high),
+                    "verdict": "holds" if low > 0.5 else "fails" if high < 0.5 else "undecided",
+                    "published_gain": np.nan if o.published_gain is None else o.published_gain,
+                    "gain": float(gain.mean()) if n else np.nan,
+                    "gain_sd": float(gain.std(ddof=1)) if n > 1 else np.nan,
+                }
+            )
+        table = pd.DataFrame(rows)
+        order = [r for o in self.study.orderings if not o.evidence_for
+                 for r in range(len(rows)) if o.key in (rows[r]["ordering"], rows[r]["evidence_for"])]  # fmt: skip
+        return table.loc[order].reset_index(drop=True)
