@@ -7,12 +7,27 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 from data.batch import Batch
 from data.registry import Effort
 from features.design import Design
 from features.rises import temperature_inputs
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """One known weakness of a selector, measured: a statistic against the threshold that is usual for it.
+
+    `ok` False is a warning, not an error; `comment` says in plain words what the value means.
+    """
+
+    statistic: str
+    value: float
+    threshold: float
+    ok: bool
+    comment: str
 
 
 class Selector(ABC):
@@ -30,6 +45,10 @@ class Selector(ABC):
 
         The inputs come back in the design's order, so equal sets are equal tuples.
         """
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        """What is known to go wrong with this selector, measured on its choice of n_tsp inputs; none unless it says."""
+        return ()
 
     def select(self, train_batches: Sequence[Batch], target: str, n_tsp: int) -> tuple[str, ...]:
         """Chosen channel names among all temperatures of the batches."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
-from features.selectors.statistics import DIGITS, Statistics, in_order, ranking
+from features.selectors.statistics import DIGITS, Statistics, chosen_of_varying, ranking
 
 Array = NDArray[np.float64]
 
@@ -55,16 +55,12 @@ def best_of_clusters(
 
     Constant inputs have no similarity; they join, in the design's order, only when n exceeds the number of the others.
     """
-    order = ranking(score, statistics.varying)
     varying = np.flatnonzero(statistics.varying)
-    constant = np.flatnonzero(~statistics.varying)
     classes = partitions(transitive_closure(np.abs(statistics.between[np.ix_(varying, varying)])))
-    place = np.searchsorted(varying, order[: len(varying)])  # members of `classes`, best first
-    chosen = {}
-    for n in n_tsps:
-        if n <= len(varying):
-            _, best = np.unique(classes[n - 1, place], return_index=True)
-            chosen[n] = in_order(design, order[best])
-        else:
-            chosen[n] = in_order(design, np.concatenate([varying, constant[: n - len(varying)]]))
-    return chosen
+    best_first = ranking(score[varying], np.ones(len(varying), bool))
+
+    def best_of_each(n: int) -> NDArray[np.int64]:
+        _, best = np.unique(classes[n - 1, best_first], return_index=True)
+        return best_first[best]
+
+    return chosen_of_varying(design, varying, n_tsps, best_of_each)

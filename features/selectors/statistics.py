@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from data.errors import InputError
 from features.design import Design
 
 Array = NDArray[np.float64]
+Columns = NDArray[np.int64]
 DIGITS = 9  # scores equal to so many digits are a tie: summation order must not choose a sensor
 _CONSTANT = 1e-12  # variance over mean square below which an input counts as constant
 
@@ -60,9 +61,28 @@ def ranking(score: Array, varying: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.lexsort((np.round(-score, DIGITS), ~varying)).astype(np.int64)
 
 
-def in_order(design: Design, columns: Sequence[int] | NDArray[np.int64]) -> tuple[str, ...]:
+def in_order(design: Design, columns: Sequence[int] | Columns) -> tuple[str, ...]:
     """Names of the columns, in the design's order."""
     return tuple(design.inputs[c] for c in sorted(int(c) for c in columns))
+
+
+def chosen_of_varying(
+    design: Design, varying: NDArray[np.int64], n_tsps: Sequence[int], pick: Callable[[int], Sequence[int] | Columns]
+) -> dict[int, tuple[str, ...]]:
+    """`pick(n)` says which n of the columns `varying` are chosen, as places in it; it is asked for fewer than all.
+
+    Constant inputs join, in the design's order, only when n exceeds the number of the others.
+    """
+    constant = np.setdiff1d(np.arange(len(design.inputs)), varying)
+    return {
+        n: in_order(
+            design,
+            varying[np.asarray(pick(n), int)]
+            if n < len(varying)
+            else np.concatenate([varying, constant[: n - len(varying)]]),
+        )
+        for n in n_tsps
+    }
 
 
 def check_n_tsps(design: Design, n_tsps: Sequence[int], selector: str) -> None:

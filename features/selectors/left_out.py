@@ -1,0 +1,127 @@
+"""How well subsets of inputs predict left-out batches by least squares, from sums per batch alone.
+
+Every block of a training set is left out once. For it two matrices over [target, inputs] are kept: `learned`, the
+centred products of the other blocks, and `left`, the products of the left-out block about the others' mean. To take
+input j into the model, every remaining column loses its part along j as the other blocks see it, in both matrices
+(one step of Gaussian elimination). What then stands in the target's corner of `left` is the sum of squared errors
+that least squares on the taken inputs makes on the left-out block: no system is solved, no row is read.
+
+Source: G. Furnival and R. Wilson (1974), Regressions by leaps and bounds, Technometrics 16, 499–511, for the
+elimination through all subsets; the left-out matrix beside it is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from features.design import Design
+from features.selectors.blocks import Blocks
+from features.selectors.statistics import DIGITS
+
+Array = NDArray[np.float64]
+Sets = NDArray[np.bool_]
+_TAKEN = 1e-10  # share of an input's variance left by the taken ones, below which it says nothing new
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Stacks of `learned` and `left`, both (S, B, p + 1, p + 1): S models that have taken some inputs, B blocks.
+
+    Inputs are scaled to unit size in `learned`, the target to unit spread over all blocks. `rows` (B,) is n − 1.
+    """
+
+    learned: Array
+    left: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, design: Design, train: Sequence[int], columns: NDArray[np.int64]) -> LeftOut:
+        """One model that has taken nothing."""
+        blocks = Blocks.of(design, train, columns)
+        n_blocks = len(blocks.count)
+        _, mean, learned = blocks.pooled(~np.eye(n_blocks, dtype=bool))
+        crossed = mean[:, :, None] * (blocks.sum_z - 0.5 * blocks.count[:, None] * mean)[:, None, :]
+        left = blocks.zz - crossed - np.swapaxes(crossed, 1, 2)
+        size = np.sqrt(np.maximum(np.einsum("bjj->bj", learned), 0.0))
+        count, _, whole = blocks.pooled(np.ones((1, n_blocks), bool))
+        size[:, 0] = np.sqrt(max(float(whole[0, 0, 0]), 0.0) / count[0])
+        size[size == 0.0] = 1.0
+        scale = size[:, :, None] * size[:, None, :]
+        return cls((learned / scale)[None], (left / scale)[None], np.maximum(blocks.count - 1.0, 1.0))
+
+    def error(self) -> Array:
+        """Mean over the blocks of S = sqrt(Σ e² / (n − 1)), over the target's spread, of every model; (S,)."""
+        return self._mean_S(self.left[..., 0, 0])
+
+    def error_with(self) -> Array:
+        """The same after taking one input more, for each input (S, p); a taken one changes nothing."""
+        gain = _share(self.learned[..., 0, 1:], np.einsum("sbjj->sbj", self.learned)[..., 1:])
+        own = np.einsum("sbjj->sbj", self.left)
+        return self._mean_S(own[..., :1] - 2.0 * gain * self.left[..., 0, 1:] + gain**2 * own[..., 1:])
+
+    def taking(self, model: NDArray[np.int64], column: NDArray[np.int64]) -> LeftOut:
+        """Models `model` (N,), each with its input `column` (N,) taken: row and column of it become 0."""
+        n, j = np.arange(len(model)), column + 1
+        learned, left = self.learned[model], self.left[model]
+        along, across = learned[n, :, j], left[n, :, j]
+        gain = _share(along, along[n, :, j][..., None])
+        crossed = gain[..., :, None] * (across - 0.5 * across[n, :, j][..., None] * gain)[..., None, :]
+        learned -= gain[..., :, None] * along[..., None, :]
+        left -= crossed
+        left -= np.swapaxes(crossed, -1, -2)
+        return LeftOut(learned, left, self.rows)
+
+    def _mean_S(self, squares: Array) -> Array:
+        rows = self.rows.reshape(-1, *(1,) * (squares.ndim - 2))
+        mean: Array = np.sqrt(np.maximum(squares, 0.0) / rows).mean(axis=1)
+        return mean
+
+
+def errors_of_all(nothing: LeftOut) -> Array:
+    """Left-out error of every subset of p inputs, (2^p,): bit p − 1 − j of the index says whether input j is taken.
+
+    Inputs are decided from the last to the first. A decided one leaves the matrices, so most of the work is in small
+    ones: about 2^p times 30 numbers per block in all.
+    """
+    learned, left = nothing.learned, nothing.left
+    while learned.shape[-1] > 1:
+        along, across = learned[..., :-1, -1], left[..., :-1, -1]
+        gain = _share(along, learned[..., -1:, -1])
+        crossed = gain[..., :, None] * (across - 0.5 * left[..., -1:, -1] * gain)[..., None, :]
+        learned, left = learned[..., :-1, :-1], left[..., :-1, :-1]
+        learned = np.concatenate([learned, learned - gain[..., :, None] * along[..., None, :]])
+        left = np.concatenate([left, left - crossed - np.swapaxes(crossed, -1, -2)])
+    return LeftOut(learned, left, nothing.rows).error()
+
+
+def beam(nothing: LeftOut, width: int) -> list[tuple[Sets, Array]]:
+    """For 1 to p inputs the `width` best sets found, best first: (sets (≤ width, p), errors).
+
+    Every set grows by every input; of the results the best `width` grow on. Width 1 is forward selection.
+    Equal errors go by the order of the inputs.
+    """
+    p = nothing.learned.shape[-1] - 1
+    state, sets = nothing, np.zeros((1, p), bool)
+    found = []
+    for _ in range(p):
+        model, column = np.nonzero(~sets)
+        grown = sets[model]
+        grown[np.arange(len(grown)), column] = True
+        _, first = np.unique(np.packbits(grown, axis=1), axis=0, return_index=True)  # many ways lead to a set
+        model, column, grown = model[first], column[first], grown[first]
+        error = state.error_with()[model, column]
+        order = np.lexsort((*(~grown.T)[::-1], np.round(error, DIGITS)))[:width]
+        state, sets = state.taking(model[order], column[order]), grown[order]
+        found.append((sets, error[order]))
+    return found
+
+
+def _share(along: Array, own: Array) -> Array:
+    """`along` / `own`, 0 where `own`, what is left of an input's unit size, is nothing."""
+    enough = own > _TAKEN
+    out: Array = np.where(enough, along / np.where(enough, own, 1.0), 0.0)
+    return out
