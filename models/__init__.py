@@ -17,6 +17,7 @@ FAMILIES = Registry(
         "pcr_lbo": "models.pcr:PCRByLeaveBatchOut",
         "pls": "models.pls:PLS",
         "elastic_net": "models.elastic_net:ElasticNet",
+        "huber": "models.huber:Huber",
         "bp": "models.bp:BP",
         "lssvm": "models.lssvm:LSSVM",
         "gm1n": "models.gm1n:GM1N",

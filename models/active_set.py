@@ -27,7 +27,7 @@ def sparse_coefficients(xx: Array, xy: Array, absolute: Array, square: Array, st
     beta, sign = start.copy(), np.sign(start)
     square = square + _FLOOR * np.einsum("sjj->s", xx) / max(1, p)
     enough = absolute + _SLACK * np.abs(xy).max(axis=1, initial=0.0)
-    moving = sign.any(axis=1)
+    moving = np.count_nonzero(sign, axis=1) > 0
     todo = np.arange(len(xy))
     for _ in range(_STEPS_PER_INPUT * max(1, p)):
         resting = todo[~moving[todo]]

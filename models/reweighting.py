@@ -1,0 +1,90 @@
+"""Huber's criterion with its scale, minimised for many training sets at once by weighted least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.base import Array
+from models.linear import Mask
+
+_SETTLED = 1e-8  # of the scale: a step that moves predictions (RMS) and scale by less is the last
+_MOST_STEPS = 500
+_EXACT = 1e-9  # of the target's size: a smaller scale is an exact fit
+_AT_ONCE = 1_000_000  # weights in memory
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Coefficients (S, q), scale σ (S,), share of rows beyond ε σ (S,), steps taken (S,)."""
+
+    beta: Array
+    scale: Array
+    far_share: Array
+    steps: NDArray[np.int64]
+
+
+def settle(x: Array, y: Array, member: Mask, epsilon: Array, penalty: Array, moves: Mask) -> Settled:
+    """β and σ minimising `Σ (σ + σ H(r/σ)) + Σ_j penalty_j β_j²/σ` over the rows of each of S sets.
+
+    x (n, q), y (n,), member (S, n), epsilon (S,), penalty and moves (S, q); inputs that do not move keep β = 0.
+    `H(z) = z²` up to |z| = ε and `2 ε |z| − ε²` beyond, r = y − x β. The criterion is convex in β and σ together, and
+    both steps lower it: `σ² = (Σ min(r², ε² σ²) + Σ penalty β²)/n`, then weights `min(1, ε σ/|r|)`.
+
+    Source: P. Huber and R. Dutter, Numerical solution of robust regression problems, COMPSTAT (1974); the criterion:
+    A. Owen, A robust hybrid of lasso and ridge regression (2007).
+    """
+    step = max(1, _AT_ONCE // max(1, len(y)))
+    parts = [
+        _settle(x, y, member[i : i + step].astype(float), epsilon[i : i + step], penalty[i : i + step],
+                moves[i : i + step])
+        for i in range(0, len(member), step)
+    ]  # fmt: skip
+    return Settled(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Settled)))
+
+
+def _settle(x: Array, y: Array, member: Array, epsilon: Array, penalty: Array, moves: Mask) -> Settled:
+    n = np.maximum(member.sum(axis=1), 1.0)
+    least = np.maximum(_EXACT * np.sqrt(member @ y**2 / n), np.finfo(float).tiny)
+    beta, _ = _weighted(x, y, member, penalty, moves)
+    scale = np.maximum(np.sqrt((member * (y - beta @ x.T) ** 2).sum(axis=1) / n), least)
+    far_share, steps = np.zeros(len(n)), np.full(len(n), _MOST_STEPS)
+    todo = np.arange(len(n))
+    for step in range(_MOST_STEPS):
+        inside, before = member[todo], scale[todo]
+        size = np.abs(y - beta[todo] @ x.T)
+        near = np.minimum(size, (epsilon[todo] * before)[:, None])
+        squares = np.einsum("sn,sn,sn->s", inside, near, near) + (penalty[todo] * beta[todo] ** 2).sum(axis=1)
+        scale[todo] = np.maximum(np.sqrt(squares / n[todo]), least[todo])
+        reach = (epsilon * scale)[todo, None]
+        far = size > reach
+        far_share[todo] = (inside * far).sum(axis=1) / n[todo]
+        weight = np.divide(reach, size, out=np.ones_like(size), where=far)
+        weight *= inside
+        found, gram = _weighted(x, y, weight, penalty[todo], moves[todo])
+        change = found - beta[todo]
+        beta[todo] = found
+        moved = np.sqrt(np.einsum("sj,sjk,sk->s", change, gram, change) / n[todo]) + np.abs(scale[todo] - before)
+        settled = moved <= _SETTLED * scale[todo]
+        steps[todo[settled]] = step + 1
+        todo = todo[~settled]
+        if not len(todo):
+            break
+    return Settled(beta, scale, far_share, steps)
+
+
+def _weighted(x: Array, y: Array, weight: Array, penalty: Array, moves: Mask) -> tuple[Array, Array]:
+    """β (S, q) of weighted least squares with weights (S, n), and the matrices (S, q, q) of their equations."""
+    q = x.shape[1]
+    gram = np.empty((len(weight), q, q))
+    for j in range(q):  # one thin product after the other: rows times q² would not fit for many inputs
+        gram[:, j, j:] = weight @ (x[:, j:] * x[:, j, None])
+        gram[:, j:, j] = gram[:, j, j:]
+    gram *= moves[:, :, None] & moves[:, None, :]
+    np.einsum("sjj->sj", gram)[:] += np.where(moves, penalty, 1.0)
+    right = (weight @ (x * y[:, None])) * moves
+    size = 1.0 / np.sqrt(np.einsum("sjj->sj", gram))
+    even = gram * (size[:, :, None] * size[:, None, :])
+    return np.linalg.solve(even, (right * size)[:, :, None])[:, :, 0] * size, gram
