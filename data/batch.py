@@ -21,7 +21,8 @@ class Channel:
     """What one column of a batch means.
 
     `unit` is the canonical unit in the lake (degC, um, rpm, mm/min, mm, …); `resolution` the
-    smallest step the instrument shows, in that unit; `low` and `high` the plausible range.
+    smallest step the instrument shows, in that unit; `low` and `high` the plausible range. An error channel measured
+    along an axis names the `position` channel: a row's error is that at the row's position, NaN where none was read.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Channel:
     resolution: float | None = None
     low: float | None = None
     high: float | None = None
+    position: str = ""
 
 
 @dataclass(frozen=True)

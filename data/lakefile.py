@@ -169,11 +169,17 @@ def _meta(batch: Batch, digest: str) -> dict[str, Any]:
         "start": _start_text(batch),
         "simulated": bool(batch.simulated),
         "source": batch.source,
-        "channels": [_plain(asdict(c), where) for c in batch.channels.values()],
+        "channels": [_plain(_channel(c), where) for c in batch.channels.values()],
         "repairs": _plain(batch.repairs, where),
         "findings": [_plain(f.as_dict(), where) for f in batch.findings],
         "labels": _plain(batch.labels, where),
     }
+
+
+def _channel(channel: Channel) -> dict[str, Any]:
+    """The channel's fields; a position only where there is one, so that lakes older than positions stay as they are."""
+    fields = asdict(channel)
+    return fields if channel.position else {k: v for k, v in fields.items() if k != "position"}
 
 
 def _start_text(batch: Batch) -> str | None:

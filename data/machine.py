@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from data.batch import Channel, Role
+from data.errors import InputError, closest
 from data.yaml_file import load_yaml, parse_yaml
 
 
@@ -63,7 +64,9 @@ class ChannelPart(_Part):
     """One channel: role, canonical unit, where it stands in the file, resolution and plausible range in that unit.
 
     `column` defaults to the channel's name; `unit_in_file` to `unit`. A driver that only the schedule gives has
-    `column: null` and `source: schedule`.
+    `column: null` and `source: schedule`. An error channel that is measured at positions along an axis names the
+    position channel in `position`. Where the file has one column for each position, `columns` gives them, and the
+    position channel needs no column: a pattern whose * is the position (``"x=*"``), or column -> position.
     """
 
     role: Role
@@ -73,6 +76,9 @@ class ChannelPart(_Part):
     source: Literal["file", "schedule"] = "file"
     resolution: Annotated[float, Field(gt=0)] | None = None
     range: tuple[float, float] | None = None
+    position: str | None = None
+    columns: str | dict[str | int, float] | None = None  # positions in the position channel's unit in the file
+    fixed_end: float | None = None  # of a position channel: where the axis' screw is held, in `unit`
     guessed: list[str] = []  # keys that `describe` guessed and nobody has confirmed
 
     @model_validator(mode="after")
@@ -109,7 +115,7 @@ class Machine(_Part):
     def channel(self, name: str) -> Channel:
         c = self.channels[name]
         low, high = c.range if c.range else (None, None)
-        return Channel(name, c.role, c.unit, c.resolution, low, high)
+        return Channel(name, c.role, c.unit, c.resolution, low, high, c.position or "")
 
     def batch_channels(self) -> dict[str, Channel]:
         """Name -> Channel for every channel, in the file's order."""
@@ -118,6 +124,14 @@ class Machine(_Part):
     def names(self, *roles: str) -> tuple[str, ...]:
         return tuple(n for n, c in self.channels.items() if c.role in roles)
 
+    def axes(self) -> dict[str, tuple[str, ...]]:
+        """Position channel -> error channels that are measured at its positions."""
+        out: dict[str, tuple[str, ...]] = {}
+        for name, part in self.channels.items():
+            if part.position is not None:
+                out[part.position] = (*out.get(part.position, ()), name)
+        return out
+
 
 def load_machine(path: Path | str) -> Machine:
     """Read and check a machine file.
@@ -125,9 +139,56 @@ def load_machine(path: Path | str) -> Machine:
     Raises:
         InputError: file missing, not YAML, a misspelt key (with the closest), a wrong value; one line each.
     """
-    return load_yaml(Path(path), Machine, "machine file")
+    return _axes_checked(load_yaml(Path(path), Machine, "machine file"), f"machine file {path}")
 
 
 def parse_machine(text: str, where: str) -> Machine:
     """The same from text; `where` names the origin in error lines."""
-    return parse_yaml(text, Machine, f"machine file {where}")
+    return _axes_checked(parse_yaml(text, Machine, f"machine file {where}"), f"machine file {where}")
+
+
+def _axes_checked(machine: Machine, where: str) -> Machine:
+    """The machine, if its error channels along axes and their position channels fit together."""
+    for name, part in machine.channels.items():
+        here = f"{where}: channel {name!r}"
+        if part.fixed_end is not None and part.role != "position":
+            raise InputError(f"{here} is a {part.role} and has a fixed_end; give that to the axis' position channel")
+        if part.position is None and part.columns is not None:
+            raise InputError(f"{here} has columns but no position; add position: with the name of a position channel")
+        if part.position is None:
+            continue
+        if part.role != "error":
+            raise InputError(f"{here} is a {part.role} and has a position; only error channels are measured at one")
+        along = machine.channels.get(part.position)
+        if along is None or along.role != "position":
+            got = "no channel" if along is None else f"a {along.role}"
+            names = machine.names("position")
+            raise InputError(
+                f"{here}: position {part.position!r} is {got}, expected a channel with role: position; "
+                f"{closest(part.position, names) if names else 'add one with unit: mm'}"
+            )
+        if along.unit != "mm":
+            raise InputError(
+                f"{here}: its position channel {part.position!r} has unit {along.unit!r}, expected 'mm'; "
+                f"write unit: mm and unit_in_file: {along.unit!r}"
+            )
+        _columns_checked(machine, name, part, here)
+    return machine
+
+
+def _columns_checked(machine: Machine, name: str, part: ChannelPart, here: str) -> None:
+    if part.columns is None:
+        return
+    if isinstance(part.columns, str) and (part.columns.count("*") != 1 or not machine.recording.header):
+        raise InputError(
+            f"{here}: columns {part.columns!r}, expected a header's pattern with one * where the position stands, "
+            'such as "x=*"; without a header give column: position for each'
+        )
+    if part.column is not None:
+        raise InputError(f"{here} has both column and columns; leave column: out, each position has a column")
+    others = [n for n in machine.axes()[part.position or ""] if n != name]
+    if others:
+        raise InputError(
+            f"{here} has one column for each position, but position channel {part.position!r} also serves "
+            f"{others[0]!r}; give it a position channel alone"
+        )

@@ -42,7 +42,7 @@ class OwnFile:
             )
         own = Recording(time=TimeColumn(), step_s=machine.recording.step_s, max_gap_s=machine.recording.max_gap_s)
         channels = {
-            n: c.model_copy(update={"column": n, "unit_in_file": c.unit, "source": "file"})
+            n: c.model_copy(update={"column": n, "columns": None, "unit_in_file": c.unit, "source": "file"})
             for n, c in machine.channels.items()
         }
         simulated = machine.simulated or bool(self.note["simulated"])

@@ -19,6 +19,8 @@
 | `unparsable_values` | cells that are no number; empty cells and "NaN" are not counted |
 | `missing_channels`, `unknown_columns` | channels without a column, columns without a channel |
 | `preamble_rows`, `unit_rows`, `skipped_sheets` | title lines, lines between header and data, sheets of other content |
+| `readings` | along axes (see `data.sweeps`): that were read, of errors at a position |
+| `readings_without_position` | errors along an axis whose row has no position: nowhere in the grid |
 | `start_unreadable` | 1 if the file's name does not fit start_from_name |
 """
 
@@ -41,6 +43,7 @@ from data.readers.base import Sheet
 from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, cut_runs, gather, stream
 from data.schedule import scheduled
+from data.sweeps import Columns, take_readings
 from data.timegrid import repair_time, to_grid
 from data.units import check_canonical, convert
 
@@ -143,7 +146,7 @@ def _sheet_batches(
     extra = {**extra, **layout.counts}
     if split is None:
         rows = gather(blocks, sheet)
-        yield _batch(rows, machine, path, batch_id, where, need_error, extra, 0.0)
+        yield _batch(rows, layout.sweeps, machine, path, batch_id, where, need_error, extra, 0.0)
         return
     if split.driver not in machine.channels:
         raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
@@ -159,15 +162,16 @@ def _sheet_batches(
     for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
         part_id = f"{batch_id}-{k + 1:02d}"
         try:
-            yield _batch(rows, machine, path, part_id, f"{where} part {k + 1:02d}", need_error, extra, first[0])
+            here = f"{where} part {k + 1:02d}"
+            yield _batch(rows, layout.sweeps, machine, path, part_id, here, need_error, extra, first[0])
         except InputError as error:
             errors.append(error)
         extra = {}
 
 
 def _batch(
-    rows: Rows, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool, extra: dict[str, int],
-    file_start: float,
+    rows: Rows, sweeps: Columns, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool,
+    extra: dict[str, int], file_start: float,
 ) -> Batch:  # fmt: skip
     """`file_start` is the file's first time in s, needed where its name gives the start and the file is cut."""
     recording = machine.recording
@@ -184,8 +188,16 @@ def _batch(
         if not filled.all():
             filled |= ~np.isnan(v)
     rows.columns.clear()
+    readings, read_counts = take_readings(values, repaired.time_s, machine, sweeps, where)
     grid = to_grid(repaired.time_s, values, held, recording.step_s, recording.max_gap_s, where)
-    used = grid.used & filled
+    is_reading = np.zeros(len(filled), bool)
+    for r in readings:
+        grid.columns.update(r.on_grid(recording.step_s, len(grid.time_s), recording.max_gap_s, where))
+        is_reading[r.row] = True
+    if readings:  # rows of a sweep under one time stamp repeat no time
+        repeats = np.diff(repaired.time_s, prepend=-1.0) == 0
+        repaired.counts["duplicates"] -= int((repeats & is_reading).sum())
+    used = (grid.used | is_reading) & filled
     repairs = {
         "rows_in": n_rows + rows.ragged + rows.before_run,
         "rows_used": int(used.sum()),
@@ -197,6 +209,7 @@ def _batch(
         "rows_between": int((filled & ~used).sum()),
         "channel_gaps": grid.channel_gaps,
         "unparsable_values": unreadable,
+        **read_counts,
         **extra,
     }
     reasons = ("ragged_rows", "unparsable_time", "time_outliers", "rows_before_run", "rows_empty", "rows_between")

@@ -123,6 +123,23 @@ class Design:
         return np.repeat(np.arange(self.n_batches), np.diff(self.offsets))
 
     @cached_property
+    def along(self) -> str:
+        """The position channel along which the target was measured, "" for none."""
+        known = self.batches[0].channels if self.batches else {}
+        return known[self.target].position if self.target in known else ""
+
+    def position_mm(self, channel: str) -> Array:
+        """A position channel of the batches on every row (n,), NaN where nothing was read."""
+        known = self.root._positions
+        if channel not in known:
+            known[channel] = np.concatenate([np.empty(0), *(b.masked(channel) for b in self.batches)])
+        return known[channel]
+
+    @cached_property
+    def _positions(self) -> dict[str, Array]:
+        return {}
+
+    @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """Rows with a finite target and finite inputs, (n,), read-only."""
         if self._parent is not None and self._columns is not None:

@@ -23,6 +23,7 @@ from scipy.signal import lfilter
 
 from data.batch import Batch
 from data.errors import InputError, closest
+from data.sweeps import position_bins, sweep_numbers
 
 Array = NDArray[np.float64]
 _RATE_WINDOW_S = 600.0
@@ -74,9 +75,14 @@ def feature_unit(batch: Batch, name: str) -> str:
 
 
 def zeroed_error_um(batch: Batch, target: str) -> Array:
-    """The error channel in µm less its first usable sample, shape (n,); NaN where masked."""
+    """The error channel in µm less its first usable sample, shape (n,); NaN where masked.
+
+    An error along an axis less that of the first sweep at the same position, E(P, t) − E(P, 0): linear between the
+    first sweep's positions, NaN beyond them.
+    """
     values = batch.masked(target)
-    return values - _first(values)
+    channel = batch.channels[target].position
+    return values - (_first_sweep_um(batch, values, channel) if channel else _first(values))
 
 
 def first_order_lag(values: Array, tau_s: float, step_s: float, start: float | None = None) -> Array:
@@ -110,6 +116,23 @@ def temperature_inputs(
 ) -> tuple[str, ...]:
     """Candidate channels in the first batch's order."""
     return batches[0].names(*roles) if batches else ()
+
+
+def _first_sweep_um(batch: Batch, error_um: Array, channel: str) -> Array:
+    """What the first sweep read at every row's position, (n,); NaN where there is no position, or none of its own."""
+    position_mm = batch.masked(channel)
+    read = np.flatnonzero(np.isfinite(error_um) & np.isfinite(position_mm))
+    if not len(read):
+        return np.full(batch.n_rows, np.nan)
+    at_mm = position_mm[read]
+    bins = position_bins(at_mm)
+    first = read[sweep_numbers(batch.time_s[read], at_mm) == 0]
+    here, rows = np.unique(bins[: len(first)], return_index=True)  # of several readings of a position the first
+    known_mm, known_um = position_mm[first[rows]], error_um[first[rows]]
+    out = np.full(batch.n_rows, np.nan)
+    inside = (bins >= here[0]) & (bins <= here[-1])
+    out[read[inside]] = np.interp(at_mm[inside], known_mm, known_um)
+    return out
 
 
 def _first(values: Array) -> float:

@@ -49,6 +49,11 @@ class Check:
         return Finding(self.key, channel, words, start_s, end_s, masks)
 
 
+def in_time(batch: Batch, *roles: str) -> tuple[str, ...]:
+    """Channels of the given roles whose rows follow each other in time: none that is read here and there on an axis."""
+    return tuple(n for n in batch.names(*roles) if not batch.channels[n].position)
+
+
 def stretches(flags: Bools) -> list[tuple[int, int]]:
     """First and last row of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))

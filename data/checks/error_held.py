@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import THERMAL, Array, Check, constant_runs, smallest_step, span_words, standing
+from data.checks.base import THERMAL, Array, Check, constant_runs, in_time, smallest_step, span_words, standing
 from data.checks.signals import EQUAL, signals
 from data.machine import Machine
 
@@ -27,7 +27,7 @@ class ErrorHeld(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)
-        names = [n for n in batch.names("error") if np.isfinite(seen.values(n)).sum() > _ROWS]
+        names = [n for n in in_time(batch, "error") if np.isfinite(seen.values(n)).sum() > _ROWS]
         if not names or batch.n_rows < 2 * _ROWS:
             return []
         least = max(_ROWS, int(_SECONDS / batch.step_s))

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import THERMAL, Array, Check, constant_runs, smallest_step, span_words
+from data.checks.base import THERMAL, Array, Check, constant_runs, in_time, smallest_step, span_words
 from data.checks.jump_no_return import JumpNoReturn
 from data.checks.signals import signals
 from data.checks.spike import Spike
@@ -41,7 +41,7 @@ class Frozen(Check):
         found = []
         seen = signals(batch)
         witnesses = _Witnesses(batch, machine)
-        for name in batch.names("temperature", "ambient", "error"):
+        for name in in_time(batch, "temperature", "ambient", "error"):
             if not seen.rests(name, _ROWS):
                 continue
             v = seen.values(name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import Check, span_words, stretches
+from data.checks.base import Check, in_time, span_words, stretches
 from data.checks.signals import signals
 from data.machine import Machine
 
@@ -15,7 +15,7 @@ class Gap(Check):
     words = "nothing recorded"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        names = [n for n in batch.names("temperature", "ambient", "error") if n in batch.table.columns]
+        names = [n for n in in_time(batch, "temperature", "ambient", "error") if n in batch.table.columns]
         if not names or not batch.n_rows:
             return []
         if all(signals(batch).whole(n) for n in names):

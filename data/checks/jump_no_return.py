@@ -11,6 +11,7 @@ from data.checks.base import (
     Bools,
     Check,
     clock,
+    in_time,
     load_changes,
     robust_sigma,
     step_limit,
@@ -47,7 +48,7 @@ class JumpNoReturn(Check):
 
     def _at(self, batch: Batch) -> list[Finding]:
         seen = signals(batch)
-        names = batch.names("temperature", "error")
+        names = in_time(batch, "temperature", "error")
         # a step less the median step around it is at most twice the largest step: the others cannot be odd
         able = [n for n in names if seen.largest_step(n) > _floor(batch, n) / 2.0]
         if batch.n_rows < 12 or not able:

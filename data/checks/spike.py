@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import SIGMAS, STEPS, Check, clock, load_changes, robust_sigma
+from data.checks.base import SIGMAS, STEPS, Check, clock, in_time, load_changes, robust_sigma
 from data.checks.signals import rolling_median, signals
 from data.machine import Machine
 
@@ -25,7 +25,7 @@ class Spike(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)
-        names = batch.names("temperature", "ambient", "error")
+        names = in_time(batch, "temperature", "ambient", "error")
         # who stands off the rows around by the floor got there in three steps at most
         names = tuple(n for n in names if seen.largest_step(n) * _HALF > _FLOOR[batch.channels[n].role])
         loaded = load_changes(batch) if names else np.zeros(0, bool)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import THERMAL, Array, Check
+from data.checks.base import THERMAL, Array, Check, in_time
 from data.machine import Machine
 
 _BATCHES = 8
@@ -33,7 +33,7 @@ class Unexplained(Check):
         x = [np.column_stack([b.masked(n) for n in names]) for b in batches]
         x = [v - v[:3].mean(axis=0) for v in x]
         found: dict[int, list[Finding]] = {}
-        for target in batches[0].names("error"):
+        for target in in_time(batches[0], "error"):
             sums = _Sums(x, [b.masked(target) if target in b.channels else np.empty(0) for b in batches])
             odd: list[int] = []
             while len(odd) < len(batches) // 4:

@@ -22,27 +22,49 @@ class NotThisTable(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """First data row, position of time and of each channel found, and what was left aside."""
+    """First data row, position of time and of each channel found, and what was left aside.
+
+    `sweeps`: error channel -> (key in `positions`, position along its axis) where each position has a column.
+    """
 
     first_row: int
     time: int
     positions: Mapping[str, int]
     counts: Mapping[str, int] = field(default_factory=dict)
+    sweeps: Mapping[str, tuple[tuple[str, float], ...]] = field(default_factory=dict)
 
 
 def wanted_columns(machine: Machine) -> dict[str, str | int]:
-    """Channel -> column (name or position) for every channel that the file must give."""
+    """Channel -> column (name, position or pattern of several) for every channel that the file must give."""
     found: dict[str, str | int] = {}
+    by_columns = {part.position for part in machine.channels.values() if part.columns is not None}
     for name, part in machine.channels.items():
-        if part.source == "file":
+        if part.columns:
+            found[name] = part.columns if isinstance(part.columns, str) else next(iter(part.columns))
+        elif part.source == "file" and name not in by_columns:
             found[name] = name if part.column is None else part.column
     return found
 
 
 def hints(machine: Machine) -> list[str]:
     """The column names that a recording is expected to have."""
-    columns = [machine.recording.time.column, *wanted_columns(machine).values()]
+    several = [c for part in machine.channels.values() if isinstance(part.columns, dict) for c in part.columns]
+    columns = [machine.recording.time.column, *wanted_columns(machine).values(), *several]
     return [c for c in columns if isinstance(c, str)]
+
+
+def _sweep_columns(columns: str | Mapping[str | int, float], header: Sequence[Any]) -> list[tuple[str | int, float]]:
+    """(column, position along the axis) of the columns in the file's order; a column of the header by its place."""
+    if not isinstance(columns, str):
+        return list(columns.items())
+    before, _, after = _squeezed(columns).partition("*")
+    pattern = re.compile(rf"{re.escape(before)}([-+]?\d+(?:[.,]\d+)?){re.escape(after)}")
+    found = ((i, pattern.fullmatch(_squeezed(cell))) for i, cell in enumerate(header) if cell is not None)
+    return [(i, float(match[1].replace(",", "."))) for i, match in found if match]
+
+
+def _squeezed(name: object) -> str:
+    return normalise(name).replace(" ", "")
 
 
 def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) -> Layout:
@@ -70,7 +92,16 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
             return by_name.get(normalise(column))
         return column if 0 <= column < width else None
 
-    positions = {name: p for name, c in wanted.items() if (p := position(c)) is not None}
+    positions: dict[str, int] = {}
+    sweeps: dict[str, tuple[tuple[str, float], ...]] = {}
+    for name, column in wanted.items():
+        if columns := machine.channels[name].columns:
+            several = [(p, mm) for c, mm in _sweep_columns(columns, header) if (p := position(c)) is not None]
+            sweeps |= {name: tuple((f"{name}@{p}", mm) for p, mm in several)} if several else {}
+            positions |= {f"{name}@{p}": p for p, _ in several}
+        elif (p := position(column)) is not None:
+            positions[name] = p
+    got_channels = {*positions, *sweeps} & set(wanted)
     at = position(time)
     got = _some([str(c) for c in header]) if header else f"{width} columns"
     if not positions:
@@ -78,7 +109,7 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
     if at is None:
         raise InputError(f"{where}: time column {time!r} is missing; got {got}; correct recording.time.column")
     errors = [n for n in machine.names("error") if n in wanted]
-    if need_error and errors and not any(n in positions for n in errors):
+    if need_error and errors and not any(n in got_channels for n in errors):
         raise InputError(
             f"{where}: no error channel; got {got}, expected column {_some([str(wanted[n]) for n in errors])};"
             " correct column: of the error channels"
@@ -90,9 +121,9 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         "preamble_rows": max(row, 0) if header else first,
         "unit_rows": sum(bool(r) for r in sheet.head[row + 1 : first]) if header else 0,
         "unknown_columns": max(0, named - len(known)),
-        "missing_channels": len(wanted) - len(positions),
+        "missing_channels": len(wanted) - len(got_channels),
     }
-    return Layout(first, at, positions, {k: v for k, v in counts.items() if v})
+    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps)
 
 
 def _plain(column: str) -> str | int:
