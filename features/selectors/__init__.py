@@ -10,6 +10,7 @@ SELECTORS = Registry(
         "pca_elimination": "features.selectors.pca_elimination:PcaElimination",
         "fcgc": "features.selectors.fcgc:FuzzyClusterGreyCorrelation",
         "fuzzy_correlation": "features.selectors.fuzzy_correlation:FuzzyCorrelation",
+        "main_factor_bp": "features.selectors.main_factor_bp:MainFactorBP",
         "fcm_grey": "features.selectors.fcm_grey:FcmGrey",
         "mrmr": "features.selectors.mrmr:MRMR",
         "elastic_net_path": "features.selectors.elastic_net_path:ElasticNetPath",
