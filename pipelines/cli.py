@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from data.errors import InputError, WorkError
-from pipelines import report_command, screen, twin_commands
+from pipelines import report_command, reproduce_command, screen, twin_commands
 from pipelines import settings as settings_module
 from pipelines.options import Json, MachineFile, names, split
 
@@ -191,6 +191,7 @@ def predict(
 
 for command in (twin_commands.simulate, twin_commands.calibrate, twin_commands.diagnose):
     app.command()(command)
+app.command()(reproduce_command.reproduce)
 
 
 @app.command()

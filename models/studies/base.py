@@ -49,6 +49,7 @@ class Study(ABC):
     """A published system. `assumed` are the things its description leaves open and what stands for them here."""
 
     key: ClassVar[str]
+    title: ClassVar[str]
     words: ClassVar[str]
     source: ClassVar[str]
     machine: ClassVar[str]

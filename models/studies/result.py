@@ -17,11 +17,11 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class StudyResult:
-    """`values`: one row per seed and figure with the columns study, seed, figure, value. All of it is simulated."""
+    """`table`: one row per seed and figure with the columns study, seed, figure, value. All of it is simulated."""
 
     study: type[Study]
     seeds: tuple[int, ...]
-    values: pd.DataFrame
+    table: pd.DataFrame
 
     @classmethod
     def of(cls, key: str, runs: Sequence[tuple[int, dict[str, float]]]) -> StudyResult:
@@ -33,8 +33,14 @@ class StudyResult:
     @property
     def wide(self) -> pd.DataFrame:
         """A row per seed, a column per figure, in the study's order."""
-        table = self.values.pivot(index="seed", columns="figure", values="value")
+        table = self.table.pivot(index="seed", columns="figure", values="value")
         return table.loc[list(self.seeds), [f.key for f in self.study.figures]]
+
+    def by_seed(self, names: Sequence[str]) -> list[dict[str, float]]:
+        """The named figures of every seed."""
+        return [
+            {n: float(v) for n, v in zip(names, row, strict=True)} for row in self.wide[list(names)].to_numpy(float)
+        ]
 
     def figures(self) -> pd.DataFrame:
         """One row per figure: figure, words, unit, published (NaN: not printed), mean, sd (ddof 1), p5, p95, digits."""
@@ -64,20 +70,20 @@ class StudyResult:
         """One row per ordering, evidence behind what it explains.
 
         Columns: ordering, words, evidence_for, why (with the means), held (seeds), seeds, share, low and high (95 % by
-        Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`), published_gain and gain, the
-        mean of 1 − a/b over the seeds for the first pair.
+        Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`),
+        published_gain and gain, the mean of 1 − a/b over the seeds for the first pair, with its gain_sd.
         """
         wide = self.wide
         said = {f.key: f"{wide[f.key].mean():.{f.digits}f}".replace("-", "−") for f in self.study.figures}
         rows = []
         for o in self.study.orderings:
             names = list(dict.fromkeys(name for pair in o.less for name in pair))
-            known = wide[np.isfinite(wide[names].to_numpy(float)).all(axis=1)]
-            held, n = sum(o.holds(row) for row in known[names].to_dict("records")), len(known)
+            known = [v for v in self.by_seed(names) if np.isfinite(list(v.values())).all()]
+            held, n = sum(o.holds(v) for v in known), len(known)
             low, high = (0.0, 1.0) if n == 0 else binomtest(held, n).proportion_ci(CONFIDENCE, "exact")
             a, b = o.less[0]
             with np.errstate(divide="ignore", invalid="ignore"):
-                gain = 1 - known[a].to_numpy(float) / known[b].to_numpy(float)
+                gain = 1 - np.array([v[a] for v in known]) / np.array([v[b] for v in known])
             rows.append(
                 {
                     "study": self.study.key,

@@ -90,6 +90,7 @@ class YearRoundPCR(Study):
     """
 
     key = "year_round_pcr"
+    title = "Year-round PCR"
     words = "PCA elimination and principal component regression over a year, trained on one batch"
     source = "year-round PCR study of a Vcenter-55 vertical machining centre"
     machine = (
@@ -152,9 +153,9 @@ class YearRoundPCR(Study):
         Ordering(
             "bp_predicts_worst", "the BP net predicts worst",
             tuple((f"{m}_S_mean", "fcgc2_bp_S_mean") for m in ("fcgc2_mlr", "fcgc2_ridge", "pca4_pcr")),
-            why="The net has the greatest mean, {fcgc2_bp_S_mean} µm, and the least robust, {fcgc2_bp_S_std} µm, but not "
-            "in every year. What makes it bad is training to the end: with weight decay and the mean of three starts "
-            "it has {fcgc2_calm_bp_S_mean} µm.",
+            why="The net has the greatest mean, {fcgc2_bp_S_mean} µm, and is the least robust, {fcgc2_bp_S_std} µm, "
+            "but not in every year. What makes it bad is training to the end: with weight decay and the mean of three "
+            "starts it has {fcgc2_calm_bp_S_mean} µm.",
         ),
         Ordering(
             "more_points_less_accurate", "with more than 2 points accuracy falls",
