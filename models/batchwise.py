@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from data.errors import InputError
 from features.design import Design
+from features.rises import hold_last
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,17 @@ def unpadded(design: Design, values: Array) -> Array:
 def by_batch(design: Design, columns: Array, wanted: Sequence[Sequence[int]]) -> list[list[Array]]:
     """Columns (n, F) of all rows cut to the batches that each of them is wanted for."""
     return [[columns[design.rows(k), f] for k in batches] for f, batches in enumerate(wanted)]
+
+
+def bridged(design: Design, values: Array) -> Array:
+    """Values (n, p) with holes held batch by batch; NaN where a batch has none at all."""
+    if np.isfinite(values).all():
+        return values
+    out = values.copy()
+    for k in range(design.n_batches):
+        for j in range(values.shape[1]):
+            out[design.rows(k), j] = hold_last(values[design.rows(k), j])
+    return out
 
 
 def steps_s(design: Design) -> Array:

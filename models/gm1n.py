@@ -11,9 +11,8 @@ from scipy.signal import lfilter
 from data.errors import InputError, closest
 from features.design import Design
 from features.grey_model import equations, least_squares
-from features.rises import hold_last
 from models.base import Array, Family, Plain
-from models.batchwise import by_batch, padded, steps_s, too_few_rows, unpadded
+from models.batchwise import bridged, by_batch, padded, steps_s, too_few_rows, unpadded
 
 RESPONSES = ("difference", "whitening")
 _A_HIGHEST = 2.0  # beyond it the recursion's pole (1 − a/2)/(1 + a/2) is negative: the prediction would zigzag
@@ -127,7 +126,7 @@ class GM1N(Family):
                         f"family gm1n: batch {design.batch_ids[k]} has a step of {steps[k]:g} s, the model learned "
                         f"from {learned_s:g} s and its sums count rows; resample the batch to {learned_s:g} s"
                     )
-        held = _bridged(design, design.x)
+        held = bridged(design, design.x)
         out = np.empty((len(design.time_s), len(models)))
         for f, m in enumerate(models):
             drive = padded(design, held @ m.fitted["b"])
@@ -148,17 +147,6 @@ def response(drive: Array, a: float, kind: str = "difference") -> Array:
     u[:, 1:2] += drive[:, :1]
     c = 1.0 / (1.0 + a / 2.0)
     out: Array = lfilter([c], [1.0, -(1.0 - a / 2.0) * c], u, axis=1)
-    return out
-
-
-def _bridged(design: Design, values: Array) -> Array:
-    """Inputs (n, p) with holes held batch by batch; NaN where a batch has none at all."""
-    if np.isfinite(values).all():
-        return values
-    out = values.copy()
-    for k in range(design.n_batches):
-        for j in range(values.shape[1]):
-            out[design.rows(k), j] = hold_last(values[design.rows(k), j])
     return out
 
 
