@@ -7,6 +7,21 @@ from collections.abc import Sequence
 from itertools import combinations
 
 from data.errors import InputError
+from features.selectors.base import Diagnostic
+
+_STABLE = 0.7  # as the promotion rule asks
+
+
+def stability_over_batches(sets: Sequence[tuple[str, ...]]) -> Diagnostic:
+    """Whether one batch more or less changes the choice: `tsp_stability` of the leave-batch-out choices of a selector.
+
+    Raises:
+        InputError: no set at all.
+    """
+    value = tsp_stability(sets)
+    rare = [f"{name} {share:.0%}" for name, share in tsp_frequency(sets).items() if share < 1.0]
+    words = "not in every fold: " + ", ".join(rare) if rare else "the same points whichever batch is left out"
+    return Diagnostic("stability over batches", value, _STABLE, value >= _STABLE, words)
 
 
 def tsp_stability(sets: Sequence[tuple[str, ...]]) -> float:

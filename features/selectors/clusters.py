@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
+from features.selectors.base import Diagnostic
 from features.selectors.statistics import DIGITS, Statistics, chosen_of_varying, ranking
 
 Array = NDArray[np.float64]
+_CHAINED, _ONE_CLUSTER = 0.1, 0.6  # a weaker pair than its cluster's level by this; a share of all in one cluster
 
 
 def transitive_closure(similarity: Array) -> Array:
@@ -64,3 +66,25 @@ def best_of_clusters(
         return best_first[best]
 
     return chosen_of_varying(design, varying, n_tsps, best_of_each)
+
+
+def chaining(design: Design, statistics: Statistics, n_tsp: int) -> tuple[Diagnostic, ...]:
+    """What single linkage is known for, of the largest of n clusters: members joined over others, and its size."""
+    varying = np.flatnonzero(statistics.varying)
+    if not 1 < n_tsp < len(varying):
+        return ()
+    similarity = np.abs(statistics.between[np.ix_(varying, varying)])
+    closure = transitive_closure(similarity)
+    label = partitions(closure)[n_tsp - 1]
+    largest = np.flatnonzero(label == np.argmax(np.bincount(label)))
+    direct = similarity[np.ix_(largest, largest)]
+    i, j = np.unravel_index(np.argmin(direct), direct.shape)
+    level = float(closure[np.ix_(largest, largest)].min())
+    gap, share = level - float(direct[i, j]), len(largest) / len(varying)
+    one, other = (design.inputs[varying[largest[k]]] for k in sorted((i, j)))
+    return (
+        Diagnostic("chaining in the largest cluster", gap, _CHAINED, gap <= _CHAINED,
+                   f"{one} and {other} share a cluster of level {level:.2f}; their own |corr| is {direct[i, j]:.2f}"),
+        Diagnostic("share of inputs in the largest cluster", share, _ONE_CLUSTER, share <= _ONE_CLUSTER,
+                   f"{len(largest)} of {len(varying)} inputs; {n_tsp} clusters in all"),
+    )  # fmt: skip

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from features.design import Design
-from features.selectors.base import Selector
+from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import check_n_tsps, in_order, ranking, training_statistics
+
+_NEAR_TWINS = 0.95
 
 
 class Correlation(Selector):
@@ -27,3 +29,16 @@ class Correlation(Selector):
         statistics = training_statistics(design, train, self.key)
         order = ranking(np.abs(statistics.with_target), statistics.varying)
         return {n: in_order(design, order[:n]) for n in n_tsps}
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        if n_tsp < 2:
+            return ()
+        statistics = training_statistics(design, train, self.key)
+        chosen = np.sort(ranking(np.abs(statistics.with_target), statistics.varying)[:n_tsp])
+        between = np.triu(np.abs(statistics.between[np.ix_(chosen, chosen)]), 1)
+        i, j = np.unravel_index(np.argmax(between), between.shape)
+        value = float(between[i, j])
+        words = f"{design.inputs[chosen[i]]} and {design.inputs[chosen[j]]} tell " + (
+            "nearly the same" if value > _NEAR_TWINS else "different things; no chosen pair is closer"
+        )
+        return (Diagnostic("largest |corr| among the chosen", value, _NEAR_TWINS, value <= _NEAR_TWINS, words),)

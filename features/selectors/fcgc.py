@@ -8,8 +8,8 @@ import numpy as np
 
 from features.design import Design
 from features.grey import relational_degree
-from features.selectors.base import Selector
-from features.selectors.clusters import best_of_clusters
+from features.selectors.base import Diagnostic, Selector
+from features.selectors.clusters import best_of_clusters, chaining
 from features.selectors.statistics import check_n_tsps, training_statistics
 
 
@@ -32,3 +32,6 @@ class FuzzyClusterGreyCorrelation(Selector):
         degree = np.zeros(len(design.inputs))
         degree[statistics.varying] = relational_degree(x[:, statistics.varying], y_um)
         return best_of_clusters(design, statistics, degree, n_tsps)
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        return chaining(design, training_statistics(design, train, self.key), n_tsp)

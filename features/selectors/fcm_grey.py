@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from features.design import Design
 from features.grey_model import equations, least_squares
-from features.selectors.base import Selector
+from features.selectors.base import Diagnostic, Selector
 from features.selectors.fuzzy_c_means import fuzzy_c_means
 from features.selectors.statistics import check_n_tsps, chosen_of_varying, ranking, training_statistics
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
+Clusters = dict[int, Columns]
 
 
 class FcmGrey(Selector):
@@ -39,23 +40,36 @@ class FcmGrey(Selector):
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)
+        inputs, clusters = self._clusters(design, train, n_tsps)
+        strongest = ranking(driving_strengths(design, train, inputs), np.ones(len(inputs), bool))
+
+        def of_each(n: int) -> Columns:
+            cluster = clusters.get(n, np.zeros(len(inputs), np.int64))
+            _, first = np.unique(cluster[strongest], return_index=True)
+            best = strongest[np.sort(first)]
+            rest = strongest[~np.isin(strongest, best)]
+            return np.asarray(np.concatenate([best, rest[: n - len(best)]]))
+
+        varying = np.sort(inputs)
+        return chosen_of_varying(design, varying, n_tsps, lambda n: np.searchsorted(varying, inputs[of_each(n)]))
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        _, clusters = self._clusters(design, train, [n_tsp])
+        if n_tsp not in clusters:
+            return ()
+        empty = n_tsp - len(np.unique(clusters[n_tsp]))
+        words = f"of {n_tsp} asked; their points were filled up by the largest driving coefficients"
+        return (Diagnostic("clusters without a member", float(empty), 0.0, empty == 0, words if empty else "none"),)
+
+    def _clusters(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> tuple[Columns, Clusters]:
+        """The inputs that vary, by |corr| with the error, and for n = 2 to all but one of them the cluster of each."""
         statistics = training_statistics(design, train, self.key)
         inputs = ranking(np.abs(statistics.with_target), statistics.varying)[: np.count_nonzero(statistics.varying)]
         side = np.where(statistics.with_target[inputs] < 0, -1.0, 1.0)
         curves = statistics.between[np.ix_(inputs, inputs)] * side * side[:, None]
         numbers = [n for n in n_tsps if 1 < n < len(inputs)]
         memberships = fuzzy_c_means(curves, numbers, self.starts, self.seed, self.fuzziness)
-        strongest = ranking(driving_strengths(design, train, inputs), np.ones(len(inputs), bool))
-
-        def of_each(n: int) -> Columns:
-            cluster = np.argmax(memberships[n], axis=0) if n > 1 else np.zeros(len(inputs), int)
-            _, first = np.unique(cluster[strongest], return_index=True)
-            best = strongest[np.sort(first)]
-            rest = strongest[~np.isin(strongest, best)]
-            return np.asarray(np.concatenate([best, rest[: n - len(best)]]))
-
-        place = np.argsort(inputs)  # of the rising columns in `inputs`
-        return chosen_of_varying(design, inputs[place], n_tsps, lambda n: np.argsort(place)[of_each(n)])
+        return inputs, {n: np.argmax(u, axis=0) for n, u in memberships.items()}
 
 
 def driving_strengths(design: Design, train: Sequence[int], columns: Columns) -> Array:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from features.design import Design
-from features.selectors.base import Selector
-from features.selectors.clusters import best_of_clusters
+from features.selectors.base import Diagnostic, Selector
+from features.selectors.clusters import best_of_clusters, chaining
 from features.selectors.statistics import check_n_tsps, training_statistics
 
 
@@ -27,3 +27,6 @@ class FuzzyCorrelation(Selector):
         check_n_tsps(design, n_tsps, self.key)
         statistics = training_statistics(design, train, self.key)
         return best_of_clusters(design, statistics, np.abs(statistics.with_target), n_tsps)
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        return chaining(design, training_statistics(design, train, self.key), n_tsp)

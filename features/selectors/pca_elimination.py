@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
-from features.selectors.base import Selector
+from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import DIGITS, Statistics, check_n_tsps, in_order, training_statistics
 
 _SAME_EIGENVALUE = 1e-10
+_CLOSE_EIGENVALUES = 0.05
 
 
 class PcaElimination(Selector):
@@ -32,6 +33,25 @@ class PcaElimination(Selector):
         check_n_tsps(design, n_tsps, self.key)
         dropped = elimination_order(training_statistics(design, train, self.key))
         return {n: in_order(design, dropped[len(dropped) - n :]) for n in n_tsps}
+
+    def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
+        statistics = training_statistics(design, train, self.key)
+        dropped = elimination_order(statistics)
+        first = int(np.count_nonzero(~statistics.varying))
+        gaps = []
+        for step in range(first, len(dropped) - max(n_tsp, 1)):
+            left = np.sort(dropped[step:])
+            least, next_one = np.linalg.eigvalsh(statistics.between[np.ix_(left, left)])[:2]
+            gaps.append(
+                (float(1.0 - max(least, 0.0) / next_one) if next_one > _SAME_EIGENVALUE else 0.0, dropped[step])
+            )
+        if not gaps:
+            return ()
+        gap, column = min(gaps)
+        return (
+            Diagnostic("gap of the smallest eigenvalues", gap, _CLOSE_EIGENVALUES, gap >= _CLOSE_EIGENVALUES,
+                       f"least of all steps, as {design.inputs[column]} was dropped; without a gap the choice is chance"),
+        )  # fmt: skip
 
 
 def elimination_order(statistics: Statistics) -> list[int]:
