@@ -21,6 +21,7 @@ from models import FAMILIES
 from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
 from models.protocols import Fold, season, speed, start_ambient_degC
 from models.result import CELL_KEYS, GridResult
+from models.trust import error_against_distance
 
 _crossings: Mapping[str, Crossing] = {}  # of a worker process, set when it starts
 
@@ -44,6 +45,12 @@ class Workers:
         if self._pool is None:
             return cross_family(self._crossings[job[0]], job[1])
         return self._pool_of(job).submit(_cross, job).result()
+
+    def distances(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
+        """`error_against_distance` of (error channel, selector, family, n_tsp), beside what the crossing left there."""
+        if self._pool is None:
+            return error_against_distance(self._crossings[cell[0]], *cell[1:])
+        return self._pool_of((cell[0], cell[2])).submit(_distances, cell).result()
 
     def _pool_of(self, job: tuple[str, str]) -> ProcessPoolExecutor:
         assert self._pool is not None
@@ -171,6 +178,10 @@ def _start(crossings: Mapping[str, Crossing]) -> None:
     global _crossings
     _crossings = crossings
     threadpool_limits(limits=1)
+
+
+def _distances(cell: tuple[str, str, str, int]) -> pd.DataFrame:
+    return error_against_distance(_crossings[cell[0]], *cell[1:])
 
 
 def _cross(job: tuple[str, str]) -> FamilyResult:

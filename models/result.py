@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ class GridResult:
     - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um and one float32 column per
       "selector|family|n_tsp" with the left-out prediction in µm.
     - `findings`: batch_id, check, channel, start_s, end_s, words, masks, overruled.
+    - `distances`: how far left-out batches were from the training of the chosen cell, and its S there, see
+      `models.trust`; empty where nobody chose.
     - `excluded`: channel, reason: channels that no cell may use.
     """
 
@@ -46,6 +48,7 @@ class GridResult:
     predictions: pd.DataFrame
     findings: pd.DataFrame
     excluded: pd.DataFrame
+    distances: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def save(self, folder: Path) -> None:
         """One Parquet file per table and `result.json`."""
@@ -63,7 +66,7 @@ class GridResult:
     def load(cls, folder: Path) -> GridResult:
         """The inverse of `save`."""
         meta: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        tables = [f.name for f in fields(cls) if f.name not in meta]
+        tables = [f.name for f in fields(cls) if (folder / f"{f.name}.parquet").exists()]
         values = {k: v for k, v in meta.items() if k != "schema"}
         values |= {name: pd.read_parquet(folder / f"{name}.parquet") for name in tables}
         return cls(**values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
 
 from models.base import Family
+from models.region import Region
+from models.trust import Rise
 from pipelines import model_store, pyfunc_model
 from pipelines.settings import Settings
 from pipelines.tracking import open_store, store_errors
@@ -29,7 +31,8 @@ def log_version(
     name: str,
     family: Family,
     machine_yaml: str,
-    region: Mapping[str, Sequence[float]],
+    region: Region,
+    rise: Rise | None,
     info: dict[str, Any],
     tags: dict[str, str],
     training_id: str,
@@ -40,7 +43,7 @@ def log_version(
     """
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        model_store.save(folder, family, machine_yaml, region, info)
+        model_store.save(folder, family, machine_yaml, region, info, rise)
         stored = model_store.load(folder)
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]

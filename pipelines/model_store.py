@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,10 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
-from models.region import Region, outside
+from models.region import Region, watched
+from models.trust import Rise
 
-SCHEMA = "thermodrift.model/1"
+SCHEMA = "thermodrift.model/2"
 FILES = ("model.json", "arrays.npz", "machine.yml")
 Array = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ class StoredModel:
     machine: Machine
     region: Region
     info: dict[str, Any] = field(default_factory=dict)  # training_id, cell, n_batches, simulated, …
+    rise: Rise | None = None  # of the error with the distance from the region, where it was measured
 
     @property
     def simulated(self) -> bool:
@@ -73,12 +75,19 @@ class StoredModel:
 
     def outside(self, batch: Batch) -> list[str]:
         """For every row, which inputs, drivers or start temperatures lie beyond what training saw, joined by ", "."""
-        region = {name: limits for name, limits in self.region.items() if name.partition("@")[0] in batch.table}
         out = [""] * batch.n_rows
-        for name, hit in outside(batch, region, self.family.inputs).items():
+        for name, hit in self.region.outside(batch, self.family.inputs).items():
             for i in np.flatnonzero(hit):
                 out[i] += f", {name}" if out[i] else name
         return out
+
+    def distance(self, batch: Batch) -> Array:
+        """How far each row (n,) lies outside the trained region, in trained widths; 0 inside."""
+        return self.region.distance(watched(batch, self.family.inputs))
+
+    def expected_S_um(self, distance: Array) -> Array:
+        """S (n,) that batches so far away were left with, µm; NaN where nobody measured it."""
+        return np.full(len(distance), np.nan) if self.rise is None else self.rise.expected_um(distance)
 
     def _column(self, channel: str) -> str | int:
         part = self.machine.channels.get(channel)
@@ -89,8 +98,9 @@ def save(
     folder: Path,
     family: Family,
     machine_yaml: str,
-    region: Mapping[str, Sequence[float]],
+    region: Region,
     info: Mapping[str, Any] | None = None,
+    rise: Rise | None = None,
 ) -> None:
     """Write the three files; `machine_yaml` is the text of the machine file."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +109,8 @@ def save(
     document = {
         "schema": SCHEMA,
         **plain,
-        "region": {k: [float(v) for v in limits] for k, limits in region.items()},
+        "region": _to_json(region.as_plain(), arrays),
+        "rise": None if rise is None else _to_json(rise.as_plain(), arrays),
         "info": dict(info or {}),
     }
     (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -128,9 +139,8 @@ def load(folder: Path) -> StoredModel:
         raise InputError(f"model folder {folder}: got schema {got!r}, expected {SCHEMA!r}; train the model again")
     plain = _from_json(document, arrays)
     machine = parse_machine(machine_yaml, str(inner / "machine.yml"))
-    return StoredModel(
-        family_from_plain(plain), machine, {k: (low, high) for k, (low, high) in plain["region"].items()}, plain["info"]
-    )
+    rise = None if plain["rise"] is None else Rise.from_plain(plain["rise"])
+    return StoredModel(family_from_plain(plain), machine, Region.from_plain(plain["region"]), plain["info"], rise)
 
 
 def frame_to_batch(model: StoredModel, table: pd.DataFrame, batch_id: str = "frame") -> Batch:

@@ -57,7 +57,9 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
 
     Returns:
         batch_id, time_s (s), predicted_um (µm, relative to the batch's start; NaN where an input is missing),
-        outside_region (the row extrapolates), outside_of (which quantities), simulated (model or recording).
+        outside_region (the row extrapolates), outside_of (which quantities), distance (how far, in widths of the
+        trained range), expected_S_um (what left-out batches so far away were left with; NaN where nobody measured it),
+        simulated (model or recording).
 
     Raises:
         InputError: unknown model, a file that cannot be read, a missing input; one line each.
@@ -68,11 +70,11 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     tables = []
     for batch in read_batches(Path(file), model.machine, need_error=False):
         predicted = model.predict(batch)
-        outside = model.outside(batch)
+        outside, distance = model.outside(batch), model.distance(batch)
         tables.append(pd.DataFrame({
             "batch_id": batch.batch_id, "time_s": batch.time_s, "predicted_um": predicted,
-            "outside_region": [bool(o) for o in outside], "outside_of": outside,
-            "simulated": model.simulated or batch.simulated,
+            "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
+            "expected_S_um": model.expected_S_um(distance), "simulated": model.simulated or batch.simulated,
         }))  # fmt: skip
     if not tables:
         raise InputError(f"recording {file}: no batch in it that machine {model.machine.machine} can read")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +22,9 @@ from data.errors import InputError, closest
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.metrics import residual_std_um
+from models.region import Region
 from models.result import GridResult
+from models.trust import Rise
 from pipelines import model_store
 from pipelines.model_log import local_folder, log_version
 from pipelines.promotion import Choice, Comparison, compare_paired, left_out
@@ -74,7 +76,7 @@ def promote(
     machine_yaml: str,
     training_id: str,
     settings: Settings,
-    region: Mapping[str, Sequence[float]],
+    region: Region,
     batches: Sequence[Batch] = (),
     *,
     force: bool = False,
@@ -89,7 +91,7 @@ def promote(
     Args:
         family: the cell refitted on all batches.
         machine_yaml: text of the machine file; it travels with the model.
-        region: from `models.region.region_of`.
+        region: where it was trained.
         batches: the training's batches (optional).
         force: make it the champion whatever the comparison says; the reason says so.
 
@@ -135,7 +137,8 @@ def promote(
             "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
             **({"replaces": champion.version} if champion is not None and replaces else {}),
         }  # fmt: skip
-        new = log_version(client, name, family, machine_yaml, region, info, tags, training_id)
+        rise = Rise.of_cell(result.distances, choice.cell)
+        new = log_version(client, name, family, machine_yaml, region, rise, info, tags, training_id)
         client.update_model_version(name, new, ("SIMULATED. " if result.simulated else "") + choice.words)
         client.set_registered_model_tag(name, "simulated", _text(result.simulated))
         if replaces:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from data.machine import Machine, load_machine
 from models import FAMILIES
 from models.crossing import Crossing, Plan, prepare, refit, with_target
 from models.grid import Workers, assemble, jobs_of, workers_for
-from models.region import region_of
+from models.region import Region
 from models.result import GridResult
 from pipelines import promotion, registry, tracking
 from pipelines.caller import RETRIES, Caller
@@ -83,17 +83,23 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     jobs = jobs_of(plan, targets)
     with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
         done = dict(zip(jobs, caller.map("grid", workers.cross, jobs), strict=True))
-    for t in targets:
-        outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
-    clock("grid")
+        for t in targets:
+            outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
+        clock("grid")
+        if settings.promotion.protocol in plan.protocols:
+            say("trust")
+            for t in targets:
+                outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
+            chosen = [(t, c.selector, c.family, c.n_tsp) for t, c in outcome.choices.items()]
+            for t, distances in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
+                outcome.results[t] = replace(outcome.results[t], distances=distances)
+            clock("trust")
     say("track")
     track = partial(_track, outcome.results, plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
     clock("track")
     if request.promote:
         say("promote")
-        for t in targets:
-            outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
         promote = partial(_promote, outcome, crossings, request.machine_file, settings)
         outcome.promotions = dict(zip(targets, caller.map("promote", promote, targets, retries=RETRIES), strict=True))
         clock("promote")
@@ -143,7 +149,7 @@ def promote_tracked(
     choice = promotion.decide(result, settings.promotion, cell)
     family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target, machine)
     text = machine_file.read_text(encoding="utf-8")
-    region = region_of(batches, family.inputs)
+    region = Region.of(batches, family.inputs)
     return registry.promote(result, choice, family, text, training_id, settings, region, batches, force=force)
 
 
@@ -200,7 +206,7 @@ def _promote(
         machine_file.read_text(encoding="utf-8"),
         outcome.training_ids[target],
         settings,
-        region_of(crossing.batches, family.inputs),
+        Region.of(crossing.batches, family.inputs),
         crossing.batches,
     )
 

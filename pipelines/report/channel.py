@@ -23,6 +23,7 @@ from pipelines.report.extracts import (
 )
 from pipelines.report.layout import Key, Panel, Plot, Table
 from pipelines.report.story import Verdict, comparison_rows, mark_of
+from pipelines.report.trust import rise_panel, rise_table
 from pipelines.report.words import (
     BLUE,
     INK,
@@ -59,6 +60,8 @@ class Channel:
     left_out: Panel | None
     protocols: tuple[Table, ...]
     batches: Table
+    rise: Panel | None
+    rises: Table | None
     comparison: tuple[tuple[str, str], ...]
     trainings: Table | None
     changes: tuple[str, ...]
@@ -106,6 +109,8 @@ def channel_part(
         left_out=_left_out(name, result, choice, digits),
         protocols=tuple(others),
         batches=tables.batches(result, choice, digits),
+        rise=rise_panel(name, result.distances, result.simulated),
+        rises=rise_table(name, result.distances, digits, result.simulated),
         comparison=tuple(comparison_rows(group[0].promotion)),
         trainings=_trainings(group, choices) if len(group) > 1 else None,
         changes=changes,

@@ -84,7 +84,7 @@ def _matrix(colored: dict[str, Any], text: list[str], dark: Any, height: int, to
     words = {"type": "scatter", "mode": "text", "x": colored["x"], "y": colored["y"], "text": text, "hoverinfo": "skip",
              "textfont": {"size": 12, "color": ["#ffffff" if d else INK for d in dark]}}  # fmt: skip
     still = {"showgrid": False, "fixedrange": True, "ticks": "", "showline": False, "type": "category"}
-    layout = _layout(height, simulated, below=True, top=top)
+    layout = base_layout(height, simulated, below=True, top=top)
     layout["xaxis"] |= {**still, "side": "top", "tickangle": 0}
     layout["yaxis"] |= {**still, "autorange": "reversed", "automargin": True}
     layout["margin"] |= {"l": 20, "b": 28}
@@ -121,7 +121,7 @@ def against_points(
             "marker": {"symbol": symbol, "size": 9 if strong else 6, "color": color},
             "hovertemplate": f"{label}, %{{x}} points: %{{y:.3g}} µm<extra></extra>",
         })  # fmt: skip
-    layout = _layout(330, simulated)
+    layout = base_layout(330, simulated)
     layout["xaxis"] |= {"title": {"text": "number of points n"}, "range": [0.6, n_max + 0.4], "tick0": 1,
                         "dtick": max(1, math.ceil(n_max / 12))}  # fmt: skip
     top = float(flat[column].max()) if len(flat) else math.inf
@@ -153,7 +153,7 @@ def left_out(batch: LeftOut, target: str, residual_range_um: tuple[float, float]
          "line": {"color": color, "width": width}, "hovertemplate": f"{name} %{{y:.1f}} µm<extra></extra>"}
         for name, y, color, width, axis in lines
     ]  # fmt: skip
-    layout = _layout(350, simulated)
+    layout = base_layout(350, simulated)
     layout["xaxis"] |= {"title": {"text": "time since start, h"}, "anchor": "y2"}
     layout["yaxis2"] = dict(layout["yaxis"]) | {
         "title": {"text": "residual, µm"}, "domain": [0.0, 0.36], "range": list(residual_range_um), "nticks": 5,
@@ -190,13 +190,13 @@ def before_and_after(both: pd.DataFrame, simulated: bool) -> go.Figure:
          "hovertemplate": f"%{{x}}: {name} %{{y:.2f}} µm<extra></extra>"}
         for name, y, marker in markers
     ]  # fmt: skip
-    layout = _layout(340, simulated)
+    layout = base_layout(340, simulated)
     layout["xaxis"] |= {"type": "category", "tickangle": -60, "tickfont": {"size": 10}, "automargin": True}
     layout["yaxis"] |= {"title": {"text": "S on the left-out batch, µm"}, "rangemode": "tozero"}
     return go.Figure({"data": data, "layout": layout})
 
 
-def _layout(height: int, simulated: bool, below: bool = False, top: int = 22) -> dict[str, Any]:
+def base_layout(height: int, simulated: bool, below: bool = False, top: int = 22) -> dict[str, Any]:
     """The look that all figures share; simulated data are called so inside the picture."""
     axis = {"gridcolor": _GRID, "zeroline": False, "ticks": "outside", "ticklen": 4, "tickcolor": _RULE,
             "showline": True, "linecolor": _RULE}  # fmt: skip

@@ -16,6 +16,7 @@ from data.errors import InputError
 from data.machine import parse_machine
 from models import FAMILIES
 from models.base import Family
+from models.region import Region
 from pipelines import model_store, registry, tracking
 from pipelines.predict import load_model, predict_file
 from pipelines.promotion import choose
@@ -54,7 +55,8 @@ def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monk
     if uri.startswith("runs:"):
         uri = f"runs:/{training_id}/model"
     got = predict_file(uri.format(name=promotion.name, run=training_id), Path("run7.csv"), store)
-    assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "simulated"]
+    assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "distance",
+                         "expected_S_um", "simulated"]  # fmt: skip
     assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
     assert not got["outside_region"].any()
     assert got["simulated"].all()
@@ -114,8 +116,8 @@ def test_rows_beyond_the_training_are_marked_with_what(stored):
     table.loc[50:, "speed"] = 9000.0
     outside = model.outside(model_store.frame_to_batch(model, table))
     assert outside[:40] == [""] * 40
-    assert outside[45] == "front"
-    assert outside[55] == "front, speed"
+    assert outside[45] == "front, pattern of the points"
+    assert outside[55] == "front, speed, pattern of the points"
     cold = batch.table.assign(front=batch.table["front"] - 15)
     assert set(model.outside(model_store.frame_to_batch(model, cold))) == {"front@start"}
 
@@ -123,8 +125,8 @@ def test_rows_beyond_the_training_are_marked_with_what(stored):
 def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
     assert {p.name for p in stored.iterdir()} == set(model_store.FILES)
     document = json.loads((stored / "model.json").read_text())
-    assert document["schema"] == "thermodrift.model/1"
-    assert document["region"]["speed"] == [4000.0, 4000.0]
+    assert document["schema"] == "thermodrift.model/2"
+    assert document["region"]["ranges"]["speed"] == [4000.0, 4000.0]
     batch = toy_batches("toy-folder", 4)[1]
     before, _ = toy_model(toy_batches("toy-folder", 4))
     assert np.array_equal(model_store.load(stored).predict(batch), before.predict(batch))
@@ -145,7 +147,7 @@ def test_every_family_is_stored_without_loss(key, tmp_path):
             machine_yaml("toy-family"),
         )
     fitted = cls().fit(batches[:4], sensors if cls.uses_inputs else (), "z", machine)
-    model_store.save(tmp_path, fitted, text, {})
+    model_store.save(tmp_path, fitted, text, Region.of([], ()))
     model = model_store.load(tmp_path)
     assert np.array_equal(model.predict(batches[4]), fitted.predict(batches[4]), equal_nan=True)
     assert model.family.n_parameters() == fitted.n_parameters()
@@ -154,7 +156,9 @@ def test_every_family_is_stored_without_loss(key, tmp_path):
 
 def test_a_driver_that_the_model_follows_must_be_there(tmp_path):
     batches = toy_batches("toy-driver", 4)
-    model_store.save(tmp_path, FAMILIES["thermal_exponential"]().fit(batches, (), "z"), machine_yaml("toy-driver"), {})
+    model_store.save(
+        tmp_path, FAMILIES["thermal_exponential"]().fit(batches, (), "z"), machine_yaml("toy-driver"), Region.of([], ())
+    )
     model = model_store.load(tmp_path)
     assert model.channels() == ("speed",)
     table = batches[0].table
@@ -182,7 +186,7 @@ def test_every_kind_of_plain_data_comes_back(tmp_path, monkeypatch):
     }  # fmt: skip
     monkeypatch.setitem(FAMILIES._members, "odd", "here:Odd")
     monkeypatch.setattr("data.registry.import_module", lambda _: type("here", (), {"Odd": Odd}))
-    model_store.save(tmp_path, odd, machine_yaml("m"), {})
+    model_store.save(tmp_path, odd, machine_yaml("m"), Region.of([], ()))
     got = model_store.load(tmp_path).family.fitted
     assert np.array_equal(got["w"], odd.fitted["w"])
     assert got["nested"]["deep"].dtype == bool
@@ -190,7 +194,7 @@ def test_every_kind_of_plain_data_comes_back(tmp_path, monkeypatch):
     assert (got["n"], got["f"], got["words"], got["flag"], got["none"]) == (3, float("inf"), "ä µm", True, None)
     odd.fitted = {"bad": object()}
     with pytest.raises(TypeError, match="object is not plain data"):
-        model_store.save(tmp_path, odd, machine_yaml("m"), {})
+        model_store.save(tmp_path, odd, machine_yaml("m"), Region.of([], ()))
 
 
 def test_a_damaged_or_foreign_folder_is_told(stored, store, tmp_path):
@@ -199,8 +203,8 @@ def test_a_damaged_or_foreign_folder_is_told(stored, store, tmp_path):
     with pytest.raises(InputError, match=r"no such folder; expected models:/NAME@champion"):
         load_model(str(tmp_path / "nowhere"), store)
     text = (stored / "model.json").read_text()
-    (stored / "model.json").write_text(text.replace("thermodrift.model/1", "thermodrift.model/9"))
-    with pytest.raises(InputError, match=r"got schema 'thermodrift.model/9', expected 'thermodrift.model/1'"):
+    (stored / "model.json").write_text(text.replace("thermodrift.model/2", "thermodrift.model/9"))
+    with pytest.raises(InputError, match=r"got schema 'thermodrift.model/9', expected 'thermodrift.model/2'"):
         load_model(str(stored), store)
     (stored / "model.json").write_text(text)
     np.savez(stored / "arrays.npz", a0=np.array([object()], dtype=object))
@@ -242,5 +246,5 @@ def test_needed_channels_follow_from_the_features(stored):
     model = model_store.load(stored)
     with_room = machine_yaml("m") + "  room: {role: ambient, unit: degC}\n"
     model.family.inputs = ("front@lag30min", "bed@ambient", "front")
-    other = model_store.StoredModel(model.family, parse_machine(with_room, "test"), {})
+    other = model_store.StoredModel(model.family, parse_machine(with_room, "test"), Region.of([], ()))
     assert other.channels() == ("front", "bed", "room")

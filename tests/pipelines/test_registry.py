@@ -9,6 +9,7 @@ from mlflow.tracking import MlflowClient
 from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 from data.errors import InputError
+from models.region import Region
 from pipelines import registry, tracking
 from pipelines.promotion import Choice, choose
 
@@ -181,7 +182,7 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
 
     got = registry.promote(
         result, choice, Zero().fit(batches, (), "z"), machine_yaml("toy-zero"),
-        tracking.log_training(result, store), store, {},
+        tracking.log_training(result, store), store, Region.of([], ()),
     )  # fmt: skip
     assert not got.trusted
     assert "nothing beats zero (best other: 9.00 µm): do not trust" in got.words

@@ -192,7 +192,7 @@ def test_the_champion_predicts_a_raw_file(story: Story, store: Any, tmp_path: Pa
 def test_progress_is_said(story: Story) -> None:
     said = story.steps["said"]
     assert said[:2] == ["ingest in", "features and selectors of 6 batches"]
-    assert said[2:4] == ["grid", "track"] and "promote" in said and "report" in said
+    assert said[2:5] == ["grid", "trust", "track"] and "promote" in said and "report" in said
 
 
 def test_without_promotion_any_protocol_will_do(story: Story, store: Any) -> None:

@@ -11,7 +11,7 @@ import pandas as pd
 from data.batch import Batch
 from data.machine import parse_machine
 from models.mlr import MLR
-from models.region import region_of
+from models.region import Region
 from models.result import SCORES, GridResult
 
 GAIN_UM_PER_K = (3.0, -1.5)
@@ -47,9 +47,9 @@ def toy_batches(machine: str, n: int) -> list[Batch]:
     return out
 
 
-def toy_model(batches: Sequence[Batch]) -> tuple[MLR, dict[str, tuple[float, float]]]:
+def toy_model(batches: Sequence[Batch]) -> tuple[MLR, Region]:
     """A regression on both points, and its region."""
-    return MLR().fit(batches, ("front", "bed"), "z"), region_of(batches, ("front", "bed"))
+    return MLR().fit(batches, ("front", "bed"), "z"), Region.of(batches, ("front", "bed"))
 
 
 def toy_result(batches: Sequence[Batch], S_um: dict[str, Sequence[float]], **stability: float) -> GridResult:
