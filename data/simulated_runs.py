@@ -6,7 +6,7 @@ Every number that is drawn is drawn whatever its range, so a scatter that is nar
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -114,91 +114,96 @@ class SimulatedRun:
 
 
 @dataclass(frozen=True)
-class Instruments:
-    """What is recorded: `sensors` by channel at which body (`room`: the air), every `sample_s`; errors of the machine.
+class MachineType:
+    """A type of machine: its network, which channel stands at which body (`room`: the air), and its slow castings.
 
-    Sensors lag 60 s, see a twentieth of the air, have an offset of their own and show 0.1 K; probes have 0.7 µm of
-    noise and show 1 µm.
+    `slow_bodies` names the bodies of every part that starts away from the room (bed, column, table).
     """
 
+    machine: ThermalMachine
     sensors: Mapping[str, str]
-    offset_K: Mapping[str, float]
-    sample_s: float
+    slow_bodies: Mapping[str, Sequence[str]]
 
-    @classmethod
-    def drawn(cls, sensors: Mapping[str, str], sample_s: float, rng: np.random.Generator) -> Instruments:
-        """Offsets drawn within ±0.2 K; they belong to the machine.
+    def drawn(self, rng: np.random.Generator, sample_s: float) -> Rig:
+        """One machine of the type: every conductance, capacity and heat ±20 %, sensor offsets within ±0.2 K.
 
         Raises:
             InputError: a sampling step that is no whole number of the simulation's steps.
         """
         if sample_s <= 0 or sample_s % STEP_S:
             raise InputError(f"simulated runs: sample_s {sample_s:g}; expected a whole number of steps of {STEP_S:g} s")
-        offset_K = {name: float(rng.uniform(-SENSOR_OFFSET_K, SENSOR_OFFSET_K)) for name in sensors}
-        return cls(sensors, offset_K, sample_s)
+        machine = self.machine.scattered(rng, MACHINE_SHARE)
+        offset_K = {name: float(rng.uniform(-SENSOR_OFFSET_K, SENSOR_OFFSET_K)) for name in self.sensors}
+        return Rig(replace(self, machine=machine), offset_K, sample_s)
 
 
-def record(
-    machine: ThermalMachine,
-    slow_bodies: Mapping[str, Sequence[str]],
-    instruments: Instruments,
-    runs: Sequence[SimulatedRun],
-    rng: np.random.Generator,
-) -> list[Batch]:
-    """Simulate the runs at once and read the instruments; a batch per run, marked as simulated.
+@dataclass(frozen=True)
+class Rig:
+    """One machine with its instruments, read every `sample_s`.
 
-    `slow_bodies` names the bodies of every part that starts away from the room. The first row is the machine at its
-    start; a row shows the speed of the step that ends there.
+    Sensors lag 60 s, see a twentieth of the air, have an offset of their own and show 0.1 K; probes have 0.7 µm of
+    noise and show 1 µm.
     """
-    steps = int(max(r.duration_s for r in runs) / STEP_S)
-    time_s = np.arange(steps + 1, dtype=float) * STEP_S
-    room_degC = np.stack([r.room_degC(time_s) for r in runs], axis=1)
-    speed_rpm = np.stack([r.speed_rpm(time_s[:-1]) for r in runs], axis=1)
-    body_degC = machine.simulate(
-        speed_rpm,
-        (room_degC[:-1] + room_degC[1:]) / 2,
-        np.array([r.floor_degC for r in runs]),
-        np.stack([_start_degC(machine, slow_bodies, r) for r in runs]),
-        np.array([r.friction for r in runs]),
-        STEP_S,
-    )
-    ended_rpm = np.concatenate([np.zeros((1, len(runs))), speed_rpm])
-    error_um = machine.error_um(body_degC - body_degC[0], ended_rpm)
-    shown = {
-        name: sensor_degC(room_degC if body == ROOM else body_degC[..., machine.place[body]], room_degC, SENSOR_BONDING)
-        + instruments.offset_K[name]
-        for name, body in instruments.sensors.items()
-    }
-    channels = _channels(instruments, machine)
-    every = int(instruments.sample_s / STEP_S)
-    batches = []
-    for b, run in enumerate(runs):
-        rows = slice(0, int(run.duration_s / STEP_S) + 1, every)
-        columns = {"time_s": time_s[rows]}
-        columns |= {n: _stepped(v[rows, b], TEMPERATURE_STEP_K) for n, v in shown.items()}
-        columns["spindle_rpm"] = ended_rpm[rows, b]
-        for name, values in error_um.items():
-            noisy = values[rows, b] + rng.normal(0.0, PROBE_NOISE_UM, len(columns["time_s"]))
-            columns[name] = _stepped(noisy, PROBE_STEP_UM)
-        batches.append(Batch("simulated", run.batch_id, pd.DataFrame(columns), channels, simulated=True))
-    return batches
 
+    of: MachineType
+    offset_K: Mapping[str, float]
+    sample_s: float
 
-def _start_degC(machine: ThermalMachine, slow_bodies: Mapping[str, Sequence[str]], run: SimulatedRun) -> Array:
-    start = np.full(len(machine.bodies), run.start_degC)
-    for part, offset_K in run.slow_start_K.items():
-        for body in slow_bodies.get(part, ()):
-            start[machine.place[body]] += offset_K
-    return start
+    def record(self, runs: Sequence[SimulatedRun], rng: np.random.Generator) -> list[Batch]:
+        """Simulate the runs at once and read the instruments; a batch per run, marked as simulated.
 
+        The first row is the machine at its start; a row shows the speed of the step that ends there.
+        """
+        machine = self.of.machine
+        steps = int(max(r.duration_s for r in runs) / STEP_S)
+        time_s = np.arange(steps + 1, dtype=float) * STEP_S
+        room_degC = np.stack([r.room_degC(time_s) for r in runs], axis=1)
+        speed_rpm = np.stack([r.speed_rpm(time_s[:-1]) for r in runs], axis=1)
+        body_degC = machine.simulate(
+            speed_rpm,
+            (room_degC[:-1] + room_degC[1:]) / 2,
+            np.array([r.floor_degC for r in runs]),
+            np.stack([self._start_degC(r) for r in runs]),
+            np.array([r.friction for r in runs]),
+            STEP_S,
+        )
+        ended_rpm = np.concatenate([np.zeros((1, len(runs))), speed_rpm])
+        error_um = machine.error_um(body_degC - body_degC[0], ended_rpm)
+        shown = {
+            name: self.offset_K[name]
+            + sensor_degC(room_degC if body == ROOM else body_degC[..., machine.place[body]], room_degC, SENSOR_BONDING)
+            for name, body in self.of.sensors.items()
+        }
+        every = int(self.sample_s / STEP_S)
+        batches = []
+        for b, run in enumerate(runs):
+            rows = slice(0, int(run.duration_s / STEP_S) + 1, every)
+            columns = {"time_s": time_s[rows]}
+            columns |= {n: _stepped(v[rows, b], TEMPERATURE_STEP_K) for n, v in shown.items()}
+            columns["spindle_rpm"] = ended_rpm[rows, b]
+            for name, values in error_um.items():
+                noisy = values[rows, b] + rng.normal(0.0, PROBE_NOISE_UM, len(columns["time_s"]))
+                columns[name] = _stepped(noisy, PROBE_STEP_UM)
+            batches.append(Batch("simulated", run.batch_id, pd.DataFrame(columns), self.channels, simulated=True))
+        return batches
 
-def _channels(instruments: Instruments, machine: ThermalMachine) -> dict[str, Channel]:
-    out = {
-        name: Channel(name, "ambient" if body == ROOM else "temperature", "degC", TEMPERATURE_STEP_K)
-        for name, body in instruments.sensors.items()
-    }
-    out["spindle_rpm"] = Channel("spindle_rpm", "driver", "rpm", 1.0)
-    return out | {name: Channel(name, "error", "um", PROBE_STEP_UM) for name in machine.um_per_K}
+    @property
+    def channels(self) -> dict[str, Channel]:
+        """Sensors, the spindle's speed, the machine's errors."""
+        out = {
+            name: Channel(name, "ambient" if body == ROOM else "temperature", "degC", TEMPERATURE_STEP_K)
+            for name, body in self.of.sensors.items()
+        }
+        out["spindle_rpm"] = Channel("spindle_rpm", "driver", "rpm", 1.0)
+        return out | {name: Channel(name, "error", "um", PROBE_STEP_UM) for name in self.of.machine.um_per_K}
+
+    def _start_degC(self, run: SimulatedRun) -> Array:
+        machine = self.of.machine
+        start = np.full(len(machine.bodies), run.start_degC)
+        for part, offset_K in run.slow_start_K.items():
+            for body in self.of.slow_bodies.get(part, ()):
+                start[machine.place[body]] += offset_K
+        return start
 
 
 def _stepped(values: Array, step: float) -> Array:

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from data import sample_machine
 from data.batch import Batch
-from data.simulated_runs import MACHINE_SHARE, ROOM, Instruments, Scatter, SimulatedRun, record
+from data.simulated_runs import Scatter, SimulatedRun
+from data.simulated_vmc import SENSORS, VMC
 from features.design import Design
 from models.base import Family
 from models.bp import BP
@@ -22,9 +22,7 @@ from models.studies.trained import Inputs, accuracy_and_robustness_um, choices, 
 
 Array = NDArray[np.float64]
 
-SENSORS = ("front", "rear", "motor", "head_front", "head_rear", "screw", "column_front", "column_back", "bed", ROOM)
 ON_THE_SPINDLE = {"front", "rear", "motor", "head_front", "head_rear"}
-SLOW_BODIES = {"bed": ("bed",), "table": ("table",), "column": ("column_front", "column_back")}
 SPEEDS_RPM = (2000.0, 4000.0, 6000.0)
 SPECTRUM_RPM, STAGE_S = (1500.0, 3000.0, 4500.0, 6000.0), 900.0
 COLDEST_DEGC, WARMEST_DEGC = 2.94, 32.37
@@ -69,8 +67,7 @@ PUBLISHED = {
 def machine_year(seed: int, scatter: Scatter | None = None) -> list[Batch]:
     """K1..K9 in an order of their own, V1..V3 and the run that is compensated, of one machine."""
     rng = np.random.default_rng([seed, 1])
-    machine = sample_machine.machine().scattered(rng, MACHINE_SHARE)
-    instruments = Instruments.drawn({s: s for s in SENSORS}, SAMPLE_S, rng)
+    rig = VMC.drawn(rng, SAMPLE_S)
     rest = (SAMPLE_S, 0.0)
     starts_degC = np.linspace(COLDEST_DEGC, WARMEST_DEGC, N_MODELS)
     constant = [(rest, (RUN_S, SPEEDS_RPM[k % 3])) for k in range(N_MODELS)]
@@ -80,7 +77,7 @@ def machine_year(seed: int, scatter: Scatter | None = None) -> list[Batch]:
     plans += [(f"V{i + 1}", spectrum, float(rng.uniform(*VERIFIED_DEGC))) for i in range(N_VERIFIED)]
     plans += [("C", (rest, (RUN_S, SPEEDS_RPM[-1])), float(rng.uniform(*VERIFIED_DEGC)))]
     runs = [SimulatedRun.drawn(name, stages, degC, rng, scatter) for name, stages, degC in plans]
-    return record(machine, SLOW_BODIES, instruments, runs, rng)
+    return rig.record(runs, rng)
 
 
 class YearRoundPCR(Study):
