@@ -31,6 +31,7 @@ from pipelines.diagnosis_trigger import diagnose_if_grown
 from pipelines.report import figure_pngs, write_report
 from pipelines.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
+from pipelines.unfinished import Unfinished
 
 Say = Callable[[str], None]
 
@@ -80,9 +81,9 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs = jobs_of(plan, targets)
+    jobs, unfinished = jobs_of(plan, targets), Unfinished(home() / "unfinished", crossings)
     with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
-        done = dict(zip(jobs, caller.map("grid", workers.cross, jobs), strict=True))
+        done = dict(zip(jobs, caller.map("grid", unfinished.crossed(workers.cross), jobs), strict=True))
         for t in targets:
             outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
         clock("grid")
@@ -97,6 +98,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     say("track")
     track = partial(_track, outcome.results, plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
+    unfinished.forget()
     clock("track")
     if request.promote:
         say("promote")
