@@ -65,8 +65,8 @@ def _read(held: Path) -> FamilyResult:
     with np.load(held / "predictions.npz", allow_pickle=False) as stored:
         predictions = {name: stored[name] for name in stored.files}
     failures = [(a, b) for a, b in json.loads((held / "failures.json").read_text(encoding="utf-8"))]
-    tables = (pd.read_parquet(held / f"{name}.parquet") for name in ("scores", "cells"))
-    return FamilyResult(*tables, predictions, failures)
+    scores, cells = (pd.read_parquet(held / f"{name}.parquet") for name in ("scores", "cells"))
+    return FamilyResult(scores, cells, predictions, failures)
 
 
 def _digest(crossings: Mapping[str, Crossing]) -> str:
