@@ -18,6 +18,8 @@ FAMILIES = Registry(
         "pls": "models.pls:PLS",
         "elastic_net": "models.elastic_net:ElasticNet",
         "huber": "models.huber:Huber",
+        "distributed_lag": "models.distributed_lag:DistributedLag",
+        "axis_coupled": "models.axis_coupled:AxisCoupled",
         "bp": "models.bp:BP",
         "lssvm": "models.lssvm:LSSVM",
         "gm1n": "models.gm1n:GM1N",

@@ -174,7 +174,7 @@ class LSSVM(Family):
             "bias": float(best.bias[f]),
             "gamma": float(best.gamma[f]),
             "sigma": float(best.sigma[f]),
-            "scale": _scale(design),
+            "scale": unit_scale(design),
             "inner_rms_um": float(best.score[f]),
         }
         return self._learned(design, fitted)
@@ -219,7 +219,7 @@ class _Problem:
             at[s, : layout.shape[0], : layout.shape[1]] = np.where(layout >= 0, r[layout], -1)
         at = at.reshape(len(rows), -1)
         known = at >= 0
-        u = np.where(known[:, :, None], design.x[at] / _scale(design), 0.0)
+        u = np.where(known[:, :, None], design.x[at] / unit_scale(design), 0.0)
         return cls(u, np.where(known, design.y_um[at], 0.0), known, int(m))
 
     @property
@@ -268,7 +268,8 @@ class _Best:
         self.alpha[at], self.bias[at] = alpha, bias
 
 
-def _scale(design: Design) -> Array:
+def unit_scale(design: Design) -> Array:
+    """What inputs are divided by for their unit, (p,): the same in every fold."""
     units = design.input_units or ("",) * len(design.inputs)
     return np.array([SCALES.get(u, _OTHER_SCALE) for u in units])
 

@@ -1,0 +1,251 @@
+"""Distributed lags against sums written out, planted laws, brute-force choices, and other sampling steps."""
+
+import numpy as np
+import pytest
+
+from data.errors import InputError
+from features.design import Design
+from features.rises import first_order_lag
+from models.distributed_lag import KOYCK_TAUS_S, DistributedLag
+from models.lag_responses import lag_responses
+from models.lag_shapes import RIDGES, LagRegression, effective_rows, free_shapes, koyck_shapes, polynomial_shapes
+from models.linear import Blocks, Task
+
+SIZES = (60, 45, 52, 40, 57)
+
+
+def rises(n, p, rng, step_s=300.0):
+    """Smooth rises with some ripple, 0 at the start, (n, p)."""
+    hours = np.arange(n)[:, None] * step_s / 3600
+    load = rng.uniform(5, 15, p) * (1 - np.exp(-hours / rng.uniform(0.3, 4, p)))
+    return load + rng.uniform(0.5, 2, p) * np.sin(hours * rng.uniform(2, 5, p))
+
+
+def make_design(law=None, p=2, noise_um=0.0, seed=0, step_s=300.0, drivers=()) -> Design:
+    """`law(x)` gives the error (n,) of one batch from its rises (n, p)."""
+    rng = np.random.default_rng(seed)
+    parts = [rises(n, p, rng, step_s) for n in SIZES]
+    y = np.concatenate([law(x) if law else 2 * x[:, 0] - x[:, -1] for x in parts])
+    names = tuple(f"t{j}" for j in range(p))
+    return Design(names, "z", tuple(f"K{k + 1}" for k in range(len(SIZES))), np.vstack(parts),
+                  y + rng.normal(0, noise_um, len(y)), np.concatenate([np.arange(n) * step_s for n in SIZES]),
+                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s, driver_names=drivers)  # fmt: skip
+
+
+def shifted(x, rows, before=0.0):
+    out = np.full_like(x, before)
+    out[rows:] = x[: len(x) - rows]
+    return out
+
+
+def table_of(design, orders):
+    """The lagged columns written out, lag after lag, `orders` rows apart."""
+    return np.vstack([np.hstack([shifted(design.x[design.rows(k)], rows) for rows in orders])
+                      for k in range(design.n_batches)])  # fmt: skip
+
+
+def ridge(x, y, k):
+    """Coefficients and intercept with k times the mean variance of the columns as penalty."""
+    centred = x - x.mean(0)
+    matrix = centred.T @ centred
+    matrix += k * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+    beta = np.linalg.solve(matrix, centred.T @ (y - y.mean()))
+    return beta, y.mean() - x.mean(0) @ beta
+
+
+def test_responses_are_shifts_and_first_order_lags_of_each_batch_alone():
+    design = make_design(seed=1)
+    got = lag_responses(design, [(0, 0), (900, 0), (450, 0), (0, 1800), (600, 1800)])
+    for k in range(design.n_batches):
+        x, own = design.x[design.rows(k)], got[design.rows(k)]
+        np.testing.assert_array_equal(own[:, 0], x)
+        np.testing.assert_array_equal(own[:, 1], shifted(x, 3))
+        np.testing.assert_allclose(own[:, 2], (shifted(x, 1) + shifted(x, 2)) / 2, atol=1e-12)
+        lag = np.column_stack([first_order_lag(c, 1800, 300) for c in x.T])
+        np.testing.assert_allclose(own[:, 3], lag, atol=1e-12)
+        np.testing.assert_allclose(own[:, 4], shifted(lag, 2), atol=1e-12)
+
+
+def test_before_the_start_a_temperature_has_its_first_value_and_a_driver_rests():
+    design = make_design(seed=2, drivers=("t1",))
+    design.x[:] += 7.0
+    got = lag_responses(design, [(600, 0), (0, 3600)])[design.rows(1)]
+    x = design.x[design.rows(1)]
+    np.testing.assert_array_equal(got[:2, 0], [[x[0, 0], 0.0]] * 2)
+    np.testing.assert_array_equal(got[0, 1], [x[0, 0], 0.0])
+    np.testing.assert_allclose(got[:, 1, 1], first_order_lag(x[:, 1], 3600, 300, start=0.0), atol=1e-12)
+
+
+def test_holes_are_bridged_and_a_missing_input_is_nan():
+    design = make_design(seed=3)
+    design.x[5:8, 0] = np.nan
+    design.x[design.rows(2), 1] = np.nan
+    model = DistributedLag().fit_design(design, [0, 1, 3])
+    own, other = model.predict_design(design, [0, 2])
+    assert np.isfinite(own).all() and np.isnan(other).all()
+
+
+@pytest.mark.parametrize("lags", ["free", "almon"])
+def test_a_planted_law_of_lags_is_found(lags):
+    # Four lags of 20 min: two inputs whose weights lie on a straight line over the lags.
+    weights = np.array([[3.0, -1.0], [2.0, -0.5], [1.0, 0.0], [0.0, 0.5]])
+    design = make_design(lambda x: sum(shifted(x, 4 * lag) @ w for lag, w in enumerate(weights)), seed=4)
+    model = DistributedLag(lags, lag_min=20, max_lags=3, degree=1).fit_design(design, [0, 1, 2, 3])
+    np.testing.assert_allclose(model.predict_design(design, [4])[0], design.y_um[design.rows(4)], atol=1e-3)
+    np.testing.assert_allclose(model.fitted["weights_um_per_K"], weights, atol=1e-3)
+    np.testing.assert_array_equal(model.fitted["delays_s"], [0, 1200, 2400, 3600])
+
+
+def test_a_planted_geometric_lag_is_found_with_its_decay():
+    tau_s = KOYCK_TAUS_S[3]
+    keep = np.exp(-300 / tau_s)
+
+    def law(x):
+        # Koyck's transformed equation run free: y_t = λ y_(t−1) + 4 (1 − λ) x_t, and a direct part −1.5 x_t.
+        y = np.zeros(len(x))
+        for t in range(1, len(x)):
+            y[t] = keep * y[t - 1] + 4 * (1 - keep) * x[t, 0]
+        return y - 1.5 * x[:, 0]
+
+    design = make_design(law, p=1, seed=5)
+    model = DistributedLag().fit_design(design, [0, 1, 2, 3])
+    np.testing.assert_array_equal(model.fitted["taus_s"], [0, tau_s])
+    np.testing.assert_allclose(model.fitted["weights_um_per_K"][:, 0], [-1.5, 4.0], atol=1e-4)
+    np.testing.assert_allclose(model.predict_design(design, [4])[0], design.y_um[design.rows(4)], atol=1e-4)
+
+
+def test_no_lag_where_none_is():
+    design = make_design(lambda x: 2 * x[:, 0] - 3 * x[:, 1], noise_um=0.5, seed=6)
+    for lags in ("free", "almon", "koyck"):
+        fitted = DistributedLag(lags, order_by="bic").fit_design(design, range(5)).fitted
+        np.testing.assert_array_equal([fitted["delays_s"], fitted["taus_s"]], [[0], [0]])
+        np.testing.assert_allclose(fitted["weights_um_per_K"], [[2, -3]], atol=0.1)
+        assert fitted["residual_autocorrelation"] < 0.15
+
+
+@pytest.mark.parametrize("fold", [[0, 1, 2, 3, 4], [0, 2, 4], [1]])
+def test_the_choice_is_the_brute_force_choice(fold):
+    design = make_design(lambda x: x[:, 0] + 2 * shifted(x[:, 1], 6), noise_um=2.0, seed=7)
+    fitted = DistributedLag("free", lag_min=15, max_lags=3).fit_design(design, fold).fitted
+    parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold]
+    if len(fold) < 3:
+        parts = [part[(np.arange(len(part)) * 4) // len(part) == q] for part in parts for q in range(4)]
+    S_um = {}
+    for q in (0, 1, 2, 3):
+        table = table_of(design, [3 * lag for lag in range(q + 1)])
+        for k in RIDGES:
+            left = []
+            for out in parts:
+                rest = np.setdiff1d(np.concatenate(parts), out)
+                beta, constant = ridge(table[rest], design.y_um[rest], k)
+                e = design.y_um[out] - table[out] @ beta - constant
+                left.append(np.sqrt(e @ e / (len(e) - 1)))
+            S_um[q, k] = np.mean(left)
+    best = min(S_um, key=S_um.get)
+    assert (len(fitted["delays_s"]) - 1, fitted["k"]) == best
+    rows = np.concatenate([np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold])
+    table = table_of(design, [3 * lag for lag in range(best[0] + 1)])
+    beta, constant = ridge(table[rows], design.y_um[rows], best[1])
+    np.testing.assert_allclose(fitted["weights_um_per_K"].ravel(), beta, atol=1e-6)
+    assert fitted["intercept_um"] == pytest.approx(constant, abs=1e-6)
+
+
+def test_almon_weights_lie_on_a_polynomial_and_equal_regression_on_its_terms():
+    design = make_design(lambda x: sum(shifted(x, 2 * lag) @ [1.0, -0.3] * lag for lag in range(7)), noise_um=1, seed=8)
+    model = DistributedLag("almon", lag_min=10, max_lags=6, degree=2, order_by="aic").fit_design(design, range(5))
+    weights, lag = model.fitted["weights_um_per_K"], np.arange(7)
+    assert len(weights) == 7
+    for column in weights.T:
+        np.testing.assert_allclose(np.polyval(np.polyfit(lag, column, 2), lag), column, atol=1e-10)
+    terms = np.linalg.qr(np.vander(lag / 3.0 - 1, 3, increasing=True))[0]
+    table = np.stack([table_of(design, [2 * m]) for m in lag], axis=1)
+    basis = np.einsum("nlp,ld->ndp", table, terms).reshape(len(table), -1)
+    beta, _ = ridge(basis, design.y_um, model.fitted["k"])
+    np.testing.assert_allclose(weights, terms @ beta.reshape(3, 2), atol=1e-6)
+
+
+def task_of(design, folds):
+    masks = np.array([[k in fold for k in range(design.n_batches)] for fold in folds])
+    blocks = Blocks.of(design.moments)
+    return Task(design, masks, blocks, blocks.pool(masks, False), False)
+
+
+@pytest.mark.parametrize("order_by", ["aic", "bic"])
+def test_the_criteria_count_parameters_and_effective_rows(order_by):
+    design = make_design(noise_um=1.0, seed=9)
+    columns = Design(tuple("abcdef"), "z", design.batch_ids, table_of(design, [0, 3, 6]), design.y_um, design.time_s,
+                     design.offsets, 300.0)  # fmt: skip
+    task = task_of(columns, [[0, 1, 2, 3, 4], [1, 2, 3]])
+    got = LagRegression(free_shapes(2), order_by)._criterion(task)
+    for f, fold in enumerate([[0, 1, 2, 3, 4], [1, 2, 3]]):
+        x, y, batch = columns.stacked(fold)
+        beta, constant = ridge(x, y, RIDGES[-1])
+        e = y - x @ beta - constant
+        rho = sum(e[batch == k][1:] @ e[batch == k][:-1] for k in fold) / (e @ e)
+        rows = len(y) * (1 - max(rho, 0)) / (1 + max(rho, 0))
+        for q in range(3):
+            for r, k in enumerate(RIDGES):
+                z = x[:, : 2 * q + 2] - x[:, : 2 * q + 2].mean(0)
+                beta, constant = ridge(x[:, : 2 * q + 2], y, k)
+                sse = np.sum((y - x[:, : 2 * q + 2] @ beta - constant) ** 2)
+                values = np.linalg.svd(z, compute_uv=False) ** 2
+                parameters = 1 + np.sum(values / (values + k * values.mean()))
+                weight = 2 if order_by == "aic" else np.log(rows)
+                want = rows * np.log(sse / len(y)) + weight * parameters
+                assert got[f, q * len(RIDGES) + r] == pytest.approx(want, rel=1e-6)
+
+
+def test_effective_rows_of_residuals_with_a_known_memory():
+    rng, n = np.random.default_rng(10), 4000
+    e = np.zeros((3, n))
+    for t in range(1, n):
+        e[:, t] = 0.8 * e[:, t - 1] + rng.normal(size=3)
+    x, time_s = rng.normal(size=(3 * n, 1)), np.tile(np.arange(n) * 60.0, 3)
+    design = Design(("t",), "z", ("a", "b", "c"), x, e.ravel(), time_s,
+                    np.arange(4, dtype=np.int64) * n, 60.0)  # fmt: skip
+    rho, rows = effective_rows(task_of(design, [[0, 1, 2]]), np.zeros((1, 1)))
+    assert rho[0] == pytest.approx(0.8, abs=0.02)
+    assert rows[0] == pytest.approx(3 * n / 9, rel=0.12)
+
+
+@pytest.mark.parametrize("lags", ["koyck", "almon", "free"])
+def test_a_model_learned_at_one_step_holds_at_another(lags):
+    hours = [np.arange(0, n * 300, 60) / 3600 for n in SIZES]
+    fine = [
+        np.column_stack([9 * (1 - np.exp(-h / 1.5)), 5 * (1 - np.exp(-h / 3)) + np.sin(2 * h) * h / 4]) for h in hours
+    ]
+
+    def design_of(every):
+        parts = [x[::every] for x in fine]
+        y = np.concatenate([2 * x[:, 0] + shifted(x[:, 1], 60 // every) for x in parts])
+        sizes = [len(x) for x in parts]
+        return Design(("a", "b"), "z", tuple("VWXYZ"), np.vstack(parts), y,
+                      np.concatenate([np.arange(n) * 60.0 * every for n in sizes]),
+                      np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), 60.0 * every)  # fmt: skip
+
+    coarse, close = design_of(5), design_of(1)
+    model = DistributedLag(lags).fit_design(coarse, [0, 1, 2, 3])
+    at_300_s, at_60_s = model.predict_design(coarse, [4])[0], model.predict_design(close, [4])[0]
+    assert np.abs(at_60_s[::5] - at_300_s).max() < 0.02 * np.ptp(at_300_s)
+
+
+def test_lags_are_never_closer_than_a_step():
+    design = make_design(step_s=900.0)
+    fitted = DistributedLag("free", lag_min=5, max_lags=2, order_by="aic").fit_design(design, range(5)).fitted
+    assert set(np.diff(fitted["delays_s"])) <= {900.0}
+
+
+def test_shapes():
+    assert [len(s.responses) for s in free_shapes(5)] == [1, 2, 3, 4, 5, 6]
+    assert [s.mix.shape for s in polynomial_shapes(4, 2)] == [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3)]
+    assert [s.responses for s in koyck_shapes(2)] == [(0,), (0, 1), (0, 2)]
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"lags": "almond"}, "unknown lags 'almond': did you mean 'almon'"),
+    ({"order_by": "bix"}, "unknown order_by 'bix': did you mean 'bic'"),
+    ({"lag_min": 0}, "expected lag_min above 0"),
+])  # fmt: skip
+def test_impossible_options_are_told(options, words):
+    with pytest.raises(InputError, match=words):
+        DistributedLag(**options)
