@@ -125,15 +125,25 @@ class ThermalMachine:
 
     def heat_W(self, body_degC: Array, speed_rpm: Array, friction: Array) -> Array:
         """Heat into every body (B, N), W, from temperatures (B, N), speed (B,) and the friction factor (B,)."""
+        heat = self.driven_heat_W(speed_rpm)
+        self._add_friction(heat, body_degC, speed_rpm, friction)
+        return heat
+
+    def driven_heat_W(self, speed_rpm: Array) -> Array:
+        """The part of the heat that no temperature changes, (..., N), W, at speeds (...,)."""
         x = speed_rpm / self.rated_rpm
-        heat = np.zeros_like(body_degC)
+        heat = np.zeros((*speed_rpm.shape, len(self.bodies)))
         for body, watts in self.always_W.items():
-            heat[:, self.place[body]] += watts
+            heat[..., self.place[body]] += watts
         for law in self.heats:
             total = np.zeros_like(x)
             for watts, exponent in law.terms:
                 total += watts * x**exponent
-            heat[:, self.place[law.body]] += np.where(x > 0, total, 0.0)
+            heat[..., self.place[law.body]] += np.where(x > 0, total, 0.0)
+        return heat
+
+    def _add_friction(self, heat: Array, body_degC: Array, speed_rpm: Array, friction: Array) -> None:
+        """Add the bearings' heat (B, N)."""
         shaft = self.place["shaft"]
         for bearing in self.bearings:
             housing = self.place[bearing.housing]
@@ -141,7 +151,6 @@ class ThermalMachine:
             half = friction * bearing_heat_W(bearing, speed_rpm, oil) / 2
             heat[:, housing] += half
             heat[:, shaft] += half
-        return heat
 
     def simulate(
         self,
@@ -151,11 +160,13 @@ class ThermalMachine:
         start_degC: Array,
         friction: Array,
         step_s: float = 10.0,
+        feed_heat_W: Array | None = None,
     ) -> Array:
         """Temperatures (S + 1, B, N) of B runs at once.
 
         speed and room (S, B) hold during each step, floor (B,), start (B, N), friction (B,). Conduction and convection
         are exact (matrix exponential per speed); heat that depends on temperature holds for one step, at most 10 s.
+        `feed_heat_W` (S, B, N) is what the axes' drives bring in besides, as given.
         """
         speeds, which = np.unique(speed_rpm, return_inverse=True)
         which = which.reshape(speed_rpm.shape)
@@ -168,9 +179,13 @@ class ThermalMachine:
         out = np.empty((len(speed_rpm) + 1, *start_degC.shape))
         out[0] = start_degC
         floor_gain = floor_degC[:, None] * floor_rate
+        heat = self.driven_heat_W(speed_rpm)
         for s in range(len(speed_rpm)):
             gain = room_degC[s][:, None] * room_rate + floor_gain
-            gain += self.heat_W(out[s], speed_rpm[s], friction) / self.capacity
+            self._add_friction(heat[s], out[s], speed_rpm[s], friction)
+            gain += heat[s] / self.capacity
+            if feed_heat_W is not None:
+                gain += feed_heat_W[s] / self.capacity
             # einsum, not matmul: no BLAS, so the sum does not depend on its threads
             out[s + 1] = np.einsum("bij,bj->bi", free[which[s]], out[s])
             out[s + 1] += np.einsum("bij,bj->bi", forced[which[s]], gain)

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from models.studies import STUDIES
 from models.studies.base import Study
 
 CONFIDENCE = 0.95
@@ -24,11 +23,11 @@ class StudyResult:
     table: pd.DataFrame
 
     @classmethod
-    def of(cls, key: str, runs: Sequence[tuple[int, dict[str, float]]]) -> StudyResult:
+    def of(cls, study: type[Study], runs: Sequence[tuple[int, dict[str, float]]]) -> StudyResult:
         """From (seed, figures) pairs."""
-        rows = [(key, seed, figure, value) for seed, figures in runs for figure, value in figures.items()]
+        rows = [(study.key, seed, figure, value) for seed, figures in runs for figure, value in figures.items()]
         table = pd.DataFrame(rows, columns=["study", "seed", "figure", "value"])
-        return cls(STUDIES[key], tuple(seed for seed, _ in runs), table)
+        return cls(study, tuple(seed for seed, _ in runs), table)
 
     @property
     def wide(self) -> pd.DataFrame:

@@ -10,9 +10,10 @@ from threadpoolctl import threadpool_limits
 
 from data.errors import InputError
 from models.studies import STUDIES
+from models.studies.base import Study
 from models.studies.result import StudyResult
 
-Job = tuple[str, int]
+Job = tuple[type[Study], int]
 
 
 def run_studies(
@@ -25,15 +26,14 @@ def run_studies(
     """
     if seeds < 2:
         raise InputError(f"reproduce: seeds is {seeds}; expected at least 2, for a spread, and 20 for a verdict")
-    for key in keys:
-        STUDIES[key]
-    jobs = [(key, seed) for key in keys for seed in range(seeds)]
-    done: dict[Job, dict[str, float]] = {}
+    jobs: list[Job] = [(STUDIES[key], seed) for key in keys for seed in range(seeds)]
+    done: dict[str, list[tuple[int, dict[str, float]]]] = {key: [] for key in keys}
 
     def note(job: Job, figures: dict[str, float]) -> None:
-        done[job] = figures
+        study, seed = job
+        done[study.key].append((seed, figures))
         if progress:
-            progress(f"{job[0].replace('_', ' ')}, seed {job[1]}", len(done), len(jobs))
+            progress(f"{study.title}, seed {seed}", sum(map(len, done.values())), len(jobs))
 
     if workers > 1:
         # spawned, never forked: a fork of a process that runs threads can hang
@@ -43,11 +43,10 @@ def run_studies(
     else:
         for job in jobs:
             note(job, _run(job))
-    return {key: StudyResult.of(key, [(s, done[key, s]) for s in range(seeds)]) for key in keys}
+    return {key: StudyResult.of(STUDIES[key], runs) for key, runs in done.items()}
 
 
 def _run(job: Job) -> dict[str, float]:
-    key, seed = job
+    study, seed = job
     with threadpool_limits(limits=1):
-        figures: dict[str, float] = STUDIES[key]().run(seed)
-    return figures
+        return study().run(seed)
