@@ -54,9 +54,9 @@ class Exhaustive(Selector):
             sets, error = self._best_two(design, train, varying)[n_tsp - 1]
             gap = float(error[1] / error[0] - 1.0) if len(error) > 1 and error[0] > 0 else 0.0
             other = ", ".join(design.inputs[c] for c in varying[sets[-1]])
-            words = "as good" if gap < _TIE else "clearly worse"
+            words = "second best" if gap >= _TIE else "as good within the tie"
             out.append(
-                Diagnostic("gap to the runner-up", gap, _TIE, gap >= _TIE, f"second best, {words}: {other}")
+                Diagnostic("gap to the runner-up", gap, _TIE, gap >= _TIE, f"{words}: {other}")
             )  # fmt: skip
         return tuple(out)
 

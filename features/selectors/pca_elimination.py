@@ -50,7 +50,7 @@ class PcaElimination(Selector):
         gap, column = min(gaps)
         return (
             Diagnostic("gap of the smallest eigenvalues", gap, _CLOSE_EIGENVALUES, gap >= _CLOSE_EIGENVALUES,
-                       f"least of all steps, as {design.inputs[column]} was dropped; without a gap the choice is chance"),
+                       f"least of all steps, when {design.inputs[column]} was dropped; without a gap it is chance"),
         )  # fmt: skip
 
 

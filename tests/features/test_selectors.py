@@ -1,58 +1,26 @@
-"""Every selector of the registry under the same rules, and each against a truth of its own."""
+"""Every selector of the registry under the same rules, and the correlations that they share against numpy."""
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import squareform
+from stacked_rows import LENGTHS, P, stack, year
 
 from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
-from features.grey import relational_degree
 from features.selectors import SELECTORS
-from features.selectors.clusters import partitions, transitive_closure
 from features.selectors.statistics import training_statistics
 
 Array = NDArray[np.float64]
-LENGTHS = [30, 42, 25, 37, 33]
 TRAIN = [0, 1, 3]
-P = 7
 ALL_N = list(range(1, P + 1))
 CHOOSING = [key for key in SELECTORS if SELECTORS[key].takes_n_tsp]
-
-
-def stack(x: Array, y: Array, lengths: list[int], inputs: tuple[str, ...] | None = None) -> Design:
-    inputs = inputs or tuple(f"t{i}" for i in range(x.shape[1]))
-    ids = tuple(f"b{k}" for k in range(len(lengths)))
-    time_s = np.concatenate([300.0 * np.arange(n) for n in lengths])
-    return Design(inputs, "z_um", ids, x, y, time_s, np.cumsum([0, *lengths]), 300.0)
-
-
-def year() -> tuple[Array, Array]:
-    """Rises of 7 sensors that share three slow modes, as a machine's do, and an error made from them."""
-    rng = np.random.default_rng(11)
-    modes = []
-    for n in LENGTHS:
-        t = 300.0 * np.arange(n)
-        taus = np.array([1500.0, 6000.0, 20000.0])
-        modes.append((1 - np.exp(-t[:, None] / taus)) * rng.uniform(0.3, 2.0, 3) * [1, 1, rng.choice([-1, 1])])
-    m = np.concatenate(modes)
-    x = m @ rng.uniform(0, 6, (3, P)) + rng.normal(0, 0.1, (len(m), P))
-    return x, m @ [20.0, 9.0, -12.0] + rng.normal(0, 0.5, len(m))
 
 
 def chosen(key: str, design: Design, train: list[int] | None = None) -> dict[int, tuple[str, ...]]:
     result: dict[int, tuple[str, ...]] = SELECTORS[key]().select_design(design, train or TRAIN, ALL_N)
     return result
-
-
-def orthonormal(n: int, p: int, seed: int = 0) -> Array:
-    """p uncorrelated sequences of mean 0 and equal length, (n, p)."""
-    rng = np.random.default_rng(seed)
-    raw = np.column_stack([np.ones(n), rng.normal(size=(n, p))])
-    return np.linalg.qr(raw)[0][:, 1:]
 
 
 @pytest.mark.parametrize("key", SELECTORS)
@@ -175,6 +143,50 @@ def test_batches_of_temperatures_go_in_too(key: str) -> None:
     assert len(SELECTORS[key]().select(batches, "z_um", 3)) == (3 if SELECTORS[key].takes_n_tsp else P)
 
 
+@pytest.mark.parametrize("key", CHOOSING)
+def test_a_number_asked_alone_gives_what_it_gives_among_others(key: str) -> None:
+    design = stack(*year(), LENGTHS)
+    every = chosen(key, design)
+    for n in (1, 3, 5):
+        assert SELECTORS[key]().select_design(design, TRAIN, [n]) == {n: every[n]}
+
+
+@pytest.mark.parametrize("key", SELECTORS)
+@pytest.mark.parametrize("train", [[2], [0, 4]])
+def test_one_or_two_batches_are_enough(key: str, train: list[int]) -> None:
+    x, y = year()
+    x[LENGTHS[0] + LENGTHS[1] + 4, 3] = np.nan
+    choice = chosen(key, stack(x, y, LENGTHS), train)
+    assert [len(v) for v in choice.values()] == (ALL_N if SELECTORS[key].takes_n_tsp else [P] * P)
+
+
+@pytest.mark.parametrize("key", SELECTORS)
+def test_three_usable_rows_are_enough(key: str) -> None:
+    x, y = year()
+    y = y.copy()
+    y[3 : LENGTHS[0]] = np.nan
+    assert len(chosen(key, stack(x, y, LENGTHS), [0])) == P
+
+
+@pytest.mark.parametrize("key", CHOOSING)
+def test_more_inputs_than_all_subsets_can_be_tried_of(key: str) -> None:
+    x, y = year(p=20)
+    choice = SELECTORS[key]().select_design(stack(x, y, LENGTHS), TRAIN, [1, 6, 20])
+    assert [len(v) for v in choice.values()] == [1, 6, 20]
+
+
+@pytest.mark.parametrize("key", SELECTORS)
+def test_diagnostics_are_finite_and_say_something(key: str) -> None:
+    x, y = year()
+    x[:, 4] = 7.0
+    design = stack(x, y, LENGTHS)
+    for train in (TRAIN, [2]):
+        for n in (1, 2, 5, P):
+            for d in SELECTORS[key]().diagnostics(design, train, n):
+                assert np.isfinite([d.value, d.threshold]).all() and d.statistic and d.comment
+                assert "\n" not in d.comment and isinstance(d.ok, bool)
+
+
 def test_correlations_from_sums_equal_numpy_on_stacked_rows() -> None:
     x, y = year()
     x[5:9, 3] = np.nan
@@ -188,100 +200,3 @@ def test_correlations_from_sums_equal_numpy_on_stacked_rows() -> None:
     order = np.argsort(-np.abs(truth[:P, P]))
     for n, inputs in chosen("correlation", design).items():
         assert set(inputs) == {f"t{i}" for i in order[:n]}
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_closure_is_the_fixed_point_of_max_min_and_equals_single_linkage(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    p = int(rng.integers(2, 13))
-    r = np.abs(np.corrcoef(rng.normal(size=(p, 6))))
-    r = (r + r.T) / 2
-    np.fill_diagonal(r, 1.0)
-    squared = r
-    for _ in range(p):
-        squared = np.maximum.reduce([np.minimum(squared[:, k, None], squared[None, k]) for k in range(p)])
-    closure = transitive_closure(r)
-    assert np.array_equal(closure, squared)
-    tree = linkage(squareform(1 - r, checks=False), "single")
-    classes = partitions(closure)
-    for n in range(1, p + 1):
-        truth = fcluster(tree, n, "maxclust")
-        assert len(set(classes[n - 1])) == n
-        assert np.array_equal(truth[:, None] == truth, classes[n - 1][:, None] == classes[n - 1])
-
-
-def test_ties_in_the_closure_are_split_in_input_order() -> None:
-    r = np.full((4, 4), 0.5) + 0.5 * np.eye(4)
-    assert partitions(transitive_closure(r)).tolist() == [[0, 0, 0, 0], [0, 0, 0, 3], [0, 0, 2, 3], [0, 1, 2, 3]]
-
-
-def test_pca_elimination_on_three_sensors_by_hand() -> None:
-    q = orthonormal(40, 2)
-    x = np.column_stack([0.6 * q[:, 0] + 0.8 * q[:, 1], q])
-    # R = [[1 .6 .8], [.6 1 0], [.8 0 1]]: eigenvalue 0 with (1, −.6, −.8)/√2, so the first goes; then R = I, a tie
-    got = SELECTORS["pca_elimination"]().select_design(stack(x, q[:, 0], [20, 20]), [0, 1], [1, 2, 3])
-    assert got == {3: ("t0", "t1", "t2"), 2: ("t1", "t2"), 1: ("t1",)}
-
-
-def test_pca_elimination_drops_twins_first_and_is_blind_to_the_error() -> None:
-    q = orthonormal(40, 3, seed=4)
-    x = np.column_stack([q[:, 0], q[:, 1], q[:, 0], q[:, 2] + 0.3 * q[:, 1], 5 * q[:, 0]])  # t2 and t4 are t0 again
-    design, other = stack(x, q[:, 0], [40]), stack(x, q[:, 2], [40])
-    got = SELECTORS["pca_elimination"]().select_design(design, [0], [3, 4])
-    assert got == {4: ("t0", "t1", "t2", "t3"), 3: ("t0", "t1", "t3")}
-    assert SELECTORS["pca_elimination"]().select_design(other, [0], [3, 4]) == got
-
-
-def test_pca_elimination_breaks_the_tightest_relation_first() -> None:
-    r = np.zeros((5, 5))
-    r[:3, :3], r[3:, 3:] = 0.8, 0.99  # three loose neighbours and a tight pair: eigenvalues 2.6 .2 .2 and 1.99 .01
-    np.fill_diagonal(r, 1.0)
-    q = orthonormal(60, 5, seed=6)
-    design = stack(q @ np.linalg.cholesky(r).T, q[:, 0], [60])
-    got = SELECTORS["pca_elimination"]().select_design(design, [0], [1, 2, 3, 4])
-    # the pair's later one; then .2 is shared by the three, whose last goes; then ties
-    assert got == {4: ("t0", "t1", "t2", "t3"), 3: ("t0", "t1", "t3"), 2: ("t0", "t3"), 1: ("t0",)}
-
-
-def test_pca_elimination_equals_the_last_right_singular_vector_of_the_standardised_rows() -> None:
-    x, y = year()
-    design = stack(x, y, LENGTHS)
-    rows = design.stacked(TRAIN)[0]
-    z = (rows - rows.mean(axis=0)) / rows.std(axis=0)
-    left = list(range(P))
-    while len(left) > 2:
-        left.pop(int(np.argmax(np.abs(np.linalg.svd(z[:, left])[2][-1]))))
-        assert chosen("pca_elimination", design)[len(left)] == tuple(f"t{i}" for i in left)
-
-
-def chain() -> tuple[Array, Array]:
-    """Two groups with correlation 0.6 (t0 t1 | t3 t4), a sensor half-way between (t2) and an odd one (t5)."""
-    q = orthonormal(200, 5, seed=5)
-    a, b = q[:, 0], 0.6 * q[:, 0] + 0.8 * q[:, 1]
-    x = np.column_stack([a, a + 0.2 * q[:, 2], a + b, b + 0.2 * q[:, 3], b, 0.4 * a + q[:, 4]])
-    return x, a - b
-
-
-def test_fcgc_chains_two_groups_together_through_one_sensor_between_them() -> None:
-    x, y = chain()
-    design = stack(x, y, [100, 100])
-    similarity = np.abs(training_statistics(design, [0, 1], "any").between)
-    assert similarity[0, 4] == pytest.approx(0.6)  # below any sensible cut
-    assert transitive_closure(similarity)[0, 4] == pytest.approx(np.sqrt(0.8))  # 2 steps over t2
-    assert partitions(transitive_closure(similarity))[1].tolist() == [0, 0, 0, 0, 0, 5]
-    two = SELECTORS["fcgc"]().select_design(design, [0, 1], [2])[2]
-    assert "t5" in two and len({"t0", "t1", "t3", "t4"} & set(two)) <= 1  # y = a − b needs one of each group
-
-
-@pytest.mark.parametrize("key", ["fcgc", "fuzzy_correlation"])
-def test_the_best_of_every_cluster_is_taken(key: str) -> None:
-    x, y = year()
-    design = stack(x, y, LENGTHS)
-    rows, target, _ = design.stacked(TRAIN)
-    truth = np.corrcoef(np.column_stack([rows, target]), rowvar=False)
-    score = relational_degree(rows, target) if key == "fcgc" else np.abs(truth[:P, P])
-    tree = linkage(squareform(1 - np.abs(truth[:P, :P]), checks=False), "single")
-    for n, inputs in chosen(key, design).items():
-        classes = fcluster(tree, n, "maxclust")
-        best = {max(np.flatnonzero(classes == c), key=lambda i: score[i]) for c in set(classes)}
-        assert set(inputs) == {f"t{i}" for i in best}
