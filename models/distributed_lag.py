@@ -11,6 +11,7 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import by_batch, steps_s, too_few_rows
+from models.kernel_expansion import unit_scale
 from models.lag_responses import Response, lag_responses
 from models.lag_shapes import (
     CRITERIA,
@@ -23,7 +24,6 @@ from models.lag_shapes import (
     polynomial_shapes,
 )
 from models.linear import Blocks, Task
-from models.lssvm import unit_scale
 
 LAGS = ("koyck", "almon", "free")
 KOYCK_TAUS_S = tuple(60.0 * t for t in (10, 20, 40, 80, 160, 320, 640))

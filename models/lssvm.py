@@ -4,27 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data.errors import InputError
+from data.errors import InputError, closest
 from features.design import Design
-from models.base import Array, Family, inner_groups
-from models.batchwise import by_batch, too_few_rows
+from models.base import Array, inner_groups
+from models.batchwise import too_few_rows
 from models.bordered import Bordered, Kernel
+from models.kernel_expansion import KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
+from models.particle_swarm import least
 
-Rows = NDArray[np.int64]
-SCALES = {"K": 10.0, "degC": 10.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}
-LINEAR_WEIGHT = 10.0  # at equal weight the RBF takes half of every slope, and keeps it at home
-_OTHER_SCALE = 10.0  # inputs without a known unit are taken for rises
+TUNINGS = ("closed_form", "particle_swarm")
 _LEAST_ROWS_PER_BATCH = 8
-_ROWS_AT_ONCE = 128  # of a prediction: its kernel stays in a processor's cache
 _STACK_VALUES = 500_000  # of the matrices solved together: what fits a processor's cache
 
 
-class LSSVM(Family):
+class LSSVM(KernelExpansion):
     """Least-squares support vector regression: `[[0, 1ᵀ], [1, Ω + I/γ]] [b; α] = [0; y]`.
 
     `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `10 u_i·u_j/p` with `linear`: an RBF alone falls back to b outside the
@@ -32,9 +31,11 @@ class LSSVM(Family):
     10 K/h, 1000 rpm, …), the same for every fold, so all folds share one kernel; σ is in those scales. The model is
     linear in y, so scaling y would change nothing.
 
-    γ and σ are chosen on the grid `gammas` × `sigmas` by leave-batch-out inside the training batches (contiguous
-    quarters of one or two batches), least mean RMS over the batches left out. Batches are decimated evenly, all to
-    at most `max_rows` over the number of batches in the design (at least 8 each); `fitted` tells the rows kept.
+    γ and σ are those of least mean RMS over the training batches (contiguous quarters of one or two), each left out
+    once. `tuning` looks for them on the grid `gammas` × `sigmas` (`closed_form`), or between the grid's ends by a
+    `particle_swarm` over (log σ, log γ) of a seed, fold by fold: the same fitness, slower. Batches are decimated
+    evenly, all to at most `max_rows` over the number of batches in the design (at least 8 each); `fitted` tells the
+    rows kept.
 
     Source: J. Suykens et al., Least squares support vector machines (2002); left-out residuals from the
     inverse: G. Cawley, Leave-one-out cross-validation based model selection criteria for weighted LS-SVMs (2006).
@@ -44,7 +45,6 @@ class LSSVM(Family):
     words = "least-squares support vector machine, RBF and linear kernel"
     source = "Suykens et al. 2002"
     effort = "quick"
-    closed_form = False
     rank = 60
 
     def __init__(
@@ -53,8 +53,13 @@ class LSSVM(Family):
         max_rows: int = 480,
         sigmas: Sequence[float] = (0.3, 1.0, 3.0, 10.0),
         gammas: Sequence[float] = (1.0, 10.0, 100.0, 1e3, 1e4),
+        tuning: str = "closed_form",
+        seed: int = 0,
     ) -> None:
         super().__init__()
+        if tuning not in TUNINGS:
+            raise InputError(f"{self.key}: unknown tuning {tuning!r}: {closest(tuning, TUNINGS)}")
+        self.tuning, self.seed = tuning, int(seed)
         self.linear, self.max_rows = bool(linear), int(max_rows)
         self.sigmas, self.gammas = [float(s) for s in sigmas], [float(g) for g in gammas]
 
@@ -72,7 +77,7 @@ class LSSVM(Family):
         gaps = [present[~np.isin(present, list(fold))] for fold in folds]
         shared = [f for f, gap in enumerate(gaps) if len(gap) == 1 and len(present) >= 4]
         out: dict[int, Self] = {}
-        if len(shared) > 1:
+        if len(shared) > 1 and self.tuning == "closed_form":
             out |= self._fit_shared(design, rows, batch, {f: int(gaps[f][0]) for f in shared})
         alone: dict[int, tuple[Rows, Rows]] = {}
         for f, fold in enumerate(folds):
@@ -81,59 +86,16 @@ class LSSVM(Family):
                 if len(inside) < 2:
                     raise too_few_rows(self.key, design, fold, len(inside), 2)
                 alone[f] = inside, _layout(inner_groups(design.group[inside]))
+        if self.tuning == "particle_swarm":
+            return [self._fit_swarm(design, *alone[f]) for f in range(len(folds))]
         for stack in _stacks({f: layout.shape for f, (_, layout) in alone.items()}):
             out |= self._fit_stack(design, {f: alone[f] for f in stack})
         return [out[f] for f in range(len(folds))]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        f = self.fitted
-        scale, support, alpha = (np.asarray(f[k], float) for k in ("scale", "support", "alpha"))
-        out = []
-        for k in batches:
-            u = design.x[design.rows(k)] / scale
-            parts = [
-                kernel(u[i : i + _ROWS_AT_ONCE], support, f["sigma"], self.linear) @ alpha
-                for i in range(0, len(u), _ROWS_AT_ONCE)
-            ]
-            out.append(np.concatenate([*parts, np.empty(0)]) + f["bias"])
-        return out
-
-    def predict_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
-    ) -> list[list[Array]]:
-        """Models that share σ share the kernel of their united support rows."""
-        out = np.empty((len(design.x), len(fitted)))
-        asked = np.flatnonzero(np.isin(design.group, sorted({k for batches in wanted for k in batches})))
-        by_kernel: dict[tuple[float, bytes], list[int]] = {}
-        for f, m in enumerate(fitted):
-            by_kernel.setdefault((m.fitted["sigma"], np.asarray(m.fitted["scale"]).tobytes()), []).append(f)
-        for (sigma, _), members in by_kernel.items():
-            models = [fitted[f] for f in members]
-            support, place = _united([np.atleast_2d(m.fitted["support"]) for m in models])
-            alpha = np.zeros((len(support), len(members)))
-            for c, m in enumerate(models):
-                np.add.at(alpha[:, c], place[c], m.fitted["alpha"])
-            scale = np.asarray(models[0].fitted["scale"], float)
-            bias = np.array([m.fitted["bias"] for m in models])
-            for start in range(0, len(asked), _ROWS_AT_ONCE):
-                some = asked[start : start + _ROWS_AT_ONCE]
-                values = kernel(design.x[some] / scale, support, sigma, self.linear) @ alpha + bias
-                out[some[:, None], members] = values
-        return by_batch(design, out, wanted)
-
-    def n_parameters(self) -> int:
-        return int(np.size(self.fitted["alpha"])) + 3
-
     def _decimated(self, design: Design) -> tuple[Rows, Rows]:
         """Rows kept, evenly over each batch's usable rows, and their batch."""
         most = max(_LEAST_ROWS_PER_BATCH, self.max_rows // max(1, design.n_batches))
-        kept = []
-        for k in range(design.n_batches):
-            usable = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-            if len(usable) > most:
-                usable = usable[np.round(np.linspace(0, len(usable) - 1, most)).astype(int)]
-            kept.append(usable)
-        rows = np.concatenate(kept) if kept else np.empty(0, np.int64)
+        rows = evenly(design, range(design.n_batches), most)
         return rows, design.group[rows]
 
     def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gap: dict[int, int]) -> dict[int, Self]:
@@ -162,6 +124,23 @@ class LSSVM(Family):
                 best.take(better, sigma, gamma, score[better], alpha[better], bias[better])
         return {f: self._made(design, problem, best, i, i, problem.known[i]) for i, f in enumerate(alone)}
 
+    def _fit_swarm(self, design: Design, rows: Rows, layout: Rows) -> Self:
+        problem = _Problem.of(design, [rows], [layout])
+        best = _Best.empty(1, problem.n)
+
+        def fitness(at: Array) -> Array:
+            """Left-out RMS in µm at (log σ, log γ), (P, 2)."""
+            systems = [problem.system(problem.kernels(sigma, self.linear), gamma) for sigma, gamma in np.exp(at)]
+            return np.array([problem.score(system.left_out(problem.group_rows))[0] for system in systems])
+
+        low, high = (np.log([end(self.sigmas), end(self.gammas)]) for end in (min, max))
+        with np.errstate(all="ignore"):
+            at, score = least(fitness, low, high, self.seed)
+            sigma, gamma = (float(v) for v in np.exp(at))
+            system = problem.system(problem.kernels(sigma, self.linear), gamma)
+            best.take(np.array([0]), sigma, gamma, np.array([score]), *system.solutions(problem.group_rows))
+        return self._made(design, problem, best, 0, 0, problem.known[0])
+
     def _made(self, design: Design, problem: _Problem, best: _Best, f: int, s: int, kept: NDArray[np.bool_]) -> Self:
         if not np.isfinite(best.score[f]):
             raise InputError(
@@ -178,28 +157,6 @@ class LSSVM(Family):
             "inner_rms_um": float(best.score[f]),
         }
         return self._learned(design, fitted)
-
-
-def kernel(u: Array, v: Array, sigma: float, linear: bool) -> Array:
-    """Ω (n, m) of scaled inputs u (n, p), v (m, p); NaN rows give NaN."""
-    return _kernel(*_products(u, v), sigma, linear)
-
-
-def _products(u: Array, v: Array) -> tuple[Array, Array]:
-    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p: all that a kernel needs besides σ."""
-    p = max(1, u.shape[1])
-    dot = u @ v.T / p
-    half = dot - (u**2).sum(axis=1)[:, None] / (2.0 * p)
-    half -= (v**2).sum(axis=1) / (2.0 * p)
-    return np.minimum(half, 0.0, out=half), dot
-
-
-def _kernel(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
-    omega: Array = half / sigma**2
-    np.exp(omega, out=omega)
-    if linear:
-        omega += LINEAR_WEIGHT * dot
-    return omega
 
 
 @dataclass(frozen=True)
@@ -226,18 +183,29 @@ class _Problem:
     def n(self) -> int:
         return self.known.shape[1]
 
+    @cached_property
+    def _products(self) -> list[tuple[Array, Array]]:
+        return [products(u, u) for u in self.u]
+
+    def kernels(self, sigma: float, linear: bool) -> list[Kernel]:
+        """The kernel of every training set."""
+        out = []
+        for product, known in zip(self._products, self.known.astype(float), strict=True):
+            omega = kernel_of(*product, sigma, linear)
+            out.append(Kernel(omega if known.all() else omega * known[:, None] * known))
+        return out
+
+    def system(self, kernels: list[Kernel], gamma: float) -> Bordered:
+        """Solved; NaN where γ is lost in rounding."""
+        return Bordered.of(kernels, self.known.astype(float), self.y_um, gamma)
+
     def systems(self, family: LSSVM) -> Iterator[tuple[float, float, Bordered]]:
-        """Every (σ, γ) of a family, solved."""
-        known = self.known.astype(float)
+        """Every (σ, γ) of a family's grid, solved."""
         with np.errstate(all="ignore"):  # a γ lost in rounding gives NaN, and is not chosen
-            products = [_products(u, u) for u in self.u]
             for sigma in family.sigmas:
-                kernels = []
-                for product, k in zip(products, known, strict=True):
-                    omega = _kernel(*product, sigma, family.linear)
-                    kernels.append(Kernel(omega if k.all() else omega * k[:, None] * k))
+                kernels = self.kernels(sigma, family.linear)
                 for gamma in family.gammas:
-                    yield sigma, gamma, Bordered.of(kernels, known, self.y_um, gamma)
+                    yield sigma, gamma, self.system(kernels, gamma)
 
     def score(self, residual: Array, member: NDArray[np.bool_] | None = None) -> Array:
         """Mean over the groups of the RMS of residual (F, G, m); ∞ where it is not a number."""
@@ -268,12 +236,6 @@ class _Best:
         self.alpha[at], self.bias[at] = alpha, bias
 
 
-def unit_scale(design: Design) -> Array:
-    """What inputs are divided by for their unit, (p,): the same in every fold."""
-    units = design.input_units or ("",) * len(design.inputs)
-    return np.array([SCALES.get(u, _OTHER_SCALE) for u in units])
-
-
 def _stacks(shapes: dict[int, tuple[int, ...]]) -> list[list[int]]:
     """Folds of like shape together, as long as their matrices stay few."""
     stacks: dict[tuple[int, ...], list[list[int]]] = {}
@@ -292,12 +254,3 @@ def _layout(group: Rows) -> Rows:
     for i, part in enumerate(parts):
         out[i, : len(part)] = part
     return out
-
-
-def _united(supports: Sequence[Array]) -> tuple[Array, list[Rows]]:
-    """Distinct support rows and where each model's lie among them."""
-    stacked = np.concatenate(supports)
-    keys = np.ascontiguousarray(stacked).view(np.dtype((np.void, stacked.shape[1] * 8)))[:, 0]
-    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
-    borders = np.cumsum([len(s) for s in supports])[:-1]
-    return stacked[first], np.split(place, borders)

@@ -8,7 +8,8 @@ from data.errors import InputError
 from features.design import Design
 from models import bordered
 from models.bordered import Bordered, Kernel
-from models.lssvm import LSSVM, kernel
+from models.kernel_expansion import kernel
+from models.lssvm import LSSVM
 
 SIZES = (14, 9, 12, 11, 13)
 SMALL = {"sigmas": (0.5, 2.0), "gammas": (1.0, 100.0)}
@@ -159,6 +160,26 @@ def test_folds_at_once_are_the_folds_alone(max_rows):
         np.testing.assert_allclose(np.concatenate(model.predict_design(design, everything)), want, atol=1e-8)
         np.testing.assert_allclose(np.concatenate(columns[f]), want, atol=1e-8)
         assert len(model.fitted["alpha"]) <= max(max_rows, 8 * len(fold))
+
+
+@pytest.mark.parametrize("fold", [[0, 1, 2, 3], [4]])
+def test_the_swarm_finds_at_least_what_the_grid_finds_and_its_score_is_that_of_refits(fold):
+    design = make_design(10)
+    options = {"sigmas": (0.3, 1.0, 3.0), "gammas": (1.0, 30.0, 1000.0)}
+    grid = LSSVM(**options).fit_design(design, fold).fitted
+    swarm = LSSVM(**options, tuning="particle_swarm").fit_design(design, fold)
+    assert swarm.fitted["inner_rms_um"] < grid["inner_rms_um"] * 1.001
+    assert 0.3 <= swarm.fitted["sigma"] <= 3.0 and 1.0 <= swarm.fitted["gamma"] <= 1000.0
+    if len(fold) > 1:
+        score, _, _ = brute_force(design, fold, [swarm.fitted["sigma"]], [swarm.fitted["gamma"]])
+        assert swarm.fitted["inner_rms_um"] == pytest.approx(score, rel=1e-6)
+    again = LSSVM(**options, tuning="particle_swarm").fit_folds(design, [fold, [0, 1]])[0]
+    np.testing.assert_array_equal(again.fitted["alpha"], swarm.fitted["alpha"])
+
+
+def test_an_unknown_tuning_is_told():
+    with pytest.raises(InputError, match="lssvm: unknown tuning 'swarm'"):
+        LSSVM(tuning="swarm")
 
 
 def test_left_out_batch_changes_nothing():
