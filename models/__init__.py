@@ -19,6 +19,7 @@ FAMILIES = Registry(
         "elastic_net": "models.elastic_net:ElasticNet",
         "huber": "models.huber:Huber",
         "distributed_lag": "models.distributed_lag:DistributedLag",
+        "lag_dictionary": "models.lag_dictionary:LagDictionary",
         "axis_coupled": "models.axis_coupled:AxisCoupled",
         "bp": "models.bp:BP",
         "lssvm": "models.lssvm:LSSVM",
