@@ -25,9 +25,13 @@ def print_results(results: Sequence[StudyResult], page: Path | None) -> None:
         study = result.study
         screen.out.print(f"{study.key} ({LABEL})", style="bold", highlight=False)
         screen.line(f"{study.words}; after the {study.source}; {len(result.seeds)} simulated machine-years")
-        screen.out.print(_figures(result.figures()))
+        printed = result.figures().dropna(subset="published")
+        if len(printed):
+            screen.out.print(_figures(printed))
         table = result.orderings()
         screen.out.print(_orderings(table))
+        for remark in result.remarks:
+            screen.line(remark)
         for row in table[(table["verdict"] != "holds") & (table["why"] != "")].to_dict("records"):
             screen.line(f"why not always: {row['words']}: {row['why']}")
     if page is not None:
@@ -46,6 +50,7 @@ def outcome_dict(results: Sequence[StudyResult], page: Path | None) -> dict[str,
                 "source": r.study.source,
                 "machine": r.study.machine,
                 "assumed": list(r.study.assumed),
+                "remarks": list(r.remarks),
                 "seeds": list(r.seeds),
                 "figures": screen.records(r.figures().drop(columns="study")),
                 "orderings": screen.records(r.orderings().drop(columns="study")),
@@ -57,7 +62,7 @@ def outcome_dict(results: Sequence[StudyResult], page: Path | None) -> dict[str,
 
 def _figures(table: pd.DataFrame) -> Table:
     shown = _table(f"published | ours ({LABEL})", "figure", "unit", "published", "ours", "5 … 95 %")
-    for row in table[table["published"].notna()].to_dict("records"):
+    for row in table.to_dict("records"):
         published = number(float(row["published"]), int(row["digits"]))
         shown.add_row(str(row["words"]), str(row["unit"]), published, *spread(row))
     return shown

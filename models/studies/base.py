@@ -46,7 +46,10 @@ class Ordering:
 
 
 class Study(ABC):
-    """A published system. `assumed` are the things its description leaves open and what stands for them here."""
+    """A published system. `assumed` are the things its description leaves open and what stands for them here.
+
+    `remarks` say, with the means of figures in braces, what is to be known of the figures themselves.
+    """
 
     key: ClassVar[str]
     title: ClassVar[str]
@@ -54,6 +57,7 @@ class Study(ABC):
     source: ClassVar[str]
     machine: ClassVar[str]
     assumed: ClassVar[tuple[str, ...]]
+    remarks: ClassVar[tuple[str, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]]
     orderings: ClassVar[tuple[Ordering, ...]]
 

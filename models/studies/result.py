@@ -65,6 +65,16 @@ class StudyResult:
             )
         return pd.DataFrame(rows)
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The study's remarks with this run's means."""
+        return tuple(self._said(text) for text in self.study.remarks)
+
+    def _said(self, text: str) -> str:
+        wide = self.wide
+        means = {f.key: f"{wide[f.key].mean():.{f.digits}f}".replace("-", "−") for f in self.study.figures}
+        return text.format_map(means)
+
     def orderings(self) -> pd.DataFrame:
         """One row per ordering, evidence behind what it explains.
 
@@ -72,8 +82,6 @@ class StudyResult:
         Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`),
         published_gain and gain, the mean of 1 − a/b over the seeds for the first pair, with its gain_sd.
         """
-        wide = self.wide
-        said = {f.key: f"{wide[f.key].mean():.{f.digits}f}".replace("-", "−") for f in self.study.figures}
         rows = []
         for o in self.study.orderings:
             names = list(dict.fromkeys(name for pair in o.less for name in pair))
@@ -89,7 +97,7 @@ class StudyResult:
                     "ordering": o.key,
                     "words": o.words,
                     "evidence_for": o.evidence_for,
-                    "why": o.why.format_map(said),
+                    "why": self._said(o.why),
                     "held": held,
                     "seeds": n,
                     "share": held / n if n else np.nan,

@@ -44,6 +44,7 @@ class StudyPart:
     source: str
     machine: str
     assumed: tuple[str, ...]
+    remarks: tuple[str, ...]
     published: Table | None
     published_picture: str
     claims: tuple[Claim, ...]
@@ -127,6 +128,7 @@ def _part(result: StudyResult) -> StudyPart:
         source=f"{study.words[0].upper()}{study.words[1:]}, after the {study.source}.",
         machine=study.machine,
         assumed=study.assumed,
+        remarks=result.remarks,
         published=_figures("Published figures and ours", table[table["published"].notna()]) if printed else None,
         published_picture=_source(published_figure([strips[k] for k in printed])) if printed else "",
         claims=tuple(claims),

@@ -22,6 +22,7 @@ class ToyStudy(Study):
     title = "Toy"
     words, source, machine = "a toy & nothing else", "toy source", "toy, ±20 %"
     assumed = ("all of it",)
+    remarks = ("On average {a} µm.",)
     figures = (
         Figure("a", "method A <new>", published=1.5, digits=1),
         Figure("b", "method B", digits=1),
@@ -53,6 +54,7 @@ def test_tables_on_the_screen(call: Call) -> None:
     assert "holds 19/20 75 … 100 % 25 % 40 ± 22 % A is better than B" in flat
     assert "fails 1/20 0 … 25 %" in flat
     assert "why not always: B is better than A: B has 2.0 µm." in flat
+    assert "On average 1.2 µm." in flat
     assert "A has 1.2" not in flat, "what holds needs no excuse"
 
 
