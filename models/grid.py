@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import asdict, fields
 from multiprocessing import get_context
 from threading import Lock
 from types import TracebackType
@@ -17,6 +18,8 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch, finding_table
 from data.machine import Machine
 from features.selectors import SELECTORS
+from features.selectors.base import Diagnostic
+from features.stability import stability_over_batches
 from models import FAMILIES
 from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
 from models.protocols import Fold, season, speed, start_ambient_degC
@@ -135,6 +138,7 @@ def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
         predictions=pd.DataFrame(predictions),
         findings=finding_table((b.batch_id, b.findings) for b in crossing.batches),
         excluded=pd.DataFrame([*crossing.excluded, *failures], columns=["channel", "reason"]),
+        selector_diagnostics=_diagnostics_table(crossing, cells),
     )
 
 
@@ -168,6 +172,20 @@ def _subset_table(crossing: Crossing) -> pd.DataFrame:
                 for n in n_all if SELECTORS[selector].takes_n_tsp else n_all[-1:]:
                     rows.append((protocol, selector, n, fold.name, "|".join(crossing.inputs(selector, fold.train, n))))
     return pd.DataFrame(rows, columns=["protocol", "selector", "n_tsp", "fold", "inputs"])
+
+
+def _diagnostics_table(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    protocol = "leave-batch-out" if crossing.folds.get("leave-batch-out") else next(iter(crossing.folds))
+    fewer = cells[(cells["protocol"] == protocol) & (cells["n_inputs"] < len(crossing.design.inputs))]
+    for key in crossing.plan.selectors:
+        own = fewer[fewer["selector"] == key].dropna(subset="S_mean_um")
+        if SELECTORS[key].takes_n_tsp and len(own):
+            n = int(own.sort_values("S_mean_um", kind="stable")["n_tsp"].iloc[0])
+            stable = stability_over_batches([crossing.inputs(key, f.train, n) for f in crossing.folds[protocol]])
+            found = SELECTORS[key]().diagnostics(crossing.design, crossing.everything, n)
+            rows += [{"selector": key, "n_tsp": n, **asdict(d)} for d in (stable, *found)]
+    return pd.DataFrame(rows, columns=["selector", "n_tsp", *(f.name for f in fields(Diagnostic))])
 
 
 def _processes(n: int, crossings: Mapping[str, Crossing]) -> ProcessPoolExecutor:

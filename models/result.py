@@ -36,6 +36,8 @@ class GridResult:
     - `distances`: how far left-out batches were from the training of the chosen cell, and its S there, see
       `models.trust`; empty where nobody chose.
     - `excluded`: channel, reason: channels that no cell may use.
+    - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: what is known to go wrong with
+      each selector, measured on all batches at the n_tsp of its best cell short of all inputs; empty in older files.
     """
 
     machine: str
@@ -49,6 +51,7 @@ class GridResult:
     findings: pd.DataFrame
     excluded: pd.DataFrame
     distances: pd.DataFrame = field(default_factory=pd.DataFrame)
+    selector_diagnostics: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def save(self, folder: Path) -> None:
         """One Parquet file per table and `result.json`."""

@@ -22,6 +22,7 @@ from pipelines.report.extracts import (
     zero_um,
 )
 from pipelines.report.layout import Key, Panel, Plot, Table
+from pipelines.report.selector_tables import diagnostics_table
 from pipelines.report.story import Verdict, comparison_rows, mark_of
 from pipelines.report.trust import rise_panel, rise_table
 from pipelines.report.words import (
@@ -57,6 +58,7 @@ class Channel:
     heat: Panel | None
     points: Panel | None
     frequency: Panel | None
+    weaknesses: Table | None
     left_out: Panel | None
     protocols: tuple[Table, ...]
     batches: Table
@@ -106,6 +108,7 @@ def channel_part(
         heat=_heat(name, result, cells, digits),
         points=_points(name, result, cells, choice),
         frequency=_frequency(name, result, cells, protocol),
+        weaknesses=diagnostics_table(name, result),
         left_out=_left_out(name, result, choice, digits),
         protocols=tuple(others),
         batches=tables.batches(result, choice, digits),

@@ -1,0 +1,61 @@
+"""The table of the selectors' weaknesses: every measured row in words, none lost, none invented."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from report_training import Maker, column, results, settings, table_after, training
+
+from features.design import Design
+from features.selectors import SELECTORS
+from features.selectors.base import Diagnostic
+from pipelines.report import write_report
+from pipelines.report.selector_tables import _WORDS, diagnostics_table
+from pipelines.report.words import selector_label
+
+CAPTION = "z: how far each selector's choice can be trusted"
+
+
+def test_the_page_and_the_text_hold_every_measured_row(toy_batches: Maker, tmp_path: Path) -> None:
+    result = results(toy_batches)["z"]
+    measured = result.selector_diagnostics
+    assert set(measured["selector"]) == {"correlation", "pca_elimination"}
+    for suffix in ("md", "html"):
+        write_report([training(result)], tmp_path / f"r.{suffix}", settings(tmp_path))
+    rows = table_after((tmp_path / "r.md").read_text(), CAPTION)
+    assert len(rows) == 1 + len(measured)
+    for name, row in zip(column(rows, "selector"), measured.to_dict("records"), strict=True):
+        assert name == selector_label(row["selector"]) + ("" if row["ok"] else " (look)")
+    assert column(rows, "here") == measured["comment"].tolist()
+    assert CAPTION in (tmp_path / "r.html").read_text().replace("&#39;", "'")
+
+
+def test_limits_say_their_side(toy_batches: Maker) -> None:
+    found = [
+        Diagnostic("mean silhouette", 0.1, 0.25, False, "a"),
+        Diagnostic("largest VIF left", 4.0, 10.0, True, "b"),
+        Diagnostic("something new", 12.0, 10.0, False, "c"),
+        Diagnostic("stability over batches", 0.9, 0.7, True, "d"),
+    ]
+    rows = pd.DataFrame([{"selector": "kmedoids", "n_tsp": 3, **vars(d)} for d in found])
+    table = diagnostics_table("z", replace(results(toy_batches)["z"], selector_diagnostics=rows))
+    assert table is not None
+    assert [r.cells[4] for r in table.rows] == ["at least 0.25", "at most 10.00", "at most 10.00", "at least 0.70"]
+    assert [r.mark for r in table.rows] == ["look", "", "look", ""]
+    assert table.rows[2].cells[2] == "something new"
+
+
+def test_a_result_of_an_older_version_has_no_such_table(toy_batches: Maker, tmp_path: Path) -> None:
+    older = replace(results(toy_batches)["z"], selector_diagnostics=pd.DataFrame())
+    assert diagnostics_table("z", older) is None
+    write_report([training(older)], tmp_path / "r.md", settings(tmp_path))
+    assert "can be trusted" not in (tmp_path / "r.md").read_text()
+
+
+@pytest.mark.parametrize("key", SELECTORS)
+def test_every_statistic_has_words(key: str, toy_batches: Maker) -> None:
+    batches = toy_batches(k=4, n=40, sensors=4)
+    design = Design.build(batches, batches[0].names("temperature"), "z")
+    for n in (2, 3):
+        assert {d.statistic for d in SELECTORS[key]().diagnostics(design, range(4), n)} <= set(_WORDS)
