@@ -18,7 +18,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: $(READY)
-	$(BIN)/python benchmarks/grid.py
+	$(BIN)/python -m benchmarks.grid
 	$(BIN)/python benchmarks/ingest.py
 	$(BIN)/python -m benchmarks.twin
 	$(BIN)/python -m benchmarks.calibration

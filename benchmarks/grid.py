@@ -1,10 +1,15 @@
-"""Speed of the grid on the simulated sample year, beside the plain way: a scikit-learn loop doing the same fits.
+"""Speed of the grid on the simulated sample year, beside the plain ways to do the same fits.
 
-    python benchmarks/grid.py [--repeats 3] [--points 2,4,10]
+    python -m benchmarks.grid [--repeats 3] [--families mlr,ridge,…]
 
-Both ways fit the same cells (one channel, one selector, leave-batch-out, hyper-parameters by an inner leave-batch-out
-where the family has one) in turn in one process; the table shows medians, the ratio and how far the errors differ.
-Then the whole crossing of `make run` is timed once per repeat. Nothing is asserted about time.
+Three ways in turn in one process, in seconds per cell (30 folds of leave-batch-out, hyper-parameters by an inner
+leave-batch-out where the family has one; error channel z):
+- plain: a loop over folds around scikit-learn's estimator (networks: a net trained alone in torch);
+- joblib: scikit-learn's `cross_validate` over `LeaveOneGroupOut`, the selector in the pipeline, a process a core;
+- grid: the crossing of all quick selectors × numbers of points, one thread, by its number of cells.
+The plain ways are timed on every fifth fold of the cell `correlation`, 4 points, and counted five times; families on
+few rows (`ROWS`) give them as few. S is of those folds, the same where the fits are the same. Then the quick and the
+complete crossing. Nothing is asserted about time.
 """
 
 from __future__ import annotations
@@ -14,105 +19,153 @@ import os
 import statistics
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-from sklearn.base import BaseEstimator
-from sklearn.cross_decomposition import PLSRegression
-from sklearn.decomposition import PCA
-from sklearn.linear_model import LinearRegression, Ridge
-from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut
+import sklearn
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut, cross_validate
 from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_limits
 
+from benchmarks.plain_models import CHEAP, PLAIN, ROWS, TopCorrelated
 from data.batch import Batch
-from data.machine import load_machine
+from data.machine import Machine, load_machine
 from data.recording import read_batches
 from data.sample_year import write_sample_year
 from models.crossing import Crossing, Plan, cross_family, prepare
 from models.grid import run_grid
 from models.metrics import residual_std_um
 
-PENALTIES = np.logspace(-6, 3, 25)
+T = TypeVar("T")
+POINTS, EVERY = 4, 5
 
 
-def plain(family: str, p: int) -> BaseEstimator:
-    """The scikit-learn estimator that does the same."""
-    inner = {"cv": LeaveOneGroupOut(), "scoring": "neg_root_mean_squared_error"}
-    if family == "mlr":
-        return LinearRegression()
-    if family == "pcr":
-        return make_pipeline(PCA(n_components=0.95 if p > 1 else 1, svd_solver="full"), LinearRegression())
-    if family == "ridge":
-        return GridSearchCV(Ridge(), {"alpha": PENALTIES * 1e3}, **inner)
-    if family == "pcr_lbo":
-        pipe = make_pipeline(PCA(), LinearRegression())
-        return GridSearchCV(pipe, {"pca__n_components": list(range(1, p + 1))}, **inner)
-    return GridSearchCV(PLSRegression(scale=False), {"n_components": list(range(1, p + 1))}, **inner)
-
-
-def plain_loop(crossing: Crossing, family: str, points: list[int]) -> float:
-    """Mean S over the cells, fold by fold and cell by cell."""
+def plain_loop(crossing: Crossing, family: str) -> float:
+    """Mean S of the cell, fold by fold."""
     scores = []
-    for n in points:
-        for fold in crossing.folds["leave-batch-out"]:
-            design = crossing.design.subset(crossing.inputs("correlation", fold.train, n))
-            x, y, groups = design.stacked(fold.train)
-            model = plain(family, n)
-            model.fit(x, y, groups=groups) if isinstance(model, GridSearchCV) else model.fit(x, y)
-            rows = design.rows(fold.test[0])
-            scores.append(residual_std_um(design.y_um[rows] - np.ravel(model.predict(design.x[rows]))))
+    for fold in crossing.folds["leave-batch-out"][::EVERY]:
+        design = crossing.design.subset(crossing.inputs("correlation", fold.train, POINTS))
+        x, y, groups = thinned(family, *design.stacked(fold.train))
+        model = PLAIN[family](POINTS)
+        model.fit(x, y, groups=groups) if isinstance(model, GridSearchCV) else model.fit(x, y)
+        rows = design.rows(fold.test[0])
+        scores.append(float(residual_std_um(design.y_um[rows] - np.ravel(model.predict(design.x[rows])))))
     return float(np.mean(scores))
 
 
-def grid_way(crossing: Crossing, family: str, points: list[int]) -> float:
-    cells = cross_family(crossing, family).cells
-    return float(cells[cells["n_tsp"].isin(points)]["S_mean_um"].mean())
+def joblib_way(crossing: Crossing, family: str) -> float:
+    """The same by `cross_validate`, a process a core."""
+    design = crossing.design
+    x, y, groups = thinned(family, *design.stacked(range(design.n_batches)))
+    inner = PLAIN[family](POINTS)
+    folds = [*LeaveOneGroupOut().split(x, y, groups)][::EVERY]
+    with sklearn.config_context(enable_metadata_routing=True):
+        if isinstance(inner, GridSearchCV):
+            inner.cv = LeaveOneGroupOut().set_split_request(groups=True)
+        found = cross_validate(make_pipeline(TopCorrelated(POINTS), inner), x, y, cv=folds,
+                               params={"groups": groups} if isinstance(inner, GridSearchCV) else None,
+                               n_jobs=os.cpu_count(), scoring="neg_root_mean_squared_error")  # fmt: skip
+    counts = np.array([len(test) for _, test in folds])
+    return float(np.mean(-found["test_score"] * np.sqrt(counts / (counts - 1))))
 
 
-def timed(work: Callable[[], float]) -> tuple[float, float]:
+def thinned(family: str, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Evenly as few rows as the family itself learns from."""
+    n = len(arrays[0])
+    some = np.round(np.linspace(0, n - 1, min(n, ROWS.get(family, n)))).astype(int)
+    return [a[some] for a in arrays]
+
+
+def grid_way(crossing: Crossing, family: str) -> tuple[float, int]:
+    """S of the same cell, and how many cells were crossed."""
+    crossing.subsets.clear()
+    result = cross_family(crossing, family)
+    own = result.scores[(result.scores["selector"] == "correlation") & (result.scores["n_tsp"] == POINTS)]
+    return float(own["S_um"].iloc[::EVERY].mean()), len(result.cells)
+
+
+def timed(work: Callable[[], T]) -> tuple[float, T]:
     start = time.perf_counter()
     value = work()
     return time.perf_counter() - start, value
 
 
+def sample_machine() -> Machine:
+    return load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")
+
+
 def sample_batches(folder: Path) -> list[Batch]:
-    machine = load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")
+    machine = sample_machine()
     return [b for f in write_sample_year(folder) for b in read_batches(f, machine)]
+
+
+def compare(batches: list[Batch], families: list[str], repeats: int) -> None:
+    print(f"{'seconds per cell':24}{'plain':>9}{'joblib':>9}{'grid':>9}{'plain/':>8}{'joblib/':>8}"
+          f"{'S plain':>10}{'joblib':>8}{'grid µm':>9}")  # fmt: skip
+    groups: dict[str, np.ndarray] = {}
+    crossing = prepare(batches, "z", Plan(protocols=("leave-batch-out",)))
+    joblib_way(crossing, "mlr")  # the processes are there already, as in a long session
+    for family in families:
+        took: list[list[float]] = [[], [], []]
+        for _ in range(repeats if family in CHEAP else 1):
+            with threadpool_limits(limits=1):
+                a, S_plain = timed(lambda f=family: plain_loop(crossing, f))
+                b, S_joblib = timed(lambda f=family: joblib_way(crossing, f))
+                c, (S_grid, cells) = timed(lambda f=family: grid_way(crossing, f))
+            for seconds, value in zip(took, (a * EVERY, b * EVERY, c / cells), strict=True):
+                seconds.append(value)
+        a, b, c = (statistics.median(s) for s in took)
+        kind = "linear" if family in CHEAP else "kernels, trees, nets"
+        groups[kind] = groups.get(kind, np.zeros(3)) + np.array([a, b, c])
+        print(f"{family:24}{a:9.3f}{b:9.3f}{c:9.4f}{a / c:7.0f}×{b / c:7.0f}×"
+              f"{S_plain:10.3f}{S_joblib:8.3f}{S_grid:9.3f}", flush=True)  # fmt: skip
+    for words, (a, b, c) in {**groups, "all": sum(groups.values(), np.zeros(3))}.items():
+        print(f"{words:24}{a:9.3f}{b:9.3f}{c:9.4f}{a / c:7.0f}×{b / c:7.0f}×")
+    print()
+
+
+def whole(batches: list[Batch], plan: Plan, words: str) -> None:
+    """One crossing with all cores, with what each family took of it."""
+    start = last = time.perf_counter()
+    took: dict[str, float] = {}
+
+    def progress(what: str, done: int, of: int) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        took[what.split()[1]] = took.get(what.split()[1], 0.0) + now - last
+        last = now
+
+    machine = sample_machine()
+    results = run_grid(batches, "xyz", plan, machine, workers=os.cpu_count() or 1, progress=progress)
+    cells = sum(len(r.cells) for _, r in results.values())
+    slowest = sorted(took, key=lambda f: -took[f])[:6]
+    print(f"{words}: {time.perf_counter() - start:.1f} s for {cells} cells on {os.cpu_count()} cores; "
+          f"waited longest for {', '.join(f'{f} {took[f]:.0f} s' for f in slowest)}", flush=True)  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--points", default="2,4,10")
+    parser.add_argument("--families", default=",".join(PLAIN))
+    parser.add_argument("--no-whole", action="store_true", help="leave out the whole crossings")
     args = parser.parse_args()
-    points = [int(n) for n in args.points.split(",")]
+    warnings.simplefilter("ignore", ConvergenceWarning)
+    warnings.simplefilter("ignore", UserWarning)
     with tempfile.TemporaryDirectory() as folder:
         batches = sample_batches(Path(folder))
-    rows = sum(b.n_rows for b in batches)
-    print(f"simulated sample year: {len(batches)} batches, {rows} rows, points {points}, one thread each\n")
-    print(f"{'family':8} {'plain s':>9} {'grid s':>9} {'ratio':>7} {'S plain µm':>11} {'S grid µm':>10}")
-    with threadpool_limits(limits=1):
-        for family in ("mlr", "pcr", "ridge", "pcr_lbo", "pls"):
-            plan = Plan(("correlation",), (family,), ("leave-batch-out",), tuple(points))
-            slow, fast = [], []
-            for _ in range(args.repeats):
-                crossing = prepare(batches, "z", plan)
-                a, s_plain = timed(lambda c=crossing, f=family: plain_loop(c, f, points))
-                crossing.subsets.clear()
-                b, s_grid = timed(lambda c=crossing, f=family: grid_way(c, f, points))
-                slow.append(a)
-                fast.append(b)
-            a, b = statistics.median(slow), statistics.median(fast)
-            print(f"{family:8} {a:9.2f} {b:9.3f} {a / b:6.0f}× {s_plain:11.3f} {s_grid:10.3f}", flush=True)
-    for workers in (1, os.cpu_count() or 1):
-        print(f"\nthe crossing of `make run` (selectors × families × protocols, x, y and z), {workers} process(es)")
-        for _ in range(args.repeats):
-            start = time.perf_counter()
-            results = run_grid(batches, "xyz", Plan(), workers=workers)
-            cells = sum(len(r.cells) for _, r in results.values())
-            print(f"  {time.perf_counter() - start:6.1f} s for {cells} cells", flush=True)
+    print(f"simulated sample year: {len(batches)} batches, {sum(b.n_rows for b in batches)} rows\n")
+    compare(batches, args.families.split(","), args.repeats)
+    if not args.no_whole:
+        whole(batches, Plan(), "quick crossing, four protocols, x, y and z")
+        whole(
+            batches,
+            Plan(protocols=("leave-batch-out",), complete=True),
+            "complete crossing, leave-batch-out, x, y and z",
+        )
 
 
 if __name__ == "__main__":
