@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from data.batch import Batch
+from data.batch import Batch, Channel
 from data.checks import usable_channels
 from data.errors import InputError
 from data.machine import Machine
@@ -45,14 +45,19 @@ class Plan:
     iterative_n_tsps: tuple[int, ...] = (2, 4)
     complete: bool = False
 
-    def suited(self, machine: Machine | None) -> Plan:
-        """The plan with its selectors and families by name.
+    def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
+        """The plan with its selectors and families by name; `channels` are the error channels that it is for.
 
         Raises:
-            InputError: a family that the plan names needs a twin part, and the machine file has none.
+            InputError: a family that the plan names needs a twin part, and the machine file has none, or a position,
+                and a channel is not measured along an axis.
         """
         has_twin = machine is not None and machine.twin is not None
+        has_axis = any(c.position for c in channels) or bool(machine is not None and machine.axes())
         for key in self.families:
+            for channel in channels:
+                if not suits(key, channel):
+                    raise _not_along_an_axis(key, channel.name)
             if FAMILIES[key].needs_twin and not has_twin:
                 raise InputError(
                     f"family {key} needs the twin part of the machine file; add 'twin' to the file of "
@@ -60,6 +65,7 @@ class Plan:
                 )
         taken = ("quick", "complete") if self.complete else ("quick",)
         suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
+        suitable = [f for f in suitable if has_axis or not FAMILIES[f].needs_position]
         return replace(
             self,
             selectors=self.selectors or tuple(s for s in SELECTORS if SELECTORS[s].effort in taken),
@@ -72,6 +78,18 @@ class Plan:
         if not family.closed_form:
             wanted = (*(n for n in self.iterative_n_tsps if n in wanted), wanted[-1])
         return tuple(dict.fromkeys(n for n in wanted if n <= n_inputs))
+
+
+def suits(family: str, channel: Channel) -> bool:
+    """Can this family be tried on this error channel? Others simply have no cell there."""
+    return bool(channel.position) or not FAMILIES[family].needs_position
+
+
+def _not_along_an_axis(family: str, target: str) -> InputError:
+    return InputError(
+        f"family {family} needs the position of every reading, and error channel {target} has none; add position: to "
+        "the channel in the machine file, train channels along an axis alone, or leave the family out"
+    )
 
 
 @dataclass(frozen=True)
@@ -149,7 +167,8 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
     """
-    plan = plan.suited(machine)
+    known = [b.channels[target] for b in batches[:1] if target in b.channels]
+    plan = plan.suited(machine, () if plan.families else known)
     kept = with_target(batches, target)
     lost = [(target, f"batch {b.batch_id} is left out: no usable {target}") for b in batches if b not in kept]
     if len(kept) < 2:
@@ -157,6 +176,8 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
             f"{batches[0].machine if batches else 'training'}: got {len(kept)} batch(es) with a usable {target}, "
             "need at least 2; ingest more recordings or overrule a check in the machine file"
         )
+    if not any(suits(f, kept[0].channels[target]) for f in plan.families):
+        raise _not_along_an_axis(plan.families[0], target)
     inputs, excluded = usable_channels(kept, temperature_inputs(kept))
     if not inputs:
         raise InputError(f"{kept[0].machine}: no temperature channel is usable in every batch; {excluded[0][1]}")
@@ -185,11 +206,12 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
 def cross_family(crossing: Crossing, key: str) -> FamilyResult:
     """Fit and judge one family over all its cells, folds and protocols."""
     family = FAMILIES[key]
-    cells = crossing.cells(family)
+    target = crossing.design.target
+    cells = crossing.cells(family) if suits(key, crossing.batches[0].channels[target]) else []
     scores, summaries, failures = [], [], []
     predictions: dict[str, NDArray[np.float32]] = {}
     for protocol, folds in crossing.folds.items():
-        if not folds:
+        if not folds or not cells:
             continue
         judged = Judged.run(crossing.design, family(), folds, crossing.needed(folds, cells))
         failures += [(f"family {key}", f"{protocol}, {text}") for text in judged.failures]

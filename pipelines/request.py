@@ -50,7 +50,7 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
             "without promotion (--no-promote)"
         )
     if request.plan.families:
-        request.plan.suited(machine)
+        request.plan.suited(machine, [machine.channel(t) for t in targets])
     return machine, targets
 
 

@@ -69,7 +69,23 @@ twin:
 """,
     "test",
 )
+
+
+def along_an_axis(batch: Batch) -> Batch:
+    """The same run read at four positions in turn, after a first sweep at rest; the error grows with the position."""
+    table = batch.table.assign(at=np.resize([0.0, 60.0, 120.0, 180.0], N))
+    table.loc[1:3, [*INPUTS, "z"]] = table.loc[0, [*INPUTS, "z"]].to_numpy()
+    table["z"] += 0.01 * table["at"] * (table["front"] - table["front"][0])
+    channels = {
+        **batch.channels,
+        "at": Channel("at", "position", "mm"),
+        "z": Channel("z", "error", "um", position="at"),
+    }
+    return Batch("vmc", batch.batch_id, table, channels)
+
+
 BATCHES = [make_batch(k) for k in range(5)]
+AXIS_BATCHES = [along_an_axis(b) for b in BATCHES]
 _FITTED: dict[str, Family] = {}
 
 
@@ -78,9 +94,19 @@ def key(request) -> str:
     return str(request.param)
 
 
+@pytest.fixture
+def batches(key) -> list[Batch]:
+    return AXIS_BATCHES if FAMILIES[key].needs_position else BATCHES
+
+
 @pytest.fixture(scope="module")
-def design() -> Design:
-    return Design.build(BATCHES, INPUTS, "z", MACHINE)
+def designs() -> dict[bool, Design]:
+    return {along: Design.build(b, INPUTS, "z", MACHINE) for along, b in ((False, BATCHES), (True, AXIS_BATCHES))}
+
+
+@pytest.fixture
+def design(key, designs) -> Design:
+    return designs[FAMILIES[key].needs_position]
 
 
 @pytest.fixture
@@ -107,10 +133,10 @@ def test_fit_gives_a_new_copy_that_predicts_every_row(key, design, fitted):
     assert fitted.n_parameters() >= (0 if key == "zero" else 1)
 
 
-def test_fit_and_predict_on_whole_batches_are_the_same_model(key, fitted):
-    model = FAMILIES[key]().fit(BATCHES[:4], INPUTS, "z", MACHINE)
-    got = fitted.predict(BATCHES[4])
-    np.testing.assert_allclose(model.predict(BATCHES[4]), got, rtol=0, atol=1e-6 * max(1.0, np.abs(got).max()))
+def test_fit_and_predict_on_whole_batches_are_the_same_model(key, batches, fitted):
+    model = FAMILIES[key]().fit(batches[:4], INPUTS, "z", MACHINE)
+    got = fitted.predict(batches[4])
+    np.testing.assert_allclose(model.predict(batches[4]), got, rtol=0, atol=1e-6 * max(1.0, np.abs(got).max()))
 
 
 def test_beats_no_model_on_a_batch_it_never_saw(key, design, fitted):
@@ -125,15 +151,15 @@ def test_is_the_same_every_time(key, design, fitted):
     np.testing.assert_array_equal(again.predict_design(design, [4])[0], fitted.predict_design(design, [4])[0])
 
 
-def test_nothing_crosses_a_border_between_batches(key, design, fitted):
-    alone = fitted.predict_design(Design.build([BATCHES[4]], INPUTS, "z", MACHINE), [0])[0]
+def test_nothing_crosses_a_border_between_batches(batches, fitted):
+    alone = fitted.predict_design(Design.build([batches[4]], INPUTS, "z", MACHINE), [0])[0]
     for neighbours in ([4, 0], [0, 4]):
-        both = Design.build([BATCHES[k] for k in neighbours], INPUTS, "z", MACHINE)
+        both = Design.build([batches[k] for k in neighbours], INPUTS, "z", MACHINE)
         np.testing.assert_allclose(fitted.predict_design(both, [neighbours.index(4)])[0], alone, rtol=0, atol=1e-9)
 
 
-def test_a_prediction_never_sees_the_recorded_error(key, design, fitted):
-    blind = Design.build(BATCHES, INPUTS, None, MACHINE)
+def test_a_prediction_never_sees_the_recorded_error(batches, design, fitted):
+    blind = Design.build(batches, INPUTS, None, MACHINE)
     np.testing.assert_array_equal(fitted.predict_design(blind, [4])[0], fitted.predict_design(design, [4])[0])
 
 
@@ -172,8 +198,10 @@ def test_one_batch_is_enough(key, design):
         assert np.std(own - error_um) < 0.3 * np.std(error_um)
 
 
-def test_left_out_batches_do_not_touch_the_fit(key, design, fitted):
-    other = Design.build([*BATCHES[:4], make_batch(99)], INPUTS, "z", MACHINE)
+def test_left_out_batches_do_not_touch_the_fit(key, batches, design, fitted):
+    strange = make_batch(99)
+    strange = along_an_axis(strange) if FAMILIES[key].needs_position else strange
+    other = Design.build([*batches[:4], strange], INPUTS, "z", MACHINE)
     model = FAMILIES[key]().fit_design(other, [0, 1, 2, 3])
     got, want = model.predict_design(other, [0])[0], fitted.predict_design(design, [0])[0]
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * max(1.0, np.abs(want).max()))
@@ -193,11 +221,11 @@ def test_stored_as_json_and_arrays_it_predicts_the_same(key, design, fitted):
     np.testing.assert_array_equal(back.predict_design(design, [4])[0], fitted.predict_design(design, [4])[0])
 
 
-def test_no_usable_row_is_told_in_one_line(key):
+def test_no_usable_row_is_told_in_one_line(key, batches):
     if key == "zero":
         pytest.skip("learns nothing")
-    table = BATCHES[0].table.assign(z=np.nan)
-    dead = Batch("vmc", "K9", table, BATCHES[0].channels)
+    table = batches[0].table.assign(z=np.nan)
+    dead = Batch("vmc", "K9", table, batches[0].channels)
     with pytest.raises(InputError) as error:
         FAMILIES[key]().fit([dead], INPUTS, "z", MACHINE)
     assert "\n" not in str(error.value) and "K9" in str(error.value) and key.split("_")[0] in str(error.value)
