@@ -100,7 +100,7 @@ def run_grid(
 
     `progress` is called with what was done, how many of how many.
     """
-    plan = plan.suited(machine)
+    plan = plan.suited(machine, [b.channels[t] for b in batches[:1] for t in targets if t in b.channels])
     with threadpool_limits(limits=1):
         crossings = {t: prepare(batches, t, plan, machine) for t in targets}
         jobs = jobs_of(plan, targets)
@@ -121,6 +121,8 @@ def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
         "time_s": design.time_s,
         "recorded_um": design.y_um,
     }
+    if design.along:
+        predictions["position_mm"] = design.position_mm(design.along)
     for r in results:
         predictions |= r.predictions
     failures = [f for r in results for f in r.failures]

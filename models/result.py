@@ -30,14 +30,14 @@ class GridResult:
       tsp_stability (mean Jaccard similarity of the chosen sets over folds, 1 = always the same), inputs (the set
       chosen from all batches, joined by "|"), n_inputs, simulated.
     - `subsets`: protocol, selector, n_tsp, fold, inputs ("|"-joined): which points every fold chose.
-    - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um and one float32 column per
-      "selector|family|n_tsp" with the left-out prediction in µm.
+    - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um, for a channel along an axis position_mm, and
+      one float32 column per "selector|family|n_tsp" with the left-out prediction in µm.
     - `findings`: batch_id, check, channel, start_s, end_s, words, masks, overruled.
     - `distances`: how far left-out batches were from the training of the chosen cell, and its S there, see
       `models.trust`; empty where nobody chose.
     - `excluded`: channel, reason: channels that no cell may use.
     - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: what is known to go wrong with
-      each selector, measured on all batches at the n_tsp of its best cell short of all inputs; empty in older files.
+      each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty in older files.
     """
 
     machine: str
