@@ -23,6 +23,7 @@ FAMILIES = Registry(
         "axis_coupled": "models.axis_coupled:AxisCoupled",
         "bp": "models.bp:BP",
         "lssvm": "models.lssvm:LSSVM",
+        "svr": "models.svr:SVR",
         "gm1n": "models.gm1n:GM1N",
     },
 )

@@ -1,0 +1,138 @@
+"""Support vector regression against scikit-learn's own, the conditions of its optimum, and a law it must find."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sklearn.svm import SVR as LibSVR
+
+from data.errors import InputError
+from features.design import Design
+from models.svr import SVR
+
+ONE = {"sigmas": (1.0,), "costs": (2e3,), "epsilons": (0.05,)}
+
+
+def make_design(seed=0, sizes=(14, 9, 12, 11, 13), p=2, units=()) -> Design:
+    rng = np.random.default_rng(seed)
+    x = np.vstack([np.cumsum(rng.uniform(0, 2, (n, p)), axis=0) for n in sizes])
+    y = 3 * x[:, 0] - 2 * x[:, -1] + 8 * np.sin(x[:, 0] / 8) + rng.normal(0, 0.5, len(x))
+    return Design(tuple(f"t{j}" for j in range(p)), "z", tuple(f"K{k + 1}" for k in range(len(sizes))), x, y,
+                  np.concatenate([np.arange(n) * 60.0 for n in sizes]),
+                  np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), 60.0, input_units=units)  # fmt: skip
+
+
+def test_predicts_as_scikit_learn_with_its_own_rbf_does():
+    design = make_design()
+    model = SVR(**ONE).fit_design(design, [0, 1, 2, 3])
+    rows = design.group < 4
+    u, y = design.x / 10.0, design.y_um
+    mean, spread = y[rows].mean(), y[rows].std()
+    # |u − v|²/(2 p σ²) with p = 2 and σ = 1 is gamma = 1/4.
+    other = LibSVR(kernel="rbf", gamma=0.25, C=2e3 / rows.sum(), epsilon=0.05).fit(u[rows], (y[rows] - mean) / spread)
+    want = mean + spread * other.predict(u)
+    np.testing.assert_allclose(np.concatenate(model.predict_design(design, range(5))), want, atol=1e-2)
+    assert model.fitted["C"] == pytest.approx(2e3 / rows.sum())
+    assert abs(len(model.fitted["alpha"]) - len(other.support_)) <= 2
+
+
+def test_the_solution_meets_the_conditions_of_its_optimum():
+    design = make_design(1)
+    model = SVR(**ONE).fit_design(design, range(5))
+    f, spread = model.fitted, design.y_um.std()
+    residual = (design.y_um - np.concatenate(model.predict_design(design, range(5)))) / spread
+    alpha = f["alpha"] / spread
+    assert alpha.sum() == pytest.approx(0, abs=1e-6)
+    assert np.abs(alpha).max() <= f["C"] * (1 + 1e-9)
+    at = [int(np.argmin(((design.x / 10.0 - s) ** 2).sum(axis=1))) for s in f["support"]]
+    inside = np.abs(alpha) < f["C"] * (1 - 1e-6)
+    # On the tube's edge where alpha is free, beyond it where alpha is at C, inside it where a row is no support.
+    np.testing.assert_allclose(residual[at][inside] * np.sign(alpha[inside]), 0.05, atol=3e-3)
+    assert (residual[at][~inside] * np.sign(alpha[~inside]) >= 0.05 - 3e-3).all()
+    assert np.abs(np.delete(residual, at)).max() <= 0.05 + 3e-3
+
+
+def test_the_choice_is_the_setting_of_least_left_out_error():
+    design = make_design(2, sizes=(20, 18, 22, 19, 21, 20))
+    sigmas, costs, epsilons = (0.3, 1.0), (30.0, 3e3), (0.05, 0.3)
+    fitted = SVR(10_000, sigmas, costs, epsilons).fit_design(design, range(6)).fitted
+    u, y, group = design.x / 10.0, design.y_um, design.group % 3
+
+    def rms(sigma, cost, epsilon):
+        out = []
+        for g in range(3):
+            rest, left = group != g, group == g
+            mean, spread = y[rest].mean(), y[rest].std()
+            model = LibSVR(kernel="rbf", gamma=1 / (4 * sigma**2), C=cost / rest.sum(), epsilon=epsilon)
+            model.fit(u[rest], (y[rest] - mean) / spread)
+            out.append(np.sqrt(np.mean((y[left] - mean - spread * model.predict(u[left])) ** 2)))
+        return np.mean(out)
+
+    score = {(s, c): rms(s, c, 0.05) for s in sigmas for c in costs}
+    sigma, cost = min(score, key=score.get)
+    epsilon = min(epsilons, key=lambda e: rms(sigma, cost, e))
+    assert (fitted["sigma"], fitted["C"] * fitted["n_rows"], fitted["epsilon"]) == pytest.approx((sigma, cost, epsilon))
+    assert fitted["inner_rms_um"] == pytest.approx(rms(sigma, cost, epsilon), rel=1e-2)
+
+
+def test_decimation_is_even_and_stated():
+    design = make_design(3, sizes=(40, 5, 60))
+    model = SVR(30, **ONE).fit_design(design, range(3))
+    assert model.fitted["n_rows"] == 10 + 5 + 10 and model.fitted["n_usable_rows"] == 105
+    long = design.x[design.rows(2)] / 10.0
+    kept = {tuple(row) for row in long[np.round(np.linspace(0, 59, 10)).astype(int)]}
+    support = {tuple(row) for row in model.fitted["support"]}
+    assert support & {tuple(row) for row in long} <= kept
+
+
+def test_a_bend_that_no_straight_line_follows():
+    rng = np.random.default_rng(4)
+    sizes = (60,) * 5
+    x = np.concatenate([np.sort(rng.uniform(0, 40, n)) for n in sizes])[:, None]
+    y = 20 * np.tanh((x[:, 0] - 20) / 6) + rng.normal(0, 0.5, len(x))
+    design = Design(("t",), "z", tuple("ABCDE"), x, y, np.tile(np.arange(60.0), 5), np.arange(6) * 60, 1.0)
+    model = SVR().fit_design(design, [0, 1, 2, 3])
+    left = model.predict_design(design, [4])[0] - y[240:]
+    assert np.sqrt(np.mean(left**2)) < 1.0
+    slope = np.polyfit(x[:240, 0], y[:240], 1)
+    assert np.sqrt(np.mean((np.polyval(slope, x[240:, 0]) - y[240:]) ** 2)) > 3.0
+
+
+def test_far_outside_it_falls_back_to_its_bias():
+    design = make_design(5)
+    model = SVR(**ONE).fit_design(design, range(5))
+    far = Design(
+        design.inputs, "", ("far",), np.full((3, 2), 500.0), np.full(3, np.nan), np.arange(3.0), np.array([0, 3])
+    )
+    np.testing.assert_allclose(model.predict_design(far, [0])[0], model.fitted["bias"], atol=1e-6)
+
+
+def test_units_have_their_own_scale():
+    design = make_design(6, units=("rpm", "K"))
+    np.testing.assert_array_equal(SVR(**ONE).fit_design(design, [0, 1]).fitted["scale"], [1000.0, 10.0])
+
+
+def test_a_trained_model_predicts_without_scikit_learn():
+    code = (
+        "import sys, numpy as np\n"
+        "from features.design import Design\n"
+        "from models.base import family_from_plain\n"
+        "x, none = np.arange(3.0)[:, None], np.full(3, np.nan)\n"
+        "design = Design(('t',), '', ('K1',), x, none, np.arange(3.0), np.array([0, 3]))\n"
+        "fitted = {'support': np.ones((1, 1)), 'alpha': np.ones(1), 'bias': 0.0, 'sigma': 1.0, 'scale': np.ones(1)}\n"
+        "plain = {'family': 'svr', 'options': {}, 'inputs': ['t'], 'target': 'z', 'fitted': fitted}\n"
+        "model = family_from_plain(plain)\n"
+        "model.predict_design(design, [0])\n"
+        "sys.exit('sklearn' in sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_too_few_rows_and_impossible_options_are_told():
+    design = make_design(7)
+    design.y_um[:] = np.nan
+    with pytest.raises(InputError, match="family svr: got 0 usable rows of z in K2, K3, need at least 2"):
+        SVR().fit_design(design, [1, 2])
+    with pytest.raises(InputError, match=r"svr: max_rows 1,.* expected at least 2 rows and values above 0"):
+        SVR(max_rows=1)
