@@ -6,5 +6,6 @@ STUDIES = Registry(
     "study",
     {
         "year_round_pcr": "models.studies.year_round_pcr:YearRoundPCR",
+        "main_factor": "models.studies.main_factor:MainFactor",
     },
 )
