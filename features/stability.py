@@ -19,7 +19,7 @@ def stability_over_batches(sets: Sequence[tuple[str, ...]]) -> Diagnostic:
         InputError: no set at all.
     """
     value = tsp_stability(sets)
-    rare = [f"{name} {share:.0%}" for name, share in tsp_frequency(sets).items() if share < 1.0]
+    rare = [f"{name} {100 * share:.0f} %" for name, share in tsp_frequency(sets).items() if share < 1.0]
     words = "not in every fold: " + ", ".join(rare) if rare else "the same points whichever batch is left out"
     return Diagnostic("stability over batches", value, _STABLE, value >= _STABLE, words)
 

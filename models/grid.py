@@ -183,7 +183,7 @@ def _diagnostics_table(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
     for key in crossing.plan.selectors:
         own = fewer[fewer["selector"] == key].dropna(subset="S_mean_um")
         if SELECTORS[key].takes_n_tsp and len(own):
-            n = int(own.sort_values("S_mean_um", kind="stable")["n_tsp"].iloc[0])
+            n = int(own["n_tsp"].iloc[int((own["S_mean_um"] + own["S_std_um"].fillna(0.0)).argmin())])
             stable = stability_over_batches([crossing.inputs(key, f.train, n) for f in crossing.folds[protocol]])
             found = SELECTORS[key]().diagnostics(crossing.design, crossing.everything, n)
             rows += [{"selector": key, "n_tsp": n, **asdict(d)} for d in (stable, *found)]

@@ -58,8 +58,9 @@ class FcmGrey(Selector):
         if n_tsp not in clusters:
             return ()
         empty = n_tsp - len(np.unique(clusters[n_tsp]))
-        words = f"of {n_tsp} asked; their points were filled up by the largest driving coefficients"
-        return (Diagnostic("clusters without a member", float(empty), 0.0, empty == 0, words if empty else "none"),)
+        filled = f"of {n_tsp} asked; their points were filled up by the largest driving coefficients"
+        words = filled if empty else "each has a point of its own"
+        return (Diagnostic("clusters without a member", float(empty), 0.0, empty == 0, words),)
 
     def _clusters(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> tuple[Columns, Clusters]:
         """The inputs that vary, by |corr| with the error, and for n = 2 to all but one of them the cluster of each."""

@@ -39,11 +39,10 @@ class VifPruning(Selector):
     def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
         statistics = training_statistics(design, train, self.key)
         kept = pruning_order(statistics)[len(design.inputs) - n_tsp :]
-        left = float(variance_inflation(statistics.between[np.ix_(kept, kept)]).max())
-        words = (
-            "the chosen points still repeat each other" if left > _USUAL_LIMIT else "the points tell different things"
-        )
-        return (Diagnostic("largest VIF left", left, _USUAL_LIMIT, left <= _USUAL_LIMIT, words),)
+        factor = variance_inflation(statistics.between[np.ix_(kept, kept)])
+        largest = float(factor.max())
+        words = f"{design.inputs[kept[int(np.argmax(factor))]]} is the one that the other chosen points explain best"
+        return (Diagnostic("largest VIF left", largest, _USUAL_LIMIT, largest <= _USUAL_LIMIT, words),)
 
 
 def variance_inflation(correlation: Array) -> Array:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pandas as pd
+
 from models.result import GridResult
 from pipelines.report.layout import Column, Row, Table
-from pipelines.report.words import number, selector_label
+from pipelines.report.words import NOTHING, number, selector_label
 
+_STABILITY = "stability over batches"
 _WORDS = {
-    "stability over batches": "another batch changes the points",
     "largest |corr| among the chosen": "two chosen points tell the same",
     "chaining in the largest cluster": "sensors share a cluster only over others",
     "share of inputs in the largest cluster": "nearly all sensors in one cluster",
@@ -24,35 +26,49 @@ _WORDS = {
 
 
 def diagnostics_table(name: str, result: GridResult) -> Table | None:
-    """A row per selector and statistic, those beyond their limit marked; None where nothing was measured."""
+    """Per selector its stability and a row for every weakness of its own; None where nothing was measured.
+
+    A row is marked where its own value or the selector's stability is beyond the limit.
+    """
     found = result.selector_diagnostics
     if found.empty:
         return None
-    rows = [
-        Row(
-            (
-                selector_label(d["selector"]),
-                str(d["n_tsp"]),
-                f"{_WORDS[d['statistic']]}: {d['statistic']}" if d["statistic"] in _WORDS else d["statistic"],
-                number(d["value"], 2),
-                f"{'at most' if d['ok'] == (d['value'] <= d['threshold']) else 'at least'} {number(d['threshold'], 2)}",
-                d["comment"],
-            ),
-            "" if d["ok"] else "look",
-        )
-        for d in found.to_dict("records")
-    ]
+    rows = [row for _, own in found.groupby("selector", sort=False) for row in _rows(own)]
     columns = (
         Column("selector"),
         Column("points", "n", "number"),
+        Column("stability", "", "number"),
         Column("what may go wrong", "", "wide"),
         Column("value", "", "number"),
         Column("usual limit"),
         Column("here", "", "wide"),
     )
     note = (
-        "Each selector on all batches, at the number of points of its best cell short of all. A marked row is a "
-        "warning: the points may be right, yet another recording could change them."
+        "Each selector on all batches, at the number of points of its best cell short of all. Stability: mean Jaccard "
+        "similarity of the folds' choices. A marked row is a warning: the points may be right, yet another recording "
+        "could change them."
     )
-    caption = f"{name}: how far each selector's choice can be trusted"
-    return Table(caption, columns, tuple(rows), result.simulated, None, (note,))
+    return Table(f"{name}: known weaknesses of the selectors", columns, tuple(rows), result.simulated, None, (note,))
+
+
+def _rows(own: pd.DataFrame) -> list[Row]:
+    """Of one selector: its weaknesses, each with its stability."""
+    stability, others = own[own["statistic"] == _STABILITY], own[own["statistic"] != _STABILITY]
+    stable = number(float(stability["value"].iloc[0]), 2) if len(stability) else NOTHING
+    first = (selector_label(own["selector"].iloc[0]), str(own["n_tsp"].iloc[0]), stable)
+    unstable = not stability["ok"].all()
+    if others.empty:
+        return [Row((*first, "no measure of its own", NOTHING, NOTHING, stability["comment"].iloc[0]), _mark(unstable))]
+    rows = []
+    for statistic, value, limit, ok, comment in zip(
+        others["statistic"], others["value"], others["threshold"], others["ok"], others["comment"], strict=True
+    ):
+        words = f"{_WORDS[statistic]}: {statistic}" if statistic in _WORDS else statistic
+        side = "at most" if ok == (value <= limit) else "at least"
+        cells = (*first, words, number(value, 2), f"{side} {number(limit, 2)}", comment)
+        rows.append(Row(cells, _mark(unstable or not ok)))
+    return rows
+
+
+def _mark(warns: bool) -> str:
+    return "look" if warns else ""

@@ -64,6 +64,6 @@ def test_stability_names_the_points_that_come_and_go() -> None:
     torn = stability_over_batches([("a", "b"), ("a", "c"), ("a", "b"), ("a", "d")])
     # pairs: b b is 1, the five others 1/3
     assert torn.value == pytest.approx((1 + 5 / 3) / 6) and not torn.ok and torn.threshold == 0.7
-    assert torn.comment == "not in every fold: b 50%, c 25%, d 25%"
+    assert torn.comment == "not in every fold: b 50 %, c 25 %, d 25 %"
     with pytest.raises(InputError, match="got no set; expected one per fold"):
         stability_over_batches([])
