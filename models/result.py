@@ -37,7 +37,8 @@ class GridResult:
       `models.trust`; empty where nobody chose.
     - `excluded`: channel, reason: channels that no cell may use.
     - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: what is known to go wrong with
-      each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty in older files.
+      each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty
+      in older files.
     """
 
     machine: str

@@ -19,8 +19,8 @@ _FAMILIES = {"zero": "no model", "mean_curve": "mean curve", "thermal_exponentia
              "twin_residual": "twin + residual", "twin_kalman": "twin with sensors", "pcr": "PCR 95 %",
              "pcr_lbo": "PCR tuned", "gm1n": "GM(1,N)", "lssvm": "LS-SVM"}  # fmt: skip
 _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc": "FCGC", "fcm_grey": "FCM + grey",
-              "main_factor_bp": "main factor BP", "mrmr": "mRMR", "elastic_net_path": "elastic net", "vif_pruning": "VIF pruning",
-              "kmedoids": "k-medoids", "exhaustive": "all subsets"}  # fmt: skip
+              "main_factor_bp": "main factor BP", "mrmr": "mRMR", "elastic_net_path": "elastic net",
+              "vif_pruning": "VIF pruning", "kmedoids": "k-medoids", "exhaustive": "all subsets"}  # fmt: skip
 _SHOUTED = {"mlr", "pls", "bp"}
 
 
