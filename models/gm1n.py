@@ -29,6 +29,9 @@ class GM1N(Family):
     - `whitening`: `x̂1¹(k+1) = s(k+1)/a · (1 − exp(−a k))`, `s = Σ b_i x_i¹`, differenced. It is the published
       one, exact only for inputs whose cumulated sum stays constant.
 
+    `recent_rows` keeps only so many of each batch's most recent usable rows for the fit: the published sequence length
+    (the sums still begin with the batch). None keeps all.
+
     a is kept in [step/`slowest_h`, 2]: below, the response has no end in sight (a near 0 divides, a < 0 explodes);
     above, it zigzags. Where least squares leaves that range, a is set to the bound, b is fitted anew, and `fitted`
     says so in `bound`. Directions of the scaled sums below 1e-4 of the strongest are dropped. Training uses usable
@@ -46,12 +49,15 @@ class GM1N(Family):
     rowwise = False
     rank = 30
 
-    def __init__(self, response: str = "difference", slowest_h: float = 24.0) -> None:
+    def __init__(self, response: str = "difference", slowest_h: float = 24.0, recent_rows: int | None = None) -> None:
         super().__init__()
         if response not in RESPONSES:
             raise InputError(f"family gm1n: unknown response {response!r}: {closest(response, RESPONSES)}")
         self.response = response
+        if recent_rows is not None and recent_rows < 2:
+            raise InputError(f"family gm1n: recent_rows {recent_rows}; expected at least 2 rows, or None for all")
         self.slowest_h = float(slowest_h)
+        self.recent_rows = recent_rows
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         return self.fit_folds(design, [train])[0]
@@ -66,6 +72,7 @@ class GM1N(Family):
         factors, counts = np.zeros((design.n_batches, columns, columns)), np.zeros(design.n_batches, int)
         for k in sorted({k for fold in folds for k in fold}):
             rows = equations(design, k)
+            rows = rows if self.recent_rows is None else rows[-self.recent_rows :]
             counts[k] = len(rows)
             r = np.linalg.qr(rows, mode="r")
             factors[k, : len(r)] = r
@@ -134,19 +141,21 @@ class GM1N(Family):
         return out
 
 
-def response(drive: Array, a: float, kind: str = "difference") -> Array:
-    """x̂1⁰ (K, n) from Σ b_i x_i⁰ (K, n), zero in the first row, by either response."""
+def response(drive: Array, a: float, kind: str = "difference", first_um: float = 0.0) -> Array:
+    """x̂1⁰ (K, n) from Σ b_i x_i⁰ (K, n), `first_um` in the first row, by either response."""
     if drive.shape[1] == 0:
         return drive.copy()
     if kind == "whitening":
-        cumulated = np.cumsum(drive, axis=1) / a * -np.expm1(-a * np.arange(drive.shape[1]))
+        k = np.arange(drive.shape[1])
+        cumulated = np.cumsum(drive, axis=1) / a * -np.expm1(-a * k) + first_um * np.exp(-a * k)
         return np.diff(cumulated, axis=1, prepend=0.0)
     # The recursion on sums, differenced: x⁰(k) = r x⁰(k−1) + c u(k), where u(1) counts in the second row.
     u = drive.copy()
     u[:, 0] = 0.0
-    u[:, 1:2] += drive[:, :1]
+    u[:, 1:2] += drive[:, :1] - a * first_um
     c = 1.0 / (1.0 + a / 2.0)
     out: Array = lfilter([c], [1.0, -(1.0 - a / 2.0) * c], u, axis=1)
+    out[:, 0] = first_um
     return out
 
 

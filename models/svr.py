@@ -25,10 +25,10 @@ class SVR(KernelExpansion):
 
     u are the p inputs over a fixed scale per unit, as in lssvm; the error is standardised by the training rows. Outside
     the trained seasons the kernel dies out and the model falls back to its bias. Batches are decimated evenly, to at
-    most `max_rows` together. σ from `sigmas`, C from `costs` over the number of rows, and then ε (in standard deviations
-    of the error) from `epsilons`, whose first stands until then: least mean RMS over left-out groups of whole training
-    batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` tells rows, setting
-    and score, and holds the support rows: a trained model predicts without scikit-learn.
+    most `max_rows` together. σ from `sigmas`, C from `costs` over the number of rows, and then ε (in standard
+    deviations of the error) from `epsilons`, whose first stands until then: least mean RMS over left-out groups of
+    whole training batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` tells
+    rows, setting and score, and holds the support rows: a trained model predicts without scikit-learn.
 
     Source: V. Vapnik, The nature of statistical learning theory (1995), ch. 6; C.-C. Chang and C.-J. Lin, LIBSVM: a
     library for support vector machines (2011).
