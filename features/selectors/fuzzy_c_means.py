@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_NUMBERS_AT_ONCE = 1_000_000  # in a stack of memberships
 _SMALLEST_SQUARE = 1e-12  # of a distance, for curves of unit size: nearer is the centre itself
 
 
@@ -29,12 +30,33 @@ def fuzzy_c_means(
 
     Source: J. Bezdek (1981), Pattern Recognition with Fuzzy Objective Function Algorithms, ch. 3.
     """
-    p, most = len(products), max(numbers, default=0)
+    p = len(products)
     rng = np.random.default_rng(seed)
-    drawn = np.array([rng.permutation(p) for _ in range(starts)])[:, :most]
-    number = np.repeat(np.asarray(numbers, int), starts)
+    drawn = np.array([rng.permutation(p) for _ in range(starts)])
+    out: dict[int, Array] = {}
+    left = sorted(numbers)
+    while left:
+        at_once = max(1, _NUMBERS_AT_ONCE // (starts * p * left[-1]))
+        left, now = left[:-at_once], left[-at_once:]
+        membership, cost = _converged(products, np.repeat(now, starts), np.tile(drawn, (len(now), 1)),
+                                      fuzziness, iterations, tolerance)  # fmt: skip
+        best = np.argmin(cost.reshape(len(now), starts), axis=1) + starts * np.arange(len(now))
+        out |= {c: membership[t, :c] for c, t in zip(now, best, strict=True)}
+    return out
+
+
+def _converged(
+    products: Array,
+    number: NDArray[np.int64],
+    drawn: NDArray[np.int64],
+    fuzziness: float,
+    iterations: int,
+    tolerance: float,
+) -> tuple[Array, Array]:
+    """Memberships (T, c, p) of T runs of `number` clusters each, zero beyond them, and their objectives (T,)."""
+    p, most = len(products), int(number.max())
     present = np.arange(most) < number[:, None]
-    weight = np.tile(np.eye(p)[drawn], (len(numbers), 1, 1)) * present[:, :, None]
+    weight = np.eye(p)[drawn[:, :most]] * present[:, :, None]
     membership, cost = np.zeros_like(weight), np.zeros(len(number))
     running = np.arange(len(number))
     for _ in range(iterations):
@@ -50,8 +72,7 @@ def fuzzy_c_means(
         cost[running] = (raised * square).sum(axis=(1, 2))
         weight[running] = raised / np.where(there, raised.sum(axis=2, keepdims=True), 1.0)
         running = running[moved > tolerance]
-    best = {c: int(np.flatnonzero(number == c)[np.argmin(cost[number == c])]) for c in numbers}
-    return {c: membership[t, :c] for c, t in best.items()}
+    return membership, cost
 
 
 def _squares(weight: Array, products: Array) -> Array:
