@@ -6,14 +6,16 @@ import datetime as dt
 import json
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data import guess
+from data import guess, guess_axes
 from data.errors import InputError
 from data.guess import Guess
+from data.guess_axes import Group
 from data.machine import Machine, parse_machine
 from data.peek import Table, look, look_at, sheets_of
 from data.readers.header import Layout
@@ -113,30 +115,45 @@ def _write(paths: Sequence[Path], table: Table, rows: Sequence[Rows], left_out: 
         unit = Guess(written if written in ("s", "min", "h") else "s", "the units row says so")
     else:
         unit = guess.time_unit(time if table.header else "", interval, length)
-    interval *= {"min": 60.0, "h": 3600.0}.get(unit.value, 1.0)
-    step_s = guess.grid_step_s(interval)
-    column = _yaml(time) if table.header else str(table.time)
+    in_s = {"min": 60.0, "h": 3600.0}.get(unit.value, 1.0)
+    step_s = usual_s = guess.grid_step_s(interval * in_s)
+    step_words = f"samples are {interval * in_s:.4g} s apart (median)"
+    names, groups = _names(table), _groups(table)
+    longest = max(rows, key=len)
+    of_group = {i for g in groups for i in g.places}
+    columns = {n: _Column.of(table, i, longest.columns[n]) for n, i in names.items() if i not in of_group}
+    roles = {r: [n for n, c in columns.items() if c.role.value == r] for r in ("error", "position")}
+    linked = guess_axes.along(roles["error"], roles["position"], longest)
+    if linked or groups:
+        sweeps = [longest.columns[g.value] for g in linked.values()]
+        fine_s = guess_axes.step_s(longest.time_s * in_s, sweeps, [len(g.places) for g in groups])
+        if fine_s < step_s:
+            step_s, step_words = fine_s, "each reading of a sweep takes a row"
+    time_column = _yaml(time) if table.header else str(table.time)
     pattern = f", format: {_yaml(_pattern(table))}" if _pattern(table) else ""
     folder = re.sub(r"[^a-z0-9_\-]+", "_", paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
-    names = [p.name for p in paths]
+    files = [p.name for p in paths]
     lines = [
-        f"# Drafted from {len(names)} file{'s' * (len(names) > 1)}: {names[0]}{' … ' + names[-1] if names[1:] else ''}",
+        f"# Drafted from {len(files)} file{'s' * (len(files) > 1)}: {files[0]}{' … ' + files[-1] if files[1:] else ''}",
         f"# ({table.words}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
         *(f"# left out: {line}" for line in left_out),
         f"machine: {_yaml(folder)}  # guessed: the folder's name",
         "recording:",
         f"  files: [{_yaml(_files(paths))}]  # guessed: the names of the files",
         f"  header: {'true' if table.header else 'false'}",
-        f"  time: {{column: {column}, unit: {unit.value}{pattern}}}  # guessed: {unit.why}",
-        f"  step_s: {step_s:g}  # guessed: samples are {interval:.4g} s apart (median)",
-        f"  max_gap_s: {5 * step_s:g}  # guessed: 5 steps",
+        f"  time: {{column: {time_column}, unit: {unit.value}{pattern}}}  # guessed: {unit.why}",
+        f"  step_s: {step_s:g}  # guessed: {step_words}",
+        f"  max_gap_s: {5 * usual_s:g}  # guessed: 5 {'steps' if step_s == usual_s else 'samples'}",
     ]
     if start := _start_in_name(paths):
         lines.append(f"  start_from_name: {_yaml(start)}  # guessed: the files are named by date")
     lines.append("channels:")
-    for name, i in _names(table).items():
-        longest = max(rows, key=len).columns[name]
-        lines += _channel(name, i, table, longest, np.concatenate([r.columns[name] for r in rows]))
+    for name, column in columns.items():
+        lines += _channel(name, column, np.concatenate([r.columns[name] for r in rows]), linked.get(name))
+    key_of = {i: name for name, i in names.items()}
+    for group in groups:
+        stacked = np.concatenate([r.columns[key_of[i]] for r in rows for i in group.places])
+        lines += _axis(group, stacked, [*columns])
     others = [c for i, c in enumerate(table.columns) if c and i != table.time and i not in table.numeric]
     if others and table.header:
         lines.append(f"ignore: [{', '.join(map(_yaml, dict.fromkeys(others)))}]  # guessed: no numbers in them")
@@ -145,13 +162,56 @@ def _write(paths: Sequence[Path], table: Table, rows: Sequence[Rows], left_out: 
     return text
 
 
-def _channel(name: str, i: int, table: Table, longest: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
-    """Lines of one channel; its role shows in the `longest` recording, range and resolution in all `values`."""
-    header = table.columns[i] if table.header else ""
-    written = known_unit(table.units[i]) or guess.unit_in_name(header)
-    role = guess.role(header, written, longest)
-    unit = Guess(written, "the units row says so") if known_unit(table.units[i]) and written else None
-    unit = unit or guess.unit(role.value, header, values)
+@dataclass(frozen=True)
+class _Column:
+    """What is known of a column before its values are looked at closely; `key` is how the file finds it, as YAML."""
+
+    header: str
+    written: str | None
+    units_row: bool
+    role: Guess
+    key: str
+
+    @classmethod
+    def of(cls, table: Table, i: int, longest: NDArray[np.float64]) -> _Column:
+        """The role shows in the longest recording."""
+        header = table.columns[i] if table.header else ""
+        in_row = known_unit(table.units[i])
+        written = in_row or guess.unit_in_name(header)
+        role = guess.role(header, written, longest)
+        return cls(header, written, in_row is not None, role, f"column: {_yaml(header) if table.header else i}")
+
+
+def _groups(table: Table) -> list[Group]:
+    """Columns that are one error at several positions; what is in degrees is none."""
+    places = [i for i in table.numeric if quantity(known_unit(table.units[i]) or "um") == "length"]
+    return guess_axes.groups(table.columns, places) if table.header else []
+
+
+def _axis(group: Group, values: NDArray[np.float64], taken: Sequence[str]) -> list[str]:
+    """Lines of the position channel and the error channel of columns that differ by a position."""
+    words = re.sub(r"[^a-z]+", "_", group.pattern.partition("*")[0].lower()).strip("_")
+    stem = group.letter or words or "axis"
+    position, error = f"{stem}_position", f"{stem}_axis" if stem != "axis" else "axis_error"
+    if {position, error} & set(taken):
+        position, error = f"{position}_2", f"{error}_2"
+    why = Guess("error", f"{len(group.places)} columns whose names differ by a number")
+    column = _Column(group.pattern.partition("*")[0], None, False, why, f"columns: {_yaml(group.pattern)}")
+    lines = _channel(error, column, values, Guess(position, "the number in the names is taken for the position"))
+    return [
+        f"  {position}:",
+        "    role: position  # guessed: from the names of the columns",
+        "    unit: mm  # guessed: usual for positions",
+        "    guessed: [role, unit]",
+        *lines,
+    ]
+
+
+def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Guess | None) -> list[str]:
+    """Lines of one channel; range and resolution show in all `values`."""
+    role, written = column.role, column.written
+    unit = Guess(written, "the units row says so") if column.units_row and written else None
+    unit = unit or guess.unit(role.value, column.header, values)
     kept = {"temperature": "degC", "ambient": "degC", "error": "um"}.get(role.value, unit.value)
     convertible = quantity(kept) == quantity(unit.value)
     kept = kept if convertible else unit.value
@@ -159,10 +219,12 @@ def _channel(name: str, i: int, table: Table, longest: NDArray[np.float64], valu
     lines.append(
         f"    unit: {_yaml(kept)}" + (f"  # guessed: {unit.why}" if kept == unit.value else "  # what the lake keeps")
     )
-    column = _yaml(header) if table.header else str(i)
-    if column != _yaml(name):
-        lines.append(f"    column: {column}")
+    if column.key != f"column: {_yaml(name)}":
+        lines.append(f"    {column.key}")
     guessed = ["role", "unit"]
+    if along is not None:
+        lines.append(f"    position: {_yaml(along.value)}  # guessed: {along.why}")
+        guessed.append("position")
     factor, offset = 1.0, 0.0
     if kept != unit.value:
         lines.append(f"    unit_in_file: {_yaml(unit.value)}  # guessed: {unit.why}")

@@ -24,7 +24,7 @@ _DRIVER = re.compile(
 _TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
 _POSITION = re.compile(r"\bpos|axis|achse")
 _LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%"}
-_NICE_STEPS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1800, 3600)
+NICE_STEPS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1800, 3600)
 
 
 @dataclass(frozen=True)
@@ -166,4 +166,4 @@ def time_unit(name: str, step: float, length: float) -> Guess:
 
 def grid_step_s(interval_s: float) -> float:
     """The nearest usual step that is not finer than the samples."""
-    return next((s for s in _NICE_STEPS_S if s >= interval_s * 0.999), float(np.ceil(interval_s)))
+    return next((s for s in NICE_STEPS_S if s >= interval_s * 0.999), float(np.ceil(interval_s)))

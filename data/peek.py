@@ -119,7 +119,8 @@ def _time(
         numbers = [parse_number(c, decimal) for c in cells]
         if all(n is not None for n in numbers):
             steps = np.diff(np.array(numbers, float))
-            if np.mean(steps >= 0) > 0.9 and np.mean(steps > 0) > 0.5:
+            called_time = header and guess.is_time_name(columns[i])  # then many rows may share a time, as in a sweep
+            if np.mean(steps >= 0) > 0.9 and np.mean(steps > 0) > (0.0 if called_time else 0.5):
                 return i, ()
         elif all(isinstance(c, dt.date | dt.time | dt.timedelta) for c in cells):
             return i, ("",)

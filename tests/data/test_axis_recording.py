@@ -106,6 +106,13 @@ def test_a_column_for_each_position_is_the_same_recording(tmp_path, suffix) -> N
         assert "unknown_columns" not in wide.repairs
 
 
+def test_headers_that_are_the_positions_alone(tmp_path) -> None:
+    table = wide_table().rename(columns=lambda c: c.removeprefix("X=").removesuffix("mm"))
+    bare = read(tmp_path / "a.csv", table, WIDE.replace('"x = * mm"', '"*"'))
+    long = read(tmp_path / "long.csv", long_table(), LONG)
+    assert np.array_equal(bare.values("x"), long.values("x"), equal_nan=True)
+
+
 def test_columns_without_a_header_are_named_by_their_place(tmp_path) -> None:
     wide_table().to_csv(tmp_path / "w.csv", index=False, header=False)
     text = WIDE.replace("{time: {column: time", "{header: false, time: {column: 0").replace(
