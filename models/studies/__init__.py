@@ -7,5 +7,6 @@ STUDIES = Registry(
     {
         "year_round_pcr": "models.studies.year_round_pcr:YearRoundPCR",
         "main_factor": "models.studies.main_factor:MainFactor",
+        "coupled_lathe": "models.studies.coupled_lathe:CoupledLathe",
     },
 )
