@@ -120,7 +120,12 @@ class Blocks:
 
 
 def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> NDArray[np.int64]:
-    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,).
+    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,)."""
+    return np.asarray(np.argmin(left_out_mean_S_um(blocks, masks, scaled, path), axis=1))
+
+
+def left_out_mean_S_um(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> Array:
+    """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
 
     `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
     training sets are fitted once.
@@ -142,7 +147,7 @@ def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[P
     assert S_um is not None
     border = np.searchsorted(outer, np.arange(len(masks)))
     total = np.add.reduceat(S_um, border, axis=0)
-    return np.asarray(np.argmin(total, axis=1))
+    return np.asarray(total / masks.sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,142 @@
+"""Transfer function: the error as a sum of first-order responses to temperatures, drivers and the start's state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+
+from data.errors import InputError
+from features.design import Design
+from models.base import Array, Family
+from models.batchwise import too_few_rows
+from models.linear import Blocks, Mask
+from models.pole_responses import TAUS_S, Dictionary, Source, combination, drivers_of, gaps_of, only, responses
+from models.pole_search import Candidate, Search, refined
+
+_FEWEST_ROWS = 8
+_MOST_INPUTS = 60
+_ENOUGH_BATCHES = 3
+
+
+class TransferFunction(Family):
+    """`y = c + Σ_i [ k_i u_i + Σ_l K_il / (τ_il s + 1) u_i ]`, at most two poles per input, from rest, running free.
+
+    Two poles stand as the sum of their partial fractions, which contains the cascade K / ((τ1 s + 1)(τ2 s + 1)):
+    K τ1 / (τ1 − τ2) and K τ2 / (τ2 − τ1). Inputs are the chosen sensors; their direct term is near a lead. With
+    `gaps` also how far each of them stands off the room at the start, as a step: castings that have not settled
+    overnight relax like that; it takes two training batches per sensor. With `drivers` also (|n| / 1000 rpm)^m, m 1,
+    1.5 or 2, other drivers and the ambient rise.
+
+    In every fold leave-batch-out over its training batches chooses on a grid from 2 min to 12 h the poles that all
+    inputs start from, whether gaps and drivers take part, and the ridge on the gains. Then each input's poles move by
+    themselves. With fewer than three training batches nothing tells a lag from chance: only direct terms of the
+    sensors are fitted. What some batch of the design lacks takes no part.
+
+    `fitted`: per input kind, name and exponent, direct_um (µm per unit), gain_um and tau_s (inputs, poles).
+
+    Source: L. Ljung, System Identification (1999), output-error models, eq. 4.25; the gains between steps of the
+    poles: G. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), variable projection.
+    """
+
+    key = "transfer_function"
+    words = "first-order responses to the sensors and to what is not settled at the start"
+    source = "Ljung 1999, eq. 4.25; Golub and Pereyra 1973"
+    closed_form = False
+    rowwise = False
+    rank = 30
+
+    def __init__(self, poles: int = 2, gaps: bool = True, drivers: bool = False) -> None:
+        super().__init__()
+        if poles not in (0, 1, 2):
+            raise InputError(f"family {self.key}: poles is {poles!r}, expected 0, 1 or 2; choose one of them")
+        self.poles, self.gaps, self.drivers = int(poles), bool(gaps), bool(drivers)
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """All folds from the sums of one dictionary of responses.
+
+        Raises:
+            InputError: no inputs or more than 60, or fewer than 8 usable rows in a fold.
+        """
+        if not 0 < len(design.inputs) <= _MOST_INPUTS:
+            raise InputError(
+                f"family {self.key}: got {len(design.inputs)} inputs for {design.target or 'the error'}, expected 1 to "
+                f"{_MOST_INPUTS}; let a selector choose"
+            )
+        counts = np.bincount(design.group[design.usable], minlength=design.n_batches)
+        masks = np.zeros((len(folds), design.n_batches), bool)
+        for f, fold in enumerate(folds):
+            masks[f, list(fold)] = True
+            if counts[masks[f]].sum() < _FEWEST_ROWS:
+                raise too_few_rows(self.key, design, fold, int(counts[masks[f]].sum()), _FEWEST_ROWS)
+        masks &= counts > 0
+        drivers = drivers_of(design) if self.drivers else []
+        gaps = gaps_of(design) if self.gaps else []
+        dictionary = Dictionary(design, (*(Source("input", i) for i in design.inputs), *drivers, *gaps))
+        best, penalty = self._chosen(dictionary, masks)
+        out: dict[int, Self] = {}
+        for candidate in dict.fromkeys(best):
+            some = [f for f, own in enumerate(best) if own == candidate]
+            out |= zip(some, self._fitted(dictionary, masks[some], candidate, penalty[some]), strict=True)
+        return [out[f] for f in range(len(folds))]
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """NaN at a row where an input is missing, and throughout a batch that lacks a driver the model needs."""
+        f, some = self.fitted, only(design, batches)
+        parts = zip(f["kinds"], f["names"], f["exponents"], strict=True)
+        signals = np.column_stack([Source(kind, name, float(m)).signal(some) for kind, name, m in parts])
+        error_um = f["intercept_um"] + signals @ f["direct_um"]
+        tau_s, gain_um = np.asarray(f["tau_s"]), np.asarray(f["gain_um"])
+        for pole in range(tau_s.shape[1]):
+            error_um = error_um + responses(some, signals, tau_s[:, pole]) @ gain_um[:, pole]
+        error_um = np.where(np.isfinite(some.x).all(axis=1), error_um, np.nan)
+        return [error_um[some.rows(k)] for k in range(some.n_batches)]
+
+    def n_parameters(self) -> int:
+        """Gains, time constants and the intercept."""
+        return len(self.fitted["names"]) + 2 * int(np.size(self.fitted["tau_s"])) + 1 if self.fitted else 0
+
+    def _chosen(self, dictionary: Dictionary, masks: Mask) -> tuple[list[Candidate], Array]:
+        """Candidate and penalty of every fold."""
+        best, penalty = [Candidate()] * len(masks), np.zeros(len(masks))
+        many = masks.sum(axis=1) >= _ENOUGH_BATCHES
+        if many.any():
+            found, penalty[many] = Search(dictionary, dictionary.table.moments, masks[many]).run(self.poles)
+            for f, candidate in zip(np.flatnonzero(many), found, strict=True):
+                best[f] = candidate
+        if not many.all():
+            quarters = dictionary.table.quarters
+            blocks = np.repeat(masks[~many], 4, axis=1) & (quarters.count > 0)
+            penalty[~many] = Search(dictionary, quarters, blocks).penalties(Candidate())
+        return best, penalty
+
+    def _fitted(self, dictionary: Dictionary, masks: Mask, candidate: Candidate, penalty: Array) -> list[Self]:
+        """The folds that chose one candidate, their poles moved."""
+        design, moments = dictionary.design, dictionary.table.moments
+        which = candidate.sources(dictionary)
+        sources, columns = [dictionary.sources[i] for i in which], dictionary.block(which)
+        direct = np.array([s.direct for s in sources])
+        blocks = Blocks.of(moments.subset(columns))
+        pool = blocks.pool(masks, False)
+        square = masks @ (blocks.yy + blocks.count * blocks.mean_y**2) - pool.count * pool.mean_y**2
+        shared = np.tile(np.log(TAUS_S[list(candidate.poles)]), (len(masks), 1))
+        log_tau, gain = refined(pool, square, direct, shared, penalty, pool.count / masks.sum(axis=1))
+        weight, _ = combination(log_tau, direct)
+        away = ((pool.mean_x + moments.shift_x[columns])[:, None, :] @ weight @ gain[:, :, None])[:, 0, 0]
+        intercept = pool.mean_y + moments.shift_y - away
+        n_direct = int(direct.sum())
+        direct_um = np.zeros((len(masks), len(sources)))
+        direct_um[:, direct] = gain[:, :n_direct]
+        gain_um = gain[:, n_direct:].reshape(len(masks), -1, len(sources)).transpose(0, 2, 1)
+        words = {"kinds": [s.kind for s in sources], "names": [s.name for s in sources],
+                 "exponents": np.array([s.exponent for s in sources])}  # fmt: skip
+        return [
+            self._learned(design, {**words, "direct_um": direct_um[f], "gain_um": gain_um[f],
+                                   "tau_s": np.exp(log_tau[f]), "intercept_um": float(intercept[f]),
+                                   "k": float(penalty[f])})
+            for f in range(len(masks))
+        ]  # fmt: skip
