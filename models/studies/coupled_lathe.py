@@ -130,7 +130,7 @@ class CoupledLathe(Study):
         "Before and after compensation: the greatest |error| over positions and sweeps of a run, mean over the runs.",
     )
     remarks: ClassVar[tuple[str, ...]] = (
-        "Our lathe moves more than the source's ({before_x} against 18.6 µm in X, {before_z} against 24.3 µm in Z), and "
+        "Our lathe moves more than the source's ({before_x} against 18.6 µm in X, {before_z} against 24.3 µm in Z); "
         "its sensors tell more of it ({after_x} against 7.4 µm left, {after_z} against 10.5 µm). A fit on all nine "
         "runs leaves little less ({after_fit_x} and {after_fit_z} µm), so the number of runs does not make the "
         "difference: the simulated lathe has only the scatter that it was given.",
