@@ -19,6 +19,7 @@ lint: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.grid
+	$(BIN)/python -m benchmarks.grid_growth
 	$(BIN)/python benchmarks/ingest.py
 	$(BIN)/python -m benchmarks.twin
 	$(BIN)/python -m benchmarks.calibration
