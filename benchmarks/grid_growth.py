@@ -109,9 +109,9 @@ def largest(batches: int = 1_000, sensors: int = 300, rows: int = 10_000) -> Non
         coef = np.linalg.solve(pool.xx, pool.xy[:, :, None])
         S_um.append(blocks.left_out_S_um(left, pool, np.arange(len(left)), coef)[:, 0])
     took = time.perf_counter() - start
-    print(f"\n{batches} batches × {sensors} sensors × {rows} rows: "
-          f"sums {reading:.0f} s (making the rows {making:.0f} s), {batches} folds of least squares {took:.1f} s, {1e3 * took / batches:.1f} ms a fold; "
-          f"S_mean {np.mean(np.concatenate(S_um)):.3f} µm (noise 0.7)")  # fmt: skip
+    words = f"\n{batches} batches × {sensors} sensors × {rows} rows: sums {reading:.0f} s"
+    words += f" (making the rows {making:.0f} s), {batches} folds of least squares {took:.1f} s"
+    print(f"{words}, {1e3 * took / batches:.1f} ms a fold; S_mean {np.mean(np.concatenate(S_um)):.3f} µm (noise 0.7)")
 
 
 def main() -> None:
