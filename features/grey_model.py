@@ -34,10 +34,11 @@ class GreyFit:
     condition: float
 
 
-def equations(design: Design, k: int) -> Array:
+def equations(design: Design, k: int, recent_rows: int | None = None) -> Array:
     """Rows [−z, x_i¹ | x1⁰] of one batch from its second row on, (m, p + 2), usable rows only.
 
-    The sums bridge holes by the last input and by a straight line in the error.
+    `recent_rows`: of its last so many usable rows alone, and the sums begin with the first of them. The sums bridge
+    holes by the last input and by a straight line in the error.
     """
     rows = design.rows(k)
     usable, y_um = design.usable[rows], design.y_um[rows]
@@ -46,9 +47,11 @@ def equations(design: Design, k: int) -> Array:
     n = np.arange(len(y_um))
     known = np.isfinite(y_um)
     y_um = np.interp(n, n[known], y_um[known])
+    x = np.column_stack([hold_last(column) for column in design.x[rows].T]) if design.inputs else np.empty((len(n), 0))
+    first = 0 if recent_rows is None else int(np.flatnonzero(usable)[-recent_rows:][0])
+    usable, y_um, x = usable[first:], y_um[first:], x[first:]
     cumulated = np.cumsum(y_um)
     z = (cumulated[1:] + cumulated[:-1]) / 2.0
-    x = np.column_stack([hold_last(column) for column in design.x[rows].T]) if design.inputs else np.empty((len(n), 0))
     return np.column_stack([-z, np.cumsum(x, axis=0)[1:], y_um[1:]])[usable[1:]]
 
 

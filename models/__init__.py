@@ -25,5 +25,7 @@ FAMILIES = Registry(
         "lssvm": "models.lssvm:LSSVM",
         "svr": "models.svr:SVR",
         "gm1n": "models.gm1n:GM1N",
+        "transfer_function": "models.transfer_function:TransferFunction",
+        "gm_lssvm": "models.gm_lssvm:GMLSSVM",
     },
 )

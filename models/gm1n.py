@@ -29,8 +29,9 @@ class GM1N(Family):
     - `whitening`: `x̂1¹(k+1) = s(k+1)/a · (1 − exp(−a k))`, `s = Σ b_i x_i¹`, differenced. It is the published
       one, exact only for inputs whose cumulated sum stays constant.
 
-    `recent_rows` keeps only so many of each batch's most recent usable rows for the fit: the published sequence length
-    (the sums still begin with the batch). None keeps all.
+    `recent_rows` fits to only so many of each batch's most recent usable rows, the published sequence length; their
+    sums begin with the first of them, whose error is not 0, so that a is large where the error follows its inputs
+    at once. None takes whole batches.
 
     a is kept in [step/`slowest_h`, 2]: below, the response has no end in sight (a near 0 divides, a < 0 explodes);
     above, it zigzags. Where least squares leaves that range, a is set to the bound, b is fitted anew, and `fitted`
@@ -71,8 +72,7 @@ class GM1N(Family):
         columns = len(design.inputs) + 2
         factors, counts = np.zeros((design.n_batches, columns, columns)), np.zeros(design.n_batches, int)
         for k in sorted({k for fold in folds for k in fold}):
-            rows = equations(design, k)
-            rows = rows if self.recent_rows is None else rows[-self.recent_rows :]
+            rows = equations(design, k, self.recent_rows)
             counts[k] = len(rows)
             r = np.linalg.qr(rows, mode="r")
             factors[k, : len(r)] = r

@@ -1,0 +1,213 @@
+"""Grey layers against fits by hand, honest to the row; the corrector; and the published run inside one batch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data.errors import InputError
+from features.design import Design
+from models.gm1n import GM1N, response
+from models.gm_lssvm import GMLSSVM
+from models.grey_layer import grey_layers, layer_design
+from models.grey_sequence import corrected, sequence_outputs
+
+SIZES = (70, 55, 62, 58, 66)
+
+
+def literal_run(x, a, b, first=0.0):
+    """x̂⁰(k) = (Σ b X(k) − a X̂(k−1))/(1 + a/2), sums and all, from a first value."""
+    s = np.cumsum(x @ b)
+    out = np.full(len(x), float(first))
+    total = first
+    for k in range(1, len(x)):
+        out[k] = (s[k] - a * total) / (1 + a / 2)
+        total += out[k]
+    return out
+
+
+def rises(n, p, rng):
+    hours = np.arange(n)[:, None] / 12
+    return rng.uniform(5, 15, p) * (1 - np.exp(-hours / rng.uniform(0.3, 4, p))) + np.sin(hours * rng.uniform(1, 4, p))
+
+
+def make_design(bend=0.0, noise_um=0.0, seed=0, step_s=300.0) -> Design:
+    """Errors of a grey model, y + bend · y²/50."""
+    rng = np.random.default_rng(seed)
+    x = [rises(n, 2, rng) for n in SIZES]
+    x = [part - part[0] for part in x]
+    y = [literal_run(part, 0.4, np.array([0.8, -0.3])) for part in x]
+    error = np.concatenate([v + bend * v**2 / 50 for v in y]) + rng.normal(0, noise_um, sum(SIZES))
+    return Design(("a", "b"), "z", tuple(f"K{k + 1}" for k in range(5)), np.vstack(x), error,
+                  np.concatenate([np.arange(n) * step_s for n in SIZES]),
+                  np.concatenate([[0], np.cumsum(SIZES)]).astype(np.int64), step_s)  # fmt: skip
+
+
+def with_other_errors(design, rows) -> Design:
+    y = design.y_um.copy()
+    y[rows] = 99.0 - 3 * y[rows]
+    return replace(design, y_um=y)
+
+
+def test_the_outputs_for_a_training_batch_are_of_models_of_the_others():
+    design = make_design(noise_um=0.5)
+    grey = [GM1N(recent_rows=n) for n in (25, 40)]
+    folds = [[0, 1, 2, 3], [1, 2, 4]]
+    for fold, layer in zip(folds, grey_layers(design, folds, grey), strict=True):
+        for g, family in enumerate(grey):
+            own = family.fit_design(design, fold).fitted["b"]
+            np.testing.assert_allclose(layer.models[g].fitted["b"], own, rtol=1e-9)
+            for k in range(5):
+                told = layer.outputs_um[design.rows(k), g]
+                if k not in fold:
+                    assert np.isnan(told).all()
+                    continue
+                rest = family.fit_design(design, [j for j in fold if j != k])
+                np.testing.assert_allclose(told, rest.predict_design(design, [k])[0], atol=1e-8)
+
+
+@pytest.mark.parametrize("fold", [[0, 1, 2], [1, 3], [2]])
+def test_no_error_of_a_row_reaches_its_own_output(fold):
+    design = make_design(noise_um=0.5, seed=1)
+    before = grey_layers(design, [fold], [GM1N()])[0].outputs_um
+    k = fold[0]
+    rows = np.arange(design.offsets[k], design.offsets[k + 1])
+    if len(fold) < 3:  # contiguous quarters stand in for batches
+        rows = rows[(np.arange(len(rows)) * 4) // len(rows) == 2]
+    after = grey_layers(with_other_errors(design, rows), [fold], [GM1N()])[0].outputs_um
+    np.testing.assert_allclose(after[rows], before[rows], rtol=0, atol=1e-9)
+    others = np.setdiff1d(np.flatnonzero(np.isin(design.group, fold)), rows)
+    assert np.abs(after[others] - before[others]).max() > 0.1
+
+
+def test_a_sequence_is_the_most_recent_rows_and_its_sums_begin_with_it():
+    design = make_design(noise_um=1.0, seed=2)
+    model = GM1N(recent_rows=20).fit_design(design, [0, 3])
+    left, right = [], []
+    for k in (0, 3):
+        x, y = design.x[design.rows(k)][-20:], design.y_um[design.rows(k)][-20:]
+        sums = np.cumsum(y)
+        left.append(np.column_stack([-(sums[1:] + sums[:-1]) / 2, np.cumsum(x, axis=0)[1:]]))
+        right.append(y[1:])
+    want = np.linalg.lstsq(np.vstack(left), np.concatenate(right), rcond=None)[0]
+    assert model.fitted["a"] == pytest.approx(want[0], rel=1e-8)
+    np.testing.assert_allclose(model.fitted["b"], want[1:], rtol=1e-8)
+
+
+@pytest.mark.parametrize("a", [0.05, 0.6, 1.9])
+def test_a_run_from_a_measured_value_is_the_recursion_on_sums(a):
+    x, b = np.random.default_rng(3).normal(2, 1, (40, 2)), np.array([1.0, -0.4])
+    np.testing.assert_allclose(response((x @ b)[None], a, first_um=7.5)[0], literal_run(x, a, b, 7.5), atol=1e-9)
+    k, s = np.arange(40), np.cumsum(x @ b)
+    sums = (7.5 - s / a) * np.exp(-a * k) + s / a  # the published whitening response
+    sums[0] = 7.5
+    np.testing.assert_allclose(response((x @ b)[None], a, "whitening", 7.5)[0], np.diff(sums, prepend=0), atol=1e-9)
+
+
+def test_the_corrector_bends_what_grey_models_leave_straight():
+    design = make_design(bend=1.0, noise_um=0.1, seed=4)
+    y = design.y_um[design.rows(4)]
+    grey = GM1N().fit_design(design, [0, 1, 2, 3]).predict_design(design, [4])[0] - y
+    both = GMLSSVM().fit_design(design, [0, 1, 2, 3]).predict_design(design, [4])[0] - y
+    assert np.sqrt(np.mean(both**2)) < 0.65 * np.sqrt(np.mean(grey**2))
+
+
+def test_lengths_in_minutes_follow_the_step_and_are_never_too_short():
+    design = make_design()
+    fit = [0, 1, 2]
+    assert GMLSSVM((100, 150), "min").fit_design(design, fit).fitted["rows"] == [20, 30]
+    slow = make_design(step_s=600.0)
+    assert GMLSSVM((100, 150), "min").fit_design(slow, fit).fitted["rows"] == [10, 15]
+    assert GMLSSVM((5, 150), "min").fit_design(slow, fit).fitted["rows"] == [4, 15]
+    assert GMLSSVM().fit_design(slow, fit).fitted["rows"] == [25, 30, 35, 40]
+
+
+def test_the_swarm_tunes_the_same_layer():
+    design = make_design(bend=1.0, noise_um=0.3, seed=5)
+    grid, swarm = (
+        GMLSSVM(tuning=t, max_rows=60).fit_design(design, [0, 1, 2]) for t in ("closed_form", "particle_swarm")
+    )
+    np.testing.assert_array_equal(grid.fitted["support"], swarm.fitted["support"])
+    assert swarm.fitted["inner_rms_um"] < grid.fitted["inner_rms_um"] * 1.001
+
+
+def test_rows_of_the_corrector_are_shared_among_the_training_batches():
+    design = make_design()
+    for fold in ([0, 1, 2], [0, 1, 2, 3]):
+        assert len(GMLSSVM(max_rows=60).fit_design(design, fold).fitted["alpha"]) == 60
+
+
+# --- inside one batch, as published
+
+
+def one_batch(seed=6, bend=0.0):
+    rng = np.random.default_rng(seed)
+    x = rises(116, 5, rng) + 20
+    b = np.array([1.2, -0.7, 0.4, 0.9, -0.2])
+    y = literal_run(x, 1.6, b, first=3.0)
+    return x, y + bend * (y - y[15]) ** 2
+
+
+def test_on_its_own_law_every_sequence_goes_on_exactly():
+    x, y = one_batch()
+    outputs = sequence_outputs(x, y, range(15, 55))
+    assert outputs.shape == (116, 4)
+    for g, start in enumerate((30, 25, 20, 15)):  # rows 16–55 counted from 1, the last 25, 30, 35, 40 of them
+        assert np.isnan(outputs[:start, g]).all()
+        assert outputs[start, g] == y[start]
+    # A later start changes sums by a constant that this law does not have: only the first sequence's own law is exact.
+    x, b = x[15:], np.array([1.2, -0.7, 0.4, 0.9, -0.2])
+    y = literal_run(x, 1.6, b, first=4.0)
+    free = sequence_outputs(x, y, range(40), (40,))
+    np.testing.assert_allclose(free[:, 0], y, atol=1e-5)
+    ahead = sequence_outputs(x, y, range(40), (40,), one_step=True)
+    np.testing.assert_allclose(ahead[:, 0], y, atol=1e-5)
+
+
+def test_one_step_ahead_leans_on_measured_errors_and_a_free_run_does_not():
+    x, y = one_batch()
+    drifted = y.copy()
+    drifted[70:] += 10.0
+    for one_step in (False, True):
+        before = sequence_outputs(x, y, range(15, 55), one_step=one_step)
+        after = sequence_outputs(x, drifted, range(15, 55), one_step=one_step)
+        assert np.allclose(before, after, equal_nan=True) != one_step
+
+
+def test_the_corrector_learns_on_its_rows_alone():
+    x, y = one_batch(bend=0.02)
+    outputs = sequence_outputs(x, y, range(15, 55))
+    told = corrected(outputs, y, range(55, 65))
+    assert np.isnan(told[:30]).all() and np.isfinite(told[30:]).all()
+    spoiled = y.copy()
+    spoiled[np.r_[:55, 65:116]] = 1e3
+    np.testing.assert_array_equal(corrected(outputs, spoiled, range(55, 65)), told)
+    left = outputs[65:, 3] - y[65:]
+    assert np.sqrt(np.mean((told[65:] - y[65:]) ** 2)) < 0.5 * np.sqrt(np.mean(left**2))
+
+
+@pytest.mark.parametrize("lengths", [(41,), (6,)])
+def test_a_length_that_cannot_be_is_told(lengths):
+    x, y = one_batch()
+    with pytest.raises(
+        InputError, match=f"length {lengths[0]} with 40 rows to fit and 5 inputs; expected from 7 to 40"
+    ):
+        sequence_outputs(x, y, range(15, 55), lengths)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"lengths_in": "mins"}, "unknown lengths_in 'mins': did you mean 'min'"),
+    ({"lengths": ()}, "expected at least one, above 0 rows"),
+    ({"tuning": "swarm"}, "unknown tuning 'swarm'"),
+])  # fmt: skip
+def test_impossible_options_are_told(options, words):
+    with pytest.raises(InputError, match=words):
+        GMLSSVM(**options)
+
+
+def test_a_layer_is_a_design_of_its_own():
+    design = make_design()
+    outputs = np.where(design.group[:, None] == 1, design.x, np.nan)
+    layer = layer_design(design, outputs)
+    assert layer.inputs == ("grey1", "grey2") and layer.input_units == ("um", "um")
+    np.testing.assert_array_equal(layer.usable, design.group == 1)
