@@ -6,6 +6,7 @@ STUDIES = Registry(
     "study",
     {
         "year_round_pcr": "models.studies.year_round_pcr:YearRoundPCR",
+        "grey_lssvm": "models.studies.grey_lssvm:GreyLSSVM",
         "main_factor": "models.studies.main_factor:MainFactor",
         "coupled_lathe": "models.studies.coupled_lathe:CoupledLathe",
     },
