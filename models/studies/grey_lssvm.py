@@ -139,8 +139,9 @@ class GreyLSSVM(Study):
                 ),
                 why=f"{said} in {c.upper()}: combined {{combined_{measure}_{c}}}, GM {{gm_{measure}_{c}}}, LS-SVM "
                 f"{{lssvm_{measure}_{c}}}, BP {{bp_{measure}_{c}}}. Taught on rows 16–55 alone, as the grey models "
-                f"are, they have {{gm_early_{measure}_{c}}}, {{lssvm_early_{measure}_{c}}} and {{bp_early_{measure}_{c}}}. "
-                f"A corrector of all 50 rows instead of ten gives {{combined_wide_{measure}_{c}}}.",
+                f"are, they have {{gm_early_{measure}_{c}}}, {{lssvm_early_{measure}_{c}}} and "
+                f"{{bp_early_{measure}_{c}}}. A corrector of all 50 rows instead of ten gives "
+                f"{{combined_wide_{measure}_{c}}}.",
             )
             for c in CHANNELS
             for measure, (said, _) in MEASURES.items()
