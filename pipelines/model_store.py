@@ -45,7 +45,7 @@ class StoredModel:
 
     def channels(self) -> tuple[str, ...]:
         """The channels that a recording must have: those of the inputs, and what drives it as `fitted` names it."""
-        drivers = self.machine.names("driver", "ambient", "temperature")
+        drivers = self.machine.names("driver", "ambient", "temperature", "position")
         words = (w for v in self.family.fitted.values() for w in (v if isinstance(v, list) else [v]))
         named = [w for w in words if isinstance(w, str) and w in drivers]
         needed: dict[str, None] = {}

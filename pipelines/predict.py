@@ -56,7 +56,8 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     """Predicted error of every batch in a raw recording, read by the machine file that the model carries.
 
     Returns:
-        batch_id, time_s (s), predicted_um (µm, relative to the batch's start; NaN where an input is missing),
+        batch_id, time_s (s), for an error along an axis position_mm, predicted_um (µm, relative to the batch's start;
+        NaN where an input or the position is missing),
         outside_region (the row extrapolates), outside_of (which quantities), distance (how far, in widths of the
         trained range), expected_S_um (what left-out batches so far away were left with; NaN where nobody measured it),
         simulated (model or recording).
@@ -71,8 +72,10 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     for batch in read_batches(Path(file), model.machine, need_error=False):
         predicted = model.predict(batch)
         outside, distance = model.outside(batch), model.distance(batch)
+        along = str(model.family.fitted.get("along", ""))
         tables.append(pd.DataFrame({
-            "batch_id": batch.batch_id, "time_s": batch.time_s, "predicted_um": predicted,
+            "batch_id": batch.batch_id, "time_s": batch.time_s,
+            **({"position_mm": batch.masked(along)} if along else {}), "predicted_um": predicted,
             "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
             "expected_S_um": model.expected_S_um(distance), "simulated": model.simulated or batch.simulated,
         }))  # fmt: skip

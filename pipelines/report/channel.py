@@ -11,7 +11,9 @@ import pandas as pd
 from models.result import GridResult
 from pipelines.promotion import Choice, compare_paired, left_out
 from pipelines.report import figures, records, tables
+from pipelines.report.axis_figures import fan_panel
 from pipelines.report.extracts import (
+    LeftOut,
     best_per,
     frequencies,
     is_baseline,
@@ -60,6 +62,7 @@ class Channel:
     frequency: Panel | None
     weaknesses: Table | None
     left_out: Panel | None
+    fan: Panel | None
     protocols: tuple[Table, ...]
     batches: Table
     rise: Panel | None
@@ -84,6 +87,7 @@ def channel_part(
     cells = scored(result, protocol, rule)
     digits = decimals(choice.S_std_um, choice.n_batches)
     mark = mark_of(group[0])
+    shown = left_out_batches(result, choice)
     boards = tuple(
         tables.leaderboard(
             result, cells, key, choice, rule, digits, f"{name}: best cell of every {key}, {protocol}", mark
@@ -109,7 +113,8 @@ def channel_part(
         points=_points(name, result, cells, choice),
         frequency=_frequency(name, result, cells, protocol),
         weaknesses=diagnostics_table(name, result),
-        left_out=_left_out(name, result, choice, digits),
+        left_out=_left_out(name, result, choice, shown, digits),
+        fan=fan_panel(name, shown, result.target, digits, result.simulated),
         protocols=tuple(others),
         batches=tables.batches(result, choice, digits),
         rise=rise_panel(name, result.distances, result.simulated),
@@ -186,8 +191,7 @@ def _frequency(name: str, result: GridResult, cells: pd.DataFrame, protocol: str
     return Panel(f"{name}: how often each point is chosen", (Plot(figure, title),), result.simulated, (), tuple(notes))
 
 
-def _left_out(name: str, result: GridResult, choice: Choice, digits: int) -> Panel | None:
-    shown = left_out_batches(result, choice)
+def _left_out(name: str, result: GridResult, choice: Choice, shown: Sequence[LeftOut], digits: int) -> Panel | None:
     if not shown:
         return None
     limits = figures.residual_range_um(shown)
@@ -200,7 +204,9 @@ def _left_out(name: str, result: GridResult, choice: Choice, digits: int) -> Pan
         for b in shown
     )
     every = max(b.every for b in shown)
-    keys = (Key("recorded", INK), Key("predicted, batch left out", BLUE), Key("residual", ORANGE))
+    symbol = "disc" if shown[0].position_mm is not None else "line"
+    words = (("recorded", INK), ("predicted, batch left out", BLUE), ("residual", ORANGE))
+    keys = tuple(Key(text, color, symbol) for text, color in words)
     notes = [
         "Batches by S; every prediction comes from a model that never saw the batch. "
         "Residual axes are equal; the recording stops where it is masked."

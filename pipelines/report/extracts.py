@@ -22,7 +22,10 @@ _MOST_POINTS = 400
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One batch's left-out prediction, thinned for drawing; arrays (n,) with NaN where masked."""
+    """One batch's left-out prediction, thinned for drawing; arrays (n,) with NaN where masked.
+
+    Of a channel along an axis only the readings, with their positions, all of them.
+    """
 
     batch_id: str
     place: str  # best, median or worst
@@ -31,6 +34,7 @@ class LeftOut:
     recorded_um: Array
     predicted_um: Array
     every: int  # every how many samples are shown
+    position_mm: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,10 @@ def _three(n: int) -> Sequence[int]:
 
 def _left_out(table: pd.DataFrame, cell: str, batch_id: str, place: str, S_um: float) -> LeftOut:
     rows = table[table["batch_id"] == batch_id]
-    every = max(1, -(-len(rows) // _MOST_POINTS))
+    along_axis = "position_mm" in table.columns
+    if along_axis:
+        rows = rows[np.isfinite(rows["position_mm"]) & np.isfinite(rows["recorded_um"])]
+    every = 1 if along_axis else max(1, -(-len(rows) // _MOST_POINTS))
     shown = rows.iloc[::every]
     return LeftOut(
         batch_id,
@@ -140,4 +147,5 @@ def _left_out(table: pd.DataFrame, cell: str, batch_id: str, place: str, S_um: f
         shown["recorded_um"].to_numpy(float),
         shown[cell].to_numpy(float),
         every,
+        shown["position_mm"].to_numpy(float) if along_axis else None,
     )

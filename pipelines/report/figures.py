@@ -148,9 +148,13 @@ def left_out(batch: LeftOut, target: str, residual_range_um: tuple[float, float]
         ("predicted", batch.predicted_um, BLUE, 2.2, "y"),
         ("residual", residual_um, ORANGE, 1.3, "y2"),
     ]
+    if batch.position_mm is not None:  # readings along an axis: points, the recorded ones on top
+        lines = [lines[1], lines[0], lines[2]]
+    mode = "lines" if batch.position_mm is None else "markers"
     data = [
-        {"type": "scatter", "mode": "lines", "x": batch.time_h, "y": y, "name": name, "yaxis": axis,
-         "line": {"color": color, "width": width}, "hovertemplate": f"{name} %{{y:.1f}} µm<extra></extra>"}
+        {"type": "scatter", "mode": mode, "x": batch.time_h, "y": y, "name": name, "yaxis": axis,
+         "line": {"color": color, "width": width}, "marker": {"color": color, "size": 3 * width},
+         "hovertemplate": f"{name} %{{y:.1f}} µm<extra></extra>"}
         for name, y, color, width, axis in lines
     ]  # fmt: skip
     layout = base_layout(350, simulated)

@@ -87,10 +87,14 @@ def _points(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
 def _left_out(result: GridResult, shown: Sequence[LeftOut]) -> bytes:
     fig, axes = _canvas(3.5 * len(shown), 3.0, len(shown), left=0.6)
     for ax, b in zip(axes, shown, strict=True):
-        ax.plot(b.time_h, b.recorded_um, color=INK, lw=1.0, label="recorded")
-        ax.plot(b.time_h, b.predicted_um, color=BLUE, lw=1.4, label="predicted, left out")
-        ax.plot(b.time_h, b.recorded_um - b.predicted_um, color=ORANGE, lw=0.8, label="residual")
-        _name(ax, "time since start (h)", f"{b.place}: {_math_free(b.batch_id)}, S = {b.S_um:.1f} µm")
+        along_axis = b.position_mm is not None
+        x = b.time_h if b.position_mm is None else b.position_mm
+        line, marker = ("", ".") if along_axis else ("-", "")
+        ax.plot(x, b.recorded_um, color=INK, lw=1.0, ls=line, marker=marker, label="recorded")
+        ax.plot(x, b.predicted_um, color=BLUE, lw=1.4, ls=line, marker=marker, label="predicted, left out")
+        ax.plot(x, b.recorded_um - b.predicted_um, color=ORANGE, lw=0.8, ls=line, marker=marker, label="residual")
+        place = f"{b.place}: {_math_free(b.batch_id)}, S = {b.S_um:.1f} µm"
+        _name(ax, "position (mm)" if along_axis else "time since start (h)", place)
     axes[0].set_ylabel(f"{_title(result)} (µm)", fontsize=8)
     axes[0].legend(fontsize=7, frameon=False)
     return _png(fig)
