@@ -23,8 +23,7 @@ from features.design import Design
 Array = NDArray[np.float64]
 _WINDOW_S = 600.0
 _MOST_WINDOWS = 1200
-_WALK_PER_H, _OFFSET, _NOISE = 1.0, 1.0, 1.0  # shares of the variance that no column explains
-_MISTRUST = 100.0  # variance of a batch that the others do not explain, relative to theirs
+_MISTRUST = 100.0  # drift variance of a batch that the others do not explain, relative to theirs
 
 
 @dataclass(frozen=True)
@@ -38,14 +37,13 @@ class Windows:
 
     @classmethod
     def of(cls, design: Design, x: Array, train: Sequence[int]) -> Windows:
-        """Windows of 10 min, longer where all batches together have more than 1200 of them."""
+        """Windows of 10 min, longer where the batches of the design have more than 1200 of them together."""
         trained = np.zeros(design.n_batches, bool)
         trained[list(train)] = True
         rows = np.flatnonzero(design.usable & trained[design.group] & np.isfinite(x).all(axis=1))
-        begun = np.array([design.time_s[design.rows(k)][:1].sum() for k in range(design.n_batches)])
-        since_s = (design.time_s - begun[design.group])[rows]
-        recorded_s = sum(np.ptp(since_s[design.group[rows] == k]) for k in np.unique(design.group[rows]))
-        window_s = max(_WINDOW_S, recorded_s / _MOST_WINDOWS)
+        spans_s = [design.time_s[design.rows(k)][[0, -1]] for k in range(design.n_batches)]
+        since_s = (design.time_s - np.array([first for first, _ in spans_s])[design.group])[rows]
+        window_s = max(_WINDOW_S, sum(last - first for first, last in spans_s) / _MOST_WINDOWS)
         label = np.stack([design.group[rows], (since_s // window_s).astype(np.int64)])
         (batch, _), which, count = np.unique(label, axis=1, return_inverse=True, return_counts=True)
         which = which.ravel()
@@ -77,76 +75,69 @@ class Windows:
     def counts(self) -> NDArray[np.int64]:
         return np.diff(self.borders)
 
-    @cached_property
-    def drift(self) -> Array:
-        """Covariance (N, N) of what no column explains, block by block, in its own unit."""
+    def drift(self, steady: float) -> Array:
+        """Covariance (N, N) of what no column explains, block by block, in units of a random walk's after an hour.
+
+        Offset and noise have `steady` units each.
+        """
         same = self.batch[:, None] == self.batch[None, :]
         walk = np.minimum(self.time_h[:, None], self.time_h[None, :])
-        return np.where(same, _WALK_PER_H * walk + _OFFSET, 0.0) + _NOISE * np.eye(len(self.y_um))
+        return np.where(same, walk + steady, 0.0) + steady * np.eye(len(self.y_um))
 
 
 @dataclass(frozen=True)
 class BatchProcess:
-    """The process for prior variances v (m,) per unit of drift, and what it says of batches that it has not seen.
+    """What the process says of B batches that it has not seen.
 
-    `mistrusted` names batches whose drift is let grow hundredfold: they are heard, but do not pull.
+    gains (m,), µm per unit of each column; gains_without (B, m), without one batch; alone_um (B, q) residuals of every
+    batch, left out alone, 0 behind its end; pairs_um (B, B, q), at k, i those of batch i where k and i are left out.
     """
 
-    windows: Windows
-    variance: Array
-    mistrusted: tuple[int, ...] = ()
+    gains: Array
+    gains_without: Array
+    alone_um: Array
+    pairs_um: Array
 
-    @cached_property
-    def _inverse(self) -> Array:
-        w = self.windows
-        wide = np.where(np.isin(w.batch, self.mistrusted), _MISTRUST, 1.0)
-        covariance = (w.x * self.variance) @ w.x.T + w.drift * wide[:, None]
-        return np.asarray(cho_solve(cho_factor(covariance, lower=True), np.eye(len(covariance))))
+    @classmethod
+    def of(cls, windows: Windows, variance: Array, steady: float = 1.0, mistrusted: Sequence[int] = ()) -> BatchProcess:
+        """Pool all batches, for prior variances (m,) in units of the drift's.
 
-    @cached_property
-    def _weights(self) -> Array:
-        return np.asarray(self._inverse @ self.windows.y_um)
+        `mistrusted` names batches whose drift variance is let grow hundredfold: they are heard, but do not pull.
+        """
+        w = windows
+        wide = np.where(np.isin(w.batch, list(mistrusted)), _MISTRUST, 1.0)
+        covariance = (w.x * variance) @ w.x.T + w.drift(steady) * wide[:, None]
+        inverse = cho_solve(cho_factor(covariance, lower=True), np.eye(len(covariance)))
+        weights = inverse @ w.y_um
+        inverse_blocks, weight_blocks = _blocks(w, inverse, weights)
+        alone_um = _solved(inverse_blocks[range(len(w.ids)), range(len(w.ids))], weight_blocks)
+        gains = variance * (w.x.T @ weights)
+        spans = list(zip(w.borders[:-1], w.counts, strict=True))
+        pulled = [w.x.T @ (inverse[:, a : a + n] @ alone_um[i, :n]) for i, (a, n) in enumerate(spans)]
+        return cls(gains, gains - variance * np.array(pulled), alone_um, _pairs(inverse_blocks, weight_blocks))
 
-    @cached_property
-    def _blocks(self) -> tuple[Array, Array]:
-        """Inverse covariance cut into batch by batch (B, B, q, q), and weights (B, q), padded with unity."""
-        w = self.windows
-        q = int(w.counts.max(initial=0))
-        inverse, weights = np.zeros((len(w.ids), len(w.ids), q, q)), np.zeros((len(w.ids), q))
-        for i, (a, n) in enumerate(zip(w.borders, w.counts, strict=False)):
-            weights[i, :n] = self._weights[a : a + n]
-            for j, (b, m) in enumerate(zip(w.borders, w.counts, strict=False)):
-                inverse[i, j, :n, :m] = self._inverse[a : a + n, b : b + m]
-            inverse[i, i, range(n, q), range(n, q)] = 1.0
-        return inverse, weights
 
-    @cached_property
-    def alone_um(self) -> Array:
-        """Residuals (B, q) of every batch, left out alone; 0 behind its end."""
-        inverse, weights = self._blocks
-        every = np.arange(len(weights))
-        return np.asarray(np.linalg.solve(inverse[every, every], weights[:, :, None])[:, :, 0])
+def _blocks(w: Windows, inverse: Array, weights: Array) -> tuple[Array, Array]:
+    """Inverse covariance cut into batch by batch (B, B, q, q), and weights (B, q), padded with unity."""
+    n_batches, q = len(w.ids), int(w.counts.max(initial=0))
+    padded, short = np.zeros((n_batches, n_batches, q, q)), np.zeros((n_batches, q))
+    for i, (a, n) in enumerate(zip(w.borders, w.counts, strict=False)):
+        short[i, :n] = weights[a : a + n]
+        for j, (b, m) in enumerate(zip(w.borders, w.counts, strict=False)):
+            padded[i, j, :n, :m] = inverse[a : a + n, b : b + m]
+        padded[i, i, range(n, q), range(n, q)] = 1.0
+    return padded, short
 
-    @cached_property
-    def pairs_um(self) -> Array:
-        """Residuals (B, B, q): at k, i those of batch i where k and i are left out."""
-        inverse, weights = self._blocks
-        k, i = np.triu_indices(len(weights), 1)
-        both = np.block([[inverse[k, k], inverse[k, i]], [inverse[i, k], inverse[i, i]]])
-        left = np.linalg.solve(both, np.hstack([weights[k], weights[i]])[:, :, None])[:, :, 0]
-        q = weights.shape[1]
-        out = np.zeros((len(weights), *weights.shape))
-        out[i, k], out[k, i] = left[:, :q], left[:, q:]
-        return out
 
-    def gains(self, without: int | None = None) -> Array:
-        """Coefficients (m,) of the columns, in µm per unit; of batch number `without` nothing is used."""
-        w, weights = self.windows, self._weights
-        if without is not None:
-            rows = slice(w.borders[without], w.borders[without + 1])
-            weights = weights - self._inverse[:, rows] @ np.linalg.solve(self._inverse[rows, rows], weights[rows])
-        return np.asarray(self.variance * (w.x.T @ weights))
+def _pairs(inverse: Array, weights: Array) -> Array:
+    k, i = np.triu_indices(len(weights), 1)
+    both = np.block([[inverse[k, k], inverse[k, i]], [inverse[i, k], inverse[i, i]]])
+    left = _solved(both, np.hstack([weights[k], weights[i]]))
+    q = weights.shape[1]
+    out = np.zeros((len(weights), *weights.shape))
+    out[i, k], out[k, i] = left[:, :q], left[:, q:]
+    return out
 
-    def drift_variance(self) -> float:
-        """The unit of drift in µm², by maximum likelihood (Rasmussen and Williams 2006, eq. 2.30 profiled)."""
-        return float(self.windows.y_um @ self._weights / len(self.windows.y_um))
+
+def _solved(blocks: Array, right: Array) -> Array:
+    return np.asarray(np.linalg.solve(blocks, right[:, :, None])[:, :, 0])

@@ -24,6 +24,8 @@ from features.rises import first_order_lag
 from models.batchwise import bridged
 
 Array = NDArray[np.float64]
+PROMPT, UNDRIVEN, DRIVEN = 0, 1, 2  # how far a column reaches: inputs of now, what is measured, what is commanded
+_PROMPT_MIN = 10.0
 _LAGS_MIN = (0.0, 10.0, 30.0, 120.0, 480.0)
 _GONE_MIN = (30.0, 120.0, 480.0)
 _CLOCK_GONE_MIN = (10.0, *_GONE_MIN)
@@ -46,7 +48,7 @@ class Columns:
     prior_K: Array
     source: NDArray[np.int64]
     power: Array
-    from_driver: NDArray[np.bool_]
+    reach: NDArray[np.int64]
     largest: Array  # (K, r) largest size of each raw signal in each batch
 
     def prior(self, train: Sequence[int]) -> Array:
@@ -73,7 +75,7 @@ class Columns:
             np.array([p.prior_K for p in parts]),
             np.array([p.source for p in parts], np.int64),
             np.array([float(p.power) for p in parts]),
-            np.array([p.from_driver for p in parts], bool),
+            np.array([p.reach for p in parts], np.int64),
             largest.reshape(design.n_batches, raw.shape[1]),
         )
 
@@ -85,7 +87,7 @@ class _Column:
     prior_K: float = 1.0
     source: int = -1
     power: int = 1
-    from_driver: bool = False
+    reach: int = UNDRIVEN
 
 
 def _raw_signals(design: Design) -> Array:
@@ -110,6 +112,7 @@ def _inputs(design: Design) -> list[_Column]:
             _lagged(design, held[:, c], lag_min, at_rest=False),
             _FULL_SCALE_K if c in source else 1.0,
             source.get(c, -1),
+            reach=PROMPT if lag_min <= _PROMPT_MIN else UNDRIVEN,
         )
         for lag_min in _LAGS_MIN
         for c, name in enumerate(design.inputs)
@@ -126,7 +129,7 @@ def _drivers(design: Design) -> list[_Column]:
             for lag_min in _LAGS_MIN:
                 values = _lagged(design, np.abs(held[:, d]) ** power, lag_min, at_rest=True)
                 label = f"{name}^{power}" if power > 1 else name
-                out.append(_Column(f"{label} after {lag_min:g} min", values, _FULL_SCALE_K, first + d, power, True))
+                out.append(_Column(f"{label} after {lag_min:g} min", values, _FULL_SCALE_K, first + d, power, DRIVEN))
     return out
 
 
