@@ -26,7 +26,10 @@ def lag_responses(design: Design, responses: Sequence[Response]) -> Array:
     out = np.empty((len(x), len(responses), x.shape[1]))
     for k in range(design.n_batches):
         own = x[design.rows(k)]
-        before = np.where(drives, 0.0, own[0]) if len(own) else np.zeros(x.shape[1])
+        if np.isnan(own).all():
+            out[design.rows(k)] = np.nan
+            continue
+        before = np.where(drives, 0.0, own[0])
         for i, (delay_s, tau_s) in enumerate(responses):
             out[design.rows(k), i] = _delayed(_lagged(own, before, tau_s / steps[k]), before, delay_s / steps[k])
     return out

@@ -1,0 +1,165 @@
+"""A grey model behind a distributed lag, piecewise by start temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+
+from data.errors import InputError, closest
+from features.design import Design
+from models.base import Array, Family, Plain
+from models.distributed_lag import DistributedLag
+from models.gm1n import GM1N
+from models.grey_layer import grey_layers, layer_design
+from models.start_bands import band_weights, bands_of, start_temperatures_degC
+
+BANDED = ("lag", "both")
+
+
+class GMDL(Family):
+    """Two layers in bands: a free-running GM(1,N), whose output, now and before, a distributed lag weighs.
+
+    Every band of start temperature (ambient at the batch's start) has a sub-model of its own that stands at the mean
+    start temperature of its training batches. A batch that starts at T0 between neighbours Ta < T0 < Tb gets the
+    weights (Tb − T0)/(Tb − Ta) and (T0 − Ta)/(Tb − Ta); outside the range the nearest stands alone. `bands` is their
+    number, with equally many batches, or the temperatures between them, °C. A band of fewer than `least_batches`
+    training batches joins a neighbour; `fitted` tells the bands that are left. There is one band where start
+    temperatures are not known.
+
+    `banded`: "lag" bands the distributed lag behind one grey model of all batches; "both" bands both layers. The grey
+    model learns from each batch's `recent_rows` most recent rows (None: all), the distributed lag from honest outputs:
+    those for a training batch come from grey models of the other batches, with one or two batches those for a quarter
+    from models that were not shown its errors (`models.grey_layer`). `lags` and `lag_min` are the distributed lag's.
+
+    Source: study of a grey model and distributed lags, weighted by start temperature; Deng 1989; Almon 1965.
+    """
+
+    key = "gm_dl"
+    words = "grey model and distributed lag, piecewise by start temperature"
+    source = "Deng 1989; Almon 1965"
+    closed_form = False
+    rowwise = False
+    rank = 45
+
+    def __init__(
+        self,
+        bands: int | Sequence[float] = 3,
+        least_batches: int = 4,
+        banded: str = "lag",
+        lags: str = "free",
+        lag_min: float = 10.0,
+        recent_rows: int | None = 40,
+        response: str = "difference",
+    ) -> None:
+        super().__init__()
+        if banded not in BANDED:
+            raise InputError(f"gm_dl: unknown banded {banded!r}: {closest(banded, BANDED)}")
+        if least_batches < 1 or (isinstance(bands, int) and bands < 1):
+            raise InputError(
+                f"gm_dl: bands {bands}, least_batches {least_batches}; expected at least 1 of each, or bands as the "
+                "temperatures between them in °C"
+            )
+        self.bands = bands if isinstance(bands, int) else [float(edge) for edge in bands]
+        self.least_batches, self.banded = int(least_batches), banded
+        self.lags, self.lag_min, self.recent_rows, self.response = lags, float(lag_min), recent_rows, response
+        self._layers()
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """Grey models of all folds and pairs of batches left out from the same factors; equal bands are fitted once.
+
+        Raises:
+            InputError: too few usable rows, or training batches of different steps.
+        """
+        grey, lag = self._layers()
+        start_degC = start_temperatures_degC(design)
+        parts = [bands_of(start_degC, fold, self.bands, self.least_batches) for fold in folds]
+        # The training batches that each band's grey model learns from.
+        taught = [[tuple(fold)] * len(bands) if self.banded == "lag" else bands
+                  for fold, bands in zip(folds, parts, strict=True)]  # fmt: skip
+        pairs = dict.fromkeys(pair for sets, bands in zip(taught, parts, strict=True)
+                              for pair in zip(sets, bands, strict=True))  # fmt: skip
+        sets = list(dict.fromkeys(batches for batches, _ in pairs))
+        first: dict[tuple[int, ...], GM1N] = {}
+        second: dict[tuple[tuple[int, ...], tuple[int, ...]], DistributedLag] = {}
+        for batches, layer in zip(sets, grey_layers(design, sets, [grey]), strict=True):
+            bands = [band for own, band in pairs if own == batches]
+            fitted = lag.fit_folds(layer_design(design, layer.outputs_um), bands)
+            first[batches] = layer.models[0]
+            second |= {(batches, band): model for band, model in zip(bands, fitted, strict=True)}
+        return [
+            self._learned(design, _plain(start_degC, bands, [first[batches] for batches in own],
+                                         [second[pair] for pair in zip(own, bands, strict=True)]))
+            for own, bands in zip(taught, parts, strict=True)
+        ]  # fmt: skip
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Error_um (n_k,) per batch, from a zero error at its start.
+
+        Raises:
+            InputError: a batch of another step than the model learned from.
+        """
+        f = self.fitted
+        grey, lag = self._layers()
+        start_degC = start_temperatures_degC(design)
+        shares = np.array([band_weights(start_degC[k], f["band_degC"], f["band_batches"]) for k in batches])
+        total = [np.zeros(int(design.offsets[k + 1] - design.offsets[k])) for k in batches]
+        for i in range(len(f["a"])):
+            model = grey._learned(design, {"a": float(f["a"][i]), "b": f["b"][i], "step_s": f["step_s"]})
+            outputs_um = np.full((len(design.time_s), 1), np.nan)
+            for k, predicted in zip(batches, model.predict_design(design, batches), strict=True):
+                outputs_um[design.rows(k), 0] = predicted
+            layer = layer_design(design, outputs_um)
+            behind = [band for band, own in enumerate(f["grey_of_band"]) if own == i]
+            told = lag.predict_folds(
+                layer, [lag._learned(layer, _lag_of(f, b)) for b in behind], [batches] * len(behind)
+            )
+            for band, own in zip(behind, told, strict=True):
+                total = [t + share * p for t, share, p in zip(total, shares[:, band], own, strict=True)]
+        return total
+
+    def n_parameters(self) -> int:
+        """Those of the grey models, and of every band its coefficients, intercept and order."""
+        f = self.fitted
+        return int(f["a"].size + f["b"].size + f["weights"].size + 2 * len(f["band_batches"]))
+
+    def _layers(self) -> tuple[GM1N, DistributedLag]:
+        return GM1N(self.response, recent_rows=self.recent_rows), DistributedLag(self.lags, self.lag_min)
+
+
+def _plain(
+    start_degC: Array, bands: Sequence[tuple[int, ...]], grey: Sequence[GM1N], lags: Sequence[DistributedLag]
+) -> Plain:
+    """What is learned, as plain data: equal grey models once, the responses of all bands one after the other."""
+    own = list({id(model): model for model in grey}.values())
+    degC = np.array([start_degC[list(band)].mean() for band in bands])
+    fitted = [model.fitted for model in lags]
+    return {
+        "band_degC": degC[np.isfinite(degC)],
+        "band_batches": [len(band) for band in bands],
+        "grey_of_band": [next(i for i, model in enumerate(own) if model is g) for g in grey],
+        "a": np.array([model.fitted["a"] for model in own]),
+        "b": np.stack([model.fitted["b"] for model in own]),
+        "bound": [model.fitted["bound"] for model in own],
+        "step_s": own[0].fitted["step_s"],
+        "band_of_response": np.repeat(np.arange(len(bands)), [len(f["delays_s"]) for f in fitted]),
+        "delays_s": np.concatenate([f["delays_s"] for f in fitted]),
+        "taus_s": np.concatenate([f["taus_s"] for f in fitted]),
+        "weights": np.concatenate([f["weights_um_per_K"][:, 0] for f in fitted]),
+        "intercept_um": np.array([f["intercept_um"] for f in fitted]),
+        "k": np.array([f["k"] for f in fitted]),
+    }
+
+
+def _lag_of(f: Plain, band: int) -> Plain:
+    own = f["band_of_response"] == band
+    return {
+        "delays_s": f["delays_s"][own],
+        "taus_s": f["taus_s"][own],
+        "weights_um_per_K": f["weights"][own][:, None],
+        "intercept_um": float(f["intercept_um"][band]),
+    }
