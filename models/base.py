@@ -131,8 +131,9 @@ def family_from_plain(plain: Plain) -> Family:
     return family
 
 
-def inner_groups(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Groups for choices inside a training set: its batches; for fewer than 3 batches contiguous quarters of each.
+def inner_groups(group: NDArray[np.int64], parts: int = 4) -> NDArray[np.int64]:
+    """Groups for choices inside a training set: its batches; for fewer than 3 batches contiguous quarters of each (or
+    so many parts).
 
     A single batch has no batch to leave out, yet train-on-one must choose its penalty too.
     """
@@ -142,5 +143,5 @@ def inner_groups(group: NDArray[np.int64]) -> NDArray[np.int64]:
     out = np.empty(len(group), np.int64)
     for k in range(len(ids)):
         rows = np.flatnonzero(compact == k)
-        out[rows] = 4 * k + (np.arange(len(rows)) * 4) // max(1, len(rows))
+        out[rows] = parts * k + (np.arange(len(rows)) * parts) // max(1, len(rows))
     return out
