@@ -36,7 +36,7 @@ class RandomForest(Family):
     tells_sd = True
     rank = 75
 
-    def __init__(self, n_trees: int = 40, leaf: int = 3, max_rows: int = 24, seed: int = 0) -> None:
+    def __init__(self, n_trees: int = 24, leaf: int = 3, max_rows: int = 16, seed: int = 0) -> None:
         super().__init__()
         self.n_trees, self.leaf, self.max_rows, self.seed = int(n_trees), int(leaf), int(max_rows), int(seed)
 
@@ -52,11 +52,11 @@ class RandomForest(Family):
         drawn = np.stack([np.bincount(rng.integers(n_blocks, size=n_blocks), minlength=n_blocks)
                           for _ in range(self.n_trees)])  # fmt: skip
         share = max(1, -(-x.shape[1] // 3))
-        parts = []
+        parts, single = [], x.astype(np.float32)
         for t, weight in enumerate(drawn[:, block]):
             tree = DecisionTreeRegressor(min_samples_leaf=self.leaf, max_features=share, random_state=self.seed + t)
             held = np.repeat(np.arange(len(y)), weight)
-            grown = tree.fit(x[held], y[held]).tree_
+            grown = tree.fit(single[held], y[held], check_input=False).tree_
             value = grown.value[:, 0, 0]
             parts.append((grown.feature, grown.threshold, grown.children_left, grown.children_right, value))
         trees = Trees.joined(parts)

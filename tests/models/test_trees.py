@@ -6,6 +6,7 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.tree import DecisionTreeRegressor
 
 from features.design import Design
+from models.base import Family
 from models.hist_gradient_boosting import HistGradientBoosting
 from models.random_forest import RandomForest
 from models.trees import Trees, training_rows
@@ -67,7 +68,7 @@ def test_stated_intervals_hold_on_batches_that_were_never_seen(own_um: float) ->
 
 
 @pytest.mark.parametrize("cls", [RandomForest, HistGradientBoosting])
-def test_a_missing_input_is_no_prediction_and_far_away_is_the_edge(cls) -> None:
+def test_a_missing_input_is_no_prediction_and_far_away_is_the_edge(cls: type[Family]) -> None:
     design = make_design()
     fitted = cls().fit_design(design, range(8))
     x = design.x.copy()
