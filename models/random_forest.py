@@ -13,6 +13,7 @@ from features.design import Design
 from models.base import Array, Family, inner_groups
 from models.trees import Trees, training_rows
 
+_ROWS = 480  # that few batches may give together
 _PARTS_OF_ONE = 12  # of one or two batches: a tree that lacks a quarter of its only run knows too little
 
 
@@ -21,7 +22,8 @@ class RandomForest(Family):
 
     Rows of one batch are near copies of each other: a bootstrap of rows would hold nearly every batch, and what is
     out of the bag would be known all the same. Fewer than 3 batches are cut into twelfths. At a split a tree looks at
-    a third of the inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each. `sd_um`:
+    a third of the inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each, or 480
+    together. `sd_um`:
     variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag residuals.
 
     A forest repeats what it has seen: beyond the trained temperatures it stays constant.
@@ -44,7 +46,7 @@ class RandomForest(Family):
         """Raises InputError: fewer than 4 usable rows."""
         from sklearn.tree import DecisionTreeRegressor
 
-        rows = training_rows(self.key, design, train, self.max_rows)
+        rows = training_rows(self.key, design, train, self.max_rows, _ROWS)
         x, y, group = design.x[rows], design.y_um[rows], design.group[rows]
         _, block = np.unique(inner_groups(group, _PARTS_OF_ONE), return_inverse=True)
         rng = np.random.default_rng(self.seed)
