@@ -23,8 +23,8 @@ class RandomForest(Family):
     Rows of one batch are near copies of each other: a bootstrap of rows would hold nearly every batch, and what is
     out of the bag would be known all the same. Fewer than 3 batches are cut into twelfths. At a split a tree looks at
     a third of the inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each, or 480
-    together. `sd_um`:
-    variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag residuals.
+    together. `sd_um`: variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag
+    residuals.
 
     A forest repeats what it has seen: beyond the trained temperatures it stays constant.
 
