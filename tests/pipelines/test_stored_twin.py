@@ -10,6 +10,7 @@ import yaml
 
 from data.errors import InputError
 from models import FAMILIES
+from models.region import Region
 from models.twin import Twin
 from models.twin_kalman import TwinKalman
 from pipelines import model_store
@@ -22,7 +23,7 @@ def test_a_stored_twin_predicts_the_same_and_says_what_it_needs(family, tmp_path
     machine, batches = year(3)
     model = family.fit(batches[:2], ["t_head"], "z", machine)
     text = yaml.safe_dump(json.loads(machine.model_dump_json(exclude_none=True)), sort_keys=False)
-    model_store.save(tmp_path, model, text, {})
+    model_store.save(tmp_path, model, text, Region.of([], ()))
     back = model_store.load(tmp_path)
     np.testing.assert_array_equal(back.predict(batches[2]), model.predict(batches[2]))
     assert {"rpm", "room"} <= set(back.channels())
