@@ -74,8 +74,8 @@ class GreyDistributedLag(Study):
         "weighting by start temperature adapts the model to season and time of day.",
         "Bands have their borders at 10, 18 and 26 °C. Tested are new runs at the bands' own temperatures, at their "
         "borders (between) and at 1 and 35 °C (outside), each at three speeds.",
-        "Four points by FCGC from the training runs, the same for every method; both layers as the product's family gm_dl "
-        "has them, the grey model alone as gm1n.",
+        "Four points by FCGC from the training runs, the same for every method; both layers as the product's family "
+        "gm_dl has them, the grey model alone as gm1n.",
         "A band learns from three runs; with twice the runs, from six.",
     )
     figures: ClassVar[tuple[Figure, ...]] = tuple(

@@ -80,7 +80,7 @@ class StudyResult:
 
         Columns: ordering, words, evidence_for, why (with the means), held (seeds), seeds, share, low and high (95 % by
         Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`),
-        published_gain and gain, the mean of 1 − a/b over the seeds for the first pair, with its gain_sd.
+        published_gain and gain, the median over the seeds of 1 − a/b of the first pair, with gain_p5 and gain_p95.
         """
         rows = []
         for o in self.study.orderings:
@@ -105,8 +105,9 @@ class StudyResult:
                     "high": float(high),
                     "verdict": "holds" if low > 0.5 else "fails" if high < 0.5 else "undecided",
                     "published_gain": np.nan if o.published_gain is None else o.published_gain,
-                    "gain": float(gain.mean()) if n else np.nan,
-                    "gain_sd": float(gain.std(ddof=1)) if n > 1 else np.nan,
+                    "gain": float(np.median(gain)) if n else np.nan,
+                    "gain_p5": float(np.quantile(gain, 0.05)) if n else np.nan,
+                    "gain_p95": float(np.quantile(gain, 0.95)) if n else np.nan,
                 }
             )
         table = pd.DataFrame(rows)

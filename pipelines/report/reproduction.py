@@ -66,6 +66,7 @@ def reproduction_page(results: Sequence[StudyResult]) -> ReproductionPage:
     parts = tuple(_part(r) for r in results)
     verdicts = pd.Series([c.verdict for p in parts for c in p.claims])
     counted = ", ".join(f"{(verdicts == v).sum()} {v}" for v in ("holds", "undecided", "fails"))
+    counted = counted.replace("holds", "hold").replace("fails", "fail")
     rows = [Row((p.title, c.words, c.verdict, c.counted, c.gain)) for p in parts for c in p.claims]
     columns = (
         Column("Study"), Column("Published ordering", kind="wide"), Column("Verdict"), Column("Holds in"),
@@ -97,7 +98,7 @@ def counted_words(row: Record) -> str:
 
 
 def gain_words(row: Record) -> str:
-    """``23 % | −0 ± 22 %``; a dash where nothing was printed."""
+    """``23 % | 3 (−38 … 30) %``; a dash where nothing was printed."""
     return f"{printed_gain(row)} | {our_gain(row)}"
 
 
@@ -107,8 +108,9 @@ def printed_gain(row: Record) -> str:
 
 
 def our_gain(row: Record) -> str:
-    """The gain over the seeds, in percent."""
-    return f"{plus_minus(100 * float(row['gain']), 100 * float(row['gain_sd']), 0)} %"
+    """Median gain and its 5–95 % range over the seeds, in percent."""
+    median, low, high = (number(100 * float(row[k]), 0) for k in ("gain", "gain_p5", "gain_p95"))
+    return f"{median} ({low} … {high}) %"
 
 
 def _part(result: StudyResult) -> StudyPart:
@@ -146,7 +148,7 @@ def _claim(
     for e in found.to_dict("records") if found is not None else []:
         rows.append(Row((str(e["words"]), str(e["verdict"]), counted_words(e), our_gain(e))))
     return Claim(
-        words=ordering.words,
+        words=ordering.words[0].upper() + ordering.words[1:],
         verdict=str(row["verdict"]),
         counted=counted_words(row),
         gain=gain_words(row),

@@ -106,7 +106,8 @@ def test_orderings_are_counted_with_the_interval_of_clopper_and_pearson() -> Non
     assert (row["held"], row["seeds"]) == (9, 10)
     assert row["low"] == pytest.approx(beta.ppf(0.025, 9, 2)) and row["high"] == pytest.approx(beta.ppf(0.975, 10, 1))
     assert row["verdict"] == "holds" and table.loc["other", "verdict"] == "fails"
-    assert row["gain"] == pytest.approx((9 * 0.5 - 0.5) / 10)
+    assert row["gain"] == 0.5 and row["gain_p95"] == 0.5
+    assert row["gain_p5"] == pytest.approx(-0.5 + 0.45 * 1.0), "linear between the last value and the one before"
     assert row["why"] == "a has 1.2, b has 2.00"
     assert list(table.index) == ["a_less", "because", "other"], "evidence stands behind its claim"
 

@@ -51,7 +51,7 @@ def test_tables_on_the_screen(call: Call) -> None:
     assert "toy_study (SIMULATED)" in done.out and done.out.count("SIMULATED") == 3
     flat = " ".join(done.out.split())
     assert "method A <new> µm 1.5 1.2 ± 0.4 1.0 … 1.3" in flat
-    assert "holds 19/20 75 … 100 % 25 % 40 ± 22 % A is better than B" in flat
+    assert "holds 19/20 75 … 100 % 25 % 45 (36 … 50) % A is better than B" in flat
     assert "fails 1/20 0 … 25 %" in flat
     assert "why not always: B is better than A: B has 2.0 µm." in flat
     assert "On average 1.2 µm." in flat
@@ -88,7 +88,7 @@ def test_the_folder(call: Call, tmp_path: Path) -> None:
     assert "http://" not in page and "https://" not in page and "<script" not in page
     told = (out / "reproduction.md").read_text(encoding="utf-8")
     assert told.startswith("# Published systems repeated (SIMULATED)")
-    assert "| A is better than B | undecided | 3 of 4 (19 % … 99 %) | 25 % \\| 24 ± 51 % |" in told
+    assert "| A is better than B | undecided | 3 of 4 (19 % … 99 %) | 25 % \\| 49 (−36 … 50) % |" in told
 
     again = call("reproduce", "toy_study", "--seeds", 4, "--workers", 1, "--out", "out")
     assert again.code == 2 and "values.parquet exists; give another --out, or --overwrite" in again.err
