@@ -35,8 +35,7 @@ def reproduce(
         from pipelines.out_folder import check_folder
 
         check_folder(to, [to / name for name in FILES], overwrite)
-    with screen.progress(as_json) as (say, done):
-        say("simulating")
+    with screen.progress(as_json) as (_, done):
         results = run_studies(
             tuple(STUDIES) if study == "all" else (study,), seeds, workers or os.cpu_count() or 1, done
         )

@@ -105,4 +105,4 @@ def test_the_folder(call: Call, tmp_path: Path) -> None:
 )
 def test_what_cannot_be_is_told_in_one_line(call: Call, arguments: tuple[object, ...], words: str) -> None:
     done = call("reproduce", *arguments)
-    assert done.code == 2 and words in done.err and len(done.err.strip().splitlines()) <= 2
+    assert done.code == 2 and words in done.err and len(done.err.strip().splitlines()) == 1
