@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from data.sample_lathe import LATHE as SAMPLE_LATHE
 from data.sample_lathe import AXES, SLOW_BODIES, Drive, feed_heat_W
+from data.sample_lathe import LATHE as SAMPLE_LATHE
 from data.simulated_runs import ROOM, MachineType
 from data.thermal_machine import SpeedHeat, ThermalMachine
 
