@@ -27,6 +27,7 @@ FAMILIES = Registry(
         "gm1n": "models.gm1n:GM1N",
         "transfer_function": "models.transfer_function:TransferFunction",
         "gm_lssvm": "models.gm_lssvm:GMLSSVM",
+        "gaussian_process": "models.gaussian_process:GaussianProcess",
         "random_forest": "models.random_forest:RandomForest",
         "hist_gradient_boosting": "models.hist_gradient_boosting:HistGradientBoosting",
         "gm_dl": "models.gm_dl:GMDL",

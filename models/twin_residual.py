@@ -42,15 +42,14 @@ class TwinResidual(Twin):
     rank = 35
 
     def __init__(
-        self, residual: str = "ridge", inputs_as: str = "unexpected", every_s: float = 300.0, start: str = "usual",
-        seed: int = 0,
-    ) -> None:  # fmt: skip
+        self, residual: str = "ridge", inputs_as: str = "unexpected", every_s: float = 300.0, start: str = "usual"
+    ) -> None:
         super().__init__(every_s, (), start)
         if residual not in _RESIDUALS:
             raise InputError(f"family {self.key}: residual is {residual!r}, expected {' or '.join(_RESIDUALS)}")
         if inputs_as not in ("unexpected", "rises"):
             raise InputError(f"family {self.key}: inputs_as is {inputs_as!r}, expected 'unexpected' or 'rises'")
-        self.residual, self.inputs_as, self.seed = residual, inputs_as, int(seed)
+        self.residual, self.inputs_as = residual, inputs_as
 
     def options(self) -> Plain:
         return {k: v for k, v in super().options().items() if k != "channels"}
@@ -129,7 +128,7 @@ class TwinResidual(Twin):
         return replace(design, x=x, _parent=None, _columns=None)
 
     def _regression(self) -> Family:
-        return Ridge() if self.residual == "ridge" else GaussianProcess(seed=self.seed)
+        return Ridge() if self.residual == "ridge" else GaussianProcess()
 
     def _fitted_regression(self) -> Family:
         out = self._regression()

@@ -1,0 +1,164 @@
+"""The Gaussian process against scikit-learn's, refits without the left-out rows, and planted scatter of batches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
+
+from data.errors import InputError
+from features.design import Design
+from models import gaussian_process
+from models.gaussian_process import GaussianProcess, Setting
+from models.kernel_expansion import products
+from models.left_out_groups import LeftOut
+
+NOISE_UM, OWN_SLOPE_UM_PER_K = 0.5, 0.25
+
+
+def make_design(batches=8, rows=30, seed=0, own_slope=0.0, curve_um=0.0):
+    """Two rises a batch; y = 3 a − 2 b, with a curve, with a slope of the batch's own on a, with noise."""
+    rng = np.random.default_rng(seed)
+    x, y = [], []
+    for _ in range(batches):
+        end_K = rng.uniform(5, 20, 2)
+        rise = end_K * (1 - np.exp(-np.arange(rows)[:, None] / rng.uniform(5, 15, 2)))
+        law = 3 * rise[:, 0] - 2 * rise[:, 1] + curve_um * np.sin(rise[:, 0] / 5)
+        y.append(law + own_slope * rng.normal() * rise[:, 0] + rng.normal(0, NOISE_UM, rows))
+        x.append(rise)
+    offsets = np.arange(0, (batches + 1) * rows, rows)
+    names = tuple(f"b{k}" for k in range(batches))
+    return Design(("a", "b"), "z", names, np.vstack(x), np.concatenate(y), np.tile(np.arange(rows) * 60.0, batches),
+                  offsets, 60.0, input_units=("K", "K"))  # fmt: skip
+
+
+def covariance(u, group, setting):
+    half, dot = products(u, u)
+    return setting.shared(half, dot) + (group[:, None] == group) * setting.own(dot) + np.eye(len(u))
+
+
+def test_without_batches_of_their_own_it_is_scikit_learns(monkeypatch):
+    monkeypatch.setattr(Setting, "own", lambda self, dot: np.zeros_like(dot))
+    design, setting = make_design(3, 20, curve_um=4.0), Setting(100.0, 30.0, 0.7, 0.0)
+    model = GaussianProcess()._made(design, np.arange(60), setting, 1.0)
+    # |u|²/p in the line and 2 p length² below the exponent: scikit-learn's with scaled variances and lengths.
+    kernel = (
+        ConstantKernel(30.0) * RBF(0.7 * np.sqrt(2))
+        + ConstantKernel(50.0) * DotProduct(0.0, "fixed")
+        + ConstantKernel(1.0)
+    )
+    theirs = GaussianProcessRegressor(kernel + WhiteKernel(1.0), optimizer=None, alpha=0.0).fit(
+        design.x / 10, design.y_um
+    )
+    far = replace(design, x=design.x * 1.5 + 2)
+    mean, sd = theirs.predict(far.x[:20] / 10, return_std=True)
+    np.testing.assert_allclose(model.predict_design(far, [0])[0], mean, rtol=1e-6)
+    np.testing.assert_allclose(model.sd_um(far, [0])[0], sd, rtol=1e-6)
+
+
+def test_left_out_groups_are_those_of_refits():
+    design, setting = make_design(5, 7, curve_um=3.0), Setting(1e3, 10.0, 1.0, 0.3)
+    u, y, group = design.x / 10, design.y_um, design.group
+    whole = covariance(u, group, setting)
+    left = LeftOut.of(np.linalg.inv(whole), y, 7)
+    for f in (None, 1):
+        error, variance = left.alone() if f is None else left.beside(f)
+        for g in (0, 3):
+            train, test = (group != g) & (group != f) if f is not None else group != g, group == g
+            weight = whole[np.ix_(test, train)] @ np.linalg.inv(whole[np.ix_(train, train)])
+            np.testing.assert_allclose(error[g], y[test] - weight @ y[train], atol=1e-7)
+            told = whole[np.ix_(test, test)] - weight @ whole[np.ix_(train, test)]
+            np.testing.assert_allclose(variance[g], np.diag(told), rtol=1e-7)
+
+
+def test_the_choice_is_that_of_refits_done_one_by_one(monkeypatch):
+    monkeypatch.setattr(gaussian_process, "LINES", (1e2, 1e4))
+    monkeypatch.setattr(gaussian_process, "CURVES", (0.0, 10.0))
+    monkeypatch.setattr(gaussian_process, "LENGTHS", (1.0,))
+    monkeypatch.setattr(gaussian_process, "OWN_LINES", (0.1,))
+    design = make_design(6, 12, seed=3, curve_um=5.0)
+    folds = [[j for j in range(6) if j != k] for k in range(6)]
+    for fold, model in zip(folds, GaussianProcess().fit_folds(design, folds), strict=True):
+        scores = {}
+        for line in (1e2, 1e4):
+            for curve in (0.0, 10.0):
+                setting, rms = Setting(line, curve, 1.0, 0.1), []
+                for g in fold:
+                    train, test = np.isin(design.group, [j for j in fold if j != g]), design.group == g
+                    k = covariance(design.x / 10, design.group, setting)
+                    error = design.y_um[test] - k[np.ix_(test, train)] @ np.linalg.solve(
+                        k[np.ix_(train, train)], design.y_um[train]
+                    )
+                    rms.append(np.sqrt(np.mean(error**2)))
+                scores[setting] = np.mean(rms)
+        # One after the other from the start: the line at curve 0, then the curve, then the line again.
+        line = min((1e2, 1e4), key=lambda v: scores[Setting(v, 0.0, 1.0, 0.1)])
+        curve = min((0.0, 10.0), key=lambda v: scores[Setting(line, v, 1.0, 0.1)])
+        line = min((1e2, 1e4), key=lambda v: scores[Setting(v, curve, 1.0, 0.1)])
+        assert (model.fitted["line"], model.fitted["curve"]) == (line, curve)
+
+
+@pytest.mark.parametrize("own_slope", [0.0, OWN_SLOPE_UM_PER_K])
+def test_the_stated_interval_holds_on_batches_that_it_never_saw(own_slope):
+    inside, sd_um = [], []
+    for seed in range(6):
+        design = make_design(20, 24, seed=seed, own_slope=own_slope)
+        model = GaussianProcess().fit_design(design, range(12))
+        for k in range(12, 20):
+            error = design.y_um[design.rows(k)] - model.predict_design(design, [k])[0]
+            sd = model.sd_um(design, [k])[0]
+            inside.append(np.mean(np.abs(error) <= 1.6449 * sd))
+            sd_um.append(sd)
+    assert 0.85 <= np.mean(inside) <= 0.96
+    if own_slope:
+        # The batch's own slope is unknown beforehand: late rows are told to be less sure than the first.
+        assert np.mean([sd[-1] / sd[0] for sd in sd_um]) > 1.5
+    else:
+        assert np.mean(sd_um) == pytest.approx(NOISE_UM, rel=0.25)
+
+
+def test_a_curve_is_learned_and_far_from_all_rows_it_says_so():
+    design = make_design(10, 30, curve_um=6.0)
+    model = GaussianProcess().fit_design(design, range(9))
+    assert model.fitted["curve"] > 0
+    assert np.std(model.predict_design(design, [9])[0] - design.y_um[design.rows(9)]) < 1.0
+    far = replace(design, x=design.x * 4)
+    assert model.sd_um(far, [9])[0][-1] > 3 * model.sd_um(design, [9])[0][-1]
+
+
+def test_folds_are_the_fits_done_one_by_one():
+    design = make_design(7, 26, curve_um=4.0, own_slope=0.1)
+    folds = [[1, 2, 3, 4, 5, 6], [0, 1, 2, 4, 5, 6], [0, 3], [2], [0, 1, 2, 3, 4, 5, 6]]
+    for fold, model in zip(folds, GaussianProcess().fit_folds(design, folds), strict=True):
+        alone = GaussianProcess().fit_design(design, fold)
+        np.testing.assert_allclose(
+            model.predict_design(design, [0])[0], alone.predict_design(design, [0])[0], atol=1e-6
+        )
+        np.testing.assert_allclose(model.sd_um(design, [0])[0], alone.sd_um(design, [0])[0], rtol=1e-6)
+
+
+def test_one_batch_tells_nothing_of_how_batches_differ():
+    design = make_design(3)
+    assert np.isnan(GaussianProcess().fit_design(design, [0, 1]).sd_um(design, [2])[0]).all()
+    assert np.isfinite(GaussianProcess().fit_design(design, [0, 1, 2]).sd_um(design, [2])[0]).all()
+
+
+def test_rows_are_drawn_evenly_and_holes_stay_holes():
+    design = make_design(6, 100)
+    x = design.x.copy()
+    x[5, 0] = np.nan
+    holed = replace(design, x=x)
+    model = GaussianProcess(max_rows=60).fit_design(holed, range(6))
+    assert len(model.fitted["alpha"]) == 60 and model.fitted["factor"].shape == (60, 60)
+    assert np.flatnonzero(np.isnan(model.predict_design(holed, [0])[0])).tolist() == [5]
+    assert np.flatnonzero(np.isnan(model.sd_um(holed, [0])[0])).tolist() == [5]
+
+
+def test_what_cannot_be_learned_from_is_told():
+    design = make_design(3)
+    empty = replace(design, y_um=np.full_like(design.y_um, np.nan))
+    with pytest.raises(InputError, match="family gaussian_process: got 0 usable rows of z in b1, need at least 4"):
+        GaussianProcess().fit_design(empty, [1])
+    with pytest.raises(InputError, match=r"inputs reach 2e\+07 times their scale, expected about 1: check their units"):
+        GaussianProcess().fit_design(replace(design, x=np.full_like(design.x, 2e8)), range(3))
