@@ -67,7 +67,8 @@ class LagDictionary(Family):
     few, which `sd_um` tells.
 
     Delays, settings and sharpness are constants. They were fixed on the recordings of a lathe and a spindle and on
-    the simulated year after about 150 variants; within 5 % most of them score alike.
+    the simulated year, looking at about 400 variants: scores there are a little too good. On the lathe the last 120
+    lie within 15 % of each other's mean; the best on every other run is within 0.15 µm of the best on the rest.
     """
 
     key = "lag_dictionary"
