@@ -12,6 +12,7 @@ from models.result import GridResult
 from pipelines.promotion import Choice, compare_paired, left_out
 from pipelines.report import figures, records, tables
 from pipelines.report.axis_figures import fan_panel
+from pipelines.report.certainty import certainty_table
 from pipelines.report.extracts import (
     LeftOut,
     best_per,
@@ -57,6 +58,7 @@ class Channel:
     verdict: Verdict
     inputs: str
     boards: tuple[Table, ...]
+    certainty: Table | None
     heat: Panel | None
     points: Panel | None
     frequency: Panel | None
@@ -109,6 +111,7 @@ def channel_part(
         verdict=said,
         inputs=", ".join(choice.inputs),
         boards=boards,
+        certainty=certainty_table(name, result, cells, choice, digits, mark),
         heat=_heat(name, result, cells, digits),
         points=_points(name, result, cells, choice),
         frequency=_frequency(name, result, cells, protocol),
