@@ -160,10 +160,10 @@ def main() -> None:
     print(f"simulated sample year: {len(batches)} batches, {sum(b.n_rows for b in batches)} rows\n")
     compare(batches, args.families.split(","), args.repeats)
     if not args.no_whole:
-        whole(batches, Plan(), "quick crossing, four protocols, x, y and z")
+        whole(batches, Plan(effort="quick"), "quick crossing, four protocols, x, y and z")
         whole(
             batches,
-            Plan(protocols=("leave-batch-out",), complete=True),
+            Plan(protocols=("leave-batch-out",), effort="complete"),
             "complete crossing, leave-batch-out, x, y and z",
         )
 

@@ -8,8 +8,10 @@ from typing import Any, Literal
 
 from data.errors import InputError, closest
 
-Effort = Literal["quick", "complete", "on_request"]
-"""When a member takes part: in every crossing, in the complete one, or only where it is named."""
+Effort = Literal["quick", "usual", "complete", "on_request"]
+"""The least crossing that takes a member: one of seconds, the usual, the complete one, or only where it is named."""
+
+EFFORTS: tuple[Effort, ...] = ("quick", "usual", "complete", "on_request")
 
 
 class Registry(Mapping[str, Any]):

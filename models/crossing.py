@@ -17,6 +17,7 @@ from data.batch import Batch, Channel
 from data.checks import usable_channels
 from data.errors import InputError
 from data.machine import Machine
+from data.registry import EFFORTS, Effort
 from features.design import Design
 from features.rises import temperature_inputs
 from features.selectors import SELECTORS
@@ -33,7 +34,7 @@ Inputs = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to cross. Selectors or families not named: the quick ones, or with `complete` all that need no name.
+    """What to cross. Selectors or families that are not named: those that a crossing of this `effort` takes.
 
     `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all.
     """
@@ -43,7 +44,7 @@ class Plan:
     protocols: tuple[str, ...] = tuple(PROTOCOLS)
     n_tsps: tuple[int, ...] | None = None
     iterative_n_tsps: tuple[int, ...] = (2, 4)
-    complete: bool = False
+    effort: Effort = "usual"
 
     def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
         """The plan with its selectors and families by name; `channels` are the error channels that it is for.
@@ -63,7 +64,7 @@ class Plan:
                     f"family {key} needs the twin part of the machine file; add 'twin' to the file of "
                     f"{machine.machine if machine else 'the machine'}, or leave the family out"
                 )
-        taken = ("quick", "complete") if self.complete else ("quick",)
+        taken = EFFORTS[: EFFORTS.index(self.effort) + 1]
         suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
         suitable = [f for f in suitable if has_axis or not FAMILIES[f].needs_position]
         return replace(

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from data.errors import InputError
 from models.base import Array, inner_groups
-from models.linear import FLAT, Linear, Mask, Task
+from models.linear import Linear, Mask, Task
+from models.pooled_sums import FLAT
 from models.reweighting import Settled, settle
 
 
@@ -27,6 +28,7 @@ class Huber(Linear):
     key = "huber"
     words = "Huber regression: rows far off count linearly"
     source = "Huber (1964); scale and steps: Huber and Dutter (1974); the criterion: Owen (2007)"
+    effort = "usual"
     rank = 16
 
     def __init__(self, epsilons: Sequence[float] = (1.35,), ridge: float = 1e-6) -> None:

@@ -74,6 +74,7 @@ class LagDictionary(Family):
     key = "lag_dictionary"
     words = "dictionary of lags of temperatures, drivers and the start, batches pooled with a drift of their own"
     source = "generalised least squares with random effects, Henderson (1975); weights after Geisser and Eddy (1979)"
+    effort = "usual"
     closed_form = False
     rowwise = False
     tells_sd = True

@@ -39,7 +39,7 @@ class Twin(Family):
     key = "twin"
     words = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
     source = "machine file; Mayr et al. (2012), CIRP Annals 61(2), sec. 4; MAP least squares, Tarantola (2005), ch. 3"
-    effort: ClassVar[Effort] = "quick"
+    effort: ClassVar[Effort] = "usual"
     uses_inputs = False
     rowwise = False
     needs_twin = True

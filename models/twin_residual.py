@@ -36,7 +36,7 @@ class TwinResidual(Twin):
     key = "twin_residual"
     words = "physics twin plus a regression of its residual on the sensors"
     source = "Kennedy and O'Hagan (2001), eq. 4, a discrepancy beside a calibrated model; Hoerl and Kennard (1970)"
-    effort = "quick"
+    effort = "usual"
     uses_inputs = True
     closed_form = False
     rank = 35

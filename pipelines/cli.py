@@ -11,7 +11,7 @@ import typer
 from data.errors import InputError, WorkError
 from pipelines import report_command, reproduce_command, screen, twin_commands
 from pipelines import settings as settings_module
-from pipelines.options import Json, MachineFile, names, split
+from pipelines.options import Json, MachineFile, names, one_of, split
 
 app = typer.Typer(
     name="thermodrift",
@@ -95,9 +95,9 @@ def train(
     machine: MachineFile,
     recordings: Annotated[list[Path] | None, typer.Option(help="files or folders to ingest first")] = None,
     channels: Annotated[str, typer.Option(help="error channels, comma separated; default: all")] = "",
-    selectors: Annotated[str, typer.Option(help="selectors, comma separated; default: the quick ones")] = "",
-    families: Annotated[str, typer.Option(help="model families, comma separated; default: the quick ones")] = "",
-    complete: Annotated[bool, typer.Option("--complete", help="cross every selector with every family")] = False,
+    selectors: Annotated[str, typer.Option(help="selectors, comma separated; default: by effort")] = "",
+    families: Annotated[str, typer.Option(help="model families, comma separated; default: by effort")] = "",
+    effort: Annotated[str, typer.Option(help="what to cross unless named: quick, usual or complete")] = "usual",
     protocols: Annotated[str, typer.Option(help="protocols, comma separated; default: all")] = "",
     report: Annotated[Path | None, typer.Option(help="where the report goes")] = None,
     promote: Annotated[bool, typer.Option(help="promote the best cell")] = True,
@@ -106,6 +106,7 @@ def train(
 ) -> None:
     """The main job: ingest → features → grid → track → promote → report."""
     settings_module.configure_environment()
+    from data.registry import EFFORTS
     from features.selectors import SELECTORS
     from models import FAMILIES
     from models.crossing import Plan
@@ -117,7 +118,7 @@ def train(
         names(selectors, SELECTORS, "selector") if selectors else (),
         names(families, FAMILIES, "family") if families else (),
         names(protocols, PROTOCOLS, "protocol"),
-        complete=complete,
+        effort=one_of(effort, EFFORTS[:-1], "--effort"),
     )
     request = TrainRequest(machine, tuple(recordings or ()), split(channels), plan, report, promote)
     check_request(request, settings)  # before anything is started

@@ -191,9 +191,8 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
 
 def _track(results: dict[str, GridResult], plan: Plan, settings: Settings, say: Say, target: str) -> str:
     result = results[target]
-    named = {name: value for name, value in asdict(plan).items() if name != "complete"}  # its members stand there
-    params = {name: ", ".join(map(str, value)) if value else "all" for name, value in named.items()}
-    return tracking.log_training(result, settings, figures=figure_pngs(result), params=params, say=say)
+    words = {k: v if isinstance(v, str) else ", ".join(map(str, v or ("all",))) for k, v in asdict(plan).items()}
+    return tracking.log_training(result, settings, figures=figure_pngs(result), params=words, say=say)
 
 
 def _promote(

@@ -53,7 +53,7 @@ def _write(result: FamilyResult, held: Path) -> None:
     scratch = Path(tempfile.mkdtemp(dir=held.parent, prefix=".writing-"))
     result.scores.to_parquet(scratch / "scores.parquet", index=False)
     result.cells.to_parquet(scratch / "cells.parquet", index=False)
-    np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)  # type: ignore[arg-type]
+    np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
     (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
     try:
         scratch.rename(held)
