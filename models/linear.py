@@ -16,138 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError
-from features.design import Design, Moments
+from features.design import Design
 from models.base import Array, Family
+from models.left_out_spread import left_out_spread, mean_square
+from models.pooled_sums import AT_ONCE, Blocks, Mask, Pool, leave_block_out
 
-Mask = NDArray[np.bool_]
 EPS = float(np.finfo(float).eps)
-FLAT = 1e-12  # an input that moves less than this part of its own size does not move
 DIGITS_LEFT = 1e8  # beyond this condition of the covariance a fit goes back to the rows
 _CONDITION_SEEN = 1e10  # beyond this the condition itself is taken from the rows
 _MIN_ROWS = 4
-_AT_ONCE = 4_000_000  # numbers in a stack of covariances
 _KELVIN = ("K", "degC")
-
-
-@dataclass(frozen=True)
-class Pool:
-    """Centred sums of S sets of rows: count (S,), mean_x (S, p), mean_y (S,), xx (S, p, p), xy (S, p).
-
-    xx and xy are of the inputs divided by `scale` (S, p), which is 1 where all inputs are in K. `loss` (S,) says
-    how much the sums about the common origin exceed the centred ones: the digits that centring cost.
-    """
-
-    count: Array
-    mean_x: Array
-    mean_y: Array
-    xx: Array
-    xy: Array
-    scale: Array
-    loss: Array
-
-    def correlation(self) -> tuple[Array, Array]:
-        """xx of the inputs over their own spread (S, p, p), and that spread (S, p); a flat input stands alone."""
-        spread = np.sqrt(np.einsum("sjj->sj", self.xx))
-        flat = spread == 0
-        spread = np.where(flat, 1.0, spread)
-        out = self.xx / (spread[:, :, None] * spread[:, None, :])
-        np.einsum("sjj->sj", out)[flat] = 1.0
-        return out, spread
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """Sums over B blocks of rows, each about its own mean, so that pooling them cancels nothing."""
-
-    count: Array
-    mean_x: Array
-    mean_y: Array
-    xx: Array
-    xy: Array
-    yy: Array
-    raw: Array  # (B, p) sums of squares about the moments' origin
-    origin: Array  # (p,)
-
-    @classmethod
-    def of(cls, m: Moments) -> Blocks:
-        n = np.maximum(m.count, 1.0)
-        mean_x, mean_y = m.sum_x / n[:, None], m.sum_y / n
-        xx = m.xx - m.sum_x[:, :, None] * mean_x[:, None, :]
-        xy = m.xy - m.sum_x * mean_y[:, None]
-        raw = np.einsum("bjj->bj", m.xx)
-        moves = np.einsum("bjj->bj", xx) > FLAT * raw
-        xx *= moves[:, :, None] & moves[:, None, :]
-        yy = np.maximum(m.yy - m.sum_y * mean_y, 0.0)
-        return cls(m.count, mean_x, mean_y, xx, xy * moves, yy, raw, m.shift_x)
-
-    def pool(self, masks: Mask, scaled: bool) -> Pool:
-        """Sets of blocks, masks (S, B), each as one training set; `scaled` divides inputs by their std there."""
-        sets, p = len(masks), self.mean_x.shape[1]
-        take = masks.astype(float)
-        weight = take * self.count
-        count = weight.sum(axis=1)
-        n = np.maximum(count, 1.0)
-        mean_x, mean_y = weight @ self.mean_x / n[:, None], weight @ self.mean_y / n
-        root = np.sqrt(weight)
-        between = root[:, :, None] * (self.mean_x - mean_x[:, None, :])
-        between_y = root * (self.mean_y - mean_y[:, None])
-        across = between.transpose(0, 2, 1)
-        xx = (take @ self.xx.reshape(len(self.xx), -1)).reshape(sets, p, p) + across @ between
-        xy = take @ self.xy + (across @ between_y[:, :, None])[:, :, 0]
-        raw = take @ self.raw
-        square = np.einsum("sjj->sj", xx)
-        moves = square > n[:, None] * (FLAT * (np.abs(self.origin) + np.sqrt(raw / n[:, None]))) ** 2
-        if not moves.all():
-            xx *= moves[:, :, None] & moves[:, None, :]
-            xy *= moves
-        safe = np.where(moves, square, 1.0)
-        loss = np.where(moves, raw / safe, 1.0).max(axis=1, initial=1.0)
-        scale = np.sqrt(np.where(moves, square, n[:, None]) / n[:, None]) if scaled else np.ones((sets, p))
-        if scaled:
-            xx, xy = xx / (scale[:, :, None] * scale[:, None, :]), xy / scale
-        return Pool(count, mean_x, mean_y, xx, xy, scale, loss)
-
-    def left_out_S_um(self, block: NDArray[np.int64], pool: Pool, which: NDArray[np.int64], coef: Array) -> Array:
-        """S (V, G) in µm of left-out blocks (V,) under the models coef (S, p, G) fitted on pool[which]."""
-        beta = coef[which]
-        square = np.einsum("vjg,vjg->vg", beta, self.xx[block] @ beta)
-        cross = (self.xy[block][:, None, :] @ beta)[:, 0]
-        away = (self.mean_x[block] - pool.mean_x[which])[:, None, :] @ beta
-        bias = (self.mean_y[block] - pool.mean_y[which])[:, None] - away[:, 0]
-        n = self.count[block][:, None]
-        sse = self.yy[block][:, None] - 2.0 * cross + square + n * bias**2
-        return np.sqrt(np.maximum(sse, 0.0) / np.maximum(n - 1.0, 1.0))
-
-
-def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> NDArray[np.int64]:
-    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,)."""
-    return np.asarray(np.argmin(left_out_mean_S_um(blocks, masks, scaled, path), axis=1))
-
-
-def left_out_mean_S_um(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> Array:
-    """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
-
-    `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
-    training sets are fitted once.
-    """
-    outer, left = np.nonzero(masks)
-    inner = masks[outer]
-    inner[np.arange(len(left)), left] = False
-    packed = np.packbits(inner, axis=1)
-    key = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[1])))[:, 0]
-    _, first, which = np.unique(key, return_index=True, return_inverse=True)
-    step = max(1, _AT_ONCE // blocks.mean_x.shape[1] ** 2)
-    S_um: Array | None = None
-    for start in range(0, len(first), step):
-        pool = blocks.pool(inner[first[start : start + step]], scaled)
-        rows = np.flatnonzero((which >= start) & (which < start + step))
-        part = blocks.left_out_S_um(left[rows], pool, which[rows] - start, path(pool))
-        S_um = np.empty((len(left), part.shape[1])) if S_um is None else S_um
-        S_um[rows] = part
-    assert S_um is not None
-    border = np.searchsorted(outer, np.arange(len(masks)))
-    total = np.add.reduceat(S_um, border, axis=0)
-    return np.asarray(total / masks.sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)
@@ -234,7 +112,7 @@ class Linear(Family):
         learned = {"intercept_um": intercept, "condition": task.condition(), "n_rows": pool.count.astype(int)} | learned
         columns = {name: values.tolist() for name, values in learned.items()}
         return [
-            self._learned(design, {"coef_um_per_K": coef[f], **{name: values[f] for name, values in columns.items()}})
+            self._learned(design, {"coef_um_per_K": coef[f], **{n: v[f] for n, v in columns.items() if v[f] == v[f]}})
             for f in range(len(folds))
         ]
 
@@ -265,7 +143,7 @@ class Linear(Family):
         block = np.concatenate([np.asarray(batches, np.int64) for batches in trained])
         which = np.repeat(np.arange(len(fitted)), [len(batches) for batches in trained])
         S_um = np.empty(len(block))
-        step = max(1, _AT_ONCE // len(design.inputs) ** 2)
+        step = max(1, AT_ONCE // len(design.inputs) ** 2)
         for start in range(0, len(block), step):
             some = slice(start, start + step)
             k, beta = block[some], np.stack([fitted[f].fitted["coef_um_per_K"] for f in which[some]])
@@ -279,13 +157,31 @@ class Linear(Family):
         total = np.bincount(which, np.where(moments.count[block] > 1, S_um, 0.0), len(fitted))
         return np.asarray(total / np.maximum(usable, 1.0))
 
+    def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.left_out_spread`.
+
+        NaN throughout where fewer than three batches were learned from.
+        """
+        if not self.tells_sd:
+            return super().sd_um(design, batches)
+        a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
+        return [np.sqrt(a + b * mean_square(design.x[design.rows(k)], design)) for k in batches]
+
     def n_parameters(self) -> int:
         """Coefficients and intercept."""
         return len(self.inputs) + 1 if self.fitted else 0
 
     @abstractmethod
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
-        """Coefficients (F, p) per unit of the inputs, and more to remember, each (F,)."""
+        """Coefficients (F, p) per unit of the inputs, and more to remember, each (F,); what is NaN is forgotten."""
+
+    def _spread(self, task: Task, path: Callable[[Pool], Array], chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """What `sd_um` needs, for families that tell it."""
+        if not self.tells_sd:
+            return {}
+        square = mean_square(task.design.x, task.design)
+        a, b = left_out_spread(task.design, square, task.masks, task.scaled, path, chosen)
+        return {"variance_um2": a, "variance_growth_um2": b}
 
 
 class Tuned(Linear):
@@ -304,7 +200,8 @@ class Tuned(Linear):
             quarters = Blocks.of(task.design.quarters)
             masks = np.repeat(task.masks[~many], 4, axis=1) & (quarters.count > 0)
             chosen[~many] = leave_block_out(quarters, masks, task.scaled, self._path)
-        return self._refit(task, chosen)
+        coef, setting = self._refit(task, chosen)
+        return coef, setting | self._spread(task, self._path, chosen)
 
     def _refit(self, task: Task, chosen: NDArray[np.int64]) -> tuple[Array, dict[str, NDArray[Any]]]:
         coef = np.take_along_axis(self._path(task.pool), chosen[:, None, None], axis=2)[:, :, 0]

@@ -24,6 +24,7 @@ class Ridge(Tuned):
     words = "ridge regression, penalty by leave-batch-out inside the training batches"
     source = "Hoerl and Kennard (1970), eq. 2.1"
     effort = "quick"
+    tells_sd = True
     rank = 12
 
     def __init__(self, least: float = 1e-6, most: float = 1e2, n_penalties: int = 25) -> None:

@@ -11,9 +11,10 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import too_few_rows
-from models.linear import Blocks, Mask
+from models.left_out_spread import left_out_spread, mean_square
 from models.pole_responses import TAUS_S, Dictionary, Source, combination, drivers_of, gaps_of, only, responses
-from models.pole_search import Candidate, Search, refined
+from models.pole_search import Candidate, Search, gains, refined
+from models.pooled_sums import Blocks, Mask
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -46,6 +47,7 @@ class TransferFunction(Family):
     effort = "usual"
     closed_form = False
     rowwise = False
+    tells_sd = True
     rank = 30
 
     def __init__(self, poles: int = 2, gaps: bool = True, drivers: bool = False) -> None:
@@ -97,6 +99,14 @@ class TransferFunction(Family):
         error_um = np.where(np.isfinite(some.x).all(axis=1), error_um, np.nan)
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
 
+    def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.left_out_spread`.
+
+        NaN throughout where fewer than three batches were learned from.
+        """
+        a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
+        return [np.sqrt(a + b * mean_square(design.x[design.rows(k)], design)) for k in batches]
+
     def n_parameters(self) -> int:
         """Gains, time constants and the intercept."""
         return len(self.fitted["names"]) + 2 * int(np.size(self.fitted["tau_s"])) + 1 if self.fitted else 0
@@ -133,11 +143,27 @@ class TransferFunction(Family):
         direct_um = np.zeros((len(masks), len(sources)))
         direct_um[:, direct] = gain[:, :n_direct]
         gain_um = gain[:, n_direct:].reshape(len(masks), -1, len(sources)).transpose(0, 2, 1)
-        words = {"kinds": [s.kind for s in sources], "names": [s.name for s in sources],
+        plain = {"kinds": [s.kind for s in sources], "names": [s.name for s in sources],
                  "exponents": np.array([s.exponent for s in sources])}  # fmt: skip
+        spread = self._spread(dictionary, masks, candidate, penalty)
         return [
-            self._learned(design, {**words, "direct_um": direct_um[f], "gain_um": gain_um[f],
+            self._learned(design, {**plain, "direct_um": direct_um[f], "gain_um": gain_um[f],
                                    "tau_s": np.exp(log_tau[f]), "intercept_um": float(intercept[f]),
-                                   "k": float(penalty[f])})
+                                   "k": float(penalty[f]), **spread[f]})
             for f in range(len(masks))
         ]  # fmt: skip
+
+    def _spread(
+        self, dictionary: Dictionary, masks: Mask, candidate: Candidate, penalty: Array
+    ) -> list[dict[str, float]]:
+        """What `sd_um` needs, from left-out residuals with the poles where the candidate has them."""
+        names = map(str, dictionary.places(candidate.sources(dictionary), candidate.poles))
+        tried, chosen = np.unique(penalty, return_inverse=True)
+        square = mean_square(dictionary.design.x, dictionary.design)
+        spread = left_out_spread(
+            dictionary.table.subset(tuple(names)), square, masks, False, lambda pool: gains(pool, tried), chosen
+        )
+        return [
+            {"variance_um2": float(a), "variance_growth_um2": float(b)} if np.isfinite(a) else {}
+            for a, b in zip(*spread, strict=True)
+        ]

@@ -1,0 +1,105 @@
+"""The stated standard deviation of linear models and transfer functions: refits, planted scatter of batches, holes."""
+
+import numpy as np
+import pytest
+
+from data.errors import InputError
+from features.design import Design
+from models import FAMILIES
+from models.base import Family
+from models.left_out_spread import mean_square
+from models.mlr import MLR
+from models.pcr import PCR
+from models.ridge import Ridge
+
+NOISE_UM = 0.5
+FAMILIES_THAT_TELL = ("mlr", "ridge", "transfer_function")
+
+
+def make_design(batches=8, rows=30, seed=0, own_slope=0.0, units=("K", "K")) -> Design:
+    """Two rises a batch; y = 3 a − 2 b, with a slope of the batch's own on a, with noise."""
+    rng = np.random.default_rng(seed)
+    x, y = [], []
+    for _ in range(batches):
+        end_K = rng.uniform(5, 20, 2)
+        rise = end_K * (1 - np.exp(-np.arange(rows)[:, None] / rng.uniform(5, 15, 2)))
+        slope = 3 + own_slope * rng.normal()
+        y.append(slope * rise[:, 0] - 2 * rise[:, 1] + rng.normal(0, NOISE_UM, rows))
+        x.append(rise)
+    offsets = np.arange(0, (batches + 1) * rows, rows)
+    names = tuple(f"b{k}" for k in range(batches))
+    return Design(("a", "b"), "z", names, np.vstack(x), np.concatenate(y), np.tile(np.arange(rows) * 300.0, batches),
+                  offsets, 300.0, input_units=units)  # fmt: skip
+
+
+def refitted(design: Design, train: list[int], penalty: float) -> tuple[float, float]:
+    """(a, b) by refitting ridge without each batch, its penalty per row kept, and a fine search over both."""
+    squared, grows = [], []
+    for k in train:
+        rest, rows = [j for j in train if j != k], design.rows(k)
+        x, y, _ = design.stacked(rest)
+        centred = x - x.mean(axis=0)
+        matrix = centred.T @ centred
+        coef = np.linalg.solve(matrix + penalty * np.trace(matrix) / 2 * np.eye(2), centred.T @ (y - y.mean()))
+        error = design.y_um[rows] - y.mean() - (design.x[rows] - x.mean(axis=0)) @ coef
+        squared.append(error**2)
+        grows.append(((design.x[rows] / 10) ** 2).mean(axis=1))
+    s, q = np.concatenate(squared), np.concatenate(grows)
+    (a, b), *_ = np.linalg.lstsq(np.column_stack([np.ones(len(q)), q]), s, rcond=None)
+    assert a > 0.01 * s.mean() and b > 0  # the plain least squares is the answer here
+    ratio = s / (a + b * q)
+    size = max(ratio.mean(), np.quantile(ratio, 0.9) / 1.6449**2)
+    return a * size, b * size
+
+
+@pytest.mark.parametrize("family", [Ridge(least=1e-3, most=1e-3, n_penalties=1), MLR()])
+def test_the_spread_is_that_of_refits_done_one_by_one(family: Family) -> None:
+    design = make_design(own_slope=0.05)
+    folds = [[j for j in range(8) if j != k] for k in range(8)]
+    for fold, model in zip(folds, family.fit_folds(design, folds), strict=True):
+        a, b = refitted(design, fold, 1e-3 if family.key == "ridge" else 0.0)
+        assert model.fitted["variance_um2"] == pytest.approx(a, rel=1e-6)
+        assert model.fitted["variance_growth_um2"] == pytest.approx(b, rel=1e-6)
+        want = np.sqrt(a + b * ((design.x[:30] / 10) ** 2).mean(axis=1))
+        np.testing.assert_allclose(model.sd_um(design, [0])[0], want, rtol=1e-6)
+
+
+@pytest.mark.parametrize("own_slope", [0.0, 0.25])
+@pytest.mark.parametrize("key", FAMILIES_THAT_TELL)
+def test_the_stated_interval_holds_on_batches_that_it_never_saw(key: str, own_slope: float) -> None:
+    inside, sd_um = [], []
+    for seed in range(6):
+        design = make_design(20, 24, seed, own_slope)
+        model = FAMILIES[key]().fit_design(design, range(12))
+        for k in range(12, 20):
+            error = design.y_um[design.rows(k)] - model.predict_design(design, [k])[0]
+            sd = model.sd_um(design, [k])[0]
+            inside.append(np.mean(np.abs(error) <= 1.6449 * sd))
+            sd_um.append(sd)
+    assert 0.85 <= np.mean(inside) <= 0.96
+    if own_slope:
+        assert np.mean([sd[-1] / sd[0] for sd in sd_um]) > 1.5
+    else:
+        assert np.mean(sd_um) == pytest.approx(NOISE_UM, rel=0.15)
+
+
+@pytest.mark.parametrize("key", FAMILIES_THAT_TELL)
+def test_two_batches_tell_nothing_of_how_batches_differ(key: str) -> None:
+    design = make_design(4)
+    two, three = FAMILIES[key]().fit_folds(design, [[0, 1], [0, 1, 2]])
+    assert "variance_um2" not in two.fitted and np.isnan(two.sd_um(design, [3])[0]).all()
+    assert np.isfinite(three.sd_um(design, [3])[0]).all()
+
+
+def test_inputs_count_in_the_scale_of_their_unit_and_holes_stay_holes() -> None:
+    design = make_design(units=("rpm", "K"))
+    x = np.array([[500.0, 20.0], [np.nan, 0.0]])
+    np.testing.assert_allclose(mean_square(x, design), [(0.25 + 4.0) / 2, np.nan])
+
+
+def test_an_exact_model_states_none_and_a_silent_family_says_so() -> None:
+    design = make_design()
+    exact = Design(design.inputs, "z", design.batch_ids, design.x, 3 * design.x[:, 0], design.time_s, design.offsets)
+    assert MLR().fit_design(exact, range(8)).sd_um(exact, [0])[0].max() < 1e-6
+    with pytest.raises(InputError, match="family pcr: tells no predictive sd; choose one that does"):
+        PCR().fit_design(design, range(8)).sd_um(design, [0])
