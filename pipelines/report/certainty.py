@@ -61,7 +61,7 @@ def certainty_table(
             "S_mean": number(row["S_mean_um"], digits),
             "inside": f"{plus_minus(100 * mean, 100 * spread, 0)} %",
             "season": percent(season),
-            "it is": verdict(mean, spread, len(inside)),
+            "it is": verdict(mean, spread, len(inside), season),
         }
         promoted_row = [row[k] for k in ("selector", "family", "n_tsp")] == promoted
         body.append(Row(tuple(shown[c.key] for c in columns), mark if promoted_row else ""))
@@ -74,16 +74,16 @@ def certainty_table(
     )
 
 
-def verdict(mean: float, spread: float, n_batches: int) -> str:
+def verdict(mean: float, spread: float, n_batches: int, season: float = math.nan) -> str:
     """In plain words what a mean share inside the 90 % interval, with its spread over batches, says.
 
     Within five per cent of nine tenths it is honest; beyond that "perhaps", unless the mean lies further off than
-    chance would put it (one-sided 95 % of a mean over batches).
+    chance would put it (one-sided 95 % of a mean over batches). `season`: the share where whole seasons are left out.
     """
     if not math.isfinite(mean):
         return NOTHING
     if abs(mean - _MEANT) <= _TOLERATED:
-        return "honest"
+        return "honest, but too sure of a new season" if season < _MEANT - _TOLERATED else "honest"
     words = "too sure" if mean < _MEANT else "too careful"
     if math.isfinite(spread) and abs(mean - _MEANT) > _BEYOND_CHANCE * spread / math.sqrt(n_batches):
         return words
