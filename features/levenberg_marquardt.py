@@ -31,7 +31,7 @@ def train(
     Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
     torch.get_num_threads()  # torch sets a thread's count at its first use there, which would undo the limit
-    with _openmp().limit(limits=1), torch.inference_mode():
+    with openmp().limit(limits=1), torch.inference_mode():
         tensors = [torch.tensor(a, dtype=torch.float64, device=device) for a in (nets.parameters, x_t, y, known)]
         theta, steps = _trained(tensors, nets.n_hidden, decay, iterations)
         return Nets(theta.cpu().numpy(), nets.n_inputs, nets.n_hidden), steps.cpu().numpy()
@@ -105,6 +105,6 @@ def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int
 
 
 @cache
-def _openmp() -> Any:
+def openmp() -> Any:
     """OpenMP's thread counts. They belong to the calling thread: a limit here reaches no other thread."""
     return ThreadpoolController().select(user_api="openmp")
