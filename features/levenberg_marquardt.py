@@ -1,7 +1,8 @@
-"""Many small tanh nets trained at once by Levenberg–Marquardt with weight decay, in torch."""
+"""Many small nets trained at once by Levenberg–Marquardt with weight decay, in torch."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -33,31 +34,34 @@ def train(
     torch.get_num_threads()  # torch sets a thread's count at its first use there, which would undo the limit
     with openmp().limit(limits=1), torch.inference_mode():
         tensors = [torch.tensor(a, dtype=torch.float64, device=device) for a in (nets.parameters, x_t, y, known)]
-        theta, steps = _trained(tensors, nets.n_hidden, decay, iterations)
-        return Nets(theta.cpu().numpy(), nets.n_inputs, nets.n_hidden), steps.cpu().numpy()
+        theta, steps = _trained(tensors, nets, decay, iterations)
+        return replace(nets, parameters=theta.cpu().numpy()), steps.cpu().numpy()
 
 
-def outputs(theta: Tensor, x_t: Tensor, n_hidden: int) -> tuple[Tensor, Tensor]:
+def outputs(theta: Tensor, x_t: Tensor, n_hidden: int, transfer: str = "tanh") -> tuple[Tensor, Tensor]:
     """Outputs (S, n) and hidden activations (S, h, n) of nets theta (S, P) for inputs (S, p, n)."""
     h, p = n_hidden, x_t.shape[1]
     w, b, v, c = theta.split([h * p, h, h, 1], dim=1)
-    hidden = torch.baddbmm(b[:, :, None], w.reshape(-1, h, p), x_t).tanh_()
+    hidden = torch.baddbmm(b[:, :, None], w.reshape(-1, h, p), x_t)
+    hidden = hidden.tanh_() if transfer == "tanh" else hidden
     return torch.baddbmm(c[:, :, None], v[:, None], hidden)[:, 0], hidden
 
 
-def jacobian(theta: Tensor, x_t: Tensor, hidden: Tensor, out: Tensor) -> Tensor:
+def jacobian(theta: Tensor, x_t: Tensor, hidden: Tensor, out: Tensor, transfer: str = "tanh") -> Tensor:
     """d output / d parameter, written to out (S, P, n)."""
     (s, h, n), p = hidden.shape, x_t.shape[1]
     slope = out[:, h * p : h * (p + 1)]
-    torch.mul(theta[:, h * (p + 1) : h * (p + 2), None], 1.0 - hidden**2, out=slope)
+    bend = 1.0 - hidden**2 if transfer == "tanh" else torch.ones_like(hidden)
+    torch.mul(theta[:, h * (p + 1) : h * (p + 2), None], bend, out=slope)
     torch.mul(slope[:, :, None], x_t[:, None], out=out[:, : h * p].view(s, h, p, n))
     out[:, h * (p + 1) : h * (p + 2)] = hidden
     out[:, -1] = 1.0
     return out
 
 
-def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int) -> tuple[Tensor, Tensor]:
+def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -> tuple[Tensor, Tensor]:
     theta, x_t, y, known = tensors
+    n_hidden, transfer = nets.n_hidden, nets.transfer
     out = theta.clone()
     steps = torch.full((len(theta),), iterations, device=theta.device)
     place = torch.arange(len(theta), device=theta.device)
@@ -66,14 +70,14 @@ def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int
     penalty[-1] = 0.0
     damping = torch.full_like(count, _DAMPING_START)
     padded = not bool(known.all())
-    output, hidden = outputs(theta, x_t, n_hidden)
+    output, hidden = outputs(theta, x_t, n_hidden, transfer)
     error = (y - output).mul_(known)
     loss = error.square().sum(dim=1) / count + theta.square() @ penalty
     # Fresh memory at each step would cost as much as the algebra.
     room = x_t.new_empty((len(theta), theta.shape[1] + 1, x_t.shape[2]))
     for step in range(1, iterations + 1):
         both = room[: len(theta)]
-        slopes = jacobian(theta, x_t, hidden, both[:, :-1])
+        slopes = jacobian(theta, x_t, hidden, both[:, :-1], transfer)
         if padded:
             slopes *= known[:, None]
         both[:, -1] = error  # below the slopes, so that one product gives curvature and gradient
@@ -83,7 +87,7 @@ def _trained(tensors: list[Tensor], n_hidden: int, decay: float, iterations: int
         curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[:, None])
         factor, failed = torch.linalg.cholesky_ex(curvature)
         trial = theta + torch.cholesky_solve(gradient, factor)[..., 0]
-        output, hidden_t = outputs(trial, x_t, n_hidden)
+        output, hidden_t = outputs(trial, x_t, n_hidden, transfer)
         error_t = (y - output).mul_(known)
         loss_t = error_t.square().sum(dim=1) / count + trial.square() @ penalty
         fall = loss - loss_t

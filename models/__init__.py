@@ -22,6 +22,7 @@ FAMILIES = Registry(
         "lag_dictionary": "models.lag_dictionary:LagDictionary",
         "axis_coupled": "models.axis_coupled:AxisCoupled",
         "bp": "models.bp:BP",
+        "bp_linear": "models.bp_linear:BPLinear",
         "lstm": "models.lstm:LSTM",
         "gru": "models.gru:GRU",
         "tcn": "models.tcn:TCN",

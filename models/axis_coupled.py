@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from data.errors import InputError
 from features.design import Design
-from models.axis_terms import Chosen, RawSums, choose_terms, expanded, fixed_ends_mm, since_first_reading
 from models.base import Array, Family
 from models.batchwise import too_few_rows
+from models.parts.axis_terms import Chosen, RawSums, choose_terms, expanded, fixed_ends_mm, since_first_reading
 
 _LEAST_ROWS = 4
 

@@ -1,29 +1,36 @@
-"""BP net: a p–h–1 tanh network trained by Levenberg–Marquardt, several starts averaged."""
+"""BP net: a p–h–1 network trained by Levenberg–Marquardt, in both published forms, tanh and linear."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data.errors import InputError, closest
 from features.design import Design
 from features.nets import Nets
 from models.base import Array, Family
 from models.batchwise import too_few_rows
 
 _STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
+TRANSFERS = ("tanh", "linear")
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit spread
 
 
 class BP(Family):
-    """Back-propagation net p–`hidden`–1, tanh, linear output; the mean of `starts` nets of seeded starts.
+    """Back-propagation net p–`hidden`–1 with linear output; the mean of `starts` nets of seeded starts.
+
+    `transfer` of the hidden layer: "tanh", or "linear" as in the year-round study. With linear transfer the net is a
+    linear map x · Σ_j v_j w_j, found iteratively: least squares with the penalty 2 · decay · |β|, not squared, which
+    is the least that |w|² + |v|² can be for a slope β (Cauchy and Schwarz).
 
     Inputs and target are standardised by the training rows of the fold. Batches are decimated evenly to at most
     `max_rows` usable rows each. Every net takes at most `iterations` Levenberg–Marquardt steps with weight `decay`
     (on standardised data), the same for every fold: a net has no spare batch for early stopping in train-on-one,
-    and the decay bounds what it can say far away: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
+    and with tanh the decay bounds what it can say far away: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
 
     Source: the year-round study's 2–3–1 net; M. Hagan and M. Menhaj, IEEE Trans. Neural Networks 5 (1994).
     """
@@ -43,10 +50,13 @@ class BP(Family):
         iterations: int = 30,
         max_rows: int = 20,
         seed: int = 0,
+        transfer: str = "tanh",
     ) -> None:
         super().__init__()
+        if transfer not in TRANSFERS:
+            raise InputError(f"family {self.key}: unknown transfer {transfer!r}: {closest(transfer, TRANSFERS)}")
         self.hidden, self.starts, self.decay = int(hidden), int(starts), float(decay)
-        self.iterations, self.max_rows, self.seed = int(iterations), int(max_rows), int(seed)
+        self.iterations, self.max_rows, self.seed, self.transfer = int(iterations), int(max_rows), int(seed), transfer
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         return self.fit_folds(design, [train])[0]
@@ -75,7 +85,7 @@ class BP(Family):
 
     def _predict(self, x: Array) -> Array:
         f = self.fitted
-        nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden)
+        nets = Nets(np.atleast_2d(np.asarray(f["nets"], float)), x.shape[1], self.hidden, self.transfer)
         u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
         out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None]).mean(axis=0)
         return out
@@ -114,8 +124,8 @@ class BP(Family):
             x_t[s, :, : len(r)] = ((x - x_mean) / x_spread).T
             y[s, : len(r)], known[s, : len(r)] = (y_um - y_mean) / y_spread, 1.0
             scales.append({"x_mean": x_mean, "x_spread": x_spread, "y_mean": y_mean, "y_spread": y_spread})
-        first = Nets.drawn(starts, p, self.hidden, self.seed)
-        nets = Nets(np.tile(first.parameters, (len(rows), 1)), p, self.hidden)
+        first = Nets.drawn(starts, p, self.hidden, self.seed, self.transfer)
+        nets = replace(first, parameters=np.tile(first.parameters, (len(rows), 1)))
         nets, steps = train(nets, np.repeat(x_t, starts, axis=0), np.repeat(y, starts, axis=0),
                             np.repeat(known, starts, axis=0), self.decay, self.iterations)  # fmt: skip
         parts = nets.parameters.reshape(len(rows), starts, -1)

@@ -11,9 +11,10 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import by_batch, steps_s, too_few_rows
-from models.kernel_expansion import unit_scale
-from models.lag_responses import Response, lag_responses
-from models.lag_shapes import (
+from models.linear import Blocks, Task
+from models.parts.kernel_expansion import unit_scale
+from models.parts.lag_responses import Response, lag_responses
+from models.parts.lag_shapes import (
     CRITERIA,
     LagRegression,
     Shape,
@@ -23,7 +24,6 @@ from models.lag_shapes import (
     koyck_shapes,
     polynomial_shapes,
 )
-from models.linear import Blocks, Task
 
 LAGS = ("koyck", "almon", "free")
 KOYCK_TAUS_S = tuple(60.0 * t for t in (10, 20, 40, 80, 160, 320, 640))

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError
-from models.active_set import sparse_coefficients
 from models.base import Array
 from models.linear import Pool, Task, Tuned
+from models.parts.active_set import sparse_coefficients
 
 
 class ElasticNet(Tuned):

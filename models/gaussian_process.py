@@ -14,9 +14,9 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family, inner_groups
 from models.batchwise import too_few_rows
-from models.bordered import Kernel
-from models.kernel_expansion import evenly, products, unit_scale
-from models.left_out_groups import LeftOut
+from models.parts.bordered import Kernel
+from models.parts.kernel_expansion import evenly, products, unit_scale
+from models.parts.left_out_groups import LeftOut
 
 Rows = NDArray[np.int64]
 LINES = (1e2, 1e3, 1e4, 1e5, 1e6)

@@ -9,7 +9,7 @@ import numpy as np
 
 from features.design import Design
 from models.base import Array, Family
-from models.trees import Trees, training_rows
+from models.parts.trees import Trees, training_rows
 
 _ROWS = 720  # that few batches may give together
 

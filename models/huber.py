@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from data.errors import InputError
 from models.base import Array, inner_groups
 from models.linear import Linear, Mask, Task
-from models.pooled_sums import FLAT
-from models.reweighting import Settled, settle
+from models.parts.pooled_sums import FLAT
+from models.parts.reweighting import Settled, settle
 
 
 class Huber(Linear):

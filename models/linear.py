@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family
-from models.left_out_spread import left_out_spread, mean_square
-from models.pooled_sums import AT_ONCE, Blocks, Mask, Pool, leave_block_out
+from models.parts.left_out_spread import left_out_spread, mean_square
+from models.parts.pooled_sums import AT_ONCE, Blocks, Mask, Pool, leave_block_out
 
 EPS = float(np.finfo(float).eps)
 DIGITS_LEFT = 1e8  # beyond this condition of the covariance a fit goes back to the rows
@@ -158,7 +158,7 @@ class Linear(Family):
         return np.asarray(total / np.maximum(usable, 1.0))
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value, see `models.left_out_spread`.
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.parts.left_out_spread`.
 
         NaN throughout where fewer than three batches were learned from.
         """

@@ -14,9 +14,9 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import Array, inner_groups
 from models.batchwise import too_few_rows
-from models.bordered import Bordered, Kernel
-from models.kernel_expansion import KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
-from models.particle_swarm import least
+from models.parts.bordered import Bordered, Kernel
+from models.parts.kernel_expansion import KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
+from models.parts.particle_swarm import least
 
 TUNINGS = ("closed_form", "particle_swarm")
 _LEAST_ROWS_PER_BATCH = 8

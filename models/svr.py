@@ -13,7 +13,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, inner_groups
 from models.batchwise import too_few_rows
-from models.kernel_expansion import KernelExpansion, Rows, evenly, kernel, unit_scale
+from models.parts.kernel_expansion import KernelExpansion, Rows, evenly, kernel, unit_scale
 
 _LEAST_ROWS_PER_BATCH = 3
 _GROUPS = 3  # that the training batches are left out in, when the setting is chosen

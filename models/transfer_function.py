@@ -11,10 +11,10 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import too_few_rows
-from models.left_out_spread import left_out_spread, mean_square
-from models.pole_responses import TAUS_S, Dictionary, Source, combination, drivers_of, gaps_of, only, responses
-from models.pole_search import Candidate, Search, gains, refined
-from models.pooled_sums import Blocks, Mask
+from models.parts.left_out_spread import left_out_spread, mean_square
+from models.parts.pole_responses import TAUS_S, Dictionary, Source, combination, drivers_of, gaps_of, only, responses
+from models.parts.pole_search import Candidate, Search, gains, refined
+from models.parts.pooled_sums import Blocks, Mask
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -100,7 +100,7 @@ class TransferFunction(Family):
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value, see `models.left_out_spread`.
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.parts.left_out_spread`.
 
         NaN throughout where fewer than three batches were learned from.
         """

@@ -15,9 +15,9 @@ from data.registry import Effort
 from features.design import Design
 from models.base import Array, Family, Plain
 from models.batchwise import by_batch, too_few_rows
+from models.parts.twin_folds import Calibrated, Calibrations
+from models.parts.twin_run import TwinRun
 from models.recent import Recent
-from models.twin_folds import Calibrated, Calibrations
-from models.twin_run import TwinRun
 from twin.compile import compile_network
 from twin.network import Network
 

@@ -12,8 +12,8 @@ from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
 from models.base import Array
+from models.parts.twin_run import TwinRun
 from models.twin import Twin, run_of
-from models.twin_run import TwinRun
 from twin.kalman import Doubt, Filtered, filtered
 
 HEAT_W = (3.0, 10.0, 30.0)

@@ -13,9 +13,9 @@ from features.design import Design
 from models.base import Array, Family, Plain
 from models.batchwise import by_batch
 from models.gaussian_process import GaussianProcess
+from models.parts.twin_run import TwinRun
 from models.ridge import Ridge
 from models.twin import Twin, run_of
-from models.twin_run import TwinRun
 from twin.network import Network
 
 _RESIDUALS = ("ridge", "gp")

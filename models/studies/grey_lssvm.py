@@ -14,8 +14,8 @@ from features.grey import synthetic_degree
 from models.base import Family
 from models.bp import BP
 from models.gm1n import GM1N
-from models.grey_sequence import sequence_outputs
 from models.lssvm import LSSVM
+from models.parts.grey_sequence import sequence_outputs
 from models.studies.base import Figure, Ordering, Study
 
 Array = NDArray[np.float64]

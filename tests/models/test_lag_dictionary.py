@@ -10,10 +10,10 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
-from models.batch_process import BatchProcess, Windows
 from models.lag_dictionary import LagDictionary
-from models.lag_dictionary_columns import Columns
 from models.metrics import residual_std_um
+from models.parts.batch_process import BatchProcess, Windows
+from models.parts.lag_dictionary_columns import Columns
 from models.ridge import Ridge
 
 STEP_S, N = 300.0, 72

@@ -11,7 +11,7 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from models.metrics import residual_std_um
-from models.pole_responses import TAUS_S, Dictionary, Source, combination, only, responses
+from models.parts.pole_responses import TAUS_S, Dictionary, Source, combination, only, responses
 from models.ridge import Ridge
 from models.transfer_function import TransferFunction
 

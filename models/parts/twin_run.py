@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data.batch import Batch
 from data.errors import InputError
 from models.base import Array
-from models.twin_folds import SUBSTEPS_K
+from models.parts.twin_folds import SUBSTEPS_K
 from twin.network import Network
 from twin.simulation import choose_substeps, simulate
 from twin.simulation.inputs import Inputs, inputs_of

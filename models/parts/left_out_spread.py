@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
-from models.kernel_expansion import unit_scale
-from models.pooled_sums import AT_ONCE, Blocks, Mask, Pool, inner_sets
+from models.parts.kernel_expansion import unit_scale
+from models.parts.pooled_sums import AT_ONCE, Blocks, Mask, Pool, inner_sets
 
 Array = NDArray[np.float64]
 _ENOUGH_BATCHES = 3
@@ -83,6 +83,7 @@ def _fitted(squared: Array, grows: Array) -> tuple[float, float]:
         a, b = least, max(sq - least * q, 0.0) / qq
     if s == 0:
         return 0.0, 0.0
-    ratio = squared / (a + b * grows)
+    with np.errstate(over="ignore"):  # residuals of rounding alone
+        ratio = squared / (a + b * grows)
     size = max(float(ratio.mean()), float(np.quantile(ratio, 0.9)) / _SIDE_OF_90**2)
     return float(a * size), float(b * size)

@@ -15,8 +15,8 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array
 from models.gm1n import GM1N, response
-from models.grey_layer import layer_design
 from models.lssvm import LSSVM
+from models.parts.grey_layer import layer_design
 
 
 def sequence_outputs(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from features.design import Moments
 from models.linear import EPS
-from models.pole_responses import DRIVERS, TAUS_S, Dictionary, combination
-from models.pooled_sums import Blocks, Mask, Pool, left_out_mean_S_um
+from models.parts.pole_responses import DRIVERS, TAUS_S, Dictionary, combination
+from models.parts.pooled_sums import Blocks, Mask, Pool, left_out_mean_S_um
 
 Array = NDArray[np.float64]
 PENALTIES = np.geomspace(1e1, 1e-7, 9)

@@ -1,0 +1,1 @@
+"""What families are made of: solvers, responses, kernels, trees and nets, each in a file of its own."""
