@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError, closest
+from data.registry import Effort
 from features.design import Design
 from features.nets import Nets
 from models.base import Array, Family
@@ -38,7 +39,7 @@ class BP(Family):
     key = "bp"
     words = "BP neural network, Levenberg–Marquardt"
     source = "Hagan and Menhaj 1994"
-    effort = "quick"
+    effort: ClassVar[Effort] = "usual"
     closed_form = False
     rank = 70
 
