@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+from data.registry import Effort
 from models.bp import BP
 
 
@@ -11,9 +14,9 @@ class BPLinear(BP):
     key = "bp_linear"
     words = "BP neural network with linear transfer: a linear map found iteratively"
     source = "year-round PCR study; Hagan and Menhaj 1994"
-    effort = "complete"
+    effort: ClassVar[Effort] = "complete"
     rank = 20
 
-    def __init__(self, hidden: int = 3, starts: int = 1, decay: float = 3e-3, iterations: int = 30,
-                 max_rows: int = 20, seed: int = 0, transfer: str = "linear") -> None:  # fmt: skip
+    def __init__(self, hidden: int = 3, starts: int = 1, decay: float = 3e-4, iterations: int = 30,
+                 max_rows: int = 80, seed: int = 0, transfer: str = "linear") -> None:  # fmt: skip
         super().__init__(hidden, starts, decay, iterations, max_rows, seed, transfer)

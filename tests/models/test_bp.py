@@ -13,7 +13,9 @@ from data.errors import InputError
 from features.design import Design
 from features.levenberg_marquardt import jacobian, outputs, train
 from features.nets import Nets
-from models.bp import BP
+from models.bp import BP, TRANSFERS
+from models.bp_linear import BPLinear
+from models.mlr import MLR
 
 
 def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> Design:
@@ -33,13 +35,14 @@ def make_design(seed=0, sizes=(40, 25, 33, 30), p=2, law=None, ambient=None) -> 
 
 def slopes_of(nets, x_t):
     theta, x = torch.from_numpy(nets.parameters), torch.from_numpy(x_t)
-    out, hidden = outputs(theta, x, nets.n_hidden)
+    out, hidden = outputs(theta, x, nets.n_hidden, nets.transfer)
     np.testing.assert_allclose(out.numpy(), nets.outputs(x_t), atol=1e-12)  # what is trained is what predicts
-    return jacobian(theta, x, hidden, x.new_empty((*theta.shape, x.shape[2]))).numpy()
+    return jacobian(theta, x, hidden, x.new_empty((*theta.shape, x.shape[2])), nets.transfer).numpy()
 
 
-def test_jacobian_is_the_difference_quotient():
-    nets = Nets.drawn(4, 3, 2, seed=1)
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_jacobian_is_the_difference_quotient(transfer):
+    nets = Nets.drawn(4, 3, 2, seed=1, transfer=transfer)
     x_t = np.random.default_rng(0).normal(size=(4, 3, 7))
     got = slopes_of(nets, x_t)
     assert got.shape == (4, 2 * 5 + 1, 7)
@@ -189,3 +192,42 @@ def test_too_few_rows_in_words():
     design = make_design()
     with pytest.raises(InputError, match="family bp: got 0 usable rows of z in no batch, need at least 2"):
         BP().fit_design(design, [])
+
+
+def test_linear_transfer_is_least_squares_with_a_penalty_on_the_length_of_the_slope():
+    """min mean (y − c − x·β)² + 2 decay |β| is convex: at its one minimum mean x (y − ŷ) = decay β / |β|."""
+    rng = np.random.default_rng(0)
+    x_t, decay = rng.normal(size=(1, 4, 80)), 0.05
+    y = np.array([[1.0, -2.0, 0.5, 0.0]]) @ x_t[0] + 3.0 + rng.normal(size=(1, 80))
+    slopes = []
+    for hidden, seed in ((1, 0), (3, 0), (3, 1)):
+        nets, _ = train(Nets.drawn(1, 4, hidden, seed, "linear"), x_t, y, np.ones((1, 80)), decay, 2000)
+        w, _, v, _ = np.split(nets.parameters[0], [4 * hidden, 5 * hidden, 6 * hidden])
+        slope = v @ w.reshape(hidden, 4)
+        left = y - nets.outputs(x_t)
+        np.testing.assert_allclose((x_t[0] @ left[0]) / 80, decay * slope / np.linalg.norm(slope), atol=1e-3)
+        assert abs(left.mean()) < 1e-3
+        slopes.append(slope)
+    np.testing.assert_allclose(slopes[1:], [slopes[0]] * 2, atol=5e-3)
+
+
+def test_without_decay_a_linear_net_is_multiple_regression():
+    design = make_design()
+    net = BPLinear(decay=0.0, iterations=200, max_rows=1000).fit_design(design, [0, 1, 2])
+    plain = MLR().fit_design(design, [0, 1, 2])
+    np.testing.assert_allclose(net.predict_design(design, [3])[0], plain.predict_design(design, [3])[0], atol=1e-4)
+    assert net.options()["transfer"] == "linear" and BP().options()["transfer"] == "tanh"
+
+
+def test_linear_transfer_cannot_bend():
+    design = make_design(law=lambda x: 20 * np.tanh(0.15 * x[:, 0] - 0.1 * x[:, 1]) + 5)
+    left = {}
+    for transfer in TRANSFERS:
+        model = BP(decay=1e-6, iterations=200, max_rows=100, transfer=transfer).fit_design(design, [0, 1, 2])
+        left[transfer] = np.std(model.predict_design(design, [3])[0] - design.y_um[design.rows(3)])
+    assert left["tanh"] < 0.2 * left["linear"]
+
+
+def test_an_unknown_transfer_in_words():
+    with pytest.raises(InputError, match="family bp: unknown transfer 'tan': did you mean 'tanh'. Allowed: linear, t"):
+        BP(transfer="tan")
