@@ -17,6 +17,7 @@ from features.nets import Nets
 Array = NDArray[np.float64]
 
 _DAMPING_START, _DAMPING_MOST = 1e-2, 1e8
+_LEAST_KEPT = 0.25  # of the fall that the quadratic model promises, for a step to be trusted farther
 
 
 def train(
@@ -25,9 +26,10 @@ def train(
     """Every net's parameters after at most `iterations` damped Gauss–Newton steps, and the steps each took.
 
     Net s minimises `mean_n known·(y − ŷ)² + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known (S, n);
-    known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that helps, × 10 after one that
-    does not) and stops by itself, so a net's result does not depend on its neighbours. Float64 on any device; on
-    the processor one thread, whatever torch is set to: the matrices are small, and callers train side by side.
+    known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that brings a quarter of the fall
+    that the quadratic model promises, else × 10; a step that raises the loss is taken back) and stops by itself, so
+    a net's result does not depend on its neighbours. Float64 on any device; on the processor one thread, whatever
+    torch is set to: the matrices are small, and callers train side by side.
 
     Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
@@ -86,7 +88,9 @@ def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -
         curvature = product[:, :-1, :-1]
         curvature.diagonal(dim1=1, dim2=2).add_(penalty + damping[:, None])
         factor, failed = torch.linalg.cholesky_ex(curvature)
-        trial = theta + torch.cholesky_solve(gradient, factor)[..., 0]
+        move = torch.cholesky_solve(gradient, factor)
+        trial = theta + move[..., 0]
+        promised = (gradient + damping[:, None, None] * move).mul_(move).sum(dim=(1, 2))
         output, hidden_t = outputs(trial, x_t, n_hidden, transfer)
         error_t = (y - output).mul_(known)
         loss_t = error_t.square().sum(dim=1) / count + trial.square() @ penalty
@@ -95,8 +99,9 @@ def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -
         each, row = better[:, None, None], better[:, None]
         theta, error = torch.where(row, trial, theta), torch.where(row, error_t, error)
         hidden, loss = torch.where(each, hidden_t, hidden), torch.where(better, loss_t, loss)
-        damping = torch.where(better, 0.1 * damping, 10.0 * damping).clamp_(min=1e-12)
-        done = (better & (fall < 1e-6 * loss_t)) | (damping > _DAMPING_MOST)
+        kept = better & (fall > _LEAST_KEPT * promised)
+        damping = torch.where(kept, 0.1 * damping, 10.0 * damping).clamp_(min=1e-12)
+        done = (kept & (fall < 1e-6 * loss_t)) | (damping > _DAMPING_MOST)
         if bool(done.any()):
             out[place[done]], steps[place[done]] = theta[done], step
             some = ~done
