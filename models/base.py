@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -66,6 +66,19 @@ class Family(ABC):
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold (a fold is the training batches' indices), equal to `fit_design` fold by fold."""
         return [self.fit_design(design, fold) for fold in folds]
+
+    def fit_subsets(
+        self, designs: Sequence[Design], folds: Sequence[Sequence[Sequence[int]]]
+    ) -> Iterator[list[Self] | InputError]:
+        """`fit_folds` of several subsets of one design, in their order, each on folds of its own.
+
+        A subset that cannot be fitted gives its error, so that the others are kept.
+        """
+        for design, own in zip(designs, folds, strict=True):
+            try:
+                yield self.fit_folds(design, own)
+            except InputError as error:
+                yield error
 
     def predict_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]

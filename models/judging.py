@@ -58,9 +58,14 @@ class Judged:
         trained = [f.train[:: -(-len(f.train) // most)] for f in folds]
         pending: list[_Column] = []
         waiting = 0
-        for sub, which in needed:
+        subsets = family.fit_subsets(
+            [sub for sub, _ in needed], [[folds[i].train for i in which] for _, which in needed]
+        )
+        for (sub, which), fitted in zip(needed, subsets, strict=True):
             try:
-                columns = _columns(sub, family, which, folds, trained)
+                if isinstance(fitted, InputError):
+                    raise fitted
+                columns = _columns(sub, fitted, which, folds, trained)
             except InputError as error:
                 out.failures.append(f"{len(sub.inputs)} points: {error}")
                 continue
@@ -114,10 +119,14 @@ class Judged:
 
 
 def _columns(
-    design: Design, family: Family, which: Sequence[int], folds: Sequence[Fold], trained: Sequence[Sequence[int]]
+    design: Design,
+    fitted: Sequence[Family],
+    which: Sequence[int],
+    folds: Sequence[Fold],
+    trained: Sequence[Sequence[int]],
 ) -> list[_Column]:
-    """The family fitted on one set of inputs for some of the folds, with its predictions on what they test."""
-    fitted = family.fit_folds(design, [folds[i].train for i in which])
+    """A family fitted on one set of inputs for some of the folds, with its predictions on what they test."""
+    family = fitted[0]
     own_S_um = family.fitting_S_um(design, fitted, [trained[i] for i in which])
     wanted = [folds[i].test if own_S_um is not None else tuple({*folds[i].test, *trained[i]}) for i in which]
     predicted = family.predict_folds(design, fitted, wanted)

@@ -12,6 +12,7 @@ from models.base import Array
 from models.parts.sequences import Sequences
 
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit size
+FEWEST_BATCHES = 3  # of fewer, none can be spared to tell whether a net helps
 _LEAST_REST = 1e-3  # of the target's size: below, the linear part leaves rounding only
 
 
@@ -54,6 +55,23 @@ class Stack:
         return cls(np.ascontiguousarray(x.transpose(2, 0, 4, 3, 1)), np.ascontiguousarray(rest.transpose(2, 0, 3, 1)),
                    known.transpose(2, 0, 3, 1).astype(float), n_batches, spread, sigma_um)  # fmt: skip
 
+    @classmethod
+    def joined(cls, stacks: Sequence[Self]) -> Self:
+        """One stack of all nets; phases, inputs and steps must agree."""
+        most = max(s.x.shape[-1] for s in stacks)
+
+        def filled(values: Array) -> Array:
+            return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, most - values.shape[-1])])
+
+        x, rest, known = (
+            np.concatenate([filled(v) for v in part], axis=1)
+            for part in zip(*((s.x, s.rest, s.known) for s in stacks), strict=True)
+        )
+        n_batches, spread, sigma_um = (
+            np.concatenate(part) for part in zip(*((s.n_batches, s.spread, s.sigma_um) for s in stacks), strict=True)
+        )
+        return cls(x, rest, known, n_batches, spread, sigma_um)
+
     def halves(self) -> Self:
         """Twice the nets: first each with its batches of even place, then each with those of odd place."""
         filled = [(0, self.x.shape[-1] % 2)]
@@ -69,3 +87,18 @@ class Stack:
         along = np.einsum("hp,rsptb->rshtb", directions, self.x) * self.known[:, :, None]
         rms = np.sqrt((along**2).sum(axis=(0, 3, 4)) / self.known.sum(axis=(0, 2, 3))[:, None])
         return np.asarray(directions / np.where(rms > 0, rms, 1.0)[:, :, None])
+
+
+def alike(n_batches: Sequence[int], n_nets: Sequence[int], most: int) -> list[list[int]]:
+    """Stacks to train as one: places in the order of their numbers of batches, cut where these are half as many again,
+    where few batches become enough to tell whether a net helps, or where `most` batches are together."""
+    groups: list[list[int]] = []
+    size = 0
+    for i in sorted(range(len(n_batches)), key=lambda i: n_batches[i]):
+        least = n_batches[groups[-1][0]] if groups else 0
+        size += n_batches[i] * n_nets[i]
+        if not groups or size > most or n_batches[i] > 1.5 * least or least < FEWEST_BATCHES <= n_batches[i]:
+            groups.append([])
+            size = n_batches[i] * n_nets[i]
+        groups[-1].append(i)
+    return groups

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -14,16 +15,25 @@ from features.design import Design
 from models.base import Array, Family, Plain
 from models.batchwise import steps_s, too_few_rows
 from models.parts.linear_memory import fit_memories, memory_columns
-from models.parts.net_stack import Stack
+from models.parts.net_stack import FEWEST_BATCHES, Stack, alike
 from models.parts.sequences import Sequences, strides
 
 Weights = dict[str, Any]  # name -> array (S, …) of S nets, numpy's or torch's
 DEVICES = ("auto", "cpu", "cuda")
 _LEAST_ROWS = 4
-_LEAST_BATCHES = 3  # of fewer, none can be spared to tell whether the net helps
 _LEAST_STEPS = 16  # of the longest training batch: short batches take a narrower spacing
 _MOST_OFF = 0.05  # of a batch's spacing from the one that was learned
-_STACK_VALUES = 6_000_000  # of the states of a stack: what fits a processor's memory
+_STACK_VALUES = 500_000  # states of a stack: what fits a processor's cache
+_WAITING_VALUES = 10_000_000  # of the inputs of stacks that wait to be joined
+
+
+@dataclass(frozen=True)
+class _Lesson:
+    """A stack, where its nets belong (subset, fold), and what is known of each before it is trained."""
+
+    stack: Stack
+    places: list[tuple[int, int]]
+    known: list[Plain]
 
 
 class SequenceNet(Family):
@@ -97,37 +107,29 @@ class SequenceNet(Family):
         Raises:
             InputError: fewer than 4 usable rows in a fold; drivers asked for and none recorded.
         """
-        if not design.inputs:
-            raise InputError(
-                f"family {self.key}: no inputs given for {design.target or 'the error'}; name at least one channel"
-            )
-        if self.drivers and not design.driver_names:
-            raise InputError(
-                f"family {self.key}: drivers=True, but batch {design.batch_ids[0]} has no driver channel; expected at "
-                "least one, e.g. the spindle speed with role driver in the machine file; or set drivers=False"
-            )
-        drivers = design.driver_names if self.drivers else ()
-        by_spacing: dict[tuple[int, float], list[int]] = {}
-        for f, fold in enumerate(folds):
-            by_spacing.setdefault(self._spacing(design, fold), []).append(f)
-        out: dict[int, Self] = {}
-        for (stride, spacing_s), which in by_spacing.items():
-            sequences = Sequences.of(design, stride, drivers).for_training()
-            rows = sequences.known.sum(axis=(1, 2))
-            for f in which:
-                if (got := int(rows[list(folds[f])].sum())) < _LEAST_ROWS:
-                    raise too_few_rows(self.key, design, folds[f], got, _LEAST_ROWS)
-            columns = memory_columns(sequences.x)
-            coef, intercept_um = fit_memories(sequences, columns, [folds[f] for f in which])
-            rest_um = sequences.y_um[..., None] - columns @ coef.T - intercept_um
-            for some in self._stacks([len(folds[f]) for f in which], sequences.row[0].size):
-                nets = self._trained(Stack.of(sequences, [folds[which[i]] for i in some], rest_um[..., some]))
-                for i, net in zip(some, nets, strict=True):
-                    linear = {"linear_um": coef[i], "intercept_um": float(intercept_um[i])}
-                    n_rows = int(rows[list(folds[which[i]])].sum())
-                    frame = {"spacing_s": spacing_s, "drivers": list(drivers), "n_rows": n_rows}
-                    out[which[i]] = self._learned(design, linear | net | frame)
-        return [out[f] for f in range(len(folds))]
+        (fitted,) = self.fit_subsets([design], [folds])
+        if isinstance(fitted, InputError):
+            raise fitted
+        return fitted
+
+    def fit_subsets(
+        self, designs: Sequence[Design], folds: Sequence[Sequence[Sequence[int]]]
+    ) -> Iterator[list[Self] | InputError]:
+        """The same with nets of all subsets in common stacks, as far as their numbers of inputs agree."""
+        lessons: list[_Lesson] = []
+        errors: dict[int, InputError] = {}
+        first = 0
+        for d, (design, own) in enumerate(zip(designs, folds, strict=True)):
+            try:
+                lessons += self._lessons(design, own, d)
+            except InputError as error:
+                errors[d] = error
+            if d + 1 == len(designs) or sum(lesson.stack.x.size for lesson in lessons) > _WAITING_VALUES:
+                fitted = self._learn(lessons)
+                for done in range(first, d + 1):
+                    nets = [fitted[done, f] for f in range(len(folds[done]))] if done not in errors else []
+                    yield errors.get(done) or [self._learned(designs[done], net) for net in nets]
+                lessons, first = [], d + 1
 
     def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
         return self.predict_folds(design, [self], [batches])[0]
@@ -141,12 +143,12 @@ class SequenceNet(Family):
             InputError: a batch whose step does not divide the steps that the net learned.
         """
         out: list[list[Array]] = [[] for _ in fitted]
-        alike: dict[tuple[float, tuple[str, ...], int], list[int]] = {}
+        by_kind: dict[tuple[float, tuple[str, ...], int], list[int]] = {}
         for f, model in enumerate(fitted):
             key = (float(model.fitted["spacing_s"]), tuple(model.fitted["drivers"]), len(wanted[f]))
-            alike.setdefault(key, []).append(f)
+            by_kind.setdefault(key, []).append(f)
         lengths = np.diff(design.offsets)
-        for (spacing_s, drivers, n_wanted), which in alike.items():
+        for (spacing_s, drivers, n_wanted), which in by_kind.items():
             sequences = Sequences.of(design, self._stride(design, spacing_s), drivers)
             at_once = max(1, _STACK_VALUES // max(1, self.hidden * n_wanted * sequences.row[0].size))
             for start in range(0, len(which), at_once):
@@ -181,17 +183,59 @@ class SequenceNet(Family):
             )
         return int(rows.max(initial=1))
 
-    def _stacks(self, n_batches: Sequence[int], places: int) -> list[list[int]]:
-        """Folds in the order of their batches, cut where these are half as many again or the stack is full."""
-        stacks: list[list[int]] = []
-        for f in sorted(range(len(n_batches)), key=lambda i: n_batches[i]):
-            last = stacks[-1] if stacks else []
-            full = (len(last) + 1) * n_batches[f] * places * self.hidden > _STACK_VALUES
-            few = bool(last) and n_batches[last[0]] < _LEAST_BATCHES <= n_batches[f]
-            if not last or full or few or n_batches[f] > 1.5 * n_batches[last[0]]:
-                stacks.append([])
-            stacks[-1].append(f)
-        return stacks
+    def _lessons(self, design: Design, folds: Sequence[Sequence[int]], place: int) -> list[_Lesson]:
+        """The linear part of every fold, and what it leaves to the nets."""
+        if not design.inputs:
+            raise InputError(
+                f"family {self.key}: no inputs given for {design.target or 'the error'}; name at least one channel"
+            )
+        if self.drivers and not design.driver_names:
+            raise InputError(
+                f"family {self.key}: drivers=True, but batch {design.batch_ids[0]} has no driver channel; expected at "
+                "least one, e.g. the spindle speed with role driver in the machine file; or set drivers=False"
+            )
+        drivers = design.driver_names if self.drivers else ()
+        by_spacing: dict[tuple[int, float], list[int]] = {}
+        for f, fold in enumerate(folds):
+            by_spacing.setdefault(self._spacing(design, fold), []).append(f)
+        out = []
+        for (stride, spacing_s), which in by_spacing.items():
+            sequences = Sequences.of(design, stride, drivers).for_training()
+            rows = [int(sequences.known[list(folds[f])].sum()) for f in which]
+            for f, got in zip(which, rows, strict=True):
+                if got < _LEAST_ROWS:
+                    raise too_few_rows(self.key, design, folds[f], got, _LEAST_ROWS)
+            columns = memory_columns(sequences.x)
+            coef, intercept_um = fit_memories(sequences, columns, [folds[f] for f in which])
+            rest_um = sequences.y_um[..., None] - columns @ coef.T - intercept_um
+            frame = {"spacing_s": spacing_s, "drivers": list(drivers)}
+            for some in alike([len(folds[f]) for f in which], [1] * len(which), self._most(*sequences.row[0].shape)):
+                stack = Stack.of(sequences, [folds[which[i]] for i in some], rest_um[..., some])
+                linear = [{"linear_um": coef[i], "intercept_um": float(intercept_um[i])} for i in some]
+                known = [part | frame | {"n_rows": rows[i]} for i, part in zip(some, linear, strict=True)]
+                out.append(_Lesson(stack, [(place, which[i]) for i in some], known))
+        return out
+
+    def _learn(self, lessons: Sequence[_Lesson]) -> dict[tuple[int, int], Plain]:
+        """What is learned in each place: lessons of one shape are joined before they are trained."""
+        out: dict[tuple[int, int], Plain] = {}
+        by_shape: dict[tuple[int, int, int], list[_Lesson]] = {}
+        for lesson in lessons:
+            n_phases, _, p, n_steps, _ = lesson.stack.x.shape
+            by_shape.setdefault((n_phases, n_steps, p), []).append(lesson)
+        for (n_phases, n_steps, _), same in by_shape.items():
+            n_batches, n_nets = ([lesson.stack.x.shape[i] for lesson in same] for i in (-1, 1))
+            for group in alike(n_batches, n_nets, self._most(n_phases, n_steps)):
+                joined = [same[i] for i in group]
+                nets = self._trained(Stack.joined([lesson.stack for lesson in joined]))
+                places = [place for lesson in joined for place in lesson.places]
+                known = [part for lesson in joined for part in lesson.known]
+                out |= {at: part | net for at, part, net in zip(places, known, nets, strict=True)}
+        return out
+
+    def _most(self, n_phases: int, n_steps: int) -> int:
+        """Batches of all nets of a stack."""
+        return _STACK_VALUES // (self.hidden * n_phases * n_steps)
 
     def _trained(self, stack: Stack) -> list[Plain]:
         """What each net of a stack learned, for inputs in their own units."""
@@ -201,7 +245,7 @@ class SequenceNet(Family):
         start = self.start(stack.unit_directions(drawn))
         share = np.zeros(len(stack.n_batches))
         weights, readout = start, np.zeros((len(share), self.n_states()))
-        if stack.n_batches.min() >= _LEAST_BATCHES:
+        if stack.n_batches.min() >= FEWEST_BATCHES:
             weights, readout = train(self, stack, start)
             share = self._share(stack, start)
         weights["input"] = weights["input"] / stack.spread[:, None]

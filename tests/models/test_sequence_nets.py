@@ -300,6 +300,27 @@ def test_small_stacks_give_what_one_stack_gives(Net, monkeypatch):
         np.testing.assert_allclose(a[0], b[0], atol=1e-7)
 
 
+@pytest.mark.parametrize("waiting", [1, 10_000_000])
+def test_subsets_together_are_each_alone_and_one_that_fails_keeps_the_others(Net, waiting, monkeypatch):
+    monkeypatch.setattr("models.parts.sequence_net._WAITING_VALUES", waiting)
+    design = plant(bent_law)
+    designs = [design.subset(names) for names in (("a",), ("b",), ("a", "b"), ("b", "a"))]
+    folds = [[[0, 1, 2, 3], [4]], [[]], [[1, 2, 3]], [[0, 1, 2, 3], [2, 3, 4, 5, 6, 7]]]
+    one, failed, *others = Net(epochs=4).fit_subsets(designs, folds)
+    assert isinstance(failed, InputError) and "in no batch" in str(failed)
+    for d, fitted in zip((0, 2, 3), (one, *others), strict=True):
+        for model, fold in zip(fitted, folds[d], strict=True):
+            alone = Net(epochs=4).fit_design(designs[d], fold)
+            got, want = (m.predict_design(designs[d], [7])[0] for m in (model, alone))
+            np.testing.assert_allclose(got, want, atol=1e-7)
+
+
+def test_a_family_that_joins_nothing_fits_subset_by_subset():
+    design = plant(bent_law)
+    first, failed = MLR().fit_subsets([design.subset(("a",)), design], [[[0, 1], [2]], [[]]])
+    assert [m.inputs for m in first] == [("a",), ("a",)] and isinstance(failed, InputError)
+
+
 def test_torch_keeps_its_thread_count_and_a_result_does_not_depend_on_it(Net):
     design, before = plant(bent_law, batches=4), torch.get_num_threads()
     told = []
