@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data.errors import InputError, closest
 from data.registry import Effort
+from features.decimation import decimated_rows
 from features.design import Design
 from features.nets import Nets
 from models.base import Array, Family
@@ -68,7 +69,7 @@ class BP(Family):
         Raises:
             InputError: fewer than 2 usable rows in a fold.
         """
-        kept = self._decimated(design)
+        kept = decimated_rows(design, range(design.n_batches), self.max_rows)
         rows = [np.concatenate([kept[k] for k in fold]) if len(fold) else np.empty(0, np.int64) for fold in folds]
         for f, fold in enumerate(folds):
             if len(rows[f]) < 2:
@@ -90,15 +91,6 @@ class BP(Family):
         u = (x - np.asarray(f["x_mean"], float)) / np.asarray(f["x_spread"], float)
         out: Array = f["y_mean"] + f["y_spread"] * nets.outputs(u.T[None]).mean(axis=0)
         return out
-
-    def _decimated(self, design: Design) -> list[NDArray[np.int64]]:
-        kept = []
-        for k in range(design.n_batches):
-            usable = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-            if len(usable) > self.max_rows:
-                usable = usable[np.round(np.linspace(0, len(usable) - 1, self.max_rows)).astype(int)]
-            kept.append(usable)
-        return kept
 
     def _stacks(self, counts: Sequence[int], n_inputs: int) -> list[list[int]]:
         """Folds in the order of their rows, cut where the rows double or the stack is full."""

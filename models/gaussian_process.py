@@ -14,6 +14,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family, inner_groups
 from models.batchwise import too_few_rows
+from models.metrics import SIDE_OF_90
 from models.parts.bordered import Kernel
 from models.parts.kernel_expansion import evenly, products, unit_scale
 from models.parts.left_out_groups import LeftOut
@@ -24,7 +25,6 @@ CURVES = (0.0, 1.0, 10.0, 100.0, 1000.0)
 LENGTHS = (0.3, 1.0, 3.0)
 OWN_LINES = (0.0, 0.1, 1.0)
 _FEWEST_ROWS, _LEAST_OF_A_BATCH, _MOST_OF_A_BATCH = 4, 8, 48
-_SIDE_OF_90 = 1.6449
 _ENOUGH_BATCHES = 3  # to see how batches differ
 _LEAST_NOISE_UM = 1e-9
 _LOST = 1e12  # kernel over noise, beyond which rounding is all that is left
@@ -258,5 +258,5 @@ def _rms_um(error: Array, variance: Array, group: Rows) -> float:
 def _size_um(error: Array, variance: Array, group: Rows) -> float:
     """Noise that makes the residuals as large as stated, and nine tenths of them lie inside."""
     stated = np.abs(error) / np.sqrt(variance)
-    rms, inside = np.sqrt(np.mean(stated**2)), np.quantile(stated, 0.9) / _SIDE_OF_90
+    rms, inside = np.sqrt(np.mean(stated**2)), np.quantile(stated, 0.9) / SIDE_OF_90
     return float(max(rms, inside, _LEAST_NOISE_UM))

@@ -16,6 +16,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import by_batch, too_few_rows
+from models.metrics import SIDE_OF_90
 from models.parts.batch_process import BatchProcess, Windows
 from models.parts.lag_dictionary_columns import DRIVEN, PROMPT, UNDRIVEN, Columns
 
@@ -26,7 +27,6 @@ _ODD = 6.0  # a batch is mistrusted that leaves so many times what the median of
 _ONE_ODD_IN = 4  # batches at most, so that the others are a majority
 _FEWEST_BATCHES = 3
 _FEWEST_WINDOWS = 4
-_SIDE_OF_90 = 1.6449
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class _Pooling:
         weights = (S_mean_um.min() / S_mean_um) ** _SHARPNESS
         weights /= weights.sum()
         coef_um = weights @ np.array([self._gains(process, without) for process in processes])
-        widened = (stats.t.ppf(0.95, len(voters) - 1) / _SIDE_OF_90) ** 2
+        widened = (stats.t.ppf(0.95, len(voters) - 1) / SIDE_OF_90) ** 2
         spread_um2 = widened * self._spread_um2(np.tensordot(weights, left_um, 1), rest)
         return _Pooled(coef_um, weights, mistrusted, spread_um2)
 

@@ -17,7 +17,7 @@ from features.grey import synthetic_degree
 from models.result import SCORES
 
 Array = NDArray[np.float64]
-_SIDE_OF_90 = 1.6449  # standard deviations: a normal value lies within them nine times in ten
+SIDE_OF_90 = 1.6449  # standard deviations: a normal value lies within them nine times in ten
 
 
 def batch_scores(y_um: Array, predicted_um: Array) -> dict[str, Array]:
@@ -63,7 +63,7 @@ def coverage(y_um: Array, predicted_um: Array, sd_um: Array) -> dict[str, Array]
     known = np.isfinite(away) & np.isfinite(sd_um)
     n = known.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        inside = (away <= _SIDE_OF_90 * sd_um) & known
+        inside = (away <= SIDE_OF_90 * sd_um) & known
         return {"coverage90": inside.sum(axis=0) / n, "sd_um": np.where(known, sd_um, 0.0).sum(axis=0) / n}
 
 

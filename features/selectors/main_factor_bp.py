@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from features.decimation import decimated_rows
 from features.design import Design
 from features.nets import Nets
 from features.rises import zeroed_error_um
 from features.selectors.base import Diagnostic, Selector
-from features.selectors.decimation import decimated_rows
 from features.selectors.statistics import check_n_tsps, chosen_of_varying, in_order, ranking, training_statistics
 
 Array = NDArray[np.float64]

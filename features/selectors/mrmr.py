@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
+from features.decimation import decimated_rows
 from features.design import Design
 from features.selectors.base import Selector
-from features.selectors.decimation import decimated_rows
 from features.selectors.statistics import DIGITS, check_n_tsps, chosen_of_varying, training_statistics
 
 Array = NDArray[np.float64]

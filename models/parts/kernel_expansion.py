@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from features.decimation import even_rows
 from features.design import Design
 from models.base import Array, Family
 from models.batchwise import by_batch
@@ -100,13 +101,7 @@ def unit_scale(design: Design) -> Array:
 
 def evenly(design: Design, batches: Sequence[int], most: int) -> Rows:
     """Numbers of at most `most` usable rows of each batch, evenly over them."""
-    kept = [np.empty(0, np.int64)]
-    for k in batches:
-        usable = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-        if len(usable) > most:
-            usable = usable[np.round(np.linspace(0, len(usable) - 1, most)).astype(int)]
-        kept.append(usable)
-    return np.concatenate(kept)
+    return np.concatenate([np.empty(0, np.int64), *(even_rows(design, k, most) for k in batches)])
 
 
 def _united(supports: Sequence[Array]) -> tuple[Array, list[Rows]]:

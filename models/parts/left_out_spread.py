@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from features.design import Design
+from models.metrics import SIDE_OF_90
 from models.parts.kernel_expansion import unit_scale
 from models.parts.pooled_sums import AT_ONCE, Blocks, Mask, Pool, inner_sets
 
 Array = NDArray[np.float64]
 _ENOUGH_BATCHES = 3
-_SIDE_OF_90 = 1.6449
 _MOST_ROWS = 120  # of a batch that residuals are taken at
 _LEAST_SHARE = 0.01  # of the mean square residual, that a keeps: no recorded value is free of noise
 
@@ -87,5 +87,5 @@ def _fitted(squared: Array, grows: Array) -> tuple[float, float]:
         return 0.0, 0.0
     with np.errstate(over="ignore"):  # residuals of rounding alone
         ratio = squared / (a + b * grows)
-    size = max(float(ratio.mean()), float(np.quantile(ratio, 0.9)) / _SIDE_OF_90**2)
+    size = max(float(ratio.mean()), float(np.quantile(ratio, 0.9)) / SIDE_OF_90**2)
     return float(a * size), float(b * size)

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from features.decimation import decimated_rows
 from features.design import Design
 from models.batchwise import too_few_rows
 
@@ -87,11 +88,7 @@ def training_rows(key: str, design: Design, train: Sequence[int], most: int, tog
         InputError: fewer than 4 usable rows.
     """
     each = max(most, together // max(1, len(train)))
-    kept = [np.empty(0, np.int64)]
-    for k in sorted(train):
-        rows = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-        kept.append(rows[np.unique(np.round(np.linspace(0, len(rows) - 1, min(len(rows), each))).astype(int))])
-    out = np.concatenate(kept)
+    out = np.concatenate([np.empty(0, np.int64), *decimated_rows(design, train, each)])
     if len(out) < _FEWEST:
         raise too_few_rows(key, design, train, len(out), _FEWEST)
     return out

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from stacked_rows import LENGTHS, P, orthonormal, stack, year
 
-from features.selectors.decimation import decimated_rows
+from features.decimation import decimated_rows
 from features.selectors.mrmr import MRMR, incremental_order, mutual_information
 
 Array = NDArray[np.float64]
