@@ -1,0 +1,1 @@
+"""The proof: the diagnosis examined on recordings in which the effect is concealed."""
