@@ -5,9 +5,12 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from scipy import sparse
 
-from twin.plants.casting import Array, Cells
+from twin.plants.casting import Array
 from twin.plants.structure import Structure
+
+LEAST_UM_PER_K = 0.05
 
 
 def links_W_per_K(s: Structure) -> dict[tuple[str, str], float]:
@@ -15,46 +18,28 @@ def links_W_per_K(s: Structure) -> dict[tuple[str, str], float]:
 
     For heat that enters one body evenly and leaves the other evenly, with nothing else around.
     """
-    solid = s.surfaces == 0
-    out = {}
-    for one, other in combinations(s.bodies, 2):
-        a, b = s.bodies[one], s.bodies[other]
-        cells = np.concatenate([a, b])
-        number = np.full(s.size, -1)
-        number[cells] = np.arange(len(cells))
-        i, j, g = number[s.one[solid]], number[s.other[solid]], s.between_W_per_K[solid]
-        within = (i >= 0) & (j >= 0)
-        i, j, g = i[within], j[within], g[within]
-        if np.any((i < len(a)) != (j < len(a))):
-            out[one, other] = _effective(i, j, g, len(a), len(b))
-    return out
+    pairs = {(one, other): s.between(one, other) for one, other in combinations(s.bodies, 2)}
+    return {(a, b): _effective(s, a, b, within) for (a, b), within in pairs.items() if within is not None}
 
 
-def _effective(i: Cells, j: Cells, g: Array, n_one: int, n_other: int) -> float:
-    n = n_one + n_other
-    laplacian = np.zeros((n, n))
-    np.add.at(laplacian, (i, i), g)
-    np.add.at(laplacian, (j, j), g)
-    np.add.at(laplacian, (i, j), -g)
-    np.add.at(laplacian, (j, i), -g)
-    heat = np.concatenate([np.full(n_one, 1.0 / n_one), np.full(n_other, -1.0 / n_other)])
-    rise = np.zeros(n)
-    rise[1:] = np.linalg.solve(laplacian[1:, 1:], heat[1:])  # the first cell is held at 0
-    return float(1.0 / (rise[:n_one].mean() - rise[n_one:].mean()))
+def _effective(s: Structure, one: str, other: str, within: sparse.csc_matrix) -> float:
+    """One over the difference of the means that a watt through both makes."""
+    cells = np.union1d(s.bodies[one].cells, s.bodies[other].cells)
+    through = np.zeros(s.size)
+    s.bodies[one].add(through, 1.0)
+    s.bodies[other].add(through, -1.0)
+    rise = np.zeros(len(cells))
+    rise[1:] = np.linalg.solve(within[cells][:, cells].toarray()[1:, 1:], through[cells][1:])  # the first is held at 0
+    return float(1.0 / (through[cells] @ rise))
 
 
 def exposures_W_per_K(s: Structure) -> dict[tuple[str, str], float]:
     """(body, "air" or "room") -> conductance of its whole surface."""
-    out = {}
-    for name, cells in s.bodies.items():
-        for around, conductance in (("air", s.air_W_per_K), ("room", s.room_W_per_K)):
-            total = float(conductance[cells].sum())
-            if total > 0:
-                out[name, around] = total
-    return out
+    exposed = {(body, around): g for body in s.bodies for around, g in s.exposure_W_per_K(body).items()}
+    return {where: g for where, g in exposed.items() if g > 0}
 
 
 def gains_um_per_K(s: Structure, weights_um_per_K: Array) -> dict[str, float]:
-    """What each body's mean rise adds to an error."""
-    sums = {name: float(weights_um_per_K[cells].sum()) for name, cells in s.bodies.items()}
-    return {name: total for name, total in sums.items() if total}
+    """What each body's mean rise adds to an error; what no drawing would show, below `LEAST_UM_PER_K`, left out."""
+    sums = {body: float(s.share_of(body) @ weights_um_per_K) for body in s.bodies}
+    return {body: total for body, total in sums.items() if abs(total) > LEAST_UM_PER_K}

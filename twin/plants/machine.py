@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from twin.plants.casting import Array, Cells
+from twin.plants.casting import Array
 from twin.plants.growth import Growth
-from twin.plants.structure import Structure
+from twin.plants.structure import Part, Structure
 
 FEATURES = ("feed", "coolant", "walls", "layers", "motor_loss", "bending", "growth", "mandrel")
 Law = Literal["viscous", "load", "motor"]
@@ -18,21 +18,21 @@ Law = Literal["viscous", "load", "motor"]
 class Source:
     """Heat of the spindle: `watts` at the rated speed by law (viscous, load: one; motor: idle, linear, quadratic).
 
-    `share` (N,) says into which cells it goes and adds up to 1; `film` and `housing` are the cells whose temperatures
-    a bearing's lubricant and its outer ring have; `shaft` the inner ring's.
+    `share` (N,) says into which nodes it goes and adds up to 1; `shaft` and `housing` are where a bearing's inner and
+    outer ring sit.
     """
 
     law: Law
     watts: tuple[float, ...]
     share: Array
     amount: float = 1.0
-    shaft: Cells | None = None
-    housing: Cells | None = None
+    shaft: Part | None = None
+    housing: Part | None = None
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A temperature channel: its cell, how late and how wrong it shows it."""
+    """A temperature channel: its node, how late and how wrong it shows it."""
 
     channel: str
     body: str
@@ -40,6 +40,14 @@ class Sensor:
     lag_s: float
     offset_K: float
     drift_K_per_h: float = 0.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a kind of plant draws of a machine: its castings, cut up, and what their rises do to the tool."""
+
+    structure: Structure
+    growths: tuple[Growth, ...]
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class Plant:
     sensors: tuple[Sensor, ...]
     features: frozenset[str]
 
-    def cells(self, body: str) -> Cells:
+    def part(self, body: str) -> Part:
         return self.structure.bodies[body]
 
     def body_like(self, *wanted: str) -> str:

@@ -12,7 +12,7 @@ from twin.plants.effects.base import Effect
 from twin.plants.lumping import exposures_W_per_K, gains_um_per_K, links_W_per_K
 from twin.plants.machine import Plant, Source
 from twin.plants.options import Options
-from twin.plants.recorded import ERROR_STEP_UM, ERRORS
+from twin.plants.recorded import ERROR_STEP_UM, ERRORS, GAP_STEPS
 from twin.plants.seeds import stream
 
 RPM_NMM_W = 1.047e-4
@@ -79,7 +79,7 @@ def machine_file(plant: Plant, effects: Sequence[Effect], name: str, seed: int, 
         description="Simulated machine drawn at random; no recording of a real one.",
         simulated=True,
         recording={  # type: ignore[arg-type]
-            "files": ["*.csv"], "step_s": options.step_s, "max_gap_s": 3.0 * options.step_s,
+            "files": ["*.csv"], "step_s": options.step_s, "max_gap_s": GAP_STEPS * options.step_s,
             "start_from_name": "%Y%m%d_%H%M",
         },
         channels=_channels(plant, options),  # type: ignore[arg-type]
@@ -94,10 +94,12 @@ def _channels(plant: Plant, options: Options) -> dict[str, dict[str, Any]]:
     if "walls" in plant.features:
         out["wall"] = {"role": "ambient", **degC}
     out["spindle_rpm"] = {"role": "driver", "unit": "rpm", "resolution": 1}
+    switch = {"role": "driver", "unit": "1", "resolution": 1}
     if "feed" in plant.features:
         out["feed"] = {"role": "driver", "unit": "mm/min", "resolution": 1}
     if "coolant" in plant.features:
-        out["coolant"] = {"role": "driver", "unit": "1", "resolution": 1}
+        out["coolant"] = switch
+    out |= {name: switch for name in options.idle}
     return out | {c: {"role": "error", "unit": "um", "resolution": ERROR_STEP_UM} for c in ERRORS}
 
 
@@ -118,9 +120,9 @@ def _around(plant: Plant, body: str, around: str) -> str:
 def _bodies(plant: Plant, pen: _Pen, hidden: set[str]) -> dict[str, Any]:
     s = plant.structure
     out: dict[str, Any] = {}
-    for name, cells in s.bodies.items():
-        capacity = pen.mass(float(s.capacity_J_per_K[cells].sum()))
-        casting = next((c for n, c in s.castings.items() if cells[0] in s.cells[n]), None)
+    for name, part in s.bodies.items():
+        capacity = pen.mass(part.capacity_J_per_K)
+        casting = next((c for n, c in s.castings.items() if part.cells[0] in s.cells[n]), None)
         if name not in hidden:
             out[name] = {"capacity": capacity} | ({} if casting is None else {"material": casting.material})
     return out

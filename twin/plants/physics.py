@@ -12,7 +12,7 @@ from twin.plants.conditions import Now, moments
 from twin.plants.effects.base import Effect
 from twin.plants.machine import Plant, Source
 from twin.plants.runs import Run
-from twin.plants.solver import GAMMA, Heat, integrate
+from twin.plants.structure import Heat
 
 LEAD_S, TAIL_S = 900.0, 900.0  # simulated finely about the run itself: lags settle, clocks may be off
 COARSE_S = 60.0  # step in the hours before
@@ -42,12 +42,11 @@ def simulated(
     slow = np.zeros(s.size)
     slow[np.concatenate([s.cells[n] for n in ("bed", "column", "table")])] = 1.0
     start = room0 + slow[:, None] * np.array([r.slow_K for r in runs])
-    losses = s.losses()
 
     def stretch(from_s: float, until_s: float, size_s: float, at: Array) -> Array:
         steps = round((until_s - from_s) / size_s)
         heat = heat_of(plant, runs, effects, from_s, size_s, steps)
-        return integrate(s.capacity_J_per_K, losses, heat, at, size_s, steps)
+        return s.integrate(heat, at, size_s, steps)
 
     before = stretch(first_s, -LEAD_S, COARSE_S, start)
     end_s = runs[0].hours * 3600.0 + TAIL_S
@@ -63,7 +62,7 @@ def heat_of(
 ) -> Heat:
     """The heat into the cells beside conduction and constant convection, as the solver asks for it."""
     at_s = from_s + np.arange(steps, dtype=np.float64) * np.float64(step_s)
-    now = [moments(runs, at_s, at_s + share * step_s) for share in (0.0, GAMMA)]
+    now = [moments(runs, at_s, at_s + share * step_s) for share in plant.structure.stages]
     friction = np.array([r.friction for r in runs])
     shares = np.stack([source.share for source in plant.sources.values()], axis=1)
     room = plant.structure.room_W_per_K[:, None]

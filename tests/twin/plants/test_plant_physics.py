@@ -9,17 +9,17 @@ import pytest
 from plant_cases import NONE, SEED, Array, plant
 from scipy import sparse
 
-from twin.plants.casting import Casting
 from twin.plants.drawing import draw_plant
 from twin.plants.effects import EFFECTS
-from twin.plants.growth import bending
 from twin.plants.lumping import exposures_W_per_K, links_W_per_K
 from twin.plants.machine import FEATURES
 from twin.plants.physics import simulated
 from twin.plants.runs import Block, held, plan_runs
 from twin.plants.seeds import stream
-from twin.plants.solver import integrate
-from twin.plants.structure import Structure
+from twin.plants.volumes.casting import Plate
+from twin.plants.volumes.growth import bending
+from twin.plants.volumes.solver import integrate
+from twin.plants.volumes.structure import Volumes, even
 
 
 @pytest.mark.parametrize("key", [None, "preload_feedback", "draught", "rotating_convection", "natural_convection"])
@@ -81,12 +81,12 @@ def test_machines_differ_and_are_resolved_finely(seed: int) -> None:
     s = p.structure
     assert 8 <= len(s.castings) + (s.air_cell is not None) <= 14
     assert 100 <= s.size <= 300
-    covered = np.concatenate(list(s.bodies.values()))
+    covered = np.concatenate([part.cells for part in s.bodies.values()])
     assert sorted(covered) == list(range(s.size))
     assert 7 <= len(p.sensors) <= 12
     for sensor in p.sensors:
-        assert sensor.cell in s.bodies[sensor.body]
-        assert sensor.cell not in s.joined() or len(s.bodies[sensor.body]) <= 5
+        assert sensor.cell in s.bodies[sensor.body].cells
+        assert sensor.cell not in s.joined() or len(s.bodies[sensor.body].cells) <= 5
         assert 30 <= sensor.lag_s <= 60
     for source in p.sources.values():
         assert source.share.sum() == pytest.approx(1.0)
@@ -123,11 +123,15 @@ def test_a_column_bends_as_the_beam_with_that_gradient() -> None:
 
 def test_lumped_links_of_a_bar_in_two_pieces_are_those_of_the_textbook() -> None:
     """Two halves of a rod with even heat in one and out of the other: 3 k A / L between their means."""
-    rod = Casting("rod", "steel", 7850.0 * 1.0 * 0.01, 1.0, 0.1, 0.1, (400, 1), 0.0)
+    rod = Plate("rod", "steel", 7850.0 * 1.0 * 0.01, 1.0, 0.1, 0.1, (400, 1), 0.0)
     one, other, conductance = rod.conduction()
-    bodies = {"left": np.arange(200), "right": np.arange(200, 400)}
-    none = np.zeros(400)
-    s = Structure({}, {}, bodies, none, none, none, none, one, other, conductance, 0 * conductance, none)
+    none, capacity = np.zeros(400), rod.capacity_J_per_K
+    bodies = {"left": even(np.arange(200), capacity, none), "right": even(np.arange(200, 400), capacity, none)}
+    s = Volumes(
+        castings={"rod": rod}, cells={"rod": np.arange(400)}, bodies=bodies, capacity_J_per_K=capacity,
+        above_floor_m=none, room_W_per_K=none, surface_m2=none, expansion_um_per_mK=none,
+        one=one, other=other, between_W_per_K=conductance, surfaces=0 * conductance,
+    )  # fmt: skip
     assert links_W_per_K(s)["left", "right"] == pytest.approx(3.0 * 48.0 * 0.01 / 1.0, rel=1e-3)
 
 

@@ -19,7 +19,8 @@ class _FrontBearings(Effect):
     def _temperatures(self, cells_degC: Array) -> tuple[Array, Array]:
         """Inner and outer ring, degC, each (B,)."""
         at: Source = self.plant.sources[self.source]
-        return cells_degC[at.shaft].mean(axis=0), cells_degC[at.housing].mean(axis=0)
+        assert at.shaft is not None and at.housing is not None, "a bearing has both"
+        return at.shaft.mean(cells_degC), at.housing.mean(cells_degC)
 
 
 class ViscosityFeedback(_FrontBearings):

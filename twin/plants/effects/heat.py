@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.plants.casting import Array, Cells
+from twin.plants.casting import Array
 from twin.plants.conditions import Now
 from twin.plants.effects.base import Answer, Effect
 from twin.plants.machine import Plant
+from twin.plants.structure import Part
 
 
 class FloorSink(Effect):
@@ -17,8 +18,7 @@ class FloorSink(Effect):
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
-        bed = plant.structure.castings["bed"]
-        self.feet = plant.structure.cells["bed"][bed.box(height=(0.0, 0.3))]
+        self.feet = plant.structure.part("bed", height=(0.0, 0.3))
         self.conductance_W_per_K = float(rng.uniform(18.0, 32.0)) * size
 
     def answer(self) -> Answer:
@@ -26,8 +26,8 @@ class FloorSink(Effect):
         return Answer(self.key, "node", "bed", values, words="the bed loses heat to the floor")
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
-        each = self.conductance_W_per_K / len(self.feet)
-        heat_W[self.feet] += each * (now.ground_degC - cells_degC[self.feet])
+        each = self.conductance_W_per_K * self.feet.weights[:, None]
+        heat_W[self.feet.cells] += each * (now.ground_degC - cells_degC[self.feet.cells])
 
 
 class _Steady(Effect):
@@ -38,18 +38,18 @@ class _Steady(Effect):
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
-        self.at: Cells = self._cells(plant)
+        self.at = self._part(plant)
         self.power_W = self.watts * float(rng.uniform(0.8, 1.25)) * size
 
-    def _cells(self, plant: Plant) -> Cells:
-        return plant.cells(self.body)
+    def _part(self, plant: Plant) -> Part:
+        return plant.part(self.body)
 
     def share(self, cells_degC: Array, now: Now) -> Array:
         """Of the full power, (B,)."""
         raise NotImplementedError
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
-        heat_W[self.at] += self.power_W / len(self.at) * self.share(cells_degC, now)
+        self.at.add(heat_W, self.power_W * self.share(cells_degC, now))
 
 
 class CabinetHeat(_Steady):
@@ -58,10 +58,8 @@ class CabinetHeat(_Steady):
     key = "cabinet_heat"
     body, watts = "column_back", 80.0
 
-    def _cells(self, plant: Plant) -> Cells:
-        column = plant.structure.castings["column"]
-        back = plant.structure.cells["column"][column.box((0.0, 0.3), (0.35, 0.9))]
-        return np.intersect1d(back, plant.cells("column_back"))
+    def _part(self, plant: Plant) -> Part:
+        return plant.structure.part("column", (0.0, 0.3), (0.35, 0.9))
 
     def answer(self) -> Answer:
         return Answer(
@@ -125,16 +123,16 @@ class UnlistedWarmSpeed(_Steady):
     key = "unlisted_warm_speed"
     watts = 50.0  # at the rated speed and 10 K above 20 degC
 
-    def _cells(self, plant: Plant) -> Cells:
+    def _part(self, plant: Plant) -> Part:
         self.body = plant.body_like("head_rear", "head")
-        return plant.cells(self.body)
+        return plant.part(self.body)
 
     def answer(self) -> Answer:
         values = {"power": (self.power_W, "W")}
         return Answer(None, "node", self.body, values, words="power (n / rated) (T - 20 degC) / 10 K")
 
     def share(self, cells_degC: Array, now: Now) -> Array:
-        return now.speed_rpm / self.plant.rated_rpm * (cells_degC[self.at].mean(axis=0) - 20.0) / 10.0
+        return now.speed_rpm / self.plant.rated_rpm * (self.at.mean(cells_degC) - 20.0) / 10.0
 
 
 class UnlistedCoolantSpeed(PumpHeat):

@@ -24,8 +24,8 @@ class Radiation(Effect):
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
         self.body = str(rng.choice(["column_back", "bed"]))
-        self.cells = plant.cells(self.body)
-        self.area_m2 = size * plant.structure.surface_m2[self.cells][:, None]
+        part = plant.part(self.body)
+        self.cells, self.area_m2 = part.cells, size * part.surface_m2[:, None]
 
     def answer(self) -> Answer:
         values = {"area": (float(np.sum(self.area_m2)), "m**2"), "emissivity": (EMISSIVITY, "1")}
@@ -43,7 +43,7 @@ class RotatingConvection(Effect):
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
-        self.cells, self.air = plant.cells("shaft"), plant.structure.air_cell
+        self.cells, self.air = plant.part("shaft").cells, plant.structure.air_cell
         rest = plant.structure.air_W_per_K if self.air is not None else plant.structure.room_W_per_K
         self.rest_W_per_K = rest[self.cells][:, None]
         self.gain = 4.0 * size
@@ -70,8 +70,8 @@ class NaturalConvection(Effect):
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
-        self.cells = plant.cells("motor")
-        self.area_m2 = 2.0 * size * plant.structure.surface_m2[self.cells][:, None]  # ribs
+        motor = plant.part("motor")
+        self.cells, self.area_m2 = motor.cells, 2.0 * size * motor.surface_m2[:, None]  # ribs
 
     def answer(self) -> Answer:
         values = {"area": (float(np.sum(self.area_m2)), "m**2"), "height": (self.height_m, "m")}

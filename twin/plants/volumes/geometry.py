@@ -6,22 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.plants.casting import Casting
 from twin.plants.seeds import stream
-from twin.plants.structure import Assembly, Structure
+from twin.plants.volumes.casting import Plate
+from twin.plants.volumes.structure import Assembly, Volumes
 
 
 @dataclass(frozen=True)
-class Layout:
+class Drawn:
     """What the drawing decides and the rest of the plant must know, lengths in m."""
 
-    structure: Structure
+    structure: Volumes
     head_at: float  # height of the head's middle as a share of the column's
     reach_m: float  # from the column's front to the spindle
     table_width_m: float
 
 
-def draw_layout(seed: int, mandrel: bool) -> Layout:
+def draw_castings(seed: int, mandrel: bool) -> Drawn:
     """The structure of the machine of a seed, with or without a test mandrel in its spindle."""
     rng = stream(seed, "geometry")
     size = float(rng.uniform(0.8, 1.3))
@@ -40,7 +40,7 @@ def draw_layout(seed: int, mandrel: bool) -> Layout:
     joints = {n: g * float(np.exp(0.25 * rng.standard_normal())) for n, g in _JOINTS_W_PER_K.items()}
     _join(a, joints, head_at)
     _expose(a, rng)
-    return Layout(a.done(air_room_W_per_K), head_at, 0.9 * a.castings["head"].depth_m, 0.1 * size)
+    return Drawn(a.done(air_room_W_per_K), head_at, 0.9 * a.castings["head"].depth_m, 0.1 * size)
 
 
 _COUNTS = {
@@ -59,24 +59,24 @@ _JOINTS_W_PER_K = {
 }  # fmt: skip
 
 
-def _castings(s: float, f: dict[str, float], n: dict[str, int], head_at: float) -> list[Casting]:
+def _castings(s: float, f: dict[str, float], n: dict[str, int], head_at: float) -> list[Plate]:
     """Iron castings scale with the machine's size, squared in mass; the spindle does not."""
     foot = 0.45 * s
     head_m = foot + 1.4 * s * head_at - 0.22 * s
     iron, steel = "cast_iron", "steel"
     column = n["column_x"], n["column_z"]
     return [
-        Casting("shaft", steel, 14 * f["spindle"], 0.42, 0.06, 0.06, (n["shaft"], 1), head_m, upright=True),
-        Casting("front", steel, 17 * f["spindle"], 0.15, 0.18, 0.05, (5, 1), head_m),
-        Casting("rear", steel, 10.5 * f["spindle"], 0.12, 0.15, 0.05, (4, 1), head_m + 0.35),
-        Casting("motor", steel, 50 * f["motor"], 0.26, 0.22, 0.22, (5, 1), head_m + 0.45 * s),
-        Casting("head", iron, 320 * s * s * f["head"], 0.62 * s, 0.45 * s, 0.3 * s, (n["head_x"], n["head_z"]), head_m),
-        Casting("column", iron, 640 * s * s * f["column"], 0.5 * s, 1.4 * s, 0.45 * s, column, foot),
-        Casting("bed", iron, 1700 * s * s * f["bed"], 1.8 * s, 0.45 * s, 0.7 * s, (n["bed"], 3), 0.0),
-        Casting("saddle", iron, 220 * s * s * f["saddle"], 0.7 * s, 0.12 * s, 0.5 * s, (6, 1), foot),
-        Casting("table", iron, 380 * s * s * f["table"], 0.6 * s, 0.14 * s, 0.9 * s, (8, 2), foot + 0.12 * s),
-        Casting("screw", steel, 14 * f["spindle"], 0.75 * s, 0.035, 0.035, (12, 1), foot + 0.6 * s, upright=True),
-        Casting("mandrel", steel, 3.5, 0.25, 0.04, 0.04, (5, 1), head_m - 0.25, upright=True),
+        Plate("shaft", steel, 14 * f["spindle"], 0.42, 0.06, 0.06, (n["shaft"], 1), head_m, upright=True),
+        Plate("front", steel, 17 * f["spindle"], 0.15, 0.18, 0.05, (5, 1), head_m),
+        Plate("rear", steel, 10.5 * f["spindle"], 0.12, 0.15, 0.05, (4, 1), head_m + 0.35),
+        Plate("motor", steel, 50 * f["motor"], 0.26, 0.22, 0.22, (5, 1), head_m + 0.45 * s),
+        Plate("head", iron, 320 * s * s * f["head"], 0.62 * s, 0.45 * s, 0.3 * s, (n["head_x"], n["head_z"]), head_m),
+        Plate("column", iron, 640 * s * s * f["column"], 0.5 * s, 1.4 * s, 0.45 * s, column, foot),
+        Plate("bed", iron, 1700 * s * s * f["bed"], 1.8 * s, 0.45 * s, 0.7 * s, (n["bed"], 3), 0.0),
+        Plate("saddle", iron, 220 * s * s * f["saddle"], 0.7 * s, 0.12 * s, 0.5 * s, (6, 1), foot),
+        Plate("table", iron, 380 * s * s * f["table"], 0.6 * s, 0.14 * s, 0.9 * s, (8, 2), foot + 0.12 * s),
+        Plate("screw", steel, 14 * f["spindle"], 0.75 * s, 0.035, 0.035, (12, 1), foot + 0.6 * s, upright=True),
+        Plate("mandrel", steel, 3.5, 0.25, 0.04, 0.04, (5, 1), head_m - 0.25, upright=True),
     ]  # fmt: skip
 
 

@@ -6,18 +6,16 @@ part L-stable, one step at a time, so that a jump of the drivers between two ste
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from twin.plants.casting import Array
+from twin.plants.structure import Heat
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 DELTA = 1.0 - 1.0 / (2.0 * GAMMA)
-
-Heat = Callable[[int, int, Array], Array]  # step, stage (0: its start, 1: GAMMA into it), cells (N, B) -> W (N, B)
+STAGES = (0.0, float(GAMMA))
 
 
 def integrate(

@@ -1,0 +1,1 @@
+"""Plant B: castings as bars and plates of finite volumes."""

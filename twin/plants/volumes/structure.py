@@ -1,0 +1,181 @@
+"""The castings put together: all cells of a machine, what conducts between them and what they lose to the room."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy import sparse
+
+from twin.plants.casting import MATERIALS, Array, Cells
+from twin.plants.structure import AIR, WHOLE, Heat, Part, Structure
+from twin.plants.volumes.casting import Plate
+from twin.plants.volumes.solver import STAGES, integrate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Volumes(Structure):
+    """N finite volumes, each of one body.
+
+    surface_m2 and expansion_um_per_mK (N,). `one`, `other` and `between_W_per_K` (E,) are conduction, joints and
+    convection to the enclosure's air, which is a cell of its own; `surfaces` (E,) tells the last kind.
+    """
+
+    castings: Mapping[str, Plate]
+    surface_m2: Array
+    expansion_um_per_mK: Array
+    one: Cells
+    other: Cells
+    between_W_per_K: Array
+    surfaces: Array
+
+    stages: ClassVar[tuple[float, ...]] = STAGES
+
+    @property
+    def air_W_per_K(self) -> Array:
+        """Convection of every cell to the enclosure's air, W/K, (N,); the air's own entry is 0."""
+        out = np.zeros(self.size)
+        np.add.at(out, self.one[self.surfaces > 0], self.between_W_per_K[self.surfaces > 0])
+        return out
+
+    def part(self, casting: str, depth: tuple[float, float] = WHOLE, height: tuple[float, float] = WHOLE) -> Part:
+        """The cells whose centres lie there; where there is none, the one nearest its middle."""
+        return even(
+            self.cells[casting][self.castings[casting].box(depth, height)], self.capacity_J_per_K, self.surface_m2
+        )
+
+    def touching(self) -> set[frozenset[str]]:
+        body = {int(c): name for name, part in self.bodies.items() for c in part.cells}
+        pairs = {frozenset((body[int(i)], body[int(j)])) for i, j in zip(self.one, self.other, strict=True)}
+        return {pair for pair in pairs if len(pair) == 2}
+
+    def joined(self) -> set[int]:
+        casting = np.full(self.size, -1)
+        for k, cells in enumerate(self.cells.values()):
+            casting[cells] = k
+        contact = (casting[self.one] != casting[self.other]) & (self.surfaces == 0)
+        return {int(c) for c in np.concatenate([self.one[contact], self.other[contact]])}
+
+    def off_middle(self, body: str) -> Array:
+        cells = self.bodies[body].cells
+        name = next(n for n, own in self.cells.items() if cells[0] in own)
+        here = np.searchsorted(self.cells[name], cells)
+        off = []
+        for along in self.castings[name].along_m:
+            own = along[here]
+            half = max(np.ptp(own) / 2, 1e-9)
+            off.append((own - (own.max() + own.min()) / 2) / half)
+        return np.asarray(np.max(np.abs(off), axis=0))
+
+    def losses(self) -> sparse.csc_matrix:
+        return _laplacian(self.one, self.other, self.between_W_per_K, self.room_W_per_K)
+
+    def between(self, one: str, other: str) -> sparse.csc_matrix | None:
+        a, b = self.share_of(one) > 0, self.share_of(other) > 0
+        within = (a | b)[self.one] & (a | b)[self.other] & (self.surfaces == 0)
+        i, j, g = self.one[within], self.other[within], self.between_W_per_K[within]
+        return _laplacian(i, j, g, np.zeros(self.size)) if np.any(a[i] != a[j]) else None
+
+    def exposure_W_per_K(self, body: str) -> dict[str, float]:
+        cells = self.bodies[body].cells
+        return {"air": float(self.air_W_per_K[cells].sum()), "room": float(self.room_W_per_K[cells].sum())}
+
+    def integrate(self, heat_W: Heat, start_degC: Array, step_s: float, steps: int) -> Array:
+        return integrate(self.capacity_J_per_K, self.losses(), heat_W, start_degC, step_s, steps)
+
+
+def even(cells: Cells, capacity_J_per_K: Array, surface_m2: Array) -> Part:
+    """Cells of equal weight."""
+    return Part(cells, np.full(len(cells), 1.0 / len(cells)), surface_m2[cells], float(capacity_J_per_K[cells].sum()))
+
+
+def _laplacian(one: Cells, other: Cells, conductance_W_per_K: Array, outside_W_per_K: Array) -> sparse.csc_matrix:
+    n, g = len(outside_W_per_K), conductance_W_per_K
+    off = sparse.coo_matrix((g, (one, other)), shape=(n, n))
+    diagonal = np.bincount(one, g, n) + np.bincount(other, g, n) + outside_W_per_K
+    return sparse.csc_matrix(sparse.diags(diagonal) - off - off.T)
+
+
+@dataclass
+class Assembly:
+    """A structure while it is put together; heat flows and places are stated by casting and share of its size."""
+
+    castings: dict[str, Plate] = field(default_factory=dict)
+    halves: set[str] = field(default_factory=set)  # castings that a machine file has as a front and a back half
+    air_J_per_K: float | None = None
+    _edges: list[tuple[Cells, Cells, Array, bool]] = field(default_factory=list)
+    _first: dict[str, int] = field(default_factory=dict)
+    _size: int = 0
+    _room: list[tuple[Cells, Array]] = field(default_factory=list)
+
+    def add(self, casting: Plate, halves: bool = False) -> None:
+        self.castings[casting.name], self._first[casting.name] = casting, self._size
+        one, other, conductance = casting.conduction()
+        self._edges.append((one + self._size, other + self._size, conductance, False))
+        self._size += casting.size
+        if halves:
+            self.halves.add(casting.name)
+
+    def box(
+        self, name: str, depth: tuple[float, float] = (0.0, 1.0), height: tuple[float, float] = (0.0, 1.0)
+    ) -> Cells:
+        """Cells of a casting within these shares of its axes."""
+        return self._first[name] + self.castings[name].box(depth, height)
+
+    def joint(self, one: Cells, other: Cells, conductance_W_per_K: float) -> None:
+        """A contact between two groups of cells: pairwise where they are equally many, else each with each."""
+        if len(one) != len(other):
+            a, b = (g.ravel() for g in np.meshgrid(one, other, indexing="ij"))
+        else:
+            a, b = one, other
+        self._edges.append((a, b, np.full(len(a), conductance_W_per_K / len(a)), False))
+
+    def exposed(self, cells: Cells, coefficient_W_per_m2K: float, enclosed: bool) -> None:
+        """Convection at the cells' outer surface, to the enclosure's air where there is one and they are inside."""
+        surface = np.concatenate([c.surface_m2 for c in self.castings.values()])
+        conductance = coefficient_W_per_m2K * surface[cells]
+        if enclosed and self.air_J_per_K is not None:
+            self._edges.append((cells, np.full(len(cells), -1), conductance, True))  # -1: the air, numbered last
+        else:
+            self._room.append((cells, conductance))
+
+    def done(self, air_room_W_per_K: float) -> Volumes:
+        parts, n = list(self.castings.values()), self._size
+        air = [] if self.air_J_per_K is None else [self.air_J_per_K]
+        room = np.zeros(n + len(air))
+        for cells, conductance in self._room:
+            np.add.at(room, cells, conductance)
+        room[n:] = air_room_W_per_K
+        edges = [(a, np.where(b < 0, n, b), g, np.full(len(a), float(s))) for a, b, g, s in self._edges]
+        own = {c.name: self._first[c.name] + np.arange(c.size) for c in parts}
+        bodies = {k: v for name in own for k, v in self._bodies(name, own[name]).items()}
+        if air:
+            bodies[AIR] = np.array([n])
+        capacity = np.concatenate([*(c.capacity_J_per_K for c in parts), air])
+        surface = np.concatenate([*(c.surface_m2 for c in parts), [0.0] * len(air)])
+        return Volumes(
+            castings=self.castings,
+            cells=own,
+            bodies={name: even(cells, capacity, surface) for name, cells in bodies.items()},
+            capacity_J_per_K=capacity,
+            surface_m2=surface,
+            above_floor_m=np.concatenate([*(c.above_floor_m for c in parts), [1.0] * len(air)]),
+            expansion_um_per_mK=np.concatenate(
+                [*(np.full(c.size, MATERIALS[c.material].expansion_um_per_mK) for c in parts), [0.0] * len(air)]
+            ),
+            one=np.concatenate([e[0] for e in edges]),
+            other=np.concatenate([e[1] for e in edges]),
+            between_W_per_K=np.concatenate([e[2] for e in edges]),
+            surfaces=np.concatenate([e[3] for e in edges]),
+            room_W_per_K=room,
+            air_cell=n if air else None,
+        )
+
+    def _bodies(self, name: str, cells: Cells) -> dict[str, Cells]:
+        if name not in self.halves:
+            return {name: cells}
+        front = self.castings[name].along_m[0] > self.castings[name].depth_m / 2
+        back = {"column": "column_back"}.get(name, f"{name}_rear")
+        return {f"{name}_front": cells[front], back: cells[~front]}
