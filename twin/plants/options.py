@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+MAX_HOLE_S = 900.0  # longer ones leave a simulation without its inputs
+
 
 @dataclass(frozen=True)
 class Options:
@@ -11,6 +13,11 @@ class Options:
 
     `has` and `lacks` overrule the features that the seed gives (`twin.plants.machine.FEATURES`). `file_error` is the
     sd of the logarithm of what the engineer's values are off by, `mass_error` that of masses.
+
+    Of the recorder: rows come up to `early_s` before they are due, `gaps` is how often a run has a hole of at most
+    `MAX_HOLE_S`, `absent` the chance that a sensor is not there in a run, `missing` that a sample is lost. Of the shop:
+    means of the room from `coldest_degC` to `warmest_degC`, starts from `earliest_h` to `latest_h`, `habit` a
+    key of `twin.plants.habits.HABITS`; `idle` are recorded switches that drive nothing. `name` is the machine's.
     """
 
     batches: int = 12
@@ -21,6 +28,16 @@ class Options:
     noise_um: float = 0.8
     quantisation_K: float = 0.1
     missing: float = 0.0
+    early_s: float = 0.0
+    gaps: float = 0.0
+    absent: float = 0.0
+    coldest_degC: float = 12.0
+    warmest_degC: float = 28.0
+    earliest_h: float = 6.5
+    latest_h: float = 14.0
+    habit: str = "ordinary"
+    idle: tuple[str, ...] = ()
+    name: str = ""
     friction_scatter: float = 0.0
     file_error: float = 0.3
     mass_error: float = 0.1

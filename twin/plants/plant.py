@@ -6,18 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import pandas as pd
+
 from data.batch import Batch
 from data.errors import InputError, closest
 from data.machine import Machine
 from twin.plants.drawing import draw_plant
 from twin.plants.effects import EFFECTS
 from twin.plants.effects.base import Answer, Effect
+from twin.plants.habits import HABITS
 from twin.plants.machine import FEATURES, Plant
 from twin.plants.machine_file import machine_file
 from twin.plants.options import Options
 from twin.plants.physics import LEAD_S, simulated
-from twin.plants.recorded import recordings
-from twin.plants.runs import plan_runs
+from twin.plants.recorded import gridded, written
+from twin.plants.runs import Run, earlier, plan_runs
 from twin.plants.seeds import stream
 from twin.plants.structure import AIR
 
@@ -26,45 +29,82 @@ from twin.plants.structure import AIR
 class Case:
     """`truth` holds effect (its key, None: nothing missing), mechanism, where, also, parameters, and one of these a
     term in `terms` where several are at work at once. Everything is simulated.
+
+    `tables` are the rows that the recorder wrote, by batch; `batches` what a reader makes of them.
     """
 
     machine: Machine
     batches: list[Batch]
     truth: Mapping[str, Any]
+    tables: Mapping[str, pd.DataFrame]
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A plant with its effects, runs and machine file, before any run is simulated."""
+
+    seed: int
+    plant: Plant
+    effects: list[Effect]
+    runs: list[Run]
+    machine: Machine
+    options: Options
 
 
 def draw(
-    seed: int, effect: str | None = None, size: float = 1.0, batches: int = 12, step_s: float = 300.0, **options: Any
-) -> Case:
+    seed: int, effect: str | None = None, size: float = 1.0, batches: int = 12, step_s: float = 300.0,
+    *, plant: str = "volumes", sizes: Mapping[str, float] | None = None, **options: Any,
+) -> Case:  # fmt: skip
     """A case; the same arguments give the same one, to the last digit.
 
-    `effect` is a key of `EFFECTS`, or several joined by "+"; None: the machine file leaves nothing out. `options` are
-    the fields of `Options`.
+    `effect` is a key of `EFFECTS`, or several joined by "+"; None: the machine file leaves nothing out. `sizes` gives
+    each effect its own size instead. `plant` is a key of `PLANTS`, `options` are the fields of `Options`.
 
     Raises:
-        InputError: an unknown effect or option, or a number out of range; one line.
+        InputError: an unknown effect, plant or option, or a number out of range; one line.
     """
-    asked = _checked(seed, size, Options, {"batches": batches, "step_s": step_s, **options})
-    kinds = {key: EFFECTS[key] for key in (effect.split("+") if effect else ())}
-    plant = _plant(seed, kinds, size, asked)
-    effects = [kind(plant, size, stream(seed, f"effect {key}")) for key, kind in kinds.items()]
-    name = f"plant_{seed:04d}"
-    machine = machine_file(plant, effects, name, seed, asked)
-    runs = plan_runs(seed, asked.batches, asked.hours, asked.step_s, plant.rated_rpm, asked.friction_scatter)
-    course = simulated(_with_amounts(plant, effects), runs, effects, asked.solver_s, asked.before_h)
-    shown = recordings(
-        _with_amounts(plant, effects), runs, course, effects, seed, name, machine.batch_channels(), asked
-    )
-    return Case(machine, shown, truth_of(effect, size, plant, effects))
+    _check("size", size, size >= 0, "0 or more")
+    own = {key: size for key in (effect.split("+") if effect else ())} if sizes is None else dict(sizes)
+    at = posed(seed, own, plant, **{"batches": batches, "step_s": step_s, **options})
+    shown, name, channels = _with_amounts(at.plant, at.effects), at.machine.machine, at.machine.batch_channels()
+    course = simulated(shown, at.runs, at.effects, at.options.solver_s, at.options.before_h)
+    tables = written(shown, at.runs, course, at.effects, seed, channels, at.options)
+    read = [gridded(name, run, table, channels, at.options) for run, table in zip(at.runs, tables, strict=True)]
+    by_batch = {run.batch_id: table for run, table in zip(at.runs, tables, strict=True)}
+    return Case(at.machine, read, truth_of(at.plant, at.effects), by_batch)
 
 
-def _plant(seed: int, kinds: Mapping[str, type[Effect]], size: float, asked: Options) -> Plant:
+def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **options: Any) -> Posed:
+    """What `draw` simulates: the plant of a kind with effects of these sizes, its runs and its machine file.
+
+    Raises:
+        InputError: as `draw`.
+    """
+    asked = _checked(seed, sizes, options)
+    kinds = {key: EFFECTS[key] for key in sizes}
+    drawn = draw_plant(seed, *_features(kinds, sizes, asked), plant)
+    effects = [kind(drawn, sizes[key], stream(seed, f"effect {key}")) for key, kind in kinds.items()]
+    machine = machine_file(drawn, effects, asked.name or f"plant_{seed:04d}", seed, asked)
+    runs = plan_runs(
+        seed, asked.batches, asked.hours, asked.step_s, drawn.rated_rpm, asked.friction_scatter,
+        (asked.coldest_degC, asked.warmest_degC), (asked.earliest_h, asked.latest_h), asked.idle,
+    )  # fmt: skip
+    runs = HABITS[asked.habit](runs, drawn.rated_rpm)
+    return Posed(seed, drawn, effects, [earlier(run, asked.early_s) for run in runs], machine, asked)
+
+
+def _features(
+    kinds: Mapping[str, type[Effect]], sizes: Mapping[str, float], asked: Options
+) -> tuple[frozenset[str], frozenset[str]]:
+    """Features that the plant must have and must not."""
     has, lacks = set(asked.has), set(asked.lacks)
-    for kind in kinds.values():
-        has |= kind.has
-        if size == 0 and kind.withholds:
+    for key, kind in kinds.items():
+        if sizes[key] == 0 and kind.withholds:
             lacks.add(kind.withholds)  # nothing of it in the plant and nothing in the file
-    return draw_plant(seed, frozenset(has), frozenset(lacks))
+        else:
+            has |= kind.has
+            lacks -= {kind.withholds}
+    return frozenset(has), frozenset(lacks)
 
 
 def _with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
@@ -81,24 +121,30 @@ def _with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
     return replace(plant, sources=sources, growths=growths)
 
 
-def truth_of(effect: str | None, size: float, plant: Plant, effects: list[Effect]) -> dict[str, Any]:
+def truth_of(plant: Plant, effects: list[Effect]) -> dict[str, Any]:
     """The answer key: plain data."""
-    terms = [_term(e.key, e.answer(), plant) for e in effects] if size else []
-    first = (
-        terms[0]
-        if terms
-        else {"where": None, "also": [], "neighbours": []} | {"mechanism": None, "parameters": {}, "words": ""}
-    )
+    terms = [_term(e, plant) for e in effects if e.size]
+    nothing: dict[str, Any] = {
+        "where": None,
+        "also": [],
+        "neighbours": [],
+        "mechanism": None,
+        "parameters": {},
+        "words": "",
+    }
+    first = terms[0] if terms else nothing
     return {
-        "simulated": True, "effect": effect if size else None, "size": size,
-        **{k: first[k] for k in ("mechanism", "where", "also", "neighbours", "parameters", "words")},
+        "simulated": True, "effect": "+".join(t["effect"] for t in terms) or None,
+        "size": first["size"] if terms else 0.0, **{k: first[k] for k in nothing},
         "terms": terms, "features": sorted(plant.features), "cells": plant.structure.size,
     }  # fmt: skip
 
 
-def _term(key: str, answer: Answer, plant: Plant) -> dict[str, Any]:
+def _term(effect: Effect, plant: Plant) -> dict[str, Any]:
+    answer = effect.answer()
     return {
-        "effect": key,
+        "effect": effect.key,
+        "size": effect.size,
         "mechanism": answer.mechanism,
         "where": {"kind": answer.kind, "name": answer.name},
         "also": list(answer.also),
@@ -115,24 +161,33 @@ def _neighbours(answer: Answer, plant: Plant) -> list[str]:
     return sorted({body for pair in s.touching() if ends & pair for body in pair} - ends)
 
 
-def _checked(seed: int, size: float, kind: type[Options], given: Mapping[str, Any]) -> Options:
+def _checked(seed: int, sizes: Mapping[str, float], given: Mapping[str, Any]) -> Options:
     for name in given:
-        if name not in kind.__dataclass_fields__:
-            raise InputError(f"plant: unknown option {name!r}; {closest(name, kind.__dataclass_fields__)}")
-    options = kind(**given)
+        if name not in Options.__dataclass_fields__:
+            raise InputError(f"plant: unknown option {name!r}; {closest(name, Options.__dataclass_fields__)}")
+    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+    options = Options(**plain)
     for name in (*options.has, *options.lacks):
         if name not in FEATURES:
             raise InputError(f"plant: unknown feature {name!r}; {closest(name, FEATURES)}")
     whole = all((s / options.solver_s).is_integer() for s in (LEAD_S, options.step_s))
+    season_K, day_h = options.warmest_degC - options.coldest_degC, options.latest_h - options.earliest_h
     for what, got, fits, expected in (
         ("seed", seed, seed >= 0, "0 or more"),
-        ("size", size, size >= 0, "0 or more"),
+        *((f"size of {key}", size, size >= 0, "0 or more") for key, size in sizes.items()),
         ("batches", options.batches, 1 <= options.batches <= 60, "1 to 60"),
         ("step_s", options.step_s, 10.0 <= options.step_s <= 1800.0, "10 to 1800 s"),
         ("hours", options.hours, 0.5 <= options.hours <= 24.0, "0.5 to 24 h"),
         ("before_h", options.before_h, 1.0 <= options.before_h <= 240.0, "1 to 240 h"),
         ("solver_s", options.solver_s, whole, f"a divisor of {LEAD_S:g} s and of step_s"),
+        ("early_s", options.early_s, 0.0 <= options.early_s < options.step_s / 2, "0 to half of step_s"),
+        ("warmest_degC less coldest_degC", season_K, season_K >= 0, "0 K or more"),
+        ("latest_h less earliest_h", day_h, day_h > 0.02, "more than a minute"),
     ):
-        if not fits:
-            raise InputError(f"plant: {what}: got {got}, expected {expected}; choose another value")
+        _check(what, got, fits, expected)
     return options
+
+
+def _check(what: str, got: float, fits: bool, expected: str) -> None:
+    if not fits:
+        raise InputError(f"plant: {what}: got {got}, expected {expected}; choose another value")

@@ -6,13 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from data.batch import Batch, Channel
+from data.timegrid import repair_time, to_grid
 from twin.plants.casting import Array
 from twin.plants.effects.base import Effect
 from twin.plants.machine import Plant, Sensor
-from twin.plants.options import Options
+from twin.plants.options import MAX_HOLE_S, Options
 from twin.plants.physics import Course
 from twin.plants.runs import Run, held
 from twin.plants.seeds import stream
@@ -20,34 +22,61 @@ from twin.plants.seeds import stream
 AMBIENT_LAG_S = 45.0
 ERRORS = ("x", "y", "z")
 ERROR_STEP_UM = 0.1
+GAP_STEPS = 3.0  # a longer hole stays a hole
 
 
-def recordings(
-    plant: Plant, runs: Sequence[Run], course: Course, effects: Sequence[Effect], seed: int, name: str,
+def written(
+    plant: Plant, runs: Sequence[Run], course: Course, effects: Sequence[Effect], seed: int,
     channels: Mapping[str, Channel], options: Options,
-) -> list[Batch]:  # fmt: skip
-    """What the instruments show, one batch a run; `channels` says which there are, in this order."""
+) -> list[pd.DataFrame]:  # fmt: skip
+    """The rows that the recorder wrote, one table a run: early ones, holes and absent sensors as they were."""
     true = shown(plant, course, effects)
     ahead = {k: v for e in effects for k, v in e.ahead_s().items()}
-    rows_s = np.arange(0.0, runs[0].hours * 3600.0 + 1.0, options.step_s)
+    due_s = np.arange(0.0, runs[0].hours * 3600.0 + 1.0, options.step_s)
     out = []
     for b, run in enumerate(runs):
-        rng = stream(seed, f"noise {b}")
+        rng, recorder = stream(seed, f"noise {b}"), stream(seed, f"recorder {b}")
+        rows_s, kept = _rows_s(due_s, recorder, options)
+        drivers = {"spindle_rpm": run.speed, "feed": run.feed, "coolant": run.coolant, **run.idle}
         table = {"time_s": rows_s}
         for c in channels.values():
             if c.role == "driver":
-                table[c.name] = held(
-                    {"spindle_rpm": run.speed, "feed": run.feed, "coolant": run.coolant}[c.name], rows_s
-                )
+                table[c.name] = held(drivers[c.name], rows_s)
                 continue
             seen = np.interp(rows_s + ahead.get(c.name, 0.0), course.time_s, true[c.name][:, b])
-            table[c.name] = _measured(seen, c, rng, options)
-        out.append(
-            Batch(
-                name, run.batch_id, pd.DataFrame(table), channels, start=run.start, simulated=True, source="simulated"
-            )
-        )
+            measured = _measured(seen, c, rng, options)
+            if c.role != "temperature" or recorder.random() >= options.absent:
+                table[c.name] = measured
+        out.append(pd.DataFrame(table)[kept].reset_index(drop=True))
     return out
+
+
+def gridded(name: str, run: Run, table: pd.DataFrame, channels: Mapping[str, Channel], options: Options) -> Batch:
+    """The batch that a reader makes of a recorder's rows."""
+    values = {n: table[n].to_numpy(np.float64) for n in channels if n in table}
+    drivers = [c.name for c in channels.values() if c.role == "driver"]
+    max_gap_s = GAP_STEPS * options.step_s
+    time_s = repair_time(table["time_s"].to_numpy(np.float64), max_gap_s).time_s
+    grid = to_grid(time_s, values, drivers, options.step_s, max_gap_s, run.batch_id)
+    nothing = np.full(len(grid.time_s), np.nan)
+    whole = {"time_s": grid.time_s, **{n: grid.columns.get(n, nothing) for n in channels}}
+    frame = pd.DataFrame(whole)
+    return Batch(name, run.batch_id, frame, channels, start=run.start, simulated=True, source="simulated")
+
+
+def _rows_s(due_s: Array, recorder: np.random.Generator, options: Options) -> tuple[Array, NDArray[np.bool_]]:
+    """When the rows came, s, and which there are; the first and the last are always there and on time."""
+    inner = np.zeros(len(due_s))
+    inner[1:-1] = 1.0
+    rows_s = due_s - np.round(options.early_s * inner * recorder.random(len(due_s)), 1)
+    kept = np.ones(len(due_s), bool)
+    for _ in range(recorder.poisson(options.gaps)):
+        rows = int(recorder.integers(1, max(2, int(MAX_HOLE_S // options.step_s))))
+        first = int(recorder.integers(1, max(2, len(due_s) - rows - 1)))
+        if kept[first - 1 : first + rows + 1].all():
+            kept[first : first + rows] = False
+    kept[-1] = True
+    return rows_s, kept
 
 
 def shown(plant: Plant, course: Course, effects: Sequence[Effect]) -> dict[str, Array]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +11,8 @@ import pandas as pd
 from twin.plants.casting import Array
 from twin.plants.seeds import stream
 
-COLDEST_DEGC, WARMEST_DEGC = 12.0, 28.0
+SEASON_DEGC = (12.0, 28.0)  # means of the room
+STARTS_H = (6.5, 14.0)  # of the day
 GROUND_MEAN_DEGC, GROUND_FOLLOWS = 18.0, 0.5
 STANDING_S = 300.0
 Course = Callable[[Array], Array]
@@ -27,7 +28,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Run:
-    """One batch as it is meant to go. Room: mean, day's swing with its warmest hour, ripple and drift."""
+    """One batch as it is meant to go. Room: mean, day's swing with its warmest hour, ripple and drift.
+
+    `idle` are recorded switches that drive nothing, by channel.
+    """
 
     start: pd.Timestamp
     hours: float
@@ -42,6 +46,7 @@ class Run:
     wall_K: float  # of the walls against the room's mean, their own day's swing is smaller and later
     slow_K: float  # castings against the room, hours before the batch
     friction: float
+    idle: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
 
     @property
     def batch_id(self) -> str:
@@ -78,18 +83,28 @@ def held(blocks: tuple[Block, ...], time_s: Array) -> Array:
 
 
 def plan_runs(
-    seed: int, batches: int, hours: float, row_s: float, rated_rpm: float, friction_scatter: float
+    seed: int,
+    batches: int,
+    hours: float,
+    row_s: float,
+    rated_rpm: float,
+    friction_scatter: float,
+    season_degC: tuple[float, float] = SEASON_DEGC,
+    starts_h: tuple[float, float] = STARTS_H,
+    idle: Sequence[str] = (),
 ) -> list[Run]:
     """The batches of a case, by date. Drivers change on rows of the recording, every `row_s`."""
     rng = stream(seed, "runs")
-    levels = rng.permutation(np.linspace(COLDEST_DEGC, WARMEST_DEGC, batches))
+    switches = {name: stream(seed, f"idle {name}") for name in idle}
+    levels = rng.permutation(np.linspace(*season_degC, batches))
     kinds = rng.permutation(np.arange(batches) % len(PROTOCOLS))
     days = rng.choice(60, batches, replace=False)
     runs: list[Run] = []
     taken: set[pd.Timestamp] = set()
     for k in range(batches):
         mean_degC = float(levels[k] + rng.uniform(-0.6, 0.6))
-        start = _season_day(mean_degC, int(days[k])) + pd.Timedelta(minutes=int(rng.integers(390, 840)))
+        minute = int(rng.integers(round(60 * starts_h[0]), round(60 * starts_h[1])))
+        start = _season_day(mean_degC, season_degC, int(days[k])) + pd.Timedelta(minutes=minute)
         while start.normalize() in taken:  # one batch a day
             start += pd.Timedelta(days=1)
         taken.add(start.normalize())
@@ -107,10 +122,24 @@ def plan_runs(
             wall_K=float(0.35 * (mean_degC - 22.0) + rng.uniform(-2.5, 1.5)),
             slow_K=float(rng.uniform(-2.0, 3.0)),
             friction=float(1.0 + friction_scatter * rng.uniform(-1.0, 1.0)),
+            idle={
+                name: _on_rows(_strokes(dice, hours * 3600.0, lambda: 1.0, idle=0.35), row_s)
+                for name, dice in switches.items()
+            },
         )
         speed, feed, coolant = (_on_rows(blocks, row_s) for blocks in (run.speed, run.feed, run.coolant))
         runs.append(replace(run, speed=speed, feed=feed, coolant=coolant))
     return sorted(runs, key=lambda r: r.start)
+
+
+def earlier(run: Run, by_s: float) -> Run:
+    """The run with every change of its drivers so much sooner."""
+
+    def sooner(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+        return tuple(replace(b, from_s=b.from_s - by_s) for b in blocks)
+
+    idle = {name: sooner(blocks) for name, blocks in run.idle.items()}
+    return replace(run, speed=sooner(run.speed), feed=sooner(run.feed), coolant=sooner(run.coolant), idle=idle)
 
 
 def _on_rows(blocks: tuple[Block, ...], row_s: float) -> tuple[Block, ...]:
@@ -119,9 +148,10 @@ def _on_rows(blocks: tuple[Block, ...], row_s: float) -> tuple[Block, ...]:
     return tuple(Block(t, v) for t, v in sorted(at.items()))
 
 
-def _season_day(mean_degC: float, day: int) -> pd.Timestamp:
+def _season_day(mean_degC: float, season_degC: tuple[float, float], day: int) -> pd.Timestamp:
     """A day of the year that fits the room's mean, spring or autumn, every `day` another."""
-    middle, swing = (COLDEST_DEGC + WARMEST_DEGC) / 2, (WARMEST_DEGC - COLDEST_DEGC) / 2
+    coldest, warmest = season_degC
+    middle, swing = (coldest + warmest) / 2, (warmest - coldest) / 2
     away = 365 / (2 * np.pi) * np.arccos(np.clip((mean_degC - middle) / swing, -1.0, 1.0))
     number = 196 + (away if day % 2 else -away) + day / 6.0 - 5.0
     return pd.Timestamp("2026-01-01") + pd.Timedelta(days=int(number) % 365)

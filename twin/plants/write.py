@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pandas as pd
 import yaml
 
 from data.atomic_file import write_atomic
-from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
 from twin.plants.plant import Case
@@ -32,8 +32,8 @@ def write_case(case: Case, folder: Path, key_folder: Path | None = None) -> tupl
         recordings.mkdir(parents=True, exist_ok=True)
         key_folder.mkdir(parents=True, exist_ok=True)
         write_atomic(machine, machine_text(case.machine))
-        for batch in case.batches:
-            write_atomic(recordings / f"{batch.batch_id}.csv", csv_text(batch))
+        for name, text in recording_texts(case).items():
+            write_atomic(recordings / name, text)
         write_atomic(key, json.dumps(case.truth, indent=1) + "\n")
     except OSError as error:
         raise InputError(f"plant: {folder} cannot be written ({error}); give a folder that can be") from None
@@ -46,7 +46,12 @@ def machine_text(machine: Machine) -> str:
     return "# Simulated machine; no recording of a real one.\n" + yaml.safe_dump(plain, sort_keys=False, width=120)
 
 
-def csv_text(batch: Batch) -> str:
-    """The recording with a first line that calls it simulated; a lost sample is an empty cell."""
-    head = f"# simulated recording, machine {batch.machine}\n"
-    return head + str(batch.table.to_csv(index=False, float_format="%.10g", lineterminator="\n"))
+def recording_texts(case: Case) -> dict[str, str]:
+    """File name -> CSV text of every run, as the recorder wrote it."""
+    return {f"{batch}.csv": csv_text(case.machine.machine, table) for batch, table in case.tables.items()}
+
+
+def csv_text(machine: str, table: pd.DataFrame) -> str:
+    """A recording with a first line that calls it simulated; a lost sample is an empty cell."""
+    head = f"# simulated recording, machine {machine}\n"
+    return head + str(table.to_csv(index=False, float_format="%.10g", lineterminator="\n"))

@@ -183,7 +183,7 @@ def test_everything_is_called_simulated() -> None:
 def test_options_shape_the_recordings() -> None:
     case = draw(SEED, None, batches=2, hours=2.0, step_s=60.0, quantisation_K=0.5, missing=0.2, friction_scatter=0.3)
     batch = case.batches[0]
-    room = batch.values("room")
+    room = case.tables[batch.batch_id]["room"].to_numpy()
     assert batch.step_s == 60.0 and batch.n_rows == 121
     assert 0.1 < np.isnan(room).mean() < 0.3
     assert np.nanmax(np.abs(room * 2 - np.rint(room * 2))) < 1e-9
