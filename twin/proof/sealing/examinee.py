@@ -1,0 +1,94 @@
+"""The process that answers one case: it shuts itself in, then diagnoses what lies in its place, and writes there.
+
+Started as ``python -I -B -m twin.proof.sealing.examinee`` with its task as JSON on standard input. Its place holds
+`case` (machine file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
+Only the standard library is imported before the walls stand.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from twin.proof.sealing.isolation import allowed, confine
+
+TOLD, FINDINGS, RIVALS = "told.json", "findings.json", "rivals.json"
+
+
+def main() -> None:
+    """Answer the case; `told.json` says how far it came, under which protection, and what went wrong."""
+    task = json.loads(sys.stdin.read())
+    place = Path(task["place"])
+    import_from = [Path(p) for p in task["import_from"]]
+    told: dict[str, Any] = {"stage": "shut in", "isolation": confine(allowed(place, import_from), place / "witness")}
+    sys.path[:0] = task["import_from"]
+    diagnose = _function(task["diagnose"])
+    rivals = _function(task["rivals"]) if task["rivals"] else None
+    _tell(place, told)
+    try:
+        begun = perf_counter()
+        diagnosis = diagnose(*_read(place), seed=0, processes=1, cache=None)
+        told |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
+        _write(place, FINDINGS, _findings_text(diagnosis))
+        _tell(place, told)
+        if rivals is not None:
+            _write(place, RIVALS, _json(rivals(diagnosis)))
+        _tell(place, told | {"stage": "done"})
+    except Exception as error:  # whatever it is, it is the answer to this case
+        _tell(place, told | {"error": _one_line(error)})
+
+
+def _read(place: Path) -> tuple[Any, list[Any]]:
+    """Machine and batches as `thermodrift diagnose` reads them: into a lake of its own, checked."""
+    from data.checks import check_machine
+    from data.errors import InputError
+    from data.ingest import ingest
+    from data.lake import Lake
+    from data.machine import load_machine
+
+    machine = load_machine(place / "case" / "machine.yml")
+    lake = Lake(place / "answer" / "lake")
+    report = ingest([place / "case" / "recordings"], machine, lake)
+    if not report.batches:
+        reasons = [r.reason for r in report.quarantined]
+        raise InputError(reasons[0] if reasons else "recordings: no recording that the machine file asks for")
+    return machine, check_machine(lake.load_all(machine.machine), machine)
+
+
+def _findings_text(diagnosis: Any) -> str:
+    from twin.diagnosis.telling.findings import as_json
+
+    return as_json(diagnosis.findings)
+
+
+def _function(where: str) -> Any:
+    module, name = where.split(":")
+    return getattr(import_module(module), name)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+
+
+def _write(place: Path, name: str, text: str) -> None:
+    """Whole or not at all."""
+    scratch = place / "answer" / f"{name}.part"
+    scratch.write_text(text, encoding="utf-8")
+    scratch.replace(place / "answer" / name)
+
+
+def _tell(place: Path, told: dict[str, Any]) -> None:
+    _write(place, TOLD, _json(told))
+
+
+def _one_line(error: Exception) -> str:
+    words = " ".join(str(error).split())
+    return words if type(error).__name__ in ("InputError", "WorkError") else f"{type(error).__name__}: {words}"
+
+
+if __name__ == "__main__":
+    main()
