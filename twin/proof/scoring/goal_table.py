@@ -1,0 +1,81 @@
+"""Every goal with what was measured, its 90 % interval and whether it is met: over all cases and by plant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from twin.proof.scoring.goals import GOALS, Goal, Wanted
+from twin.proof.scoring.intervals import bootstrap, clopper_pearson, of_groups
+from twin.proof.scoring.reliability import calibration_error, told_and_right
+
+GOAL_COLUMNS: Mapping[str, str] = {
+    "measure": "string", "goal": "string", "wanted": "Float64", "better": "string", "value": "Float64",
+    "low90": "Float64", "high90": "Float64", "n": "Int64", "met": "boolean", "plant": "string",
+}  # fmt: skip
+CALIBRATED = 0.05
+AHEAD = 0.15  # of the best baseline, in share of right answers
+
+
+def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Columns `GOAL_COLUMNS`, plant "all" first. Shares with exact intervals, the rest by a bootstrap over cases.
+
+    `compared` (`twin.proof.rivals.compared`) adds the lead over the best baseline, for all cases together.
+    """
+    rows: list[dict[str, Any]] = []
+    for plant in ["all", *sorted(outcomes["plant"].dropna().unique())]:
+        own = outcomes if plant == "all" else outcomes[outcomes["plant"] == plant]
+        parts = terms if plant == "all" else terms[terms["plant"] == plant]
+        rows += [{**row, "plant": plant} for row in _measured(own, parts)]
+        if plant == "all" and compared is not None:
+            rows.append({**_lead(compared), "plant": plant})
+    return pd.DataFrame(rows, columns=list(GOAL_COLUMNS), dtype=object).astype(dict(GOAL_COLUMNS))
+
+
+def _measured(outcomes: pd.DataFrame, terms: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    for goal in GOALS:
+        yield _row(goal, goal.of(outcomes, terms))
+    pairs = np.column_stack(told_and_right(outcomes))
+    low, high = (
+        of_groups(list(pairs[:, None]), lambda g: calibration_error(np.vstack(g))) if len(pairs) else (None,) * 2
+    )
+    wanted = Wanted("probabilities: expected calibration error", CALIBRATED, "lower", unit="")
+    yield _said(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
+
+
+def _row(goal: Goal, values: pd.Series) -> dict[str, Any]:
+    n = len(values)
+    if n == 0:
+        return _said(goal, None, None, None, 0)
+    if goal.statistic is None:
+        right = int(values.astype(bool).sum())
+        return _said(goal, right / n, *clopper_pearson(right, n), n)
+    return _said(goal, goal.statistic(values.to_numpy(float)), *bootstrap(values, goal.statistic), n)
+
+
+def _lead(compared: pd.DataFrame) -> dict[str, Any]:
+    """Over the baseline with the most right answers."""
+    wanted = Wanted("right answers: lead over the best baseline", AHEAD, "higher")
+    baselines = compared[(compared["group"] == "baseline") & compared["lead"].notna()]
+    if baselines.empty:
+        return _said(wanted, None, None, None, 0)
+    best = baselines.sort_values(["lead", "method"]).iloc[0]
+    lead, low, high = (float(best[c]) for c in ("lead", "lead_low90", "lead_high90"))
+    return _said(wanted, lead, low, high, int(best["n"]))
+
+
+def _said(wanted: Wanted, value: float | None, low: float | None, high: float | None, n: int) -> dict[str, Any]:
+    return {
+        "measure": wanted.measure,
+        "goal": wanted.words,
+        "wanted": wanted.wanted,
+        "better": wanted.better,
+        "value": value,
+        "low90": low,
+        "high90": high,
+        "n": n,
+        "met": None if value is None else wanted.met(value),
+    }

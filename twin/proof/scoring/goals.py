@@ -1,0 +1,152 @@
+"""The goals, one entry each: what is measured, over which cases, and what was wanted before any case was drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from twin.proof.scoring.intervals import Statistic
+
+Select = Callable[[pd.DataFrame, pd.DataFrame], pd.Series]
+Better = Literal["higher", "lower"]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was wanted of a measure: a share, or a number with its unit."""
+
+    measure: str
+    wanted: float
+    better: Better
+    unit: str | None = field(default=None, kw_only=True)
+
+    @property
+    def words(self) -> str:
+        sign = "≥" if self.better == "higher" else "≤"
+        wanted = f"{100 * self.wanted:g} %" if self.unit is None else f"{self.wanted:g} {self.unit}".strip()
+        return f"{sign} {wanted}"
+
+    def met(self, value: float) -> bool:
+        return value >= self.wanted if self.better == "higher" else value <= self.wanted
+
+
+@dataclass(frozen=True)
+class Goal(Wanted):
+    """`of` gives the values from outcomes and terms, indexed by case; `statistic` None: they are yes or no, a share."""
+
+    of: Select
+    statistic: Statistic | None = None
+
+
+def quantile(share: float) -> Statistic:
+    return lambda values: float(np.quantile(values, share))
+
+
+def mean(values: NDArray[np.float64]) -> float:
+    return float(np.mean(values))
+
+
+def _cases(column: str, *kinds: str, visible: bool = False) -> Select:
+    """A column of the cases of these kinds (none named: all), of those only that are visible."""
+
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        at = outcomes["kind"].isin(kinds) if kinds else pd.Series(True, outcomes.index)
+        if visible:
+            at &= outcomes["visible"].fillna(False).astype(bool)
+        return _known(outcomes[at], column)
+
+    return select
+
+
+def _known(rows: pd.DataFrame, column: str) -> pd.Series:
+    return rows.set_index("case")[column].dropna()
+
+
+def _false_alarms(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("false_claims", "nothing", "decoy")(outcomes, terms) > 0
+
+
+def _detected(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("detected", visible=True)(outcomes, terms)
+
+
+def _all_visible(kind: str) -> Select:
+    """`all_named` of the cases in which every term is visible."""
+
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        at = (outcomes["kind"] == kind) & (outcomes["visible_terms"] == outcomes["terms"]).fillna(False)
+        return _known(outcomes[at], "all_named")
+
+    return select
+
+
+def _claims_of_two(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    """Every claim of a case with two effects: whether it is true."""
+    rows = outcomes[(outcomes["kind"] == "two") & outcomes["claims"].notna()]
+    true = {
+        case: [True] * max(int(claims) - int(false), 0) + [False] * int(false)
+        for case, claims, false in zip(rows["case"], rows["claims"], rows["false_claims"], strict=True)
+    }
+    index = [case for case, own in true.items() for _ in own]
+    return pd.Series([v for own in true.values() for v in own], index=index, dtype="boolean")
+
+
+def _sized(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
+    """Visible physics that was found and whose amplitude both sides state."""
+    at = terms["visible"].fillna(False).astype(bool) & terms["found"].fillna(False).astype(bool)
+    at &= ~terms["decoy"].astype(bool) & terms["amplitude_true"].notna() & terms["amplitude_found"].notna()
+    return terms[at & (terms["amplitude_true"] != 0)].set_index("case")
+
+
+def _amplitude_error(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _sized(outcomes, terms)
+    return (rows["amplitude_found"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
+
+
+def _covered(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _sized(outcomes, terms).dropna(subset=["low90", "high90"])
+    return (rows["low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["high90"])
+
+
+def _flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("flagged_unlisted", "unlisted", visible=True)(outcomes, terms)
+
+
+def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _known(outcomes[outcomes["kind"] != "unlisted"], "flagged_unlisted")
+
+
+ONE = ("one", "invisible")  # of one listed effect each; which can be seen the true model says
+GOALS: tuple[Goal, ...] = (
+    Goal("false alarms, nothing missing", 0.01, "lower", _false_alarms),
+    Goal("detection, visible", 0.97, "higher", _detected),
+    Goal("place exact, one visible effect", 0.92, "higher", _cases("place_exact", *ONE, visible=True)),
+    Goal("place exact or neighbour, one visible effect", 0.99, "higher", _cases("place_near", *ONE, visible=True)),
+    Goal("mechanism first, one visible effect", 0.95, "higher", _cases("first_right", *ONE, visible=True)),
+    Goal("mechanism within the reported set", 0.98, "higher", _cases("in_set", *ONE, visible=True)),
+    Goal(
+        "mean size of the reported set", 2.0, "lower", _cases("set_size", *ONE, visible=True), mean, unit="explanations"
+    ),
+    Goal("when: overlap in time, mean", 0.8, "higher", _cases("overlap", *ONE, visible=True), mean, unit=""),
+    Goal("amplitude error, median", 0.12, "lower", _amplitude_error, quantile(0.5)),
+    Goal("amplitude error, 90 % quantile", 0.40, "lower", _amplitude_error, quantile(0.9)),
+    Goal("90 % intervals that cover, at least", 0.85, "higher", _covered),
+    Goal("90 % intervals that cover, at most", 0.95, "lower", _covered),
+    Goal("left-out error closed, median", 0.95, "higher", _cases("closed", "one", visible=True), quantile(0.5)),
+    Goal("left-out error closed, worst tenth", 0.80, "higher", _cases("closed", "one", visible=True), quantile(0.1)),
+    Goal("two visible effects: both named", 0.85, "higher", _all_visible("two")),
+    Goal("two effects: claims that are true", 0.97, "higher", _claims_of_two),
+    Goal("three visible effects: all named", 0.65, "higher", _all_visible("three")),
+    Goal("confounded: the set holds the truth", 0.97, "higher", _cases("set_holds_truth", "confounded", visible=True)),
+    Goal("confounded: the proposed run settles it", 0.90, "higher", _cases("settled", "confounded", visible=True)),
+    Goal("unlisted: flagged", 0.95, "higher", _flagged),
+    Goal("listed or nothing: falsely flagged as unlisted", 0.03, "lower", _falsely_flagged),
+    Goal("unlisted: driver found", 0.85, "higher", _cases("driver_right", "unlisted", visible=True)),
+    Goal("time of one case, median", 30.0, "lower", _cases("seconds"), quantile(0.5), unit="s"),
+    Goal("time of one case, 90 % quantile", 30.0, "lower", _cases("seconds"), quantile(0.9), unit="s"),
+)
