@@ -1,0 +1,42 @@
+"""How strong an effect is: drawn by logarithm around its detection limit, from below to ten times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import yaml
+
+from twin.proof.spec import Kind
+
+SHARE: Mapping[Kind, tuple[float, float]] = MappingProxyType({
+    "decoy": (0.3, 10.0), "one": (0.3, 10.0), "two": (1.0, 10.0), "three": (1.0, 10.0), "confounded": (1.0, 10.0),
+    "unlisted": (0.3, 10.0), "invisible": (0.05, 0.3),
+})  # fmt: skip
+"""From and to, in units of the size at the detection limit."""
+ALL_OR_NOTHING = ("sensor_swap",)
+MOST = 20.0
+"""No larger: beyond it, no effect is one that a machine could have."""
+
+
+@cache
+def table() -> Mapping[str, Any]:
+    """What `limits.yml` says: how it was measured, and by plant and effect the size at the detection limit."""
+    text = files("twin.proof.suite").joinpath("limits.yml").read_text(encoding="utf-8")
+    return MappingProxyType(yaml.safe_load(text))
+
+
+def limit(effect: str, plant: str) -> float:
+    """The size at which an effect is at the detection limit on a kind of plant."""
+    return float(table()["limits"][plant][effect])
+
+
+def size(effect: str, plant: str, kind: Kind, rng: np.random.Generator) -> float:
+    """A size for a case of this kind."""
+    low, high = np.log(SHARE[kind])
+    drawn = limit(effect, plant) * float(np.exp(rng.uniform(low, high)))
+    return 1.0 if effect in ALL_OR_NOTHING else float(f"{min(drawn, MOST):.4g}")
