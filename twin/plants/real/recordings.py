@@ -1,0 +1,116 @@
+"""Real recordings from a folder that the caller names: a machine file as plain data, and runs ready to be handed on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pandas as pd
+
+from data.batch import Batch, Channel
+from data.checks import check_batch, check_machine
+from data.machine import ChannelPart, Machine, Recording, load_machine
+from data.recording import read_batches, recording_files
+from twin.plants.seeds import stream
+
+MACHINES = Path(__file__).parents[3] / "machines"
+CLOCK = "%Y%m%d_%H%M"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the recordings of a machine lie below the data folder and what a case takes of them.
+
+    A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver tells of.
+    """
+
+    folder: str
+    rows_s: float
+    runs: int | None = None
+    unusable: tuple[str, ...] = ()
+
+
+ORIGINS: Mapping[str, Origin] = MappingProxyType({
+    "lathe_gv1203": Origin("lathe_gv1203", 300.0, 8, ("20200706",)),
+    "spindle_fl": Origin("spindle_fl", 120.0),
+    "tclab_board": Origin("tclab", 2.0),
+    "cell_30q": Origin("cell_30q", 10.0),
+})  # fmt: skip
+
+
+def there(machine: str, data: Path) -> bool:
+    """Whether the recordings of a machine are in the data folder."""
+    return (data / ORIGINS[machine].folder).is_dir()
+
+
+def recorded(machine: str, data: Path, seed: int, step_s: float | None = None) -> tuple[Machine, list[Batch]]:
+    """A machine file and the runs of a seed, on a grid of `step_s` (default: the rows that a case has).
+
+    The machine file reads CSV tables with a column for every channel. What a check has masked is empty. Runs of which
+    only the date is known begin at an hour that the seed draws; the others are numbered.
+
+    Raises:
+        InputError: no such folder, or a recording that cannot be read; one line.
+    """
+    origin = ORIGINS[machine]
+    given, batches = _read(machine, data, step_s or origin.rows_s)
+    usable = [b for b in batches if b.batch_id not in origin.unusable]
+    rng = stream(seed, f"runs of {machine}")
+    number = len(usable) if origin.runs is None else origin.runs
+    chosen = [usable[k] for k in sorted(rng.choice(len(usable), number, replace=False).tolist())]
+    minutes = 15 * rng.integers(6 * 4, 12 * 4, len(chosen))
+    starts = [
+        None if b.start is None else b.start + pd.Timedelta(minutes=int(m))
+        for b, m in zip(chosen, minutes, strict=True)
+    ]
+    names = [f"run_{k:02d}" if t is None else f"{t:{CLOCK}}" for k, t in enumerate(starts, 1)]
+    channels = {n: _column(c) for n, c in given.channels.items()}
+    told = dict(zip((b.batch_id for b in chosen), names, strict=True))
+    overrule = [
+        rule.model_copy(update={"batch": told.get(rule.batch, rule.batch)})
+        for rule in given.overrule
+        if rule.batch == "*" or rule.batch in told
+    ]
+    recording = Recording(
+        files=["*.csv"],
+        step_s=origin.rows_s,
+        max_gap_s=max(given.recording.max_gap_s, 3.0 * origin.rows_s),
+        start_from_name=None if None in starts else CLOCK,
+    )
+    plain = given.model_copy(
+        update={"recording": recording, "channels": channels, "ignore": [], "overrule": overrule}
+    )  # fmt: skip
+    own = plain.batch_channels()
+    return plain, [_plain(b, name, t, own) for b, name, t in zip(chosen, names, starts, strict=True)]
+
+
+@cache
+def _read(machine: str, data: Path, step_s: float) -> tuple[Machine, list[Batch]]:
+    given = load_machine(MACHINES / f"{machine}.yml")
+    reading = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
+    files, _ = recording_files(data / ORIGINS[machine].folder, reading)
+    found = [b for f in files for b in read_batches(f, reading)]
+    return given, check_machine([b.with_findings(check_batch(b, reading)) for b in found], reading)
+
+
+def _column(part: ChannelPart) -> ChannelPart:
+    """The channel as a column under its own name, in the unit that the batches have."""
+    return part.model_copy(update={"column": None, "unit_in_file": None, "source": "file", "guessed": []})
+
+
+def _plain(batch: Batch, name: str, start: pd.Timestamp | None, channels: Mapping[str, Channel]) -> Batch:
+    table = pd.DataFrame({"time_s": batch.time_s} | {c: batch.masked(c) for c in channels})
+    return replace(
+        batch, batch_id=name, table=table, channels=channels, start=start, source="", digest="", repairs={},
+        findings=(), labels={},
+    )  # fmt: skip
+
+
+def thinned(batch: Batch, rows_s: float) -> Batch:
+    """The rows of a finer grid that fall on one of `rows_s`."""
+    on_grid = np.isclose(batch.time_s % rows_s, 0.0, atol=1e-6)
+    return replace(batch, table=batch.table[on_grid].reset_index(drop=True))
