@@ -9,6 +9,7 @@ import numpy as np
 
 from data.machine import Machine
 from twin.plants.effects.base import Effect
+from twin.plants.everyday.base import Everyday, Stated
 from twin.plants.lumping import exposures_W_per_K, gains_um_per_K, links_W_per_K
 from twin.plants.machine import Plant, Source
 from twin.plants.options import Options
@@ -45,8 +46,10 @@ class _Pen:
         return {"value": f"{told:.4g} um/K", "spread": f"{0.2 * abs(told) + 0.02:.3g} um/K"}
 
 
-def machine_file(plant: Plant, effects: Sequence[Effect], name: str, seed: int, options: Options) -> Machine:
-    """The machine of a case with its twin part; what the effects withhold is not in it."""
+def machine_file(
+    plant: Plant, effects: Sequence[Effect], name: str, seed: int, options: Options, daily: Sequence[Everyday] = ()
+) -> Machine:
+    """The machine of a case with its twin part; what the effects withhold is not in it, what `daily` states is."""
     pen = _Pen(stream(seed, "file"), options)
     withheld = {e.withholds for e in effects if e.withholds}
     hidden = {"mandrel"} & withheld
@@ -64,7 +67,8 @@ def machine_file(plant: Plant, effects: Sequence[Effect], name: str, seed: int, 
             for (body, around), g in exposures_W_per_K(plant.structure).items()
             if body not in hidden
         },
-        "mechanisms": {k: _mechanism(k, s, plant, pen) for k, s in plant.sources.items() if k not in withheld},
+        "mechanisms": {k: _mechanism(k, s, plant, pen) for k, s in plant.sources.items() if k not in withheld}
+        | {stated.name: _stated(stated, pen) for piece in daily if (stated := piece.stated())},
         "sensors": {
             s.channel: {"at": s.body, "lag": {"value": "45 s", "spread": 0.3}, "offset": offset}
             for s in plant.sensors
@@ -151,6 +155,11 @@ def _mechanism(name: str, source: Source, plant: Plant, pen: _Pen) -> dict[str, 
     into = {"shaft": {"value": 0.5, "spread": 0.4}, place: "rest"}
     law = {"viscous": "bearing_viscous", "load": "bearing_load"}[source.law]
     return {"law": law, "drivers": "spindle_rpm", "into": into, "parameters": parameters}
+
+
+def _stated(stated: Stated, pen: _Pen) -> dict[str, Any]:
+    parameters = {name: pen.free(value, unit) for name, (value, unit) in stated.free.items()} | dict(stated.fixed)
+    return {"law": stated.law, "drivers": stated.drivers, "into": stated.into, "parameters": parameters}
 
 
 def _error(plant: Plant, channel: str, pen: _Pen, withheld: set[str]) -> dict[str, Any]:

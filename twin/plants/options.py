@@ -18,6 +18,7 @@ class Options:
     `MAX_HOLE_S`, `absent` the chance that a sensor is not there in a run, `missing` that a sample is lost. Of the shop:
     means of the room from `coldest_degC` to `warmest_degC`, starts from `earliest_h` to `latest_h`, `habit` a
     key of `twin.plants.habits.HABITS`; `idle` are recorded switches that drive nothing. `name` is the machine's.
+    `everyday`: whether coefficients follow the temperatures (`twin.plants.everyday`), which no answer names.
     """
 
     batches: int = 12
@@ -39,6 +40,7 @@ class Options:
     idle: tuple[str, ...] = ()
     name: str = ""
     friction_scatter: float = 0.0
+    everyday: bool = False
     file_error: float = 0.3
     mass_error: float = 0.1
     has: tuple[str, ...] = ()

@@ -14,6 +14,8 @@ from data.machine import Machine
 from twin.plants.drawing import draw_plant
 from twin.plants.effects import EFFECTS
 from twin.plants.effects.base import Answer, Effect
+from twin.plants.everyday import everyday
+from twin.plants.everyday.base import Everyday
 from twin.plants.habits import HABITS
 from twin.plants.machine import FEATURES, Plant
 from twin.plants.machine_file import machine_file
@@ -46,6 +48,7 @@ class Posed:
     seed: int
     plant: Plant
     effects: list[Effect]
+    everyday: list[Everyday]
     runs: list[Run]
     machine: Machine
     options: Options
@@ -67,7 +70,7 @@ def draw(
     own = {key: size for key in (effect.split("+") if effect else ())} if sizes is None else dict(sizes)
     at = posed(seed, own, plant, **{"batches": batches, "step_s": step_s, **options})
     shown, name, channels = _with_amounts(at.plant, at.effects), at.machine.machine, at.machine.batch_channels()
-    course = simulated(shown, at.runs, at.effects, at.options.solver_s, at.options.before_h)
+    course = simulated(shown, at.runs, [*at.effects, *at.everyday], at.options.solver_s, at.options.before_h)
     tables = written(shown, at.runs, course, at.effects, seed, channels, at.options)
     read = [gridded(name, run, table, channels, at.options) for run, table in zip(at.runs, tables, strict=True)]
     by_batch = {run.batch_id: table for run, table in zip(at.runs, tables, strict=True)}
@@ -84,13 +87,14 @@ def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **optio
     kinds = {key: EFFECTS[key] for key in sizes}
     drawn = draw_plant(seed, *_features(kinds, sizes, asked), plant)
     effects = [kind(drawn, sizes[key], stream(seed, f"effect {key}")) for key, kind in kinds.items()]
-    machine = machine_file(drawn, effects, asked.name or f"plant_{seed:04d}", seed, asked)
+    daily = everyday(drawn, seed) if asked.everyday else []
+    machine = machine_file(drawn, effects, asked.name or f"plant_{seed:04d}", seed, asked, daily)
     runs = plan_runs(
         seed, asked.batches, asked.hours, asked.step_s, drawn.rated_rpm, asked.friction_scatter,
         (asked.coldest_degC, asked.warmest_degC), (asked.earliest_h, asked.latest_h), asked.idle,
     )  # fmt: skip
     runs = HABITS[asked.habit](runs, drawn.rated_rpm)
-    return Posed(seed, drawn, effects, [earlier(run, asked.early_s) for run in runs], machine, asked)
+    return Posed(seed, drawn, effects, daily, [earlier(run, asked.early_s) for run in runs], machine, asked)
 
 
 def _features(

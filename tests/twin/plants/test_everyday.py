@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from plant_cases import SEED, full_speed, plant
 
+from twin.compile import compile_network
 from twin.plants.everyday import EVERYDAY, everyday
 from twin.plants.everyday.films import Films, radiation_factor, rising_factor
 from twin.plants.everyday.joints import Joints, contact_factor
 from twin.plants.everyday.nut import SLICES, Nut
 from twin.plants.physics import simulated
+from twin.plants.plant import draw
 from twin.plants.runs import plan_runs
 from twin.plants.seeds import stream
 
@@ -115,3 +117,16 @@ def test_it_is_moderate() -> None:
     changed = simulated(p, runs, pieces, 30.0).cells_degC
     share = np.sqrt(np.mean((changed - plain) ** 2)) / np.sqrt(np.mean((plain - plain[:1]) ** 2))
     assert 0.003 < share < 0.15
+
+
+def test_a_case_has_it_where_it_is_asked_for_and_the_file_states_the_nut() -> None:
+    brief = {"batches": 2, "hours": 1.0, "before_h": 1.0, "solver_s": 50.0, "has": ("feed",), "file_error": 0.0}
+    plain, daily = (draw(SEED, "sun", everyday=asked, **brief) for asked in (False, True))
+    assert plain.truth == daily.truth, "it is never an answer"
+    assert not plain.batches[0].table.equals(daily.batches[0].table)
+    assert plain.machine.twin is not None and daily.machine.twin is not None
+    assert set(daily.machine.twin["mechanisms"]) - set(plain.machine.twin["mechanisms"]) == {"nut"}
+    (moment,) = (piece.moment_Nm for piece in everyday(plant(SEED, "feed"), SEED) if isinstance(piece, Nut))
+    nut = daily.machine.twin["mechanisms"]["nut"]
+    assert nut["parameters"]["moment"]["value"] == f"{moment:.4g} N*m" and nut["into"] == "screw"
+    assert "nut" in [h.law.name for h in compile_network(daily.machine).heats]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from plant_cases import NONE, SEED, brief, full_speed
 
-import twin.plants
 from data.errors import InputError
 from data.machine import load_machine
 from data.recording import read_batches, recording_files
@@ -28,32 +26,6 @@ from twin.quantity import values_of
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
 from twin.simulation.law_calls import parameters_of
-
-
-def test_nothing_of_the_twin_is_imported() -> None:
-    folder = Path(twin.plants.__file__).parent
-    found = set()
-    for file in folder.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom):
-                assert node.level == 0, file
-                names = [node.module or ""]
-            found |= {n for n in names if not n.startswith("twin.plants.")}
-    outside = {n.split(".")[0] for n in found} - {"data", "numpy", "scipy", "pandas", "yaml", "skfem"}
-    assert outside <= {
-        "__future__",
-        "abc",
-        "ast",
-        "collections",
-        "dataclasses",
-        "itertools",
-        "json",
-        "pathlib",
-        "types",
-        "typing",
-        "zlib",
-    }
 
 
 def test_the_same_seed_gives_the_same_case_and_another_another() -> None:
