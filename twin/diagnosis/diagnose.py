@@ -222,6 +222,7 @@ def _diagnosis(
         added=changed_parts(part, part_after),
         notes=_notes(findings, len(batches)),
         plan_text=run.plan_text if run is not None else None,
+        search=done,
     )
 
 

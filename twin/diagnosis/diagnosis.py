@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from pydantic import BaseModel
@@ -13,6 +14,9 @@ from twin.calibration.identifiability import Interval
 from twin.diagnosis.telling.findings import Findings
 from twin.network import Network
 from twin.schema import TwinPart
+
+if TYPE_CHECKING:
+    from twin.diagnosis.rounds.search import Search
 
 # Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
 # Errors less their first sample, sensors in degC; gain in nats of left-out log score.
@@ -41,7 +45,7 @@ class Diagnosis:
 
     For the machine file, as `diagnosed_text` takes them: `network` of `part_after`, fitted `values` and `intervals` of
     its free parameters, parts `added` by name or path, `notes` on them. `plan_text` is the next run as a run plan,
-    None where there is none.
+    None where there is none. `search` is how it came to that: all rounds and fits.
     """
 
     machine: Machine
@@ -58,3 +62,4 @@ class Diagnosis:
     added: Mapping[str, BaseModel] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
     plan_text: str | None = None
+    search: Search | None = field(default=None, repr=False, compare=False)

@@ -70,7 +70,7 @@ def outcome(
     findings = None if stored.failed else stored.findings
     physics = [r for r in rows if not r["decoy"]]
     seen = [r for r in physics if r["visible"] is True]
-    known = truth is not None and bool(physics)
+    known = truth is not None and bool(physics) and (bool(seen) or all(r["visible"] is not None for r in physics))
     limits = [r["limit_share"] for r in physics if r["limit_share"] is not None]
     named = physics or rows
     out: dict[str, Any] = {

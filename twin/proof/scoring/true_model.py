@@ -1,15 +1,44 @@
-"""The twin with the true terms added, refitted: how much of the left-out error they explain, and which are visible."""
+"""The twin with the true terms in it, refitted: what a perfect answer would reach, and which terms can be seen at all.
+
+A term is visible when, with the others in, it cuts the left-out error of some channel by a tenth and gains more on the
+left-out batches than structure alone does (99 % quantile of the structural null, without a diagnosis' own margin).
+What no candidate states is compared with the same case redrawn without it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
+from twin.diagnosis.rounds.null import Null, structural_null
+from twin.diagnosis.rounds.parts_of_batches import enough_batches
+from twin.diagnosis.rounds.prediction import left_out_rows
+from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
+from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
+from twin.proof.scoring.true_candidate import true_candidate, with_terms
+from twin.schema import TwinPart, twin_part
+
+CUT = 0.1  # of a channel's left-out error: less is not worth a name
+Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
 
 
 @dataclass(frozen=True)
 class TrueModel:
-    """Errors in units of the noise (`error_level`), of the baseline and of the true model; one entry a term below.
+    """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
+    of `gain_nats` and `threshold_nats`, nan where nothing could be fitted.
 
-    `gain_nats` and `threshold_nats` of each term with the others in; `visible` says whether it counts.
+    `visible` None: not known, as no candidate states the term and the case could not be redrawn.
     """
 
     error_before: float
@@ -17,4 +46,133 @@ class TrueModel:
     error_floor: float
     gain_nats: tuple[float, ...]
     threshold_nats: tuple[float, ...]
-    visible: tuple[bool, ...]
+    visible: tuple[bool | None, ...]
+
+
+@threadpool_limits.wrap(limits=1)
+def true_model(
+    machine: Machine,
+    batches: Sequence[Batch],
+    answer: Mapping[str, Any],
+    redraw: Redraw | None = None,
+    seed: int = 0,
+) -> TrueModel:
+    """The true model of a case whose key is open.
+
+    Args:
+        answer: the key as the vault's JSON gives it.
+        redraw: from an effect's key to machine and batches of the same case without that effect.
+
+    Raises:
+        InputError: recordings or a machine file that cannot be used; WorkError: the machine file's model fails.
+    """
+    key = AnswerKey.from_json(answer)
+    fit = _fit(machine, batches)
+    level = _level(fit)
+    if not key.terms:
+        return TrueModel(level, level, 1.0, (), (), ())
+    every = proposed(fit)
+    seen = screen(fit, every)
+    null = _null(fit, seen, no_news(every), seed)
+    found = [true_candidate(t, seen, every) for t in key.terms]
+    stated = [k for k, s in enumerate(found) if s is not None]
+    full = _with(fit, key.terms, found, stated)
+    if full is None:
+        full, stated = fit, []
+    judged = [
+        _judged(fit, full, key.terms, found, [j for j in stated if j != k], null)
+        if k in stated
+        else _redrawn(fit, t, redraw, null)
+        for k, t in enumerate(key.terms)
+    ]
+    others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
+    best = full if stated and not others else others[0] if others else fit  # an unlisted effect stands alone
+    gains, thresholds, visible = zip(*((j.gain, j.threshold, j.visible) for j in judged), strict=True)
+    return TrueModel(level, _level(best), 1.0, gains, thresholds, visible)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    gain: float = float("nan")
+    threshold: float = float("nan")
+    visible: bool | None = None
+    fitted: Fitted | None = None  # of the case redrawn
+
+
+def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
+    ordered = sorted(batches, key=lambda b: b.batch_id)
+    parts, _ = enough_batches(ordered)
+    return baseline(machine, twin_part(machine), parts, None, len(ordered))
+
+
+def _null(fit: Fitted, seen: Screen, loose: set[str], seed: int) -> Null:
+    columns = {s.candidate.name: s.column for s in seen.scored if s.column >= 0 and s.candidate.name not in loose}
+    return structural_null(fit, seen.evidence, columns, seed)
+
+
+def _with(
+    fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: Sequence[int]
+) -> Fitted | None:
+    """The fit with these terms in it at its optimum; None where it cannot be simulated."""
+    own = [(terms[k], s) for k in which if (s := found[k]) is not None]
+    try:
+        part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)
+        return settle(refitted(fit, part, at))
+    except (InputError, WorkError, ValueError):
+        return None
+
+
+def _judged(
+    fit: Fitted,
+    full: Fitted,
+    terms: Sequence[TrueTerm],
+    found: Sequence[Scored | None],
+    others: Sequence[int],
+    null: Null,
+) -> _Judged:
+    """One term with the others in: the better of two fits without it is what it must beat."""
+    own = [(terms[k], s) for k in others if (s := found[k]) is not None]
+    part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
+    try:
+        without = [settle(refitted(full, part))]
+    except (InputError, WorkError):
+        return _Judged()
+    without += [fit] if not others else []
+    inflation = np.minimum(full.state.noise.inflation, without[0].state.noise.inflation)
+    scores = [_score(w, inflation) for w in without]
+    best = int(np.argmax(scores))
+    return _beyond(without[best], full, inflation, null)
+
+
+def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
+    """The case with the term against the case without it, each with the machine file alone."""
+    if redraw is None:
+        return _Judged()
+    other = _fit(*redraw(term.effect))
+    inflation = np.minimum(fit.state.noise.inflation, other.state.noise.inflation)
+    return replace(_beyond(fit, other, inflation, null), fitted=other)
+
+
+def _beyond(before: Fitted, after: Fitted, inflation: Array, null: Null) -> _Judged:
+    density = _score(after, inflation)
+    gain, threshold = density - _score(before, inflation), float(null.threshold(density))
+    old, new = _rms(before), _rms(after)
+    cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
+    return _Judged(gain, threshold, bool(gain > threshold and cut >= CUT))
+
+
+def _score(fitted: Fitted, inflation: Array) -> float:
+    return float(alone(fitted, inflation).base_score()[0])
+
+
+def _rms(fitted: Fitted) -> dict[str, float]:
+    """Left-out rms by channel over all rows."""
+    table = left_out_rows(fitted).rms
+    square = (table["rms"] ** 2 * table["rows"]).groupby(table["channel"]).sum()
+    rows = table["rows"].groupby(table["channel"]).sum()
+    return {str(c): float(np.sqrt(square[c] / rows[c])) for c in square.index}
+
+
+def _level(fitted: Fitted) -> float:
+    noise = dict(zip(fitted.problem.channels, fitted.problem.noise, strict=True))
+    return float(np.sqrt(np.mean([(value / noise[c]) ** 2 for c, value in _rms(fitted).items()])))

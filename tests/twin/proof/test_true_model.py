@@ -1,0 +1,75 @@
+"""The true model: at the noise where the twin can be the plant, and what can be seen is what was planted large."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import pytest
+
+from data.batch import Batch
+from data.machine import Machine
+from tests.twin.diagnosis.small_cases import FLOOR, runs, two_bodies
+from tests.twin.proof.answered import answer, term
+from twin.plants.plant import draw
+from twin.proof.scoring.true_model import TrueModel, true_model
+
+SHORT: dict[str, Any] = {"batches": 4, "hours": 5.0, "before_h": 5.0, "solver_s": 50.0}
+
+
+def floor(conductance: float, **changes: Any) -> dict[str, Any]:
+    values = {"conductance": {"value": conductance, "unit": "W/K"}}
+    return term("floor_sink", where={"kind": "node", "name": "head"}, parameters=values, **changes)
+
+
+@cache
+def cold(conductance: float) -> TrueModel:
+    known = two_bodies()
+    hidden = {"floor": {**FLOOR, "parameters": {"conductance": f"{conductance} W/K"}}}
+    return true_model(known, runs(known, hidden), answer("one", floor(conductance)))
+
+
+def test_a_floor_of_the_twins_own_law_is_explained_down_to_the_noise() -> None:
+    got = cold(8.0)
+    assert got.visible == (True,)
+    assert got.error_before > 2.0 * got.error_true
+    assert 0.7 < got.error_true < 1.3
+    assert got.error_floor == 1.0
+    assert got.gain_nats[0] > got.threshold_nats[0] > 0
+
+
+def test_a_floor_that_hardly_conducts_cannot_be_seen() -> None:
+    got = cold(0.02)
+    assert got.visible == (False,)
+    assert got.error_before == pytest.approx(got.error_true, rel=0.05)
+
+
+def test_where_nothing_is_missing_the_baseline_is_the_true_model() -> None:
+    known = two_bodies()
+    got = true_model(known, runs(known), answer("nothing"))
+    assert got.error_before == got.error_true
+    assert got.visible == got.gain_nats == ()
+
+
+def test_a_mechanism_of_no_candidate_is_judged_by_the_case_without_it() -> None:
+    known = two_bodies()
+    hidden = {"floor": {**FLOOR, "parameters": {"conductance": "8 W/K"}}}
+    key = answer("unlisted", floor(8.0, mechanism=None))
+
+    def without(effect: str) -> tuple[Machine, Sequence[Batch]]:
+        assert effect == "floor_sink"
+        return known, runs(known)
+
+    got = true_model(known, runs(known, hidden), key, without)
+    assert got.visible == (True,)
+    assert 0.7 < got.error_true < 1.3
+    assert true_model(known, runs(known, hidden), key).visible == (None,)
+
+
+def test_a_plant_of_other_numerics_has_a_true_model_too() -> None:
+    case = draw(2, "sun", 2.0, **SHORT)
+    key = answer("one", *({**t, "size": 2.0, "decoy": False, "active": "always"} for t in case.truth["terms"]))
+    got = true_model(case.machine, case.batches, key)
+    assert got.visible == (True,)
+    assert got.error_true < 0.7 * got.error_before

@@ -1,0 +1,74 @@
+"""A true term as a candidate that the diagnosis could have proposed, begun at the key's own values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.priors import start_values
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.scoring.screen import Scored, Screen
+from twin.mechanisms import MECHANISMS
+from twin.proof.scoring.answer_key import Spot, TrueTerm
+from twin.proof.scoring.names import counted_as
+from twin.proof.scoring.places import exact
+from twin.quantity import Value
+from twin.schema import TwinPart
+
+
+def true_candidate(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> Scored | None:
+    """Of the candidates at the term's place with its mechanism the one that gains most in the screen, if there is any.
+
+    The key does not say by which channel the twin would drive it, or which bodies it would look at besides.
+    """
+    if term.mechanism is None:
+        return None
+    own = [s for s in seen.scored if _is(term, s.candidate)]
+    own = [s for s in own if s.candidate.where.name == term.where.name] or own
+    if own:
+        return max(own, key=lambda s: s.gain)
+    unseen = next((c for c in every if _is(term, c)), None)  # what cannot be switched off has no signature
+    return None if unseen is None else Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)
+
+
+def begun_at_truth(term: TrueTerm, s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
+    """`start_values` of a refit, with the key's values to begin with; priors are what a diagnosis would have."""
+    c = s.candidate
+    if c.mechanism not in MECHANISMS or c.change is not None:
+        return start_values(s, now)
+    mechanism = MECHANISMS[c.mechanism]
+    known = {n: v for n, (v, _) in (term.parameters or {}).items() if n in {p.name for p in mechanism.parameters}}
+    told = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
+    values, at = start_values(replace(s, amplitudes={**s.amplitudes, **told}), now)
+    shaped = {
+        name: given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": given.value})
+        for name, given in values.items()
+        if name in known and name not in (mechanism.off or {})
+    }
+    return {**values, **shaped}, at
+
+
+def with_terms(
+    part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted
+) -> tuple[TwinPart, dict[str, float]]:
+    """The twin part with these candidates in it, and where a refit begins.
+
+    Raises:
+        ValueError: two of them take the same name.
+    """
+    at: dict[str, float] = {}
+    for term, s in zip(terms, found, strict=True):
+        values, begin = begun_at_truth(term, s, now)
+        part = s.candidate.applied(part, values)
+        at.update(begin)
+    return part, at
+
+
+def _is(term: TrueTerm, c: Candidate) -> bool:
+    same = counted_as(c.mechanism) == counted_as(term.mechanism)
+    return same and exact(Spot(c.where.kind, c.where.name), term)
+
+
+def _said(number: float, unit: str) -> str | float:
+    return float(f"{number:.6g}") if unit == "1" else f"{number:.6g} {unit}"
