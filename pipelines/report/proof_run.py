@@ -13,8 +13,8 @@ from data.errors import WorkError
 # The columns that the page reads; others may stand beside them, and any table may be absent or empty.
 TABLES: Mapping[str, tuple[str, ...]] = {
     "ledger": ("time", "step", "words"),
-    "outcomes": ("case", "kind", "plant", "effect", "verdict", "failed", "seconds", "visible", "error_before",
-                 "error_after", "error_true", "error_floor", "limit_share"),
+    "outcomes": ("case", "kind", "plant", "effect", "verdict", "failed", "seconds", "visible", "probability",
+                 "error_before", "error_after", "error_true", "error_floor", "limit_share"),
     "terms": ("case", "kind", "plant", "effect", "mechanism", "place", "visible", "limit_share", "decoy", "found",
               "amplitude_true", "amplitude_found", "low90", "high90"),
     "goals": ("measure", "goal", "wanted", "better", "value", "low90", "high90", "n", "met", "plant"),
@@ -26,7 +26,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "convergence": ("plant", "quantity", "refined", "size", "unit", "error", "order"),  # refined: grid or step
     "worst": ("case", "plant", "effect", "why"),
     "series": ("case", "batch", "channel", "unit", "time_s", "recorded", "before", "after"),  # of the worst cases
-    "windows": ("case", "batch", "start_s", "end_s"),  # when the concealed effects of the worst cases work; none: always
+    "windows": ("case", "batch", "start_s", "end_s"),  # when a worst case's effects work; none: always
 }  # fmt: skip
 
 
