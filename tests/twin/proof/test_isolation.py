@@ -113,7 +113,7 @@ def test_findings_outlive_rivals_that_fail(tmp_path: Path) -> None:
     by = Examinee("toy_examinee:quick", "toy_examinee:no_rivals", import_from=(HERE,))
     files = examine(case_of(tmp_path / "case", []), by, "ab")
     run = json.loads(files[RUN])
-    assert set(files) == {RUN, "findings.json"}
+    assert set(files) == {RUN, "findings.json", "next_run.yml", "series.csv"}
     assert (run["error"], run["rivals_error"]) == (None, "rivals: nothing to compare with")
 
 

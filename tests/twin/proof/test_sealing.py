@@ -260,4 +260,6 @@ def test_answers_come_from_processes_of_their_own(tmp_path: Path) -> None:
     stored = tmp_path / "proof" / "answers" / "case_0002"
     assert json.loads((stored / "findings.json").read_text())["verdict"] == "consistent"
     assert json.loads((stored / "rivals.json").read_text())["reference"]["verdict"] == "consistent"
+    assert (stored / "next_run.yml").read_text() == "hours: 3\n"
+    assert (stored / "series.csv").read_text() == "channel,time_s,recorded\nz,300,1\n"  # z is worst by its noise
     assert proof.answers["case_0002"]["kind"] == "nothing" and not proof.void

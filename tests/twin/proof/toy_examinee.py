@@ -12,6 +12,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
+
 from data.batch import Batch
 from data.errors import WorkError
 from data.machine import Machine
@@ -24,18 +26,23 @@ def diagnosis(machine: Machine, batches: Sequence[Batch], *remarks: str) -> Simp
     told = Findings(
         machine=machine.machine, batches=ids, verdict="consistent", fit=fit, seconds=0.1, remarks=remarks
     )  # fmt: skip
-    return SimpleNamespace(findings=told)
+    rms = pd.DataFrame({
+        "channel": ["front", "front", "z"], "rows": [10, 30, 40], "after": [0.1, 0.1, 3.0], "floor": [0.1, 0.05, 1.0],
+    })  # fmt: skip
+    series = pd.DataFrame({"channel": ["front", "z"], "time_s": [0.0, 300.0], "recorded": [20.123456, 1.0]})
+    tables = {"rms": rms, "series": series}
+    return SimpleNamespace(findings=told, plan_text="hours: 3\n", tables=tables, search=SimpleNamespace(found=told))
 
 
 def quick(machine: Machine, batches: Sequence[Batch], **given: Any) -> SimpleNamespace:
     return diagnosis(machine, batches)
 
 
-def rivals(found: SimpleNamespace) -> dict[str, Any]:
-    return {"reference": {"verdict": found.findings.verdict, "findings": [], "seconds": 0.0}}
+def rivals(search: SimpleNamespace) -> dict[str, Any]:
+    return {"reference": {"verdict": search.found.verdict, "findings": [], "seconds": 0.0}}
 
 
-def no_rivals(found: SimpleNamespace) -> dict[str, Any]:
+def no_rivals(search: SimpleNamespace) -> dict[str, Any]:
     raise WorkError("rivals: nothing to compare with")
 
 

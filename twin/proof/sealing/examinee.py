@@ -17,6 +17,7 @@ from typing import Any
 from twin.proof.sealing.isolation import allowed, confine
 
 TOLD, FINDINGS, RIVALS = "told.json", "findings.json", "rivals.json"
+PLAN, SERIES = "next_run.yml", "series.csv"
 
 
 def main() -> None:
@@ -31,38 +32,50 @@ def main() -> None:
     _tell(place, told)
     try:
         begun = perf_counter()
-        diagnosis = diagnose(*_read(place), seed=0, processes=1, cache=None)
+        diagnosis = diagnose(*read_case(place / "case", place / "answer" / "lake"), seed=0, processes=1, cache=None)
         told |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
-        _write(place, FINDINGS, _findings_text(diagnosis))
+        _write_diagnosis(place, diagnosis)
         _tell(place, told)
         if rivals is not None:
-            _write(place, RIVALS, _json(rivals(diagnosis)))
+            _write(place, RIVALS, _json(rivals(diagnosis.search)))
         _tell(place, told | {"stage": "done"})
     except Exception as error:  # whatever it is, it is the answer to this case
         _tell(place, told | {"error": _one_line(error)})
 
 
-def _read(place: Path) -> tuple[Any, list[Any]]:
-    """Machine and batches as `thermodrift diagnose` reads them: into a lake of its own, checked."""
+def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
+    """Machine and batches of a case as `thermodrift diagnose` reads them: into a lake, here an own one, and checked.
+
+    Raises:
+        InputError: a machine file or recordings that cannot be used.
+    """
     from data.checks import check_machine
     from data.errors import InputError
     from data.ingest import ingest
     from data.lake import Lake
     from data.machine import load_machine
 
-    machine = load_machine(place / "case" / "machine.yml")
-    lake = Lake(place / "answer" / "lake")
-    report = ingest([place / "case" / "recordings"], machine, lake)
+    machine = load_machine(case / "machine.yml")
+    held = Lake(lake)
+    report = ingest([case / "recordings"], machine, held)
     if not report.batches:
         reasons = [r.reason for r in report.quarantined]
         raise InputError(reasons[0] if reasons else "recordings: no recording that the machine file asks for")
-    return machine, check_machine(lake.load_all(machine.machine), machine)
+    return machine, check_machine(held.load_all(machine.machine), machine)
 
 
-def _findings_text(diagnosis: Any) -> str:
+def _write_diagnosis(place: Path, diagnosis: Any) -> None:
+    """The findings, the next run's plan if there is one, and the series that a picture of the case would show."""
     from twin.diagnosis.telling.findings import as_json
 
-    return as_json(diagnosis.findings)
+    _write(place, FINDINGS, as_json(diagnosis.findings))
+    if diagnosis.plan_text is not None:
+        _write(place, PLAN, diagnosis.plan_text)
+    rms, series = diagnosis.tables["rms"], diagnosis.tables["series"]
+    if len(rms) and len(series):
+        squares = rms.assign(share=rms["rows"] * (rms["after"] / rms["floor"]) ** 2).groupby("channel")
+        worst = (squares["share"].sum() / squares["rows"].sum()).idxmax()
+        _write(place, SERIES, series[series["channel"] == worst].to_csv(index=False, float_format="%.5g"))
 
 
 def _function(where: str) -> Any:

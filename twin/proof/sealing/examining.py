@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 from data.errors import WorkError
-from twin.proof.sealing.examinee import FINDINGS, RIVALS, TOLD
+from twin.proof.sealing.examinee import FINDINGS, PLAN, RIVALS, SERIES, TOLD
 from twin.proof.sealing.ledger import now
 
 RUN = "run.json"
@@ -28,7 +28,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 
 @dataclass(frozen=True)
 class Examinee:
-    """Who answers: functions as ``module:function``, called as `diagnose` and as ``rivals(diagnosis)``.
+    """Who answers: functions as ``module:function``, called as `diagnose` is and as ``rivals(search)``.
 
     `limit_s` is the longest that a diagnosis may take, and again the longest that its rivals may. `import_from` are
     folders that modules may be read from beside the package itself.
@@ -64,7 +64,8 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
         told = _told(place)
         if "isolation" not in told:
             raise WorkError(f"the answering process did not start: {error or _last_words(place)}")
-        files = {n: (place / "answer" / n).read_bytes() for n in (FINDINGS, RIVALS) if (place / "answer" / n).exists()}
+        written = [place / "answer" / name for name in (FINDINGS, PLAN, SERIES, RIVALS)]
+        files = {p.name: p.read_bytes() for p in written if p.exists()}
         error = told.get("error") or error
         if not error and told["stage"] != "done":
             error = f"the process ended while {'rivals were asked' if FINDINGS in files else 'it diagnosed'}"
