@@ -1,0 +1,1 @@
+"""Plant A: castings as finite elements in space, their displacement by thermoelasticity."""

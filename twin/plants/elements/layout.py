@@ -1,0 +1,27 @@
+"""Plant A: a machine of finite elements and what every node's rise does to its tool."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.plants.casting import Array
+from twin.plants.elements.elasticity import Elasticity
+from twin.plants.elements.geometry import Drawn, draw_castings
+from twin.plants.elements.growth import growths
+from twin.plants.machine import Layout
+
+
+def draw_layout(seed: int, features: frozenset[str]) -> Layout:
+    """The castings of a seed, cut into hexahedra, with or without a test mandrel."""
+    drawn = draw_castings(seed, mandrel="mandrel" in features)
+    return Layout(drawn.structure, growths(drawn.structure, tool_weights_um_per_K(drawn), features))
+
+
+def tool_weights_um_per_K(drawn: Drawn) -> dict[str, Array]:
+    """Channel -> error of a kelvin at each node, (N,): x sideways, y away from the column, z + closes the gap."""
+    s = drawn.structure
+    machine = Elasticity(s.meshes, drawn.contacts, "bed")
+    end = "mandrel" if "mandrel" in s.castings else "shaft"
+    away = machine.weights_um_per_K((end, drawn.tool_m), ("table", drawn.table_m))
+    signed = away * np.array([1.0, 1.0, -1.0])[:, None]
+    return dict(zip("xyz", np.pad(signed, ((0, 0), (0, s.size - signed.shape[1]))), strict=True))
