@@ -24,6 +24,11 @@ class Now:
     ground_degC: Array
     clock_h: Array
 
+    def driver(self, channel: str) -> Array:
+        """A driver by the name of its channel."""
+        shown = {"spindle_rpm": self.speed_rpm, "feed": self.feed_mm_per_min, "coolant": self.coolant}
+        return shown[channel]
+
 
 def moments(runs: Sequence[Run], step_from_s: Array, at_s: Array) -> list[Now]:
     """Conditions at `at_s` (M,); drivers are those that hold in the steps that begin at `step_from_s` (M,)."""

@@ -20,11 +20,12 @@ from twin.plants.habits import HABITS
 from twin.plants.machine import FEATURES, Plant
 from twin.plants.machine_file import machine_file
 from twin.plants.options import Options
-from twin.plants.physics import LEAD_S, simulated
+from twin.plants.physics import LEAD_S, Course, simulated
 from twin.plants.recorded import gridded, written
 from twin.plants.runs import Run, earlier, plan_runs
 from twin.plants.seeds import stream
 from twin.plants.structure import AIR
+from twin.plants.windows import windows
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def draw(
     tables = written(shown, at.runs, course, at.effects, seed, channels, at.options)
     read = [gridded(name, run, table, channels, at.options) for run, table in zip(at.runs, tables, strict=True)]
     by_batch = {run.batch_id: table for run, table in zip(at.runs, tables, strict=True)}
-    return Case(at.machine, read, truth_of(at.plant, at.effects), by_batch)
+    return Case(at.machine, read, truth_of(at, course), by_batch)
 
 
 def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **options: Any) -> Posed:
@@ -125,9 +126,10 @@ def _with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
     return replace(plant, sources=sources, growths=growths)
 
 
-def truth_of(plant: Plant, effects: list[Effect]) -> dict[str, Any]:
+def truth_of(at: Posed, course: Course) -> dict[str, Any]:
     """The answer key: plain data."""
-    terms = [_term(e, plant) for e in effects if e.size]
+    plant = at.plant
+    terms = [_term(e, plant) | {"active": windows(e, at.runs, at.options.step_s, course)} for e in at.effects if e.size]
     nothing: dict[str, Any] = {
         "where": None,
         "also": [],

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.plants.casting import Array
 from twin.plants.conditions import Now
@@ -37,6 +38,7 @@ class Effect:
     key: ClassVar[str]
     has: ClassVar[frozenset[str]] = frozenset()  # features that the plant must have for it
     withholds: ClassVar[str | None] = None  # the feature that the machine file leaves out
+    driver: ClassVar[str | None] = None  # the channel that switches it
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.plant, self.size = plant, size
@@ -44,6 +46,10 @@ class Effect:
     def answer(self) -> Answer:
         """Where and what it is."""
         raise NotImplementedError
+
+    def active(self, now: Now) -> NDArray[np.bool_]:
+        """Whether it can work at all, (B,): its driver runs, its gate is open; always, where nothing switches it."""
+        return np.ones(len(now.room_degC), bool) if self.driver is None else now.driver(self.driver) != 0
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
         """Adds to the heat into the cells in place; both (N, B)."""

@@ -14,6 +14,7 @@ PALMGREN_Y = 0.33
 
 
 class _FrontBearings(Effect):
+    driver = "spindle_rpm"
     source: str
 
     def _temperatures(self, cells_degC: Array) -> tuple[Array, Array]:

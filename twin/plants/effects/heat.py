@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.plants.casting import Array
 from twin.plants.conditions import Now
@@ -75,6 +76,7 @@ class PumpHeat(CabinetHeat):
 
     key = "pump_heat"
     has = frozenset({"coolant"})
+    driver = "coolant"
     watts = 120.0
 
     def share(self, cells_degC: Array, now: Now) -> Array:
@@ -86,6 +88,7 @@ class GuideFriction(_Steady):
 
     key = "guide_friction"
     has = frozenset({"feed"})
+    driver = "feed"
     body, watts = "table", 160.0  # at FAST_MM_PER_MIN
     FAST_MM_PER_MIN, LOAD_N = 8000.0, 5000.0
 
@@ -121,6 +124,7 @@ class UnlistedWarmSpeed(_Steady):
     """Not in any list: heat into the head's rear by speed times the head's excess over 20 degC."""
 
     key = "unlisted_warm_speed"
+    driver = "spindle_rpm"
     watts = 50.0  # at the rated speed and 10 K above 20 degC
 
     def _part(self, plant: Plant) -> Part:
@@ -143,6 +147,9 @@ class UnlistedCoolantSpeed(PumpHeat):
 
     def answer(self) -> Answer:
         return Answer(None, "node", self.body, {"power": (self.power_W, "W")}, words="power coolant (n / rated)^2")
+
+    def active(self, now: Now) -> NDArray[np.bool_]:
+        return (now.coolant != 0) & (now.speed_rpm != 0)
 
     def share(self, cells_degC: Array, now: Now) -> Array:
         return now.coolant * (now.speed_rpm / self.plant.rated_rpm) ** 2

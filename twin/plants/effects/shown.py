@@ -16,6 +16,7 @@ class SpeedShift(Effect):
     """The balls' centrifugal load moves the shaft with the speed squared (Harris and Kotzalas 2006)."""
 
     key = "speed_shift"
+    driver = "spindle_rpm"
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)

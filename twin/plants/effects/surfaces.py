@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.plants.casting import Array
 from twin.plants.conditions import Now
@@ -40,6 +41,7 @@ class RotatingConvection(Effect):
     """A turning shaft drags air along: Becker (1963), Nu with Re^(2/3), added to the exchange at rest."""
 
     key = "rotating_convection"
+    driver = "spindle_rpm"
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         super().__init__(plant, size, rng)
@@ -102,9 +104,12 @@ class Draught(Effect):
         }  # fmt: skip
         return Answer(self.key, "node", ROOM, values, (HALL_TOP, f"{AIR}-{ROOM}"), "a gate opens for a while")
 
-    def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
+    def active(self, now: Now) -> NDArray[np.bool_]:
         since_s = now.time_s - 60.0 * self.start_min
-        if 0 <= since_s < 60.0 * self.duration_min:
+        return np.full(len(now.room_degC), 0 <= since_s < 60.0 * self.duration_min)
+
+    def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
+        if self.active(now).any():
             lead_K = now.room_degC - cells_degC
             heat_W += self.room_W_per_K * (self.factor * (lead_K - self.drop_K) - lead_K)
 

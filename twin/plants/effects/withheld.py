@@ -22,6 +22,7 @@ class _Withheld(Effect):
 class MotorLoss(_Withheld):
     key = mechanism = withholds = "motor_loss"
     has = frozenset({"motor_loss"})
+    driver = "spindle_rpm"
     kind, channel = "node", "motor"
 
 

@@ -95,7 +95,6 @@ def _term(spec: CaseSpec, term: Mapping[str, Any]) -> dict[str, Any]:
         **term,
         "limit_share": round(term["size"] / limit(key, spec.plant), 4),
         "decoy": key in spec.decoys,
-        "active": "always",
         "driver": getattr(kind, "driver", None),
         "same_as": [{"mechanism": mechanism, "where": dict(term["where"])} for mechanism in partners],
     }
