@@ -128,12 +128,12 @@ def times(cases: pd.DataFrame, wanted_s: float, plants: Sequence[str]) -> Figure
     return fig
 
 
-def worst_case(series: pd.DataFrame, windows: pd.DataFrame, plant: str) -> Figure:
+def worst_case(series: pd.DataFrame, windows: pd.DataFrame | None, plant: str) -> Figure:
     """Residual of one case's channel before and after, a panel a run; shaded where the concealed effect works.
 
     Args:
         series: batch, channel, unit, time_s, recorded, before, after of one case and channel.
-        windows: batch, start_s, end_s; none where the effect works always.
+        windows: batch, start_s, end_s; without rows the effect works always, None: nothing is concealed.
     """
     batches = list(dict.fromkeys(series["batch"]))
     fig = Figure(figsize=(WIDE_IN, 2.35))
@@ -142,10 +142,11 @@ def worst_case(series: pd.DataFrame, windows: pd.DataFrame, plant: str) -> Figur
         own = series[series["batch"] == batch]
         ax = panel(fig, 0.6 + k * wide, 0.72, wide - 0.35, 1.2)
         hours = own["time_s"].to_numpy(float) / 3600
-        for w in windows[windows["batch"] == batch].to_dict("records"):
-            ax.axvspan(w["start_s"] / 3600, w["end_s"] / 3600, color=SHADE, lw=0, zorder=0)
-        if windows.empty:
-            ax.set_facecolor(SHADE)
+        if windows is not None:
+            for w in windows[windows["batch"] == batch].to_dict("records"):
+                ax.axvspan(w["start_s"] / 3600, w["end_s"] / 3600, color=SHADE, lw=0, zorder=0)
+            if windows.empty:
+                ax.set_facecolor(SHADE)
         ax.axhline(0, color=SOFT, lw=0.6)
         ax.plot(hours, own["recorded"] - own["before"], color=ORANGE, lw=1.3)
         ax.plot(hours, own["recorded"] - own["after"], color=BLUE, lw=1.3)
@@ -157,5 +158,6 @@ def worst_case(series: pd.DataFrame, windows: pd.DataFrame, plant: str) -> Figur
     unit = str(series["unit"].iloc[0])
     channel = str(series["channel"].iloc[0]).replace("$", r"\$")
     head(fig, f"{channel}: recorded − simulated, {UNITS.get(unit, unit)}", (plant,))
-    keys(fig, [("—", "before", ORANGE), ("—", "after", BLUE), ("■", "the effect works", "#e3b78f")], 0.4)
+    shaded = [("■", "the effect works", "#e3b78f")] if windows is not None else []
+    keys(fig, [("—", "before", ORANGE), ("—", "after", BLUE), *shaded], 0.4)
     return fig

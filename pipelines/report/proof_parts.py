@@ -148,15 +148,14 @@ def _worst(run: ProofRun) -> Part:
     shown = []
     for k, r in enumerate(table.to_dict("records"), 1):
         case, plant = str(r["case"]), str(r["plant"])
+        names = [e for e in str(r["effect"]).split("+") if e not in ("", "nan", "nothing", "<NA>")]
+        effects = " + ".join(map(key_label, names))
         own_series = series[series["case"] == case]
         drawn = None
         if len(own_series):
-            worst = extracts.worst_channel(own_series)
-            figure = by_case.worst_case(worst, windows[windows["case"] == case], plant)
+            active = windows[windows["case"] == case] if names else None
+            figure = by_case.worst_case(extracts.worst_channel(own_series), active, plant)
             drawn = picture(figure, f"{case}: residual before and after", (plant,))
-        effects = " + ".join(
-            key_label(e) for e in str(r["effect"] or "").split("+") if e and e not in ("nan", "nothing")
-        )
         kind = str(r.get("kind") or "")
         what = f"{KIND_WORDS.get(kind, key_label(kind))}{': ' if kind and effects else ''}{effects}"
         what += f"; plant {plant_label(plant)}"

@@ -22,7 +22,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "reliability": ("low", "high", "claimed", "right", "low90", "high90", "n"),
     "confusion_mechanism": ("true", "named", "count"),
     "confusion_place": ("true", "named", "count"),
-    "leak": ("question", "auc", "low90", "high90", "p", "n"),
+    "leak": ("question", "auc", "low90", "high90", "chance", "p", "n"),
     "convergence": ("plant", "quantity", "refined", "size", "unit", "error", "order"),  # refined: grid or step
     "worst": ("case", "plant", "effect", "why"),
     "series": ("case", "batch", "channel", "unit", "time_s", "recorded", "before", "after"),  # of the worst cases

@@ -10,7 +10,9 @@ import pandas as pd
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.proof_run import ProofRun
 from pipelines.report.proof_words import KIND_WORDS, key_label, origin, plant_label, plant_letter, plant_origin
-from pipelines.report.words import NOTHING, number, p_words
+from pipelines.report.words import NOTHING, number, p_words, percent
+
+_RARE = 0.05
 
 
 def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
@@ -56,9 +58,10 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
     rows = [
         Row(
             (
-                str(r["question"]),
+                key_label(str(r["question"])),
                 number(_float(r["auc"]), 2),
                 _range(r["low90"], r["high90"], 2),
+                number(_float(r["chance"]), 2),
                 p_words(_float(r["p"])) if math.isfinite(_float(r["p"])) else NOTHING,
                 f"{int(r['n'])}",
             )
@@ -67,9 +70,16 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
     ]
     columns = (
         Column("what the classifier is to tell", kind="wide"), Column("area under its curve", kind="number"),
-        Column("90 %", kind="number"), Column("chance gives as much", kind="number"), Column("cases", kind="number"),
+        Column("90 %", kind="number"), Column("by chance", kind="number"),
+        Column("chance does as well", kind="number"), Column("cases", kind="number"),
     )  # fmt: skip
-    notes = ("It sees names, sizes, row counts, gaps and inputs, no temperature and no displacement. Chance is 0.5.",)
+    low = int((table["p"] < _RARE).sum())
+    notes = (
+        "It sees names, sizes, row counts, gaps and inputs, no temperature and no displacement. By chance: what it "
+        "reaches when the answers are dealt anew.",
+        f"Chance does as well in fewer than {percent(_RARE)} of the deals for {low} of {len(table)} questions; "
+        f"chance alone would give about {_RARE * len(table):.1f}.",
+    )
     return Table("Leak test", columns, tuple(rows), _simulated(plants), notes=notes)
 
 

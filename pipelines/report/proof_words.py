@@ -96,7 +96,7 @@ def measured(value: float, goal: str, wanted: float) -> str:
         return NOTHING
     if "%" in goal or "point" in goal:
         scaled = 100 * value
-        digits = 1 if abs(scaled) < 9.95 or 90 < abs(scaled) < 100 else 0
+        digits = 1 if abs(scaled) < 9.95 or 90 <= abs(scaled) < 100 else 0
         return f"{number(scaled, digits)} {'%' if '%' in goal else 'points'}"
     digits = 0 if abs(value) >= 99.5 else 1 if abs(value) >= 9.95 else 2
     return f"{number(value, digits)} s" if goal.endswith(" s") else number(value, digits)

@@ -27,11 +27,13 @@ ROOT = "5f0c" * 16
 PLANTS = ("elements", "volumes")
 
 
-def toy_proof(cases: int = 300, seed: int = 1, plants: Sequence[str] = PLANTS, **changed: Any) -> ProofRun:
+def toy_proof(
+    cases: int = 300, seed: int = 1, plants: Sequence[str] = PLANTS, worst_cases: int = 10, **changed: Any
+) -> ProofRun:
     """Plausible tables of every kind, all of them made up."""
     draws = np.random.default_rng(seed)
     outcomes, terms = _answers(cases, draws, plants)
-    worst = outcomes[outcomes["visible"].eq(True)].sort_values("error_after", ascending=False)[:10]
+    worst = outcomes[outcomes["visible"].eq(True)].sort_values("error_after", ascending=False)[:worst_cases]
     why = [f"{e} was taken for heat of the cabinet; both work all day." for e in worst["effect"]]
     worst = worst[["case", "plant", "kind", "effect"]].assign(why=why)
     tables = {
@@ -44,7 +46,7 @@ def toy_proof(cases: int = 300, seed: int = 1, plants: Sequence[str] = PLANTS, *
         "confusion_mechanism": _counted(terms, "mechanism"),
         "confusion_place": _counted(terms, "place"),
         "leak": pd.DataFrame({"question": ["nothing or something", "kind"], "auc": [0.51, 0.49], "low90": [0.46, 0.45],
-                              "high90": [0.56, 0.53], "p": [0.38, 0.61], "n": [300, 300]}),
+                              "high90": [0.56, 0.53], "chance": [0.5, 0.5], "p": [0.38, 0.61], "n": [300, 300]}),
         "convergence": _convergence(),
         "worst": worst,
         "series": _series(list(worst["case"]), draws),
