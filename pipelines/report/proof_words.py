@@ -46,13 +46,15 @@ GLOSSARY = (
     ("interval", "90 %: Clopper and Pearson for shares, bootstrap over cases for medians and quantiles."),
     ("met", "The measured value itself reaches the goal; the interval says how sure that is."),
     ("detection limit", "The size at which an effect of this kind is just found on development plants."),
-    ("right answer", "Everything that was concealed is named with its place, and nothing else is claimed."),
+    ("right answer", "Every visible effect is named with its place, and nothing false is claimed. Of a confounded pair "
+     "the reported set must hold the truth; an effect that is not in the library must be called so."),
     ("decoy", "A fault of a recording or of a value in the file. Naming it is right; other claims are false."),
     ("unlisted", "Concealed is an effect that no mechanism of the library describes; right is to say so."),
     ("error", "Of left-out runs, in units of the noise: root of the mean over channels of (rms / noise)²."),
     ("with the true model", "The twin given the concealed effects and fitted: what a perfect answer would reach."),
-    ("expected calibration error", "Mean distance of claimed probability and share right, weighted by cases."),
-)
+    ("expected calibration error", "Mean distance of claimed probability and share right, weighted by cases. Right is "
+     "the mechanism of a concealed effect at its place or beside it."),
+)  # fmt: skip
 
 
 def plant_label(plant: str) -> str:
