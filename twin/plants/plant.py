@@ -70,7 +70,7 @@ def draw(
     _check("size", size, size >= 0, "0 or more")
     own = {key: size for key in (effect.split("+") if effect else ())} if sizes is None else dict(sizes)
     at = posed(seed, own, plant, **{"batches": batches, "step_s": step_s, **options})
-    shown, name, channels = _with_amounts(at.plant, at.effects), at.machine.machine, at.machine.batch_channels()
+    shown, name, channels = with_amounts(at.plant, at.effects), at.machine.machine, at.machine.batch_channels()
     course = simulated(shown, at.runs, [*at.effects, *at.everyday], at.options.solver_s, at.options.before_h)
     tables = written(shown, at.runs, course, at.effects, seed, channels, at.options)
     read = [gridded(name, run, table, channels, at.options) for run, table in zip(at.runs, tables, strict=True)]
@@ -112,7 +112,7 @@ def _features(
     return frozenset(has), frozenset(lacks)
 
 
-def _with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
+def with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
     """The plant with withheld features as strong as their effects say."""
 
     def amount(feature: str) -> float:
