@@ -89,6 +89,7 @@ def setting(seed: int, suite: str) -> dict[str, Any]:
         "has": stated,
         "lacks": [name for name in FEATURES if name not in stated],
         "habit": "ordinary",
+        "everyday": True,
         "solver_s": ALWAYS_STEP_S,
     }
 

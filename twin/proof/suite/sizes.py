@@ -19,8 +19,9 @@ SHARE: Mapping[Kind, tuple[float, float]] = MappingProxyType({
 })  # fmt: skip
 """From and to, in units of the size at the detection limit."""
 ALL_OR_NOTHING = ("sensor_swap",)
-MOST = 20.0
+MOST = 10.0
 """No larger: beyond it, no effect is one that a machine could have."""
+BOUNDS: Mapping[str, float] = MappingProxyType({"time_skew": 1.8})  # a clock's error stays within what is simulated
 
 
 @cache
@@ -35,8 +36,13 @@ def limit(effect: str, plant: str) -> float:
     return float(table()["limits"][plant][effect])
 
 
+def most(effect: str) -> float:
+    """The largest size of an effect."""
+    return BOUNDS.get(effect, MOST)
+
+
 def size(effect: str, plant: str, kind: Kind, rng: np.random.Generator) -> float:
     """A size for a case of this kind."""
     low, high = np.log(SHARE[kind])
     drawn = limit(effect, plant) * float(np.exp(rng.uniform(low, high)))
-    return 1.0 if effect in ALL_OR_NOTHING else float(f"{min(drawn, MOST):.4g}")
+    return 1.0 if effect in ALL_OR_NOTHING else float(f"{min(drawn, most(effect)):.4g}")
