@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from data.errors import InputError, WorkError
-from pipelines import report_command, reproduce_command, screen, twin_commands
+from pipelines import prove_command, report_command, reproduce_command, screen, twin_commands
 from pipelines import settings as settings_module
 from pipelines.options import Json, MachineFile, names, one_of, split
 
@@ -192,6 +192,7 @@ def predict(
 
 for command in (twin_commands.simulate, twin_commands.calibrate, twin_commands.diagnose):
     app.command()(command)
+app.add_typer(prove_command.app, name="prove")
 app.command()(reproduce_command.reproduce)
 
 

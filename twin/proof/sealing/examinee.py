@@ -1,8 +1,8 @@
 """The process that answers one case: it shuts itself in, then diagnoses what lies in its place, and writes there.
 
-Started as ``python -I -B -m twin.proof.sealing.examinee`` with its task as JSON on standard input. Its place holds
-`case` (machine file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
-Only the standard library is imported before the walls stand.
+Started by `twin.proof.sealing.examining` with its task as JSON on standard input. Its place holds `case` (machine file
+and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
+Only the standard library and names of packages are imported before the walls stand.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import data  # noqa: F401 - found before the walls stand, since the folder around it cannot be listed behind them
 from twin.proof.sealing.isolation import allowed, confine
 
 TOLD, FINDINGS, RIVALS = "told.json", "findings.json", "rivals.json"
@@ -101,7 +102,3 @@ def _tell(place: Path, told: dict[str, Any]) -> None:
 def _one_line(error: Exception) -> str:
     words = " ".join(str(error).split())
     return words if type(error).__name__ in ("InputError", "WorkError") else f"{type(error).__name__}: {words}"
-
-
-if __name__ == "__main__":
-    main()

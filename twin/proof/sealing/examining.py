@@ -17,10 +17,12 @@ from typing import Any
 
 from data.errors import WorkError
 from twin.proof.sealing.examinee import FINDINGS, PLAN, RIVALS, SERIES, TOLD
+from twin.proof.sealing.isolation import own_source
 from twin.proof.sealing.ledger import now
 
 RUN = "run.json"
 LIMIT_S = 300.0
+BEGIN = "import sys; sys.path.insert(0, sys.argv[1]); from twin.proof.sealing.examinee import main; main()"
 START_S = 120.0  # for imports, which are no part of a case
 LOOK_S = 0.05
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -35,7 +37,7 @@ class Examinee:
     """
 
     diagnose: str = "twin.diagnosis.diagnose:diagnose"
-    rivals: str | None = "twin.proof.rivals:rivals"
+    rivals: str | None = None
     limit_s: float = LIMIT_S
     import_from: tuple[str, ...] = ()
 
@@ -80,7 +82,7 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
 def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
     """Wait for the process; the reason why it was ended, if it was."""
     task = {"place": str(place), "diagnose": by.diagnose, "rivals": by.rivals, "import_from": by.import_from}
-    command = [sys.executable, "-I", "-B", "-m", "twin.proof.sealing.examinee"]
+    command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
     with (place / "said").open("wb") as said:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=said, stderr=said, cwd=place / "case", env=_environment(place)
@@ -117,4 +119,4 @@ def _told(place: Path) -> dict[str, Any]:
 
 def _last_words(place: Path) -> str:
     lines = (place / "said").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it ended without a word; call `python -m twin.proof.sealing.examinee` to see why"
+    return lines[-1] if lines else "it ended without a word; run the case again"

@@ -12,7 +12,6 @@ import pandas as pd
 import yaml
 
 RARE = 0.03  # of the cases; a word of the machine file that stands in fewer, or lacks in fewer, tells nothing
-FASTEST = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?$", re.IGNORECASE)
 
 
@@ -27,7 +26,7 @@ def leak_features(cases: Sequence[Path]) -> pd.DataFrame:
 
 
 def _described(text: str, recordings: Path) -> dict[str, float]:
-    tree: Mapping[str, Any] = yaml.load(text, FASTEST)
+    tree: Mapping[str, Any] = yaml.load(text, yaml.CSafeLoader)
     role = {name: str(given.get("role")) for name, given in tree["channels"].items()}
     return _machine(text, tree, list(role.values())) | _recordings(recordings, role)
 

@@ -1,0 +1,139 @@
+"""What scoring needs of each case once the key is open: the answer that was stored, and the true model beside it."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from twin.proof.sealing.digests import files_digest
+from twin.proof.sealing.examinee import read_case
+from twin.proof.sealing.folder import ProofFolder, read_json, write_json
+from twin.proof.sealing.isolation import own_source
+from twin.proof.sealing.opening import Opened
+from twin.proof.sealing.seal import Done
+
+if TYPE_CHECKING:
+    from twin.proof.scoring.stored import Stored
+    from twin.proof.scoring.true_model import TrueModel
+
+REDRAWN = ("elements", "volumes")  # plants that can be drawn again without an effect
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One case: what was stored, and its true model or why there is none."""
+
+    stored: Stored
+    truth: TrueModel | None
+    trouble: str = ""
+
+
+def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | None = None) -> dict[str, Judged]:
+    """Every case that counts. True models take seconds each and are kept in PROOF/judged for the next opening.
+
+    Raises:
+        WorkError: the folder cannot be written.
+    """
+    kept = folder.path / "judged"
+    kept.mkdir(exist_ok=True)
+    source = _source()
+    out: dict[str, Judged] = {}
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        waiting = {
+            pool.submit(
+                judge, folder.cases / n, folder.answers / n, kept / f"{n}.json", opened.answers[n], source
+            ): n
+            for n in opened.counting
+        }  # fmt: skip
+        for future in as_completed(waiting):
+            out[waiting[future]] = future.result()
+            if done is not None:
+                done("judge", len(out), len(waiting))
+    return dict(sorted(out.items()))
+
+
+def judge(case: Path, answer: Path, kept: Path, key: Mapping[str, Any], source: str) -> Judged:
+    """One case; its true model is read from the file `kept` where the same source worked it out."""
+    from twin.proof.scoring.stored import read_stored
+
+    with threadpool_limits(limits=1), tempfile.TemporaryDirectory(prefix="thermodrift-") as lake:
+        machine, batches = read_case(case, Path(lake))
+        stored = read_stored(answer, machine, batches)
+        held = read_json(kept) if kept.exists() else {}
+        if held.get("source") != source:
+            truth, trouble = _true(machine, batches, key)
+            held = {"source": source, "truth": _plain(asdict(truth)) if truth else None, "trouble": trouble}
+            write_json(kept, held)
+    return Judged(stored, _truth(held["truth"]), held["trouble"])
+
+
+def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tuple[TrueModel | None, str]:
+    from twin.proof.scoring.true_model import true_model
+
+    try:
+        return true_model(machine, batches, key, _redraw(key) if key["plant"] in REDRAWN else None), ""
+    except (InputError, WorkError) as error:
+        return None, str(error)
+
+
+def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch]]]:
+    """The same case without one of its effects."""
+    from twin.proof.spec import CaseSpec
+    from twin.proof.suite import build, write_built
+
+    spec = CaseSpec(**key["redraw"])
+
+    def redraw(effect: str) -> tuple[Machine, list[Batch]]:
+        sizes = {name: {k: 0.0 if k == effect else v for k, v in given.items()} for name, given in (
+            ("effects", spec.effects), ("decoys", spec.decoys))}  # fmt: skip
+        with tempfile.TemporaryDirectory(prefix="thermodrift-") as place:
+            case = Path(place) / "case"
+            write_built(build(replace(spec, **sizes)), case)  # type: ignore[arg-type]
+            return read_case(case, Path(place) / "lake")
+
+    return redraw
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: what is no number is null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
+    from twin.proof.scoring.true_model import TrueModel
+
+    if plain is None:
+        return None
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
+    before, true, floor = (number(plain[k]) for k in ("error_before", "error_true", "error_floor"))
+    gains, thresholds = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats"))
+    return TrueModel(before, true, floor, gains, thresholds, tuple(plain["visible"]))
+
+
+def _source() -> str:
+    """Digest of all that a true model is worked out with."""
+    root, _ = own_source()
+    return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))
+
+
+def rivals_of(judged: Mapping[str, Judged]) -> dict[str, Mapping[str, Any]]:
+    """What baselines and ablations said, of the cases where they were asked."""
+    return {name: j.stored.rivals for name, j in judged.items() if j.stored.rivals is not None}
