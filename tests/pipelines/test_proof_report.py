@@ -18,14 +18,12 @@ from data.errors import WorkError
 from pipelines.report import proof_extracts as extracts
 from pipelines.report.proof import headline, proof_page, write_proof_report
 from pipelines.report.proof_goals import goal_rows, shortfalls
-from pipelines.report.proof_opened import ledger_table, series_of, windows_of
 from pipelines.report.proof_run import TABLES, ProofRun
 from pipelines.report.proof_words import measured, origin
 from twin.proof.scoring.goal_table import GOAL_COLUMNS
 from twin.proof.scoring.outcomes import OUTCOMES, TERMS
 from twin.proof.scoring.reliability import COLUMNS
 from twin.proof.sealing.leak import COLUMNS as LEAK
-from twin.proof.sealing.ledger import Entry
 
 ANCHORS = (
     "goals",
@@ -254,36 +252,3 @@ def test_the_worst_channel_is_worst_against_its_own_noise() -> None:
             )
     shown = extracts.worst_channel(pd.concat(parts, ignore_index=True))
     assert set(shown["channel"]) == {"t_bed"} and list(dict.fromkeys(shown["batch"])) == ["a", "b"]
-
-
-# an opened proof
-
-
-def test_the_ledger_is_told_in_few_lines() -> None:
-    steps = [("06:00:00", "sealed", {"root": "ab"}), ("06:10:00", "run", {"workers": 2})]
-    for k in range(3):
-        steps += [(f"06:1{k}:05", "started", {"case": k}), (f"06:1{k}:50", "answered", {"case": k})]
-    steps.append(("07:00:00", "opened", {"answered": 3}))
-    table = ledger_table([Entry(f"2026-01-05T{at}Z", step, details, "") for at, step, details in steps])
-    assert list(table["step"]) == ["sealed", "run", "answered", "opened"]
-    assert (
-        table.loc[2, "words"] == "3 cases since 2026-01-05 06:10:50" and table.loc[2, "time"] == "2026-01-05T06:12:50Z"
-    )
-
-
-def test_series_are_those_that_the_answers_kept(tmp_path: Path) -> None:
-    (tmp_path / "case_1").mkdir()
-    kept = "batch,channel,unit,time_s,recorded,before,after\nk1,z_um,um,0,1.5,0.5,1.25\n"
-    (tmp_path / "case_1" / "series.csv").write_text(kept, encoding="utf-8")
-    table = series_of(tmp_path, ["case_1", "case_2"])
-    assert table[list(TABLES["series"])].to_dict("records") == [
-        {"case": "case_1", "batch": "k1", "channel": "z_um", "unit": "um", "time_s": 0, "recorded": 1.5, "before": 0.5,
-         "after": 1.25}]  # fmt: skip
-    assert series_of(tmp_path, ["case_2"]).empty
-
-
-def test_windows_are_those_of_effects_that_do_not_always_work() -> None:
-    answers = {"case_1": {"terms": [{"active": [["k1", 0.0, 600.0]]}, {"active": [["k2", 60.0, 90.0]]}]},
-               "case_2": {"terms": [{"active": "always"}, {"active": [["k1", 0.0, 600.0]]}]}}  # fmt: skip
-    table = windows_of(answers, ["case_1", "case_2"])
-    assert [tuple(r) for r in table.to_numpy()] == [("case_1", "k1", 0.0, 600.0), ("case_1", "k2", 60.0, 90.0)]
