@@ -78,7 +78,9 @@ def draw_frame(twin: Mapping[str, Any], rng: np.random.Generator) -> Frame:
     one, other, conductance = (np.array(column) for column in zip(*edges, strict=True))
     n = len(capacity)
     off = sparse.coo_matrix((conductance, (one, other)), shape=(n, n))
-    diagonal = np.bincount(one, conductance, n) + np.bincount(other, conductance, n).astype(np.float64)
+    diagonal = np.zeros(n)
+    for side in (one, other):
+        np.add.at(diagonal, side, conductance)
     for name, g in room.items():
         diagonal[bodies[name]] += g / CELLS
     return Frame(

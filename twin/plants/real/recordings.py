@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +27,21 @@ CLOCK = "%Y%m%d_%H%M"
 class Origin:
     """Where the recordings of a machine lie below the data folder and what a case takes of them.
 
-    A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver tells of.
+    A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver tells of. `known`
+    is added to the machine file, by dotted path below `twin`.
     """
 
     folder: str
     rows_s: float
     runs: int | None = None
     unusable: tuple[str, ...] = ()
+    known: Mapping[str, Any] = field(default_factory=dict)
 
 
+# Known of the lathe: its bearings' friction differs by some 10 % from run to run, which every case would find first.
+FRICTION = "mechanisms.bearings_viscous.parameters.lubrication.per_batch"
 ORIGINS: Mapping[str, Origin] = MappingProxyType({
-    "lathe_gv1203": Origin("lathe_gv1203", 300.0, 8, ("20200706",)),
+    "lathe_gv1203": Origin("lathe_gv1203", 300.0, 6, ("20200706",), {FRICTION: 0.15}),
     "spindle_fl": Origin("spindle_fl", 120.0),
     "tclab_board": Origin("tclab", 2.0),
     "cell_30q": Origin("cell_30q", 10.0),
@@ -81,11 +87,21 @@ def recorded(machine: str, data: Path, seed: int, step_s: float | None = None) -
         max_gap_s=max(given.recording.max_gap_s, 3.0 * origin.rows_s),
         start_from_name=None if None in starts else CLOCK,
     )
-    plain = given.model_copy(
-        update={"recording": recording, "channels": channels, "ignore": [], "overrule": overrule}
-    )  # fmt: skip
+    twin = copy.deepcopy(given.twin)
+    for path, value in origin.known.items():
+        *keys, last = path.split(".")
+        part_at(twin, keys)[last] = value
+    told_anew = {"recording": recording, "channels": channels, "ignore": [], "overrule": overrule, "twin": twin}
+    plain = given.model_copy(update=told_anew)
     own = plain.batch_channels()
     return plain, [_plain(b, name, t, own) for b, name, t in zip(chosen, names, starts, strict=True)]
+
+
+def part_at(twin: Any, keys: Sequence[str]) -> Any:
+    """The part of nested plain data below these keys."""
+    for key in keys:
+        twin = twin[key]
+    return twin
 
 
 @cache

@@ -11,6 +11,7 @@ import pandas as pd
 
 from data.batch import Batch
 from data.machine import Machine
+from twin.plants.real.recordings import part_at
 
 Term = dict[str, Any]
 
@@ -37,19 +38,13 @@ class KeptBack:
         part = copy.deepcopy(machine.twin) if self.twin else None
         for path in self.without:
             *keys, last = path.split(".")
-            del _at(part, keys)[last]
+            del part_at(part, keys)[last]
         for path, new in self.instead.items():
             *keys, last = path.split(".")
-            _at(part, keys)[last] = copy.deepcopy(new)
+            part_at(part, keys)[last] = copy.deepcopy(new)
         channels = {n: c for n, c in machine.channels.items() if n not in self.channels}
         bare = machine.model_copy(update={"twin": part, "channels": channels})
         return bare, [_without(b, self.channels) for b in batches]
-
-
-def _at(part: Any, keys: list[str]) -> Any:
-    for key in keys:
-        part = part[key]
-    return part
 
 
 def _without(batch: Batch, channels: tuple[str, ...]) -> Batch:
