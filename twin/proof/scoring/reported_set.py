@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from twin.diagnosis.telling.findings import Finding
+from twin.proof.rivals.answer import WITHIN
 from twin.proof.scoring.answer_key import Spot
-
-WITHIN = 0.1  # of the first one's probability: what is less likely is told, but not claimed
 
 
 def reported_set(finding: Finding) -> list[tuple[str, Spot]]:

@@ -1,0 +1,109 @@
+"""The rows of a screen as they were before the nuisances were integrated out, and with every row counted in full."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds.search import Round
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.screen import Scored
+from twin.diagnosis.scoring.whitened import Whitened
+
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class PlainRows:
+    """Residual (n,) of the fit and signatures (n, C) of what may be claimed, `batch` (n,) of every row.
+
+    Each channel is in units of its own residual's rms and about its mean, so that micrometres and kelvins count alike.
+    Amplitudes lie within `low` and `high` (C,).
+    """
+
+    scored: tuple[Scored, ...]
+    residual: Array
+    columns: Array
+    batch: NDArray[np.int64]
+    low: Array
+    high: Array
+
+
+def plain_rows(done: Round) -> PlainRows:
+    """Of a round's fit, before any candidate."""
+    news = claimable(done)
+    at = [s.column for s in news]
+    evidence = done.screen.evidence
+    residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
+    channel = np.concatenate([b.channel for b in evidence.batches])
+    residual = np.concatenate(residuals)
+    columns = np.concatenate([unwhitened(b, b.columns[:, at]) / b.scale[:, None] for b in evidence.batches])
+    for c in np.unique(channel):
+        own = channel == c
+        rms = float(np.sqrt(np.mean(residual[own] ** 2))) + TINY
+        residual[own] = (residual[own] - residual[own].mean()) / rms
+        columns[own] = (columns[own] - columns[own].mean(axis=0)) / rms
+    batch = np.repeat(np.arange(len(residuals)), [len(r) for r in residuals])
+    moves = np.linalg.norm(columns, axis=0) > TINY
+    kept = tuple(s for s, moving in zip(news, moves, strict=True) if moving)
+    low, high = evidence.low[at][moves], evidence.high[at][moves]
+    return PlainRows(kept, residual, columns[:, moves], batch, low, high)
+
+
+def claimable(done: Round) -> list[Scored]:
+    """Candidates with a signature, but those that any lumped network has some of."""
+    loose = no_news([s.candidate for s in done.screen.scored])
+    return [s for s in done.screen.scored if s.column >= 0 and s.candidate.name not in loose]
+
+
+def unwhitened(b: Whitened, rows: Array) -> Array:
+    """Rows (n, C) of a whitened batch as they were, in units of the weighted noise: the inverse of `Whitened.of`."""
+    back = b.damping / (1.0 - b.damping)
+    return np.asarray(rows + b.mixing @ (back[:, None] * (b.mixing.T @ rows)))
+
+
+def counted_in_full(evidence: Evidence) -> Evidence:
+    """The same evidence had every row noise of its own, none repeating another."""
+    inflation = evidence.rows / np.maximum(evidence.count, TINY)
+    return Evidence(
+        tuple(_stretched(b, np.sqrt(inflation)) for b in evidence.batches),
+        evidence.rows,
+        evidence.rows,
+        evidence.weight * inflation,
+        evidence.low,
+        evidence.high,
+    )
+
+
+def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidence:
+    """The same columns had no parameter, start or offset been fitted; the targets are the fit's residuals."""
+    batches = []
+    for b, residual in zip(evidence.batches, residuals, strict=True):
+        still = np.zeros((len(residual), 1))
+        batches.append(
+            replace(
+                b, target=residual * b.scale, jacobian=still, columns=unwhitened(b, b.columns),
+                mixing=b.mixing[:, :0], damping=b.damping[:0],
+            )
+        )  # fmt: skip
+    return replace(evidence, batches=tuple(batches))
+
+
+def _stretched(b: Whitened, factor: Array) -> Whitened:
+    """A batch whose channels' scales are multiplied by `factor` (K,)."""
+    own = factor[b.channel]
+    spread = b.mixing * np.sqrt(1.0 / (1.0 - b.damping) ** 2 - 1.0)
+    mixing, s, _ = np.linalg.svd(spread * own[:, None], full_matrices=False)
+    damping = 1.0 - 1.0 / np.sqrt(1.0 + s**2)
+    rows = unwhitened(b, np.column_stack([b.target, b.jacobian, b.columns])) * own[:, None]
+    rows = rows - mixing @ (damping[:, None] * (mixing.T @ rows))
+    p = 1 + b.jacobian.shape[1]
+    return replace(
+        b, target=rows[:, 0], jacobian=rows[:, 1:p], columns=rows[:, p:], scale=b.scale * own, mixing=mixing,
+        damping=damping,
+    )  # fmt: skip

@@ -1,0 +1,120 @@
+"""The round in which a diagnosis first decides about physics, and its rules, so that one of them can be replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.rounds.acceptance import flipped_threshold, stands_out
+from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
+from twin.diagnosis.rounds.refits import Tried, refit
+from twin.diagnosis.rounds.search import FINER, IMPROVED, LEAST, Round, Search
+from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.screen import alone
+from twin.diagnosis.telling.conclude import REST, SURE, remainder
+from twin.diagnosis.telling.findings import Findings
+from twin.proof.rivals.answer import WITHIN, Claim, Reply
+from twin.proof.rivals.null_again import structural_misfits
+
+COARSE = "coarse_network"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The first round that named no finer network, or the last; `findings` are of the whole diagnosis, if there are."""
+
+    done: Search
+    findings: Findings | None = None
+
+    @cached_property
+    def number(self) -> int:
+        names = [r.accepted and r.best is not None and r.best.candidate.mechanism for r in self.done.rounds]
+        return next((k for k, name in enumerate(names) if name != COARSE), len(names) - 1)
+
+    @property
+    def round(self) -> Round:
+        return self.done.rounds[self.number]
+
+    @property
+    def alone(self) -> bool:
+        """Whether no later round accepted anything."""
+        return not any(r.accepted for r in self.done.rounds[self.number + 1 :])
+
+    @cached_property
+    def refits(self) -> tuple[Tried, ...]:
+        """Its full refits; one that was swapped in beside later effects is refitted as it was here."""
+        out = []
+        for t in self.round.tried:
+            again = refit(self.round.before, t.scored) if t.fitted is self.done.final and not self.alone else t
+            if again is not None and again.fitted is not None:
+                out.append(replace(again, cluster=t.cluster))
+        return tuple(out)
+
+    @cached_property
+    def before(self) -> Evidence:
+        """How the fit without any candidate predicts batches left out."""
+        return alone(self.round.before, self.round.before.state.noise.inflation)
+
+    @cached_property
+    def after(self) -> list[Evidence]:
+        """The same of every refit, its rows counted as before."""
+        inflation = self.round.before.state.noise.inflation
+        return [alone(t.fitted, inflation) for t in self.refits if t.fitted is not None]
+
+    @cached_property
+    def misfits(self) -> list[list[Array]]:
+        """What the refined machines of the structural null show beyond the fit."""
+        return structural_misfits(self.round.before)
+
+    def bar(self, null: float) -> float:
+        """The threshold with another structural null."""
+        return max(null, flipped_threshold(self.round.flipped, len(self.round.before.batches)), LEAST)
+
+    def ranked(self, tried: Sequence[Tried]) -> list[Tried]:
+        """By gain and what is plausible, a finer network first where it gains nearly as much."""
+        temperature = self.round.null.temperature
+        order = sorted(tried, key=lambda t: -t.standing(temperature))
+        finer = [t for t in order if t.candidate.mechanism == COARSE and t.gain > FINER * order[0].gain > 0]
+        return finer[:1] + [t for t in order if t not in finer[:1]]
+
+    def decided(self, tried: Sequence[Tried], threshold: float) -> Reply:
+        """The reply under the rules of a diagnosis, by other gains or another threshold."""
+        ranked = self.ranked(tried)
+        best = ranked[0] if ranked else None
+        if best is None or not self.accepts(best, threshold):
+            return Reply("undecidable" if remainder(self._ending(None)) > REST else "consistent")
+        if best.candidate.mechanism == COARSE:
+            return Reply("consistent")  # a refinement is no finding
+        claim, told = self.claim(ranked, threshold)
+        if (claim.probability or 0.0) < SURE and any(self.ties(e, claim) for e in told):
+            return Reply("undecidable", (claim,))
+        rest = remainder(self._ending(best))
+        return Reply("partly_explained" if rest > REST else "explained", (claim,))
+
+    def accepts(self, t: Tried, threshold: float) -> bool:
+        batches = len(self.round.before.batches)
+        return t.gain > threshold and t.improved >= IMPROVED * batches and stands_out(t)
+
+    def claim(self, ranked: Sequence[Tried], threshold: float) -> tuple[Claim, list[Explanation]]:
+        """The first with its probability and its reported set, and all explanations."""
+        told, _, _ = explanations(replace(self.round, tried=tuple(ranked), threshold=threshold, accepted=True))
+        first = ranked[0].candidate
+        p = min(sum(e.probability for e in told if _same(e, first)), most_sure(self.round.before.runs))
+        alike = tuple(e.tried.candidate for e in told if not _same(e, first) and e.probability >= WITHIN * p)
+        return Claim(first, p, alike), told
+
+    @staticmethod
+    def ties(e: Explanation, claim: Claim) -> bool:
+        return not _same(e, claim.candidate) and e.alike and e.probability >= (claim.probability or 0.0) / 2
+
+    def _ending(self, t: Tried | None) -> Search:
+        """The search had it ended here."""
+        fitted = t.fitted if t is not None and t.fitted is not None else self.round.before
+        return replace(self.done, final=fitted)
+
+
+def _same(e: Explanation, c: Candidate) -> bool:
+    return (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)
