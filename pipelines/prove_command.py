@@ -115,6 +115,9 @@ def open_(
     partial: Annotated[
         bool, typer.Option("--partial", help="also when cases have no answer; they are void for good")
     ] = False,
+    publish: Annotated[
+        Path | None, typer.Option(help="Markdown page whose block of results is replaced, such as docs/proof.md")
+    ] = None,
     workers: Workers = None,
     deals: Deals = 100,
     as_json: Json = False,
@@ -125,6 +128,10 @@ def open_(
 
     with screen.progress(as_json) as (say, done):
         outcome = open_proof(proof, _count(workers), partial, _deals(deals), say, done)
+    if publish is not None:
+        from pipelines.report.proof_markdown import publish_proof
+
+        publish_proof(publish, outcome.run)
     if as_json:
         screen.print_json(outcome_dict(outcome))
     else:
