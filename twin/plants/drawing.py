@@ -7,7 +7,7 @@ import numpy as np
 from data.registry import Registry
 from twin.plants.casting import Array
 from twin.plants.machine import FEATURES, Layout, Plant, Sensor, Source
-from twin.plants.seeds import stream
+from twin.plants.seeds import stream, wider
 from twin.plants.structure import AIR, Part, Structure
 
 PLANTS = Registry(
@@ -22,12 +22,21 @@ CHANCE = {
     "feed": 0.5, "coolant": 0.5, "walls": 0.4, "layers": 0.4,
     "motor_loss": 0.75, "bending": 0.75, "growth": 0.85, "mandrel": 0.5,
 }  # fmt: skip
+WATTS = (
+    (70.0, 160.0), (20.0, 60.0), (35.0, 80.0), (10.0, 30.0),  # front and rear bearings, viscous and by load
+    (20.0, 60.0), (60.0, 140.0), (40.0, 100.0),  # the motor's
+)  # fmt: skip
 UNSENSED = ("shaft", "mandrel", AIR)
 SELDOM_SENSED = ("saddle", "table", "screw")
 
 
-def draw_plant(seed: int, has: frozenset[str], lacks: frozenset[str], kind: str = "volumes") -> Plant:
+def draw_plant(
+    seed: int, has: frozenset[str], lacks: frozenset[str], kind: str = "volumes", spread: float = 1.0, finer: int = 1
+) -> Plant:
     """The plant of a seed; `has` and `lacks` overrule what the seed says about `FEATURES`, `kind` is of `PLANTS`.
+
+    `spread` makes the ranges wider from which sizes, masses, joints, films and losses are drawn; `finer` cuts every
+    cell so many times along each axis, and the machine stays the same.
 
     Raises:
         InputError: an unknown kind.
@@ -35,10 +44,10 @@ def draw_plant(seed: int, has: frozenset[str], lacks: frozenset[str], kind: str 
     dice = stream(seed, "features").random(len(FEATURES))
     drawn = {f for f, d in zip(FEATURES, dice, strict=True) if d < CHANCE[f]}
     features = frozenset((drawn | has) - lacks)
-    layout: Layout = PLANTS[kind](seed, features)
+    layout: Layout = PLANTS[kind](seed, features, spread, finer)
     rng = stream(seed, "spindle")
     rated_rpm = float(rng.choice([6000.0, 8000.0, 10000.0, 12000.0]))
-    sources = _sources(layout.structure, rng)
+    sources = _sources(layout.structure, rng, spread)
     if "motor_loss" not in features:
         del sources["motor_loss"]
     return Plant(
@@ -46,12 +55,13 @@ def draw_plant(seed: int, has: frozenset[str], lacks: frozenset[str], kind: str 
     )  # fmt: skip
 
 
-def _sources(s: Structure, rng: np.random.Generator) -> dict[str, Source]:
+def _sources(s: Structure, rng: np.random.Generator, spread: float) -> dict[str, Source]:
     front, rear = s.part("shaft", (0.12, 0.36)), s.part("shaft", (0.68, 0.88))
     front_ring, rear_ring = s.part("front", (0.0, 0.35)), s.part("rear", (0.0, 0.35))
     into_front = _parted(s, front, front_ring, float(rng.uniform(0.4, 0.6)))
     into_rear = _parted(s, rear, rear_ring, float(rng.uniform(0.4, 0.6)))
-    watts = rng.uniform([70, 20, 35, 10, 20, 60, 40], [160, 60, 80, 30, 60, 140, 100])
+    low, high = zip(*(wider(r, spread) for r in WATTS), strict=True)
+    watts = rng.uniform(low, high)
     motor = np.zeros(s.size)
     s.part("motor").add(motor, 1.0)
     return {

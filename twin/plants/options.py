@@ -12,7 +12,8 @@ class Options:
     """Batches of `hours`, rows every `step_s`; the solver's step is `solver_s`, and it starts `before_h` earlier.
 
     `has` and `lacks` overrule the features that the seed gives (`twin.plants.machine.FEATURES`). `file_error` is the
-    sd of the logarithm of what the engineer's values are off by, `mass_error` that of masses.
+    sd of the logarithm of what the engineer's values are off by, `mass_error` that of masses. `spread` widens the
+    ranges of the plants' sizes.
 
     Of the recorder: rows come up to `early_s` before they are due, `gaps` is how often a run has a hole of at most
     `MAX_HOLE_S`, `absent` the chance that a sensor is not there in a run, `missing` that a sample is lost. Of the shop:
@@ -43,6 +44,7 @@ class Options:
     everyday: bool = False
     file_error: float = 0.3
     mass_error: float = 0.1
+    spread: float = 1.0
     has: tuple[str, ...] = ()
     lacks: tuple[str, ...] = ()
     solver_s: float = 15.0

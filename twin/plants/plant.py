@@ -86,7 +86,7 @@ def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **optio
     """
     asked = _checked(seed, sizes, options)
     kinds = {key: EFFECTS[key] for key in sizes}
-    drawn = draw_plant(seed, *_features(kinds, sizes, asked), plant)
+    drawn = draw_plant(seed, *_features(kinds, sizes, asked), plant, asked.spread)
     effects = [kind(drawn, sizes[key], stream(seed, f"effect {key}")) for key, kind in kinds.items()]
     daily = everyday(drawn, seed) if asked.everyday else []
     machine = machine_file(drawn, effects, asked.name or f"plant_{seed:04d}", seed, asked, daily)
@@ -186,6 +186,7 @@ def _checked(seed: int, sizes: Mapping[str, float], given: Mapping[str, Any]) ->
         ("hours", options.hours, 0.5 <= options.hours <= 24.0, "0.5 to 24 h"),
         ("before_h", options.before_h, 1.0 <= options.before_h <= 240.0, "1 to 240 h"),
         ("solver_s", options.solver_s, whole, f"a divisor of {LEAD_S:g} s and of step_s"),
+        ("spread", options.spread, 0.0 < options.spread <= 2.0, "above 0, at most 2"),
         ("early_s", options.early_s, 0.0 <= options.early_s < options.step_s / 2, "0 to half of step_s"),
         ("warmest_degC less coldest_degC", season_K, season_K >= 0, "0 K or more"),
         ("latest_h less earliest_h", day_h, day_h > 0.02, "more than a minute"),

@@ -11,9 +11,9 @@ from twin.plants.elements.growth import growths
 from twin.plants.machine import Layout
 
 
-def draw_layout(seed: int, features: frozenset[str]) -> Layout:
-    """The castings of a seed, cut into hexahedra, with or without a test mandrel."""
-    drawn = draw_castings(seed, mandrel="mandrel" in features)
+def draw_layout(seed: int, features: frozenset[str], spread: float = 1.0, finer: int = 1) -> Layout:
+    """The castings of a seed, cut into hexahedra, with or without a test mandrel; `finer` times along each axis."""
+    drawn = draw_castings(seed, "mandrel" in features, finer, spread)
     return Layout(drawn.structure, growths(drawn.structure, tool_weights_um_per_K(drawn), features))
 
 

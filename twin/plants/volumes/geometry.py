@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.plants.seeds import stream
+from twin.plants.seeds import stream, wider
 from twin.plants.volumes.casting import Plate
 from twin.plants.volumes.structure import Assembly, Volumes
 
@@ -21,25 +21,29 @@ class Drawn:
     table_width_m: float
 
 
-def draw_castings(seed: int, mandrel: bool) -> Drawn:
-    """The structure of the machine of a seed, with or without a test mandrel in its spindle."""
+def draw_castings(seed: int, mandrel: bool, spread: float = 1.0, finer: int = 1) -> Drawn:
+    """The structure of the machine of a seed, with or without a test mandrel; `spread` widens what sizes there are.
+
+    Every cell is cut `finer` along both axes.
+    """
     rng = stream(seed, "geometry")
-    size = float(rng.uniform(0.8, 1.3))
+    size = float(rng.uniform(*wider((0.8, 1.3), spread)))
     a = Assembly()
-    sizes = {n: float(rng.uniform(0.85, 1.2)) for n in ("column", "head", "bed", "table", "saddle", "spindle", "motor")}
+    names = ("column", "head", "bed", "table", "saddle", "spindle", "motor")
+    sizes = {n: float(rng.uniform(*wider((0.85, 1.2), spread))) for n in names}
     counts = {n: int(rng.integers(*r)) for n, r in _COUNTS.items()}
     enclosed, screw, saddle, head_halves = (bool(rng.random() < p) for p in (0.6, 0.6, 0.4, 0.6))
-    air_J_per_K, air_room_W_per_K = float(rng.uniform(18e3, 40e3)), float(rng.uniform(45.0, 95.0))
+    air_J_per_K, air_room_W_per_K = (float(rng.uniform(*wider(r, spread))) for r in ((18e3, 40e3), (45.0, 95.0)))
     head_at = float(rng.uniform(0.62, 0.8))
     absent = {n for n, there in (("screw", screw), ("saddle", saddle), ("mandrel", mandrel)) if not there}
     for casting in _castings(size, sizes, counts, head_at):
         if casting.name in absent:
             continue
-        a.add(casting, halves=casting.name == "column" or (casting.name == "head" and head_halves))
+        a.add(replace(casting, split=finer), halves=casting.name == "column" or (casting.name == "head" and head_halves))
     a.air_J_per_K = air_J_per_K if enclosed else None
-    joints = {n: g * float(np.exp(0.25 * rng.standard_normal())) for n, g in _JOINTS_W_PER_K.items()}
+    joints = {n: g * float(np.exp(0.25 * spread * rng.standard_normal())) for n, g in _JOINTS_W_PER_K.items()}
     _join(a, joints, head_at)
-    _expose(a, rng)
+    _expose(a, rng, spread)
     return Drawn(a.done(air_room_W_per_K), head_at, 0.9 * a.castings["head"].depth_m, 0.1 * size)
 
 
@@ -103,9 +107,9 @@ def _join(a: Assembly, g: dict[str, float], head_at: float) -> None:
         a.joint(a.box("mandrel", (0.8, 1.0)), a.box("shaft", (0.0, 0.1)), g["mandrel-shaft"])
 
 
-def _expose(a: Assembly, rng: np.random.Generator) -> None:
+def _expose(a: Assembly, rng: np.random.Generator, spread: float) -> None:
     """Convection, W/m²/K: what faces the work is inside the enclosure, motor, rear and back are outside."""
-    h = {name: float(rng.uniform(4.5, 8.0)) for name in a.castings}
+    h = {name: float(rng.uniform(*wider((4.5, 8.0), spread))) for name in a.castings}
     inside = ("shaft", "front", "table", "screw", "saddle", "mandrel")
     for name in a.castings:
         if name in ("head", "column"):

@@ -8,9 +8,9 @@ from twin.plants.volumes.geometry import Drawn, draw_castings
 from twin.plants.volumes.growth import bending, bow, path
 
 
-def draw_layout(seed: int, features: frozenset[str]) -> Layout:
-    """The castings of a seed, cut into cells, with or without a test mandrel."""
-    drawn = draw_castings(seed, mandrel="mandrel" in features)
+def draw_layout(seed: int, features: frozenset[str], spread: float = 1.0, finer: int = 1) -> Layout:
+    """The castings of a seed, cut into cells, with or without a test mandrel; `finer` times as fine along both axes."""
+    drawn = draw_castings(seed, "mandrel" in features, spread, finer)
     return Layout(drawn.structure, _growths(drawn, features))
 
 

@@ -41,6 +41,7 @@ class Ranges:
     season_K: tuple[float, float]
     earliest_h: tuple[float, float]
     day_h: tuple[float, float]
+    spread: float
 
 
 RANGES: Mapping[str, Ranges] = MappingProxyType({
@@ -49,14 +50,14 @@ RANGES: Mapping[str, Ranges] = MappingProxyType({
         noise_K=(0.02, 0.05), noise_um=(0.5, 1.2), quantisation_K=(0.05, 0.1, 0.1),
         missing=(0.0, 0.01), early_s=(0.0, 5.0, 15.0), gaps=(0.0, 0.3), absent=(0.0, 0.0, 0.05),
         file_error=(0.1, 0.3), mass_error=(0.05, 0.1),
-        coldest_degC=(9.0, 15.0), season_K=(10.0, 18.0), earliest_h=(6.0, 8.0), day_h=(5.0, 8.0),
+        coldest_degC=(9.0, 15.0), season_K=(10.0, 18.0), earliest_h=(6.0, 8.0), day_h=(5.0, 8.0), spread=1.0,
     ),
     "sealed": Ranges(
         batches=(10, 14), hours=(4.5, 5.0, 6.0, 7.0), step_s=(180.0, 240.0, 300.0, 300.0, 360.0),
         noise_K=(0.015, 0.06), noise_um=(0.4, 1.5), quantisation_K=(0.02, 0.05, 0.1, 0.1, 0.2),
         missing=(0.0, 0.01, 0.03), early_s=(0.0, 3.0, 10.0, 25.0), gaps=(0.0, 0.3, 0.7), absent=(0.0, 0.0, 0.08),
         file_error=(0.1, 0.4), mass_error=(0.03, 0.12),
-        coldest_degC=(6.0, 17.0), season_K=(8.0, 20.0), earliest_h=(5.0, 9.0), day_h=(3.0, 10.0),
+        coldest_degC=(6.0, 17.0), season_K=(8.0, 20.0), earliest_h=(5.0, 9.0), day_h=(3.0, 10.0), spread=1.4,
     ),
 })  # fmt: skip
 
@@ -90,6 +91,7 @@ def setting(seed: int, suite: str) -> dict[str, Any]:
         "lacks": [name for name in FEATURES if name not in stated],
         "habit": "ordinary",
         "everyday": True,
+        "spread": r.spread,
         "solver_s": ALWAYS_STEP_S,
     }
 
