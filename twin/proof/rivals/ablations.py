@@ -19,7 +19,7 @@ from twin.proof.rivals.null_again import null_of
 from twin.proof.rivals.rows import claimable, counted_in_full, without_nuisances
 from twin.proof.rivals.stage import Stage
 
-REFITTED = 3  # of a screen without projection
+REFITTED = 5  # of a screen without projection, each of another mechanism
 SIGNIFICANT = 0.01  # of a chi-square test, for all candidates together (Bonferroni)
 
 
@@ -34,11 +34,13 @@ def reference(stage: Stage) -> Reply:
 
 
 def no_projection(stage: Stage) -> Reply:
-    """Screened as if nothing had been recalibrated; the best few are refitted and judged by the full rules."""
+    """Screened as if nothing had been recalibrated; the best of few mechanisms are refitted, the full rules judge."""
     r = stage.round
     residuals = r.before.problem.residuals(r.before.x, r.before.state.nuisance)
     gain = without_nuisances(r.screen.evidence, residuals).scores().gain
-    best = sorted(claimable(r), key=lambda s: (-gain[s.column], s.candidate.name))[:REFITTED]
+    order = sorted(claimable(r), key=lambda s: (gain[s.column], s.candidate.name))
+    best = list({s.candidate.mechanism: s for s in order}.values())
+    best = sorted(best, key=lambda s: (-gain[s.column], s.candidate.name))[:REFITTED]
     known = {t.candidate.name: t for t in stage.refits}
     tried = [known.get(s.candidate.name) or refit(r.before, s) for s in best]
     fitted = [replace(t, alike=None) for t in tried if t is not None]

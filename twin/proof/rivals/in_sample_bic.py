@@ -16,7 +16,7 @@ from twin.diagnosis.rounds.search import MOST_EFFECTS, Search
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import Scored
 from twin.proof.rivals.answer import Claim, Reply
-from twin.proof.rivals.rows import claimable, counted_in_full
+from twin.proof.rivals.rows import beyond_slack, counted_in_full
 
 LOOKED_AT = 40  # candidates of a step whose criterion is worked out, by what they take off at the weights before it
 ROUNDS = 5  # of reweighting the channels
@@ -25,7 +25,7 @@ ALIKE = 2.0  # of the criterion: a difference not worth a mention (Raftery 1995)
 
 def in_sample_bic(done: Search) -> Reply:
     """All effects that lower the criterion, in the order in which they enter; alike is what lowers it as much."""
-    news = claimable(done.rounds[0])
+    news = beyond_slack(done.rounds[0])
     sums = _Sums.of(counted_in_full(done.rounds[0].screen.evidence), news)
     chosen: list[int] = []
     claims: list[Claim] = []

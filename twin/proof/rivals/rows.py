@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.proposals.slack import LOOSE, no_news
 from twin.diagnosis.rounds.search import Round
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import Scored
@@ -36,7 +36,7 @@ class PlainRows:
 
 def plain_rows(done: Round) -> PlainRows:
     """Of a round's fit, before any candidate."""
-    news = claimable(done)
+    news = beyond_slack(done)
     at = [s.column for s in news]
     evidence = done.screen.evidence
     residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
@@ -59,6 +59,14 @@ def claimable(done: Round) -> list[Scored]:
     """Candidates with a signature, but those that any lumped network has some of."""
     loose = no_news([s.candidate for s in done.screen.scored])
     return [s for s in done.screen.scored if s.column >= 0 and s.candidate.name not in loose]
+
+
+def beyond_slack(done: Round) -> list[Scored]:
+    """Those of them that are not late or off-centre readings, which every lumped network shows without a fault.
+
+    A diagnosis fits that slack beside everything; a method that does not would name nothing else.
+    """
+    return [s for s in claimable(done) if s.candidate.mechanism not in LOOSE]
 
 
 def unwhitened(b: Whitened, rows: Array) -> Array:

@@ -71,7 +71,9 @@ class Stage:
 
     def bar(self, null: float) -> float:
         """The threshold with another structural null."""
-        return max(null, flipped_threshold(self.round.flipped, len(self.round.before.batches)), LEAST)
+        flipped = self.round.flipped  # none where nothing was refitted
+        signs = flipped_threshold(flipped, len(self.round.before.batches)) if len(flipped) else 0.0
+        return max(null, signs, LEAST)
 
     def ranked(self, tried: Sequence[Tried]) -> list[Tried]:
         """By gain and what is plausible, a finer network first where it gains nearly as much."""
