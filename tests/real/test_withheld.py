@@ -52,9 +52,11 @@ def test_the_case_reads_back_from_its_files_as_it_was(name: str, tmp_path: Path)
     case = build(name, DATA, 2)
     machine = parse_machine(machine_text(case.machine), "test")
     assert machine == case.machine
+    texts = case.recordings()
+    assert len(texts) == len(case.batches) and all(t.startswith("# real recording\n") for t in texts.values())
     for batch in case.batches[:2]:
         path = tmp_path / f"{batch.batch_id}.csv"
-        batch.table.to_csv(path, index=False)
+        path.write_text(texts[path.name])
         (back,) = read_batches(path, machine)
         assert back.batch_id == batch.batch_id and back.start == batch.start
         assert list(back.channels) == list(batch.channels)

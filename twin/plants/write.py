@@ -43,7 +43,7 @@ def write_case(case: Case, folder: Path, key_folder: Path | None = None) -> tupl
 def machine_text(machine: Machine) -> str:
     """The machine as a machine file's text; reads back as the same."""
     plain = machine.model_dump(mode="json", exclude_defaults=True)
-    return "# Simulated machine; no recording of a real one.\n" + yaml.safe_dump(plain, sort_keys=False, width=120)
+    return f"# {machine.description or machine.machine}\n" + yaml.safe_dump(plain, sort_keys=False, width=120)
 
 
 def recording_texts(case: Case) -> dict[str, str]:

@@ -25,6 +25,14 @@ class RealCase:
     batches: list[Batch]
     answer: dict[str, Any]
 
+    def recordings(self) -> dict[str, str]:
+        """File name -> CSV text of every run: a first line that says what it is, a lost sample an empty cell."""
+        head = "# real recording, simulated response\n" if self.machine.simulated else "# real recording\n"
+        return {
+            f"{b.batch_id}.csv": head + str(b.table.to_csv(index=False, float_format="%.10g", lineterminator="\n"))
+            for b in self.batches
+        }
+
 
 def term(
     effect: str, mechanism: str | None, where: Place, *, parameters: Mapping[str, tuple[float, str]] | None = None,
