@@ -32,6 +32,11 @@ class Box(Casting):
     axes: Literal["block", "upright", "ring"] = "block"
 
     @property
+    def layers(self) -> int:
+        """Cells through a wall: heat crosses a ring's, and runs along the others'."""
+        return 2 if self.axes == "ring" else 1
+
+    @property
     def high_m(self) -> Array:
         return np.asarray(self.low_m) + self.size_m
 
@@ -40,7 +45,8 @@ class Box(Casting):
         """Planes of the grid along each axis, m."""
         x, y, z = (np.linspace(0.0, size, n + 1) for size, n in zip(self.size_m, self.cells, strict=True))
         if self.hollow != "block":
-            x, y = (_walled(size, n, self.wall_m) for size, n in zip(self.size_m[:2], self.cells[:2], strict=True))
+            sides = zip(self.size_m[:2], self.cells[:2], strict=True)
+            x, y = (_walled(size, n, self.wall_m, self.layers) for size, n in sides)
         if self.hollow == "cap":
             z = np.append(np.linspace(0.0, self.size_m[2] - self.wall_m, self.cells[2] + 1), self.size_m[2])
         return x + self.low_m[0], y + self.low_m[1], z + self.low_m[2]
@@ -50,7 +56,8 @@ class Box(Casting):
         """Which cells of the grid are metal."""
         out = np.ones([len(line) - 1 for line in self.lines_m], dtype=bool)
         if self.hollow != "block":
-            out[1:-1, 1:-1, : -1 if self.hollow == "cap" else None] = False
+            n = self.layers
+            out[n:-n, n:-n, : -1 if self.hollow == "cap" else None] = False
         return out
 
     @property
@@ -108,8 +115,9 @@ class _Finer(Box):
         return np.asarray(np.kron(coarse, np.ones((self.times,) * 3, dtype=bool)))
 
 
-def _walled(size_m: float, core: int, wall_m: float) -> Array:
-    return np.concatenate([[0.0], np.linspace(wall_m, size_m - wall_m, core + 1), [size_m]])
+def _walled(size_m: float, core: int, wall_m: float, layers: int) -> Array:
+    wall = np.linspace(0.0, wall_m, layers + 1)[:-1]
+    return np.concatenate([wall, np.linspace(wall_m, size_m - wall_m, core + 1), size_m - wall[::-1]])
 
 
 def _cut(line: Array, times: int) -> Array:

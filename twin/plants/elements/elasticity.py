@@ -99,7 +99,7 @@ class Elasticity:
 
     def _feet(self, casting: str) -> sparse.csr_matrix:
         mesh = self.fields[casting].mesh
-        points_m, area_m2 = mesh.outside(mesh.box.pieces(), ((2, 0),))
+        points_m, area_m2 = mesh.hull([(2, 0)]).gauss()
         axes = zip(self.fields[casting].at(points_m, self.size), FEET_N_PER_M3, strict=True)
         parts = [at.T @ sparse.diags(stiff * area_m2) @ at for at, stiff in axes]
         return sum(parts[1:], parts[0])

@@ -1,4 +1,4 @@
-"""A vertical machining centre in space drawn from a seed: places, walls, contacts, faces; no two alike.
+"""A vertical machining centre in space drawn from a seed: places and walls of its castings; no two alike.
 
 x sideways, y from the column's back to the operator, z up, the floor at 0; lengths in m.
 """
@@ -12,23 +12,17 @@ import numpy as np
 from scipy.optimize import brentq
 
 from twin.plants.casting import MATERIALS, Array
-from twin.plants.elements.box import Box, Piece
-from twin.plants.elements.structure import Assembly, Contact, Elements, Face
-from twin.plants.seeds import stream
-from twin.plants.structure import WHOLE
+from twin.plants.elements.box import Box
+from twin.plants.elements.joints import expose, join
+from twin.plants.elements.structure import Assembly, Contact, Elements
+from twin.plants.seeds import stream, wider
 
 Corner = tuple[float, float, float]
 
 FOOT, HEAD_HIGH, SHAFT_TO_HEAD = 0.42, 0.42, 0.8  # heights as shares of the machine's size; head's of the shaft
 BELT = (0.10, 0.36)  # a shaft's shares within its front bearings' housing
 TAIL = (0.66, 0.88)
-_JOINTS_W_PER_K = {
-    "shaft-front": 14.0, "shaft-rear": 8.0, "front-head": 40.0, "rear-head": 25.0, "motor-head": 9.0,
-    "head-column": 26.0, "screw-head": 5.0, "screw-column": 6.0, "column-bed": 60.0, "table-below": 18.0,
-    "saddle-bed": 20.0, "mandrel-shaft": 9.0,
-}  # fmt: skip
 
-_HULL = ((0, 0), (0, 1), (1, 0), (1, 1))  # the four sides, axis and end
 _ASIDE = {"motor": (0.02, 0.045), "table": (0.06, 0.15)}  # shares of the machine's size
 
 
@@ -55,22 +49,24 @@ class Measures:
     mandrel: bool
 
 
-def draw_castings(seed: int, mandrel: bool, finer: int = 1) -> Drawn:
-    """The machine of a seed, with or without a test mandrel in its spindle; every cell cut `finer` along each axis."""
+def draw_castings(seed: int, mandrel: bool, finer: int = 1, spread: float = 1.0) -> Drawn:
+    """The machine of a seed, with or without a test mandrel; every cell cut `finer` along each axis.
+
+    `spread` widens what sizes there are.
+    """
     rng = stream(seed, "elements geometry")
-    size = float(rng.uniform(0.85, 1.25))
+    size = float(rng.uniform(*wider((0.85, 1.25), spread)))
     names = ("column", "head", "bed", "table", "saddle", "spindle", "motor")
-    mass = {n: float(rng.uniform(0.85, 1.2)) for n in names}
+    mass = {n: float(rng.uniform(*wider((0.85, 1.2), spread))) for n in names}
     enclosed, screw, saddle, head_halves = (bool(rng.random() < p) for p in (0.6, 0.6, 0.4, 0.6))
     aside = {n: float(rng.choice([-1.0, 1.0]) * rng.uniform(*_ASIDE[n]) * size) for n in ("motor", "table")}
     m = Measures(size, mass, float(rng.uniform(0.6, 0.78)), aside, screw, saddle, mandrel)
-    air_J_per_K, air_room_W_per_K = float(rng.uniform(18e3, 40e3)), float(rng.uniform(45.0, 95.0))
+    air_J_per_K, air_room_W_per_K = (float(rng.uniform(*wider(r, spread))) for r in ((18e3, 40e3), (45.0, 95.0)))
     boxes = {box.name: box.finer(finer) if finer > 1 else box for box in _boxes(m)}
     halves = frozenset({"column", "head"} if head_halves else {"column"})
     a = Assembly(list(boxes.values()), halves, air_J_per_K if enclosed else None, air_room_W_per_K)
-    joints = {n: g * float(np.exp(0.25 * rng.standard_normal())) for n, g in _JOINTS_W_PER_K.items()}
-    _join(a, m, joints)
-    _expose(a, rng)
+    join(a, rng, spread)
+    expose(a, rng, spread)
     end = boxes["mandrel" if mandrel else "shaft"]
     tool = np.array([0.0, end.low_m[1] + end.size_m[1] / 2, end.low_m[2]])
     return Drawn(a.done(), a.contacts, tool, np.array([0.0, tool[1], boxes["table"].high_m[2]]))
@@ -98,11 +94,11 @@ def _boxes(m: Measures) -> list[Box]:
         wall = (np.sqrt(thick**2 + kg / (7850.0 * height)) - thick) / 2
         side = thick + 2 * wall
         at = (-side / 2, axis - side / 2, nose + span[0] * long)
-        return Box(name, steel, kg, at, (side, side, height), (1, 1, 2), "tube", wall, "ring")
+        return Box(name, steel, kg, at, (side, side, height), (1, 1, 3), "tube", wall, "ring")
 
     aside, over = m.aside_m, low + head_m
     boxes = [
-        bar("shaft", kg, 0.0, axis, nose, thick, long, 12),
+        bar("shaft", kg, 0.0, axis, nose, thick, long, 20),
         ring("front", 17 * f["spindle"], BELT),
         ring("rear", 10.5 * f["spindle"], TAIL),
         Box("head", iron, 300 * s * s * f["head"], (-0.16 * s, back, low), (0.32 * s, 0.64 * s, head_m), (2, 6, 4)),
@@ -133,69 +129,3 @@ def _walled(name: str, kg: float, low: Corner, size: Corner, cells: tuple[int, i
         return Box(name, "cast_iron", kg, low, size, cells, hollow, wall_m)
 
     return box(float(brentq(lambda t: box(t).volume_m3 - bulk_m3, 0.005, 0.45 * min(size))))
-
-
-def _join(a: Assembly, m: Measures, g: dict[str, float]) -> None:
-    """Contacts where they are on a machine of this kind; a bearing's seat is its ring's bore."""
-
-    def meet(one: str, other: str, patch: tuple[Array, Array], joint: str, held: tuple[float, float, float]) -> None:
-        a.contacts.append(Contact(one, other, *patch, g[joint], held))
-
-    def side(
-        name: str, axis: int, end: int, depth: tuple[float, float] = WHOLE, height: tuple[float, float] = WHOLE
-    ) -> tuple[Array, Array]:
-        mesh = a.meshes[name]
-        return mesh.outside(mesh.box.pieces(depth, height), ((axis, end),))
-
-    firm = (1.0, 1.0, 1.0)
-    for ring, hold in (("front", firm), ("rear", (1.0, 1.0, 1e-3))):  # the rear bearings let the shaft grow upwards
-        mesh = a.meshes[ring]
-        meet("shaft", ring, mesh.bore(mesh.box.pieces()), f"shaft-{ring}", hold)
-        meet(ring, "head", mesh.outside(mesh.box.pieces(), _HULL), f"{ring}-head", firm)
-    meet("motor", "head", _inside(side("motor", 2, 0), a.meshes["head"].box.pieces()), "motor-head", firm)
-    # Guides carry the head; along them the screw's nut holds it, or without a screw the clamp at the scale.
-    guide = (1.0, 1.0, 1e-3) if m.screw else firm
-    meet("head", "column", _rails(side("head", 1, 0), 0.4), "head-column", guide)
-    meet("column", "bed", side("column", 2, 0), "column-bed", firm)
-    if m.screw:
-        screw = a.meshes["screw"]
-        sides = screw.outside(screw.box.pieces(), ((0, 0), (0, 1), (1, 1)))
-        nut = _inside(sides, a.meshes["head"].box.pieces((0.0, 1.0), (0.25, 0.75)))
-        meet("screw", "head", nut, "screw-head", (1e-3, 1e-3, 3.0))
-        meet("screw", "column", side("screw", 1, 0, (0.9, 1.0)), "screw-column", firm)
-    below = "saddle" if m.saddle else "bed"
-    if m.saddle:
-        meet("saddle", "bed", side("saddle", 2, 0), "saddle-bed", firm)
-    meet("table", below, _inside(side("table", 2, 0), a.meshes[below].box.pieces()), "table-below", firm)
-    if m.mandrel:
-        meet("mandrel", "shaft", side("mandrel", 2, 1), "mandrel-shaft", firm)
-
-
-def _inside(patch: tuple[Array, Array], pieces: list[Piece]) -> tuple[Array, Array]:
-    """The patch's points within a box."""
-    (_, low, high), (points_m, area_m2) = pieces[0], patch
-    keep = np.all((points_m >= low - 1e-9) & (points_m <= high + 1e-9), axis=1)
-    return points_m[keep], area_m2[keep]
-
-
-def _rails(patch: tuple[Array, Array], share: float) -> tuple[Array, Array]:
-    """The outer thirds of a face sideways: two guides."""
-    points_m, area_m2 = patch
-    keep = np.abs(points_m[:, 0]) > share * np.abs(points_m[:, 0]).max()
-    return points_m[keep], area_m2[keep]
-
-
-def _expose(a: Assembly, rng: np.random.Generator) -> None:
-    """Convection, W/m²/K: what faces the work is inside the enclosure; motor, rear and back are outside."""
-    h = {name: float(rng.uniform(4.5, 8.0)) for name in (b.name for b in a.boxes)}
-    inside = ("shaft", "front", "table", "screw", "saddle", "mandrel")
-    for box in a.boxes:
-        if box.name in ("head", "column"):
-            a.faces.append(Face(box.name, box.pieces((0.5, 1.0)), h[box.name], enclosed=True))
-            a.faces.append(Face(box.name, box.pieces((0.0, 0.5)), h[box.name], enclosed=False))
-        elif box.name == "bed":
-            a.faces.append(Face("bed", box.pieces(height=(0.66, 1.0)), h["bed"], enclosed=True))
-            a.faces.append(Face("bed", box.pieces(height=(0.0, 0.66)), h["bed"], enclosed=False))
-        else:
-            more = 1.5 if box.name in ("motor", "table") else 1.0
-            a.faces.append(Face(box.name, box.pieces(), more * h[box.name], box.name in inside))

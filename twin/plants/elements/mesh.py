@@ -1,7 +1,8 @@
-"""The hexahedra of a box: numbering of nodes, interpolation at any point, quadrature over pieces and faces."""
+"""The hexahedra of a box: numbering of nodes, interpolation at any point, volumes and faces."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 
 import numpy as np
@@ -9,9 +10,10 @@ from scipy import sparse
 from skfem import MeshHex
 
 from twin.plants.casting import Array, Cells
-from twin.plants.elements.box import Box, Piece
+from twin.plants.elements.box import Box
+from twin.plants.elements.slabs import Slabs, joined
 
-GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
+SIDES = tuple(product(range(3), (0, 1)))
 
 
 class Mesh:
@@ -70,57 +72,30 @@ class Mesh:
         triplets = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         return sparse.csr_matrix(triplets, shape=(len(points_m), self.size))
 
-    def inside(self, pieces: list[Piece]) -> tuple[Array, Array]:
-        """Gauss points (Q, 3) and volumes (Q,) of the metal in these pieces, exact for trilinear functions."""
-        low = np.stack([n[self.cell[:, k]] for k, n in enumerate(self.lines_m)], axis=1)
-        high = np.stack([n[self.cell[:, k] + 1] for k, n in enumerate(self.lines_m)], axis=1)
-        return _gauss(low, high, pieces, (0, 1, 2))
+    def volumes(self) -> Slabs:
+        """All hexahedra."""
+        return self._slabs(self.cell)
 
-    def outside(self, pieces: list[Piece], sides: tuple[tuple[int, int], ...] | None = None) -> tuple[Array, Array]:
-        """Gauss points and areas of the faces on the box's hull in these pieces; `sides`: (axis, 0 low or 1 high)."""
-        points, areas = [], []
-        for axis, end in sides or tuple(product(range(3), (0, 1))):
-            n = len(self.lines_m[axis]) - 1
-            rim = self.cell[self.cell[:, axis] == (n - 1) * end]
-            points_m, area_m2 = self._faces(rim, axis, end, pieces)
-            points.append(points_m)
-            areas.append(area_m2)
-        return np.concatenate(points), np.concatenate(areas)
+    def hull(self, sides: Iterable[tuple[int, int]] = SIDES) -> Slabs:
+        """Faces on the box's outer planes, those of `sides`: axis, and 0 for the lower or 1 for the upper end."""
+        rims = []
+        for axis, end in sides:
+            last = len(self.lines_m[axis]) - 2
+            rims.append(self._slabs(self.cell[self.cell[:, axis] == last * end]).side(axis, end))
+        return joined(rims)
 
-    def bore(self, pieces: list[Piece]) -> tuple[Array, Array]:
-        """Gauss points and areas of the inner faces of a tube's four walls in these pieces."""
-        points, areas = [], []
+    def bore(self) -> Slabs:
+        """Inner faces of a tube's four walls."""
+        rims = []
         for axis, end in product((0, 1), (0, 1)):
             beside = self.cell.copy()
             beside[:, axis] += 2 * end - 1
-            within = (beside[:, axis] >= 0) & (beside[:, axis] < self.element.shape[axis])
-            rim = np.flatnonzero(within)
+            rim = np.flatnonzero((beside[:, axis] >= 0) & (beside[:, axis] < self.element.shape[axis]))
             rim = rim[self.element[tuple(beside[rim].T)] < 0]
-            points_m, area_m2 = self._faces(self.cell[rim], axis, end, pieces)
-            points.append(points_m)
-            areas.append(area_m2)
-        return np.concatenate(points), np.concatenate(areas)
+            rims.append(self._slabs(self.cell[rim]).side(axis, end))
+        return joined(rims)
 
-    def _faces(self, cell: Cells, axis: int, end: int, pieces: list[Piece]) -> tuple[Array, Array]:
-        low = np.stack([n[cell[:, k]] for k, n in enumerate(self.lines_m)], axis=1)
-        high = np.stack([n[cell[:, k] + 1] for k, n in enumerate(self.lines_m)], axis=1)
-        plane = (high if end else low)[:, axis]
-        low[:, axis] = high[:, axis] = plane
-        return _gauss(low, high, pieces, tuple(k for k in range(3) if k != axis))
-
-
-def _gauss(low: Array, high: Array, pieces: list[Piece], axes: tuple[int, ...]) -> tuple[Array, Array]:
-    """Two points along each of `axes` of every box or face, clipped to the pieces; signed sizes."""
-    points, sizes = [], []
-    for sign, under, over in pieces:
-        a, b = np.maximum(low, under), np.minimum(high, over)
-        flat = [k for k in range(3) if k not in axes]
-        keep = np.all((b - a)[:, list(axes)] > 1e-12, axis=1) & np.all((b - a)[:, flat] > -1e-9, axis=1)
-        a, b = np.where(b < a, b, a)[keep], b[keep]
-        size = sign * np.prod((b - a)[:, list(axes)], axis=1) / 2 ** len(axes)
-        for where in product(GAUSS, repeat=len(axes)):
-            share = np.zeros(3)
-            share[list(axes)] = where
-            points.append(a + (b - a) * share)
-            sizes.append(size)
-    return np.concatenate(points), np.concatenate(sizes)
+    def _slabs(self, cell: Cells) -> Slabs:
+        low = np.stack([line[cell[:, k]] for k, line in enumerate(self.lines_m)], axis=1)
+        high = np.stack([line[cell[:, k] + 1] for k, line in enumerate(self.lines_m)], axis=1)
+        return Slabs(low, high, np.ones(len(cell)))

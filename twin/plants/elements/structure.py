@@ -29,14 +29,16 @@ Matrices = Mapping[frozenset[str], sparse.csr_matrix]
 
 @dataclass(frozen=True)
 class Contact:
-    """A patch where two castings meet: Gauss points (Q, 3) with areas (Q,), its conductance in all.
+    """Where two castings meet: Gauss points (Q, 3) with areas (Q,), its conductance in all.
 
-    `held` is how firmly it ties displacements along x, y and z, as a share of a bolted joint's stiffness.
+    Heat passes from `points_m` of the one to `heats_m` of the other, the same points where two faces touch. Both move
+    together at `points_m`; `held` is how firmly, along x, y and z, as a share of a bolted joint's stiffness.
     """
 
     one: str
     other: str
     points_m: Array
+    heats_m: Array
     area_m2: Array
     conductance_W_per_K: float
     held: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -119,9 +121,9 @@ class Elements(Structure):
 
 def part_of(mesh: Mesh, first: int, pieces: list[Piece]) -> Part:
     """The pieces of a mesh whose nodes begin at `first` among all."""
-    points_m, volume_m3 = mesh.inside(pieces)
+    points_m, volume_m3 = mesh.volumes().within(pieces).gauss()
     carried = mesh.interpolation(points_m).T @ volume_m3
-    points_m, area_m2 = mesh.outside(pieces)
+    points_m, area_m2 = mesh.hull().within(pieces).gauss()
     surface_m2 = mesh.interpolation(points_m).T @ area_m2
     own = np.flatnonzero(np.abs(carried) > 1e-9 * np.abs(carried).max())
     capacity = mesh.box.capacity_J_per_m3K * float(carried.sum())
@@ -211,9 +213,9 @@ class Assembly:
     def _contacts(self) -> dict[frozenset[str], sparse.csr_matrix]:
         out: dict[frozenset[str], sparse.csr_matrix] = {}
         for c in self.contacts:
-            jump = self.at(c.one, c.points_m) - self.at(c.other, c.points_m)
+            jump = self.at(c.one, c.points_m) - self.at(c.other, c.heats_m)
             conductance = c.conductance_W_per_K * c.area_m2 / c.area_m2.sum()
-            one, other = self._body(c.one, c.points_m), self._body(c.other, c.points_m)
+            one, other = self._body(c.one, c.points_m), self._body(c.other, c.heats_m)
             for a in self._names(c.one):
                 for b in self._names(c.other):
                     here = np.flatnonzero((one == a) & (other == b))
@@ -228,7 +230,7 @@ class Assembly:
         exposed: dict[tuple[str, str], Array] = {}
         robin = sparse.csr_matrix((self.size, self.size), dtype=np.float64)
         for face in self.faces:
-            points_m, area_m2 = self.meshes[face.casting].outside(face.pieces)
+            points_m, area_m2 = self.meshes[face.casting].hull().within(face.pieces).gauss()
             conductance, at = face.coefficient_W_per_m2K * area_m2, self.at(face.casting, points_m)
             around = AIR if face.enclosed and air is not None else "room"
             robin = robin + exchange_W_per_K(at, conductance)
