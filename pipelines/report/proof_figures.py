@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -13,51 +15,67 @@ from pipelines.report.proof_drawing import HALF_IN, PALE, WIDE_IN, head, panel
 from pipelines.report.proof_extracts import SIZES
 from pipelines.report.proof_words import GROUPS, key_label, method_label
 from pipelines.report.twin_figures import SIZE, SOFT
-from pipelines.report.words import BLUE, INK, ORANGE, percent
+from pipelines.report.words import BLUE, INK, ORANGE, number
 
 Array = NDArray[np.float64]
 _GROUP_COLORS = {"diagnosis": BLUE, "baseline": ORANGE, "ablation": "#6b7682"}
-_ROW_IN, _NAMES_IN, _TOP_IN = 0.27, 2.75, 0.9
+_ROW_IN, _NAMES_IN, _TOP_IN = 0.27, 2.75, 1.05
 
 
 def rivals(compared: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """A dot and its 90 % interval per method (rows) and measure (columns), grouped; the diagnosis drawn through.
 
     Args:
-        compared: method, group, measure, value, low90, high90 as shares.
+        compared: method, group, measure, value, low90, high90 as shares; `lead`, `lead_low90` and `lead_high90`, where
+            there are any, become a last column.
     """
     measures = list(dict.fromkeys(compared["measure"]))
+    leads = compared[compared["lead"].notna()] if "lead" in compared else compared[:0]
     rows = _method_rows(compared)
-    tall = _ROW_IN * len(rows)
+    columns = len(measures) + bool(len(leads))
+    tall, wide = _ROW_IN * len(rows), (WIDE_IN - _NAMES_IN) / columns
     fig = Figure(figsize=(WIDE_IN, _TOP_IN + tall + 0.4))
-    wide = (WIDE_IN - _NAMES_IN) / len(measures)
-    for k, measure in enumerate(measures):
-        ax = panel(fig, _NAMES_IN + k * wide, _TOP_IN, wide - 0.6, tall)
-        own = compared[compared["measure"] == measure].drop_duplicates("method").set_index("method")
-        if "diagnosis" in own.index:
-            ax.axvline(100 * own.loc["diagnosis", "value"], color=BLUE, lw=1, alpha=0.45, zorder=1)
-        for y, (group, method) in enumerate(rows):
-            if not method and k == 0:
-                ax.text(-_NAMES_IN / (wide - 0.6) + 0.05, y, GROUPS.get(group, group), fontsize=8.5, color=SOFT,
-                        transform=ax.get_yaxis_transform(), va="center")  # fmt: skip
-            if not method or method not in own.index or not np.isfinite(own.loc[method, "value"]):
-                continue
-            value, low, high = (100 * float(own.loc[method, c]) for c in ("value", "low90", "high90"))
-            color = _GROUP_COLORS.get(group, SOFT)
-            ax.plot([low, high], [y, y], color=color, lw=2, alpha=0.55, zorder=2)
-            ax.plot([value], [y], "o", ms=6, color=color, mec="white", mew=0.8, zorder=3)
-            side = ax.get_yaxis_transform()
-            ax.text(1.02, y, percent(value / 100), fontsize=8, color=INK, transform=side, va="center")
-        ax.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
+    for k in range(columns):
+        ax = panel(fig, _NAMES_IN + k * wide, _TOP_IN, wide - 0.55, tall)
+        if k < len(measures):
+            own = compared[compared["measure"] == measures[k]].drop_duplicates("method").set_index("method")
+            line = float(own["value"].get("diagnosis", np.nan))
+            _dots(ax, rows, own[["low90", "value", "high90"]], line)
+            ax.set(xlim=(-2, 102), xticks=[0, 25, 50, 75, 100])
+            ax.set_title(textwrap.fill(measures[k], 24), fontsize=9, loc="left", color=INK, pad=5)
+            ax.set_xlabel("share of cases, %", fontsize=8, labelpad=1)
+        else:
+            _dots(ax, rows, leads.set_index("method")[["lead_low90", "lead", "lead_high90"]], 0.0)
+            ax.locator_params(axis="x", nbins=5)
+            ax.set_title("ahead of it in\nright answers", fontsize=9, loc="left", color=INK, pad=5)
+            ax.set_xlabel("points", fontsize=8, labelpad=1)
         names = [method_label(m) if m and k == 0 else "" for _, m in rows]
         ax.set_yticks(range(len(rows)), names, fontsize=8.5, color=INK)
-        ax.tick_params(axis="y", length=0)
-        ax.grid(axis="y", visible=False)
-        ax.set_xticks([0, 25, 50, 75, 100])
-        ax.set_title(measure, fontsize=9, loc="left", color=INK, pad=5)
-        ax.set_xlabel("share of cases, %", fontsize=8, labelpad=1)
+    first, side = fig.axes[0], -_NAMES_IN / (wide - 0.55) + 0.05
+    for y, (group, method) in enumerate(rows):
+        if not method:
+            words = GROUPS.get(group, group)
+            first.text(side, y, words, fontsize=8.5, color=SOFT, transform=first.get_yaxis_transform(), va="center")
     head(fig, "Against other ways, on the same recordings", plants)
     return fig
+
+
+def _dots(ax: Axes, rows: Sequence[tuple[str, str]], own: pd.DataFrame, line: float) -> None:
+    """Interval and value (low, value, high, as shares) of every method that has them; a line drawn through."""
+    if np.isfinite(line):
+        ax.axvline(100 * line, color=BLUE, lw=1, alpha=0.45, zorder=1)
+    shares = dict(zip(own.index, own.to_numpy(float), strict=True))
+    for y, (group, method) in enumerate(rows):
+        low, value, high = 100 * shares.get(method, np.full(3, np.nan))
+        if not np.isfinite(value):
+            continue
+        color = _GROUP_COLORS.get(group, SOFT)
+        ax.plot([low, high], [y, y], color=color, lw=2, alpha=0.55, zorder=2)
+        ax.plot([value], [y], "o", ms=6, color=color, mec="white", mew=0.8, zorder=3)
+        ax.text(1.03, y, number(value, 0), fontsize=8, color=INK, transform=ax.get_yaxis_transform(), va="center")
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="y", visible=False)
 
 
 def _method_rows(compared: pd.DataFrame) -> list[tuple[str, str]]:

@@ -62,7 +62,8 @@ def _rivals(run: ProofRun) -> Part:
         return _absent(own, "Rivals and ablations were not scored in this run.")
     lead = (
         "Baselines start from the same first fit. Ablations drop one rule each in the first round; compare them with "
-        "“first round, full rules”, which has no further rounds either."
+        "“first round, full rules”, which has no further rounds either. Ahead: of a baseline the diagnosis, of an "
+        "ablation the first round with full rules, paired by case."
     )
     figure = figures.rivals(table, run.plants)
     return replace(own, lead=lead, wide=(_shown(run, figure, own.title),))

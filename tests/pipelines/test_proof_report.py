@@ -20,6 +20,7 @@ from pipelines.report.proof import headline, proof_page, write_proof_report
 from pipelines.report.proof_goals import goal_rows, shortfalls
 from pipelines.report.proof_run import TABLES, ProofRun
 from pipelines.report.proof_words import measured, origin
+from twin.proof.scoring.compared import COLUMNS as COMPARED
 from twin.proof.scoring.goal_table import GOAL_COLUMNS
 from twin.proof.scoring.outcomes import OUTCOMES, TERMS
 from twin.proof.scoring.reliability import COLUMNS
@@ -153,7 +154,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_the_scoring_gives_every_column_that_the_page_reads() -> None:
     assert set(TABLES["outcomes"]) <= set(OUTCOMES) and set(TABLES["terms"]) <= set(TERMS)
     assert set(TABLES["goals"]) <= set(GOAL_COLUMNS) and set(TABLES["reliability"]) <= set(COLUMNS)
-    assert set(TABLES["leak"]) <= set(LEAK)
+    assert set(TABLES["leak"]) <= set(LEAK) and set(TABLES["compared"]) <= set(COMPARED)
 
 
 # goals

@@ -142,15 +142,21 @@ def _compared(draws: np.random.Generator) -> pd.DataFrame:
         "ablation": ("reference", "no_projection", "independent_noise", "in_sample", "no_structural_null",
                      "no_floor_check"),
     }  # fmt: skip
-    measures = {"right answers": 0.9, "mechanism first, visible single": 0.93, "false alarms": 0.01}
+    measures = {
+        "right answers": 0.9,
+        "mechanism first, one visible effect": 0.93,
+        "false alarms, nothing missing": 0.01,
+    }
     rows = []
     for group, names in methods.items():
         for name in names:
             for measure, base in measures.items():
                 off = 0.0 if name in ("diagnosis", "reference") else float(draws.uniform(0.1, 0.5))
-                v = base + off if measure == "false alarms" else base - off
+                v = base + off if measure.startswith("false") else base - off
+                lead = base - v if measure == "right answers" and off else np.nan
                 rows.append({"method": name, "group": group, "measure": measure, "value": v, "low90": max(v - 0.04, 0),
-                             "high90": min(v + 0.04, 1), "n": 300})  # fmt: skip
+                             "high90": min(v + 0.04, 1), "n": 300, "lead": lead, "lead_low90": lead - 0.05,
+                             "lead_high90": lead + 0.05})  # fmt: skip
     return pd.DataFrame(rows)
 
 
