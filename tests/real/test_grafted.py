@@ -16,6 +16,8 @@ from twin.diagnosis.proposals.candidates import candidates
 from twin.plants.grafted import build, cases
 from twin.plants.grafted.cases import CASES
 from twin.plants.real.case import RealCase
+from twin.proof.scoring.answer_key import AnswerKey
+from twin.proof.spec import KINDS
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data")
@@ -93,7 +95,8 @@ def test_cases_are_labelled_compile_and_answer_in_plain_data() -> None:
         case = built(name)
         assert case.machine.simulated and case.answer["simulated"] and all(b.simulated for b in case.batches)
         json.dumps(case.answer, allow_nan=False)
-        assert len(case.answer["terms"]) == len(CASES[name].grafts)
+        key = AnswerKey.from_json(case.answer)
+        assert len(key.terms) == len(CASES[name].grafts) and key.kind in KINDS and key.plant == "grafted"
         assert all(0.3 <= t["size"] <= 3.0 for t in case.answer["terms"])
 
 

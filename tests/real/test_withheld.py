@@ -20,6 +20,8 @@ from twin.diagnosis.proposals.candidates import candidates
 from twin.plants.real.recordings import recorded
 from twin.plants.withheld import board, build, cases, cell
 from twin.plants.withheld.cases import CASES
+from twin.proof.scoring.answer_key import AnswerKey
+from twin.proof.spec import KINDS
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data")
@@ -82,7 +84,9 @@ def test_answers_are_plain_finite_data_and_windows_lie_in_the_runs() -> None:
     for name in CASES:
         case = build(name, DATA, 6)
         json.dumps(case.answer, allow_nan=False)
-        assert not case.answer["simulated"]
+        key = AnswerKey.from_json(case.answer)
+        assert not key.simulated and key.kind in KINDS and key.plant == "withheld"
+        assert len(key.terms) == (2 if key.kind == "two" else 1)
         ends = {b.batch_id: b.time_s[-1] for b in case.batches}
         for term in case.answer["terms"]:
             assert term["active"] == "always" or all(0 <= s < e <= ends[b] for b, s, e in term["active"])

@@ -93,9 +93,6 @@ class Heat(Graft):
         seats = {c: f"cell {s.cell % len(self.frame.bodies[s.body])} of {s.body}" for c, s in self.frame.seats.items()}
         return seats | {c: f"means of {', '.join(g)}" for c, g in self.frame.gains_um_per_K.items()}
 
-    def rows(self, values: Mapping[str, Array]) -> list[Array]:
-        return [values[b.batch_id] for b in self.setting.batches]
-
 
 class CabinetHeat(Heat):
     """A cabinet that is switched on up to two hours before each run and stays on."""
