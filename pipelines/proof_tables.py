@@ -10,6 +10,7 @@ import pandas as pd
 
 from pipelines.proof_judging import Judged
 from pipelines.report.proof_run import TABLES, ProofRun
+from twin.proof.scoring.compared import compared
 from twin.proof.scoring.goal_table import goal_table
 from twin.proof.scoring.outcomes import outcomes
 from twin.proof.scoring.reliability import reliability
@@ -27,13 +28,16 @@ def tables_of(
     """Every table that the stored answers and the key give, by its name on the page."""
     keys = {name: opened.answers[name] for name in judged}
     stored = {name: j.stored for name, j in judged.items()}
-    cases, terms = outcomes(keys, stored, {n: j.truth for n, j in judged.items() if j.truth is not None})
+    truths = {n: j.truth for n, j in judged.items() if j.truth is not None}
+    cases, terms = outcomes(keys, stored, truths)
+    beside = compared(keys, stored, truths)
     ten = worst(cases)
     return {
         "ledger": ledger_table(opened.entries),
         "outcomes": cases,
         "terms": terms,
-        "goals": goal_table(cases, terms),
+        "goals": goal_table(cases, terms, beside),
+        "compared": beside,
         "reliability": reliability(cases)[0],
         "confusion_mechanism": confusion(terms, "mechanism"),
         "confusion_place": confusion(terms, "place"),

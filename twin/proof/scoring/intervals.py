@@ -28,7 +28,9 @@ def bootstrap(values: pd.Series, statistic: Statistic, seed: int = 0) -> tuple[f
     Raises:
         ValueError: no values.
     """
-    groups = [np.asarray(own, float) for _, own in values.groupby(level=0, sort=True)]
+    ordered = values.sort_index(kind="stable")
+    _, first = np.unique(ordered.index.to_numpy(), return_index=True)
+    groups = np.split(np.asarray(ordered, float), first[1:])
     return of_groups(groups, lambda chosen: statistic(np.concatenate(chosen)), seed)
 
 
