@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import pandas as pd
-
 from data.registry import Registry
-from twin.plants.runs import Block, Run
+from twin.plants.runs import STANDING_S, Block, Run
 
 Habit = Callable[[Sequence[Run], float], list[Run]]  # runs, rated speed in rpm
 
@@ -29,10 +27,18 @@ def one_speed(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
     return [replace(run, speed=tuple(replace(b, value=speed_rpm * (b.value > 0)) for b in run.speed)) for run in runs]
 
 
-def same_hour(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
-    """Every run starts at the hour at which the first one does."""
-    since = runs[0].start - runs[0].start.normalize()
-    return [replace(run, start=pd.Timestamp(run.start.normalize() + since)) for run in runs]
+def long_runs(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
+    """The spindle is switched on once and runs on to the end of the shift, from a machine at rest."""
+    out = []
+    for run in runs:
+        fastest = max((b.value for b in run.speed), default=0.0)
+        out.append(replace(run, speed=(Block(STANDING_S, fastest),) if fastest else ()))
+    return out
+
+
+def walls_as_room(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
+    """Walls inside a bigger hall: as warm as the room, all day."""
+    return [replace(run, wall_K=0.0, wall_swing=1.0, wall_late_h=0.0) for run in runs]
 
 
 LONG_AGO_S = -1e6
@@ -43,6 +49,7 @@ HABITS = Registry(
         "ordinary": "twin.plants.habits:ordinary",
         "coolant_always": "twin.plants.habits:coolant_always",
         "one_speed": "twin.plants.habits:one_speed",
-        "same_hour": "twin.plants.habits:same_hour",
+        "long_runs": "twin.plants.habits:long_runs",
+        "walls_as_room": "twin.plants.habits:walls_as_room",
     },
 )

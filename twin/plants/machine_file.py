@@ -125,10 +125,11 @@ def _bodies(plant: Plant, pen: _Pen, hidden: set[str]) -> dict[str, Any]:
     s = plant.structure
     out: dict[str, Any] = {}
     for name, part in s.bodies.items():
+        if name in hidden:
+            continue
         capacity = pen.mass(part.capacity_J_per_K)
         casting = next((c for n, c in s.castings.items() if part.cells[0] in s.cells[n]), None)
-        if name not in hidden:
-            out[name] = {"capacity": capacity} | ({} if casting is None else {"material": casting.material})
+        out[name] = {"capacity": capacity} | ({} if casting is None else {"material": casting.material})
     return out
 
 
@@ -163,20 +164,18 @@ def _stated(stated: Stated, pen: _Pen) -> dict[str, Any]:
 
 
 def _error(plant: Plant, channel: str, pen: _Pen, withheld: set[str]) -> dict[str, Any]:
+    """What is withheld is not even guessed: the file is that of a machine without it."""
     chain, tilts = [], []
     for growth in plant.growths:
-        known = growth.name not in withheld
-        if growth.channel != channel:
+        if growth.channel != channel or growth.name in withheld:
             continue
         if growth.tilt is not None:
             gain = pen.gain(growth.lumped_um_per_K)
-            tilts += (
-                [{"hot": growth.tilt[0], "cold": growth.tilt[1], "gain": gain, "words": growth.name}] if known else []
-            )
+            tilts.append({"hot": growth.tilt[0], "cold": growth.tilt[1], "gain": gain, "words": growth.name})
             continue
         for body, total in gains_um_per_K(plant.structure, growth.weights_um_per_K).items():
             gain = pen.gain(total)
-            chain += [{"body": body, "gain": gain, "words": growth.name}] if known else []
+            chain.append({"body": body, "gain": gain, "words": growth.name})
     return {"noise": "1 um", "chain": chain, "tilts": tilts}
 
 

@@ -47,6 +47,8 @@ class Run:
     slow_K: float  # castings against the room, hours before the batch
     friction: float
     idle: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
+    wall_swing: float = 1.0 / 3.0  # of the room's over the day, and by how much later
+    wall_late_h: float = 3.0
 
     @property
     def batch_id(self) -> str:
@@ -65,9 +67,9 @@ class Run:
         return np.asarray(self.room_mean_degC + self.day_K * np.cos(phase) + ripple)
 
     def wall_degC(self, time_s: Array) -> Array:
-        """Of the hall's walls: nearer to what is outside, with a third of the room's swing, 3 h later."""
-        phase = 2 * np.pi * (self.clock_h + time_s / 3600.0 - self.warmest_h - 3.0) / 24.0
-        return np.asarray(self.room_mean_degC + self.wall_K + self.day_K / 3.0 * np.cos(phase))
+        """Of the hall's walls: nearer to what is outside, with less of the room's swing, later."""
+        phase = 2 * np.pi * (self.clock_h + time_s / 3600.0 - self.warmest_h - self.wall_late_h) / 24.0
+        return np.asarray(self.room_mean_degC + self.wall_K + self.day_K * self.wall_swing * np.cos(phase))
 
     def ground_degC(self) -> float:
         """Under the floor: follows the season by half, and not the day."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from twin.plants.casting import Array
 from twin.plants.effects.base import Answer, Effect
+from twin.plants.lumping import links_W_per_K
 from twin.plants.machine import Plant, Sensor
 
 
@@ -109,13 +110,20 @@ class TimeSkew(Effect):
 
 
 class WrongParameter(Effect):
-    """Nothing is missing, but one value of the machine file is wrong far beyond its spread."""
+    """Nothing is missing, but one joint of the machine file is wrong far beyond its spread."""
 
     key = "wrong_parameter"
-    link = "column_front-bed"
+
+    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        super().__init__(plant, size, rng)
+        joints = [pair for pair in links_W_per_K(plant.structure) if "mandrel" not in pair]
+        self.link = "-".join(joints[int(rng.integers(len(joints)))])
+        self.stated = 4.0 ** (size * float(rng.choice([-1.0, 1.0])))
 
     def answer(self) -> Answer:
-        return Answer(self.key, "link", self.link, {"factor": (4.0**-self.size, "1")}, words="a joint is stated wrong")
+        return Answer(
+            self.key, "link", self.link, {"factor": (1.0 / self.stated, "1")}, words="a joint is stated wrong"
+        )
 
     def misread(self) -> Mapping[str, float]:
-        return {f"links.{self.link}": 4.0**self.size}
+        return {f"links.{self.link}": self.stated} if self.size else {}

@@ -41,9 +41,13 @@ def build(spec: CaseSpec) -> Built:
     return Built(case.machine, recording_texts(case), answer_of(spec, case))
 
 
-def without(spec: CaseSpec) -> CaseSpec:
-    """The same machine, runs and file with nothing left out: every effect and decoy at size 0."""
-    return replace(spec, effects=dict.fromkeys(spec.effects, 0.0), decoys=dict.fromkeys(spec.decoys, 0.0))
+def without(spec: CaseSpec, *keys: str) -> CaseSpec:
+    """The same machine, runs and file with these effects and decoys at size 0; with all of them where none is named."""
+
+    def less(sizes: Mapping[str, float]) -> dict[str, float]:
+        return {key: 0.0 if key in keys or not keys else size for key, size in sizes.items()}
+
+    return replace(spec, effects=less(spec.effects), decoys=less(spec.decoys))
 
 
 def write_built(built: Built, folder: Path) -> None:

@@ -10,24 +10,21 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from twin.plants.effects import EFFECTS
-
-Same = tuple[str, tuple[str, ...]]  # a place's name ("" means the effect's own), mechanisms
+ALWAYS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "cabinet_heat": ("hydraulic_unit",), "pump_heat": ("electrical_heat", "hydraulic_unit"),
+    "guide_friction": ("nut_friction", "screw_bearing"),
+})  # fmt: skip
+"""By effect the mechanisms that are the same equation under another name, in every recording."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """`one` and `other` are effects whose signatures agree where the shop has this `habit`, the machine file states
-    `stated` and not `unstated`.
-
-    `truths` of them may be what a case lacks; `rivals` are mechanisms that mean the same at the truth's own place, or
-    at the place given.
+    """`rivals` are, by what a case may lack, the mechanisms that mean the same at its place where the shop has this
+    `habit` (None: any) and the machine file states `stated` and not `unstated`.
     """
 
-    one: str
-    other: str
-    rivals: Mapping[str, tuple[str, ...]]  # by true effect
-    habit: str = "ordinary"
+    rivals: Mapping[str, tuple[str, ...]]
+    habit: str | None = None
     stated: frozenset[str] = frozenset()
     unstated: frozenset[str] = frozenset()
 
@@ -38,44 +35,40 @@ class Pair:
     def holds(self, options: Mapping[str, Any]) -> bool:
         """Whether a case of these options has the pair."""
         stated = set(options["has"])
-        return options["habit"] == self.habit and self.stated <= stated and not self.unstated & stated
+        habit = self.habit in (None, options["habit"])
+        return habit and self.stated <= stated and not self.unstated & stated
 
     def imposed(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """The options, made so that it holds."""
         has = sorted((set(options["has"]) | self.stated) - self.unstated)
         lacks = sorted((set(options["lacks"]) | self.unstated) - self.stated)
-        return {**options, "habit": self.habit, "has": has, "lacks": lacks}
+        return {**options, "habit": self.habit or options["habit"], "has": has, "lacks": lacks}
 
 
 PAIRS: Mapping[str, Pair] = MappingProxyType({
     "nose": Pair(
-        "spindle_growth", "mandrel",
         {"spindle_growth": ("mandrel_fixture",), "mandrel": ("spindle_growth",)},
-        unstated=frozenset({"growth", "mandrel"}),
+        habit="long_runs", unstated=frozenset({"growth", "mandrel"}),
     ),
     "one_speed": Pair(
-        "motor_loss", "belt_loss",
         {"motor_loss": ("belt_loss", "bearing_viscous", "bearing_load")},
         habit="one_speed", unstated=frozenset({"motor_loss"}),
     ),
     "pump": Pair(
-        "pump_heat", "cabinet_heat",
-        {"pump_heat": ("hydraulic_unit",), "cabinet_heat": ("hydraulic_unit",)},
+        {"pump_heat": ("electrical_heat", "hydraulic_unit"), "cabinet_heat": ("electrical_heat", "hydraulic_unit")},
         habit="coolant_always", stated=frozenset({"coolant"}),
     ),
-    "feed": Pair(
-        "guide_friction", "nut_friction",
-        {"guide_friction": ("nut_friction", "screw_bearing")},
-        stated=frozenset({"feed"}),
-    ),
+    "walls": Pair({"radiation": ("natural_convection",)}, habit="walls_as_room", stated=frozenset({"walls"})),
+    "feed": Pair({"guide_friction": ("nut_friction", "screw_bearing")}, stated=frozenset({"feed"})),
 })  # fmt: skip
 
 
 def rivals_of(effect: str, options: Mapping[str, Any]) -> list[str]:
     """Mechanisms that mean the same as an effect where these options hold, sorted."""
-    return sorted({m for pair in PAIRS.values() if pair.holds(options) for m in pair.rivals.get(effect, ())})
+    here = [pair.rivals.get(effect, ()) for pair in PAIRS.values() if pair.holds(options)]
+    return sorted({*ALWAYS.get(effect, ()), *(mechanism for rivals in here for mechanism in rivals)})
 
 
 def ambiguous(options: Mapping[str, Any]) -> set[str]:
     """Effects that these options make alike to another."""
-    return {e for pair in PAIRS.values() if pair.holds(options) for e in pair.truths if e in EFFECTS}
+    return {effect for pair in PAIRS.values() if pair.holds(options) for effect in pair.truths}

@@ -21,7 +21,12 @@ SHARE: Mapping[Kind, tuple[float, float]] = MappingProxyType({
 ALL_OR_NOTHING = ("sensor_swap",)
 MOST = 10.0
 """No larger: beyond it, no effect is one that a machine could have."""
-BOUNDS: Mapping[str, float] = MappingProxyType({"time_skew": 1.8})  # a clock's error stays within what is simulated
+BOUNDS: Mapping[str, float] = MappingProxyType(
+    {
+        "time_skew": 1.8,  # a clock's error stays within what is simulated
+        "wrong_parameter": 3.0,  # a joint that is off by a factor of 64
+    }
+)
 
 
 @cache
