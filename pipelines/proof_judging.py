@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -16,8 +16,9 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from pipelines.proof_again import executed
 from twin.proof.sealing.digests import files_digest
-from twin.proof.sealing.examinee import read_case
+from twin.proof.sealing.examinee import PLAN, read_case
 from twin.proof.sealing.folder import ProofFolder, read_json, write_json
 from twin.proof.sealing.isolation import own_source
 from twin.proof.sealing.opening import Opened
@@ -48,28 +49,40 @@ def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | No
     kept = folder.path / "judged"
     kept.mkdir(exist_ok=True)
     source = _source()
+    tasks = [
+        (folder.cases / n, folder.answers / n, kept / f"{n}.json", kept / n, opened.answers[n], source)
+        for n in opened.counting
+    ]
     out: dict[str, Judged] = {}
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        waiting = {
-            pool.submit(
-                judge, folder.cases / n, folder.answers / n, kept / f"{n}.json", opened.answers[n], source
-            ): n
-            for n in opened.counting
-        }  # fmt: skip
-        for future in as_completed(waiting):
-            out[waiting[future]] = future.result()
-            if done is not None:
-                done("judge", len(out), len(waiting))
+    for name, judged in _judged(tasks, workers):
+        out[name] = judged
+        if done is not None:
+            done("judge", len(out), len(tasks))
     return dict(sorted(out.items()))
 
 
-def judge(case: Path, answer: Path, kept: Path, key: Mapping[str, Any], source: str) -> Judged:
-    """One case; its true model is read from the file `kept` where the same source worked it out."""
+def _judged(tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[tuple[str, Judged]]:
+    """Names and what `judge` gives, as they come."""
+    if workers == 1:
+        yield from ((task[0].name, judge(*task)) for task in tasks)
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        waiting = {pool.submit(judge, *task): task[0].name for task in tasks}
+        yield from ((waiting[future], future.result()) for future in as_completed(waiting))
+
+
+def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, Any], source: str) -> Judged:
+    """One case; its true model is read from the file `kept` where the same source worked it out.
+
+    `again` is the folder that keeps what was found once the proposed run had been done.
+    """
     from twin.proof.scoring.stored import read_stored
 
     with threadpool_limits(limits=1), tempfile.TemporaryDirectory(prefix="thermodrift-") as lake:
         machine, batches = read_case(case, Path(lake))
         stored = read_stored(answer, machine, batches)
+        if key["kind"] == "confounded" and (answer / PLAN).exists():
+            stored = replace(stored, again=executed(case, (answer / PLAN).read_text(encoding="utf-8"), key, again))
         held = read_json(kept) if kept.exists() else {}
         if held.get("source") != source:
             truth, trouble = _true(machine, batches, key)
@@ -90,16 +103,14 @@ def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tup
 def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch]]]:
     """The same case without one of its effects."""
     from twin.proof.spec import CaseSpec
-    from twin.proof.suite import build, write_built
+    from twin.proof.suite import build, without, write_built
 
     spec = CaseSpec(**key["redraw"])
 
     def redraw(effect: str) -> tuple[Machine, list[Batch]]:
-        sizes = {name: {k: 0.0 if k == effect else v for k, v in given.items()} for name, given in (
-            ("effects", spec.effects), ("decoys", spec.decoys))}  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="thermodrift-") as place:
             case = Path(place) / "case"
-            write_built(build(replace(spec, **sizes)), case)  # type: ignore[arg-type]
+            write_built(build(without(spec, effect)), case)
             return read_case(case, Path(place) / "lake")
 
     return redraw
@@ -132,8 +143,3 @@ def _source() -> str:
     """Digest of all that a true model is worked out with."""
     root, _ = own_source()
     return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))
-
-
-def rivals_of(judged: Mapping[str, Judged]) -> dict[str, Mapping[str, Any]]:
-    """What baselines and ablations said, of the cases where they were asked."""
-    return {name: j.stored.rivals for name, j in judged.items() if j.stored.rivals is not None}

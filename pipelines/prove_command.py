@@ -13,7 +13,7 @@ from pipelines import screen
 from pipelines.options import Json, one_of, split
 
 if TYPE_CHECKING:
-    from pipelines.proving import ProofRequest
+    from pipelines.proof_suite import ProofRequest
     from twin.proof.sealing.examining import Examinee
 
 app = typer.Typer(help="Examine the diagnosis in public, on recordings in which the effect is concealed.")
@@ -22,6 +22,7 @@ Cases = Annotated[int, typer.Option(help="how many cases")]
 Out = Annotated[Path | None, typer.Option("--out", help="folder of the proof; begun ones go on")]
 Plants = Annotated[str, typer.Option(help="plants, comma separated")]
 Which = Annotated[str, typer.Option("--suite", help="sealed: from a secret; development: from a known seed")]
+Data = Annotated[Path | None, typer.Option("--data", help="folder of real recordings, for grafted and withheld")]
 Seed = Annotated[int | None, typer.Option(help="of a development suite; default: drawn and told")]
 Workers = Annotated[int | None, typer.Option(help="processes; default: one per core")]
 Limit = Annotated[float, typer.Option(help="seconds that a diagnosis may take")]
@@ -38,6 +39,7 @@ def prove(
     plants: Plants = BOTH,
     suite: Which = "sealed",
     seed: Seed = None,
+    data: Data = None,
     workers: Workers = None,
     limit: Limit = 300.0,
     deals: Deals = 100,
@@ -49,7 +51,7 @@ def prove(
     from pipelines.prove_screen import outcome_dict, print_outcome
     from pipelines.proving import prove as prove_all
 
-    request = _request(cases, to, plants, suite, seed)
+    request = _request(cases, to, plants, suite, seed, data)
     with screen.progress(as_json) as (say, done):
         outcome = prove_all(request, _count(workers), _examinee(limit), _deals(deals), say, done)
     if as_json:
@@ -65,20 +67,21 @@ def seal(
     plants: Plants = BOTH,
     suite: Which = "sealed",
     seed: Seed = None,
+    data: Data = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """Draw and build the cases, lock the answers away, and tell the root that commits to all of it."""
     from pipelines.proving import seal_proof
 
-    request = _request(cases, to, plants, suite, seed)
+    request = _request(cases, to, plants, suite, seed, data)
     with screen.progress(as_json) as (_, done):
         root = seal_proof(request, _count(workers), done)
     if as_json:
-        screen.print_json({"root": root, "out": request.out, "cases": cases, "suite": suite})
+        screen.print_json({"root": root, "out": request.out, "suite": suite})
     else:
         screen.line(f"root     {root}")
-        screen.line(f"{request.out}: {cases} cases sealed, suite {suite}; publish the root, then call")
+        screen.line(f"{request.out}: sealed, suite {suite}; publish the root, then call")
         screen.line(f"         thermodrift prove run {request.out}")
 
 
@@ -138,8 +141,9 @@ def open_(
         print_outcome(outcome)
 
 
-def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | None) -> ProofRequest:
-    from pipelines.proving import SUITES, ProofRequest, check_plants
+def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | None, data: Path | None) -> ProofRequest:
+    from pipelines.proof_suite import SUITES, ProofRequest
+    from pipelines.proving import check_plants
 
     if cases < 1:
         raise InputError(f"--cases: got {cases}, expected 1 or more")
@@ -148,7 +152,7 @@ def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | N
     if seed is not None and seed < 0:
         raise InputError(f"--seed: got {seed}, expected 0 or more")
     which = one_of(suite, SUITES, "--suite")
-    return ProofRequest(to, cases, which, check_plants(split(plants)), seed)
+    return ProofRequest(to, cases, which, check_plants(split(plants)), seed, data)
 
 
 def _examinee(limit_s: float) -> Examinee:

@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
 
 import pandas as pd
 
 from data.errors import InputError, WorkError
+from pipelines.proof_suite import ProofRequest, drawn, make_case, number_of
 from pipelines.report.proof_run import ProofRun
 from twin.proof.sealing.digests import files_digest, source_digest
 from twin.proof.sealing.examining import Examinee
 from twin.proof.sealing.folder import ProofFolder
 from twin.proof.sealing.opening import unseal
 from twin.proof.sealing.running import RunOutcome, run
-from twin.proof.sealing.seal import Done, Suite, seal
+from twin.proof.sealing.seal import Done, seal
 from twin.proof.sealing.state import state_of
-from twin.proof.spec import CaseSpec, PlantKind
+from twin.proof.spec import PLANT_KINDS, PlantKind
 
 Say = Callable[[str], None]
-Which = Literal["development", "sealed"]
-SUITES: tuple[Which, ...] = get_args(Which)
 WRITTEN = ("outcomes", "terms", "goals", "compared", "leak")  # tables that stand beside the page as CSV
-SEED_BITS = 63  # of a development suite that nobody gave a seed
-
-
-@dataclass(frozen=True)
-class ProofRequest:
-    """What to prove. `seed` None: a secret for a sealed suite, a drawn and told number for a development one."""
-
-    out: Path
-    cases: int = 60
-    suite: Which = "sealed"
-    plants: tuple[PlantKind, ...] = ("elements", "volumes")
-    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -53,34 +38,7 @@ def seal_proof(request: ProofRequest, workers: int, done: Done | None = None) ->
     Raises:
         InputError: a seed for a sealed suite, or a folder that holds something; WorkError: it cannot be written.
     """
-    from twin.proof.suite import suite
-
-    if request.suite == "sealed":
-        if request.seed is not None:
-            raise InputError(
-                f"--seed: got {request.seed}; a sealed suite is drawn from a secret, leave it out or give "
-                "--suite development"
-            )
-        secret = secrets.token_bytes(32)
-        specs = suite(secret, request.cases, "sealed", request.plants)
-        return seal_specs(request.out, Suite("sealed", specs, secret.hex(), secret=True), workers, done)
-    seed = secrets.randbits(SEED_BITS) if request.seed is None else request.seed
-    specs = suite(seed, request.cases, "development", request.plants)
-    return seal_specs(request.out, Suite("development", specs, str(seed), secret=False), workers, done)
-
-
-def seal_specs(out: Path, suite: Suite, workers: int, done: Done | None = None) -> str:
-    """Build and seal these cases; returns the root."""
-    return seal(ProofFolder(out), suite, make_case, workers, done)
-
-
-def make_case(spec: CaseSpec, folder: Path) -> dict[str, Any]:
-    """Build a case into a folder; gives its answer."""
-    from twin.proof.suite import build, write_built
-
-    built = build(spec)
-    write_built(built, folder)
-    return built.answer
+    return seal(ProofFolder(request.out), drawn(request), make_case, workers, done)
 
 
 def run_proof(
@@ -151,10 +109,11 @@ def prove(
     folder = ProofFolder(request.out)
     if folder.is_sealed:
         held = folder.committed()
-        if (held["number"], held["suite"]) != (request.cases, request.suite):
+        asked = number_of(request)
+        if (held["number"], held["suite"]) != (asked, request.suite):
             raise InputError(
                 f"--out {request.out}: holds a {held['suite']} proof of {held['number']} cases, asked for is a "
-                f"{request.suite} one of {request.cases}; give another --out"
+                f"{request.suite} one of {asked}; give another --out"
             )
     else:
         say("seal")
@@ -172,6 +131,5 @@ def check_plants(plants: Sequence[str]) -> tuple[PlantKind, ...]:
         InputError: an unknown one, with the closest.
     """
     from pipelines.options import one_of
-    from twin.proof.spec import PLANT_KINDS
 
     return tuple(one_of(p, PLANT_KINDS, "--plants") for p in plants)

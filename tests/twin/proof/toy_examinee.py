@@ -31,18 +31,18 @@ def diagnosis(machine: Machine, batches: Sequence[Batch], *remarks: str) -> Simp
     })  # fmt: skip
     series = pd.DataFrame({"channel": ["front", "z"], "time_s": [0.0, 300.0], "recorded": [20.123456, 1.0]})
     tables = {"rms": rms, "series": series}
-    return SimpleNamespace(findings=told, plan_text="hours: 3\n", tables=tables, search=SimpleNamespace(found=told))
+    return SimpleNamespace(findings=told, plan_text="hours: 3\n", tables=tables)
 
 
 def quick(machine: Machine, batches: Sequence[Batch], **given: Any) -> SimpleNamespace:
     return diagnosis(machine, batches)
 
 
-def rivals(search: SimpleNamespace) -> dict[str, Any]:
-    return {"reference": {"verdict": search.found.verdict, "findings": [], "seconds": 0.0}}
+def rivals(found: SimpleNamespace) -> dict[str, Any]:
+    return {"reference": {"verdict": found.findings.verdict, "findings": [], "seconds": 0.0}}
 
 
-def no_rivals(search: SimpleNamespace) -> dict[str, Any]:
+def no_rivals(found: SimpleNamespace) -> dict[str, Any]:
     raise WorkError("rivals: nothing to compare with")
 
 

@@ -38,7 +38,7 @@ def main() -> None:
         _write_diagnosis(place, diagnosis)
         _tell(place, told)
         if rivals is not None:
-            _write(place, RIVALS, _json(rivals(diagnosis.search)))
+            _write(place, RIVALS, _json(rivals(diagnosis)))
         _tell(place, told | {"stage": "done"})
     except Exception as error:  # whatever it is, it is the answer to this case
         _tell(place, told | {"error": _one_line(error)})

@@ -30,14 +30,14 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 
 @dataclass(frozen=True)
 class Examinee:
-    """Who answers: functions as ``module:function``, called as `diagnose` is and as ``rivals(search)``.
+    """Who answers: functions as ``module:function``, called as `diagnose` is and as ``rivals(diagnosis)``.
 
     `limit_s` is the longest that a diagnosis may take, and again the longest that its rivals may. `import_from` are
     folders that modules may be read from beside the package itself.
     """
 
     diagnose: str = "twin.diagnosis.diagnose:diagnose"
-    rivals: str | None = None
+    rivals: str | None = "twin.proof.rivals:rivals"
     limit_s: float = LIMIT_S
     import_from: tuple[str, ...] = ()
 

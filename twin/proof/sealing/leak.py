@@ -31,6 +31,8 @@ SOUND = ("nothing", "decoy")
 FOLDS = 5
 LEAST = 2 * FOLDS  # cases of a class
 RESAMPLED = 500
+TREES = 20
+ENOUGH = 10  # deals as good as the truth: more of them would not change the verdict (Besag and Clifford 1991)
 COLUMNS = ("question", "auc", "low90", "high90", "chance", "p", "n")
 Possible = Callable[[str, Mapping[str, Any]], bool]
 Features = NDArray[np.float64]
@@ -118,11 +120,12 @@ def _could(possible: Possible, effect: str, key: Mapping[str, Any]) -> bool:
 def _row(asked: Question, deals: int, rng: np.random.Generator) -> tuple[str, float, float, float, float, float, int]:
     told = _told(asked.features, asked.classes)
     auc = _area(asked.classes, told)
-    dealt = []
-    for _ in range(deals):
+    dealt: list[float] = []
+    while len(dealt) < deals and sum(d >= auc for d in dealt) < ENOUGH:
         classes = _dealt(asked.classes, asked.group, rng)
         dealt.append(_area(classes, _told(asked.features, classes)))
-    p = (1 + sum(d >= auc for d in dealt)) / (1 + deals)
+    as_good = sum(d >= auc for d in dealt)
+    p = as_good / len(dealt) if as_good == ENOUGH else (1 + as_good) / (1 + len(dealt))
     low, high = _interval(asked.classes, told, rng)
     return asked.words, auc, low, high, float(np.mean(dealt)), p, len(asked.classes)
 
@@ -130,7 +133,7 @@ def _row(asked: Question, deals: int, rng: np.random.Generator) -> tuple[str, fl
 def _told(features: Features, classes: Labels) -> Features:
     """Probability of each class (n, C) by learners that have not seen the case."""
     linear = make_pipeline(StandardScaler(), LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"))
-    trees = ExtraTreesClassifier(50, min_samples_leaf=3, class_weight="balanced", random_state=0)
+    trees = ExtraTreesClassifier(TREES, min_samples_leaf=3, class_weight="balanced", random_state=0)
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     both = [cross_val_predict(m, features, classes, cv=folds, method="predict_proba") for m in (linear, trees)]
     return np.asarray(np.mean(both, axis=0))
