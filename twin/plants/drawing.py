@@ -44,7 +44,11 @@ def draw_plant(
     dice = stream(seed, "features").random(len(FEATURES))
     drawn = {f for f, d in zip(FEATURES, dice, strict=True) if d < CHANCE[f]}
     features = frozenset((drawn | has) - lacks)
-    layout: Layout = PLANTS[kind](seed, features, spread, finer)
+    return plant_of(PLANTS[kind](seed, features, spread, finer), seed, features, spread)
+
+
+def plant_of(layout: Layout, seed: int, features: frozenset[str], spread: float = 1.0) -> Plant:
+    """The plant of a seed with these castings."""
     rng = stream(seed, "spindle")
     rated_rpm = float(rng.choice([6000.0, 8000.0, 10000.0, 12000.0]))
     sources = _sources(layout.structure, rng, spread)
