@@ -19,7 +19,7 @@ from twin.proof.rivals.null_again import null_of
 from twin.proof.rivals.rows import claimable, counted_in_full, without_nuisances
 from twin.proof.rivals.stage import Stage
 
-REFITTED = 5  # of a screen without projection, each of another mechanism
+REFITTED = 4  # of a screen without projection, each of another mechanism
 SIGNIFICANT = 0.01  # of a chi-square test, for all candidates together (Bonferroni)
 
 

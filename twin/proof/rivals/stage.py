@@ -20,6 +20,7 @@ from twin.proof.rivals.answer import WITHIN, Claim, Reply
 from twin.proof.rivals.null_again import structural_misfits
 
 COARSE = "coarse_network"
+REFITS = 10  # what gains less would not come first by any other count
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ class Stage:
 
     @cached_property
     def refits(self) -> tuple[Tried, ...]:
-        """Its full refits; one that was swapped in beside later effects is refitted as it was here."""
-        out = []
-        for t in self.round.tried:
+        """Its best full refits; one that was swapped in beside later effects is refitted as it was here."""
+        out: list[Tried] = []
+        for t in [t for t in self.round.tried if t.fitted is not None][:REFITS]:
             again = refit(self.round.before, t.scored) if t.fitted is self.done.final and not self.alone else t
             if again is not None and again.fitted is not None:
                 out.append(replace(again, cluster=t.cluster))
