@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 Kind = Literal["nothing", "decoy", "one", "two", "three", "confounded", "unlisted", "invisible"]
@@ -15,7 +15,8 @@ PLANT_KINDS: tuple[PlantKind, ...] = get_args(PlantKind)
 @dataclass(frozen=True)
 class CaseSpec:
     """One case. `effects` are keys of `twin.plants.effects.EFFECTS` with their sizes, `decoys` as well (faults of a
-    recording or of the file that an answer may name); `options` of `twin.plants.options.Options`.
+    recording or of the file that an answer may name); `options` of `twin.plants.options.Options`; of a real case
+    its own name and, where it has one, its reference's.
 
     Plants: elements (A, finite elements), volumes (B, finite volumes), grafted (C, an effect's response on real
     recordings), withheld (D, real recordings with an input or effect kept back).
@@ -29,3 +30,8 @@ class CaseSpec:
     decoys: Mapping[str, float] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
     suite: Literal["development", "sealed"] = "development"
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data; `CaseSpec(**spec.plain())` is the same again."""
+        maps = {name: dict(getattr(self, name)) for name in ("effects", "decoys", "options")}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | maps

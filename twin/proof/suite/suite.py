@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -14,33 +13,31 @@ from twin.proof.spec import CaseSpec, Kind, PlantKind
 from twin.proof.suite.confounded import PAIRS, ambiguous
 from twin.proof.suite.eligible import IDLE, decoys, effects, unlisted
 from twin.proof.suite.mix import LACKING, MIX, counts
+from twin.proof.suite.secret import Which, digits, number
 from twin.proof.suite.setting import setting
 from twin.proof.suite.sizes import size
 
-Which = Literal["development", "sealed"]
+SIMULATED: tuple[PlantKind, ...] = ("elements", "volumes")
 HABITUAL = 0.2  # share of the cases that have what makes a pair alike, whatever they lack
 SECRET_BYTES = 16
 
 
-def suite(
-    seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKind] = ("elements", "volumes")
-) -> list[CaseSpec]:
+def suite(seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKind] = SIMULATED) -> list[CaseSpec]:
     """The cases of a suite; the same seed gives the same ones.
 
     `seed` is a secret of 128 bits or more for a sealed suite, any number for a development one. The two share no case.
 
     Raises:
-        InputError: a sealed suite from less than 128 bits, no plant, or fewer than one case.
+        InputError: a sealed suite from less than 128 bits, no plant or one of another kind, or no case.
     """
     _check(seed, cases, which, plants)
-    root = seed if isinstance(seed, bytes) else str(seed).encode()
-    lot = stream(_number(root, which, "order"), "order")
+    lot = stream(number(seed, which, "order"), "order")
     kinds = [kind for kind, n in counts(cases).items() for _ in range(n)]
     first = int(lot.integers(len(plants)))
     planned = [(kind, plants[(k + first) % len(plants)]) for k, kind in enumerate(kinds)]
-    digits = max(4, len(str(cases)))
+    wide = digits(cases)
     return [
-        case(f"case_{k + 1:0{digits}d}", *planned[int(n)], _number(root, which, f"case {k + 1}"), which)
+        case(f"case_{k + 1:0{wide}d}", *planned[int(n)], number(seed, which, f"case {k + 1}"), which)
         for k, n in enumerate(lot.permutation(cases))
     ]
 
@@ -83,7 +80,7 @@ def small_suite() -> list[CaseSpec]:
     )
     out = []
     for k, (kind, plant, lacking, faults) in enumerate(wanted, 1):
-        seed = _number(b"small", "development", f"case {k}")
+        seed = number(b"small", "development", f"case {k}")
         options = {**setting(seed, "development"), "batches": 6, "hours": 4.0, "step_s": 300.0, "idle": []}
         out.append(CaseSpec(f"case_{k:04d}", kind, plant, seed, lacking, faults, options))
     return out
@@ -101,17 +98,12 @@ def _some(lot: np.random.Generator, among: Sequence[str], number: int) -> list[s
     return [among[int(k)] for k in lot.choice(len(among), number, replace=False)]
 
 
-def _number(root: bytes, which: str, what: str) -> int:
-    """256 bits that nobody can tell without the root."""
-    told = b"\0".join([b"thermodrift proof", which.encode(), what.encode(), root])
-    return int.from_bytes(hashlib.sha256(told).digest(), "big")
-
-
 def _check(seed: bytes | int, cases: int, which: str, plants: Sequence[Any]) -> None:
     if which == "sealed" and not (isinstance(seed, bytes) and len(seed) >= SECRET_BYTES):
         got = f"{8 * len(seed)} bits" if isinstance(seed, bytes) else f"the number {seed}"
         raise InputError(f"suite: seed: got {got}, expected {8 * SECRET_BYTES} bits or more; draw a secret")
-    if not plants:
-        raise InputError("suite: plants: got none, expected at least one; name elements, volumes or both")
+    for plant in plants or ("none",):
+        if plant not in SIMULATED:
+            raise InputError(f"suite: plants: got {plant}, expected {' or '.join(SIMULATED)}; name those")
     if cases < 1:
         raise InputError(f"suite: cases: got {cases}, expected 1 or more; ask for more")
