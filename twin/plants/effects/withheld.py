@@ -16,7 +16,12 @@ class _Withheld(Effect):
     kind: ClassVar[str] = "error"
 
     def answer(self) -> Answer:
-        return Answer(self.mechanism, self.kind, self.channel, {"amount": (self.size, "1")}, self.also)
+        return Answer(self.mechanism, self.kind, self.channel, self.values(), self.also)
+
+    def values(self) -> dict[str, tuple[float, str]]:
+        """Of the mechanism's parameters those that the plant has as one number; of a path its gain."""
+        own = [g for g in self.plant.growths if g.name == self.withholds and g.channel == self.channel]
+        return {"gain": (self.size * float(sum(g.weights_um_per_K.sum() for g in own)), "um/K")}
 
 
 class MotorLoss(_Withheld):
@@ -25,12 +30,19 @@ class MotorLoss(_Withheld):
     driver = "spindle_rpm"
     kind, channel = "node", "motor"
 
+    def values(self) -> dict[str, tuple[float, str]]:
+        watts = zip(("idle", "linear", "quadratic"), self.plant.sources["motor_loss"].watts, strict=True)
+        return {**{k: (self.size * w, "W") for k, w in watts}, "rated": (self.plant.rated_rpm, "rpm")}
+
 
 class ColumnBending(_Withheld):
     key = mechanism = "column_bending"
     withholds = "bending"
     has = frozenset({"bending"})
     channel, also = "y", ("z",)
+
+    def values(self) -> dict[str, tuple[float, str]]:
+        return {}  # between which bodies, and so per kelvin of what, the twin chooses
 
 
 class SpindleGrowth(_Withheld):
