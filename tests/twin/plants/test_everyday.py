@@ -17,6 +17,7 @@ from twin.plants.physics import simulated
 from twin.plants.plant import draw
 from twin.plants.runs import plan_runs
 from twin.plants.seeds import stream
+from twin.plants.volumes.structure import Volumes
 
 
 def test_air_rises_faster_by_the_root_that_mcadams_gives() -> None:
@@ -130,3 +131,30 @@ def test_a_case_has_it_where_it_is_asked_for_and_the_file_states_the_nut() -> No
     nut = daily.machine.twin["mechanisms"]["nut"]
     assert nut["parameters"]["moment"]["value"] == f"{moment:.4g} N*m" and nut["into"] == "screw"
     assert "nut" in [h.law.name for h in compile_network(daily.machine).heats]
+
+
+def test_a_bearing_tightens_by_its_shafts_lead_and_a_joint_by_its_own_warmth() -> None:
+    """Shaft at 40 degC, all else at 30: the front bearing passes G0 (f - 1) 10 K more, f by hand; others nothing."""
+    p = plant(SEED, "feed")
+    s, joints = p.structure, Joints(p, 1.0, stream(SEED, "joints"))
+    assert isinstance(s, Volumes)
+    cells = np.full((s.size, 1), 30.0)
+    cells[s.cells["shaft"]] = 40.0
+    heat = np.zeros_like(cells)
+    joints.add_heat_W(heat, cells, full_speed(p))
+    casting = {int(c): name for name, own in s.cells.items() for c in own}
+    at = [k for k, (i, j) in enumerate(zip(s.one, s.other, strict=True))
+          if (casting[int(i)], casting.get(int(j))) == ("shaft", "front")]  # fmt: skip
+    order = sorted({(list(s.cells).index(a), list(s.cells).index(b)) for a, b in _touching(s, casting)})
+    row = order.index((list(s.cells).index("shaft"), list(s.cells).index("front")))
+    gap, per_K = joints.gap[row, 0], joints.per_K[row, 0]
+    more = gap + (1 - gap) * (1 + 10 * per_K) ** 0.95 - 1
+    assert heat[s.cells["front"]].sum() == pytest.approx(s.between_W_per_K[at].sum() * more * 10.0)
+    assert 0.005 <= per_K <= 0.02
+    assert np.abs(heat[s.cells["column"]]).max() == 0
+
+
+def _touching(s: Volumes, casting: dict[int, str]) -> set[tuple[str, str]]:
+    pairs = zip(s.one, s.other, s.surfaces, strict=True)
+    named = [(casting[int(i)], casting[int(j)]) for i, j, air in pairs if not air]
+    return {(a, b) for a, b in named if a != b}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 from twin.plants.casting import Array
 from twin.plants.conditions import Now
@@ -18,7 +19,10 @@ ASSEMBLED_DEGC, LOOSEST = 20.0, 0.2
 
 
 class Joints(Everyday):
-    """G = G0 [g + (1 - g) P^0.95], P = 1 + κ ΔT with a κ and a share g of its own for every pair of castings."""
+    """G = G0 [g + (1 - g) P^0.95], P = 1 + κ ΔT with a κ and a share g of its own for every pair of castings.
+
+    ΔT is the mean over the joint, which presses as a whole.
+    """
 
     key = "joints"
 
@@ -31,27 +35,33 @@ class Joints(Everyday):
         super().__init__(plant, size, rng)
         s = plant.structure
         assert isinstance(s, Volumes)
-        names = np.array([*s.cells, ""])
         casting = np.full(s.size, len(s.cells))
         for k, cells in enumerate(s.cells.values()):
             casting[cells] = k
         contact = np.flatnonzero((casting[s.one] != casting[s.other]) & (s.surfaces == 0))
-        self.one, self.other = s.one[contact], s.other[contact]
-        self.between_W_per_K = s.between_W_per_K[contact][:, None]
-        pairs = list(zip(names[casting[self.one]], names[casting[self.other]], strict=True))
-        drawn = {
-            pair: (rng.uniform(*THROUGH_GAP), rng.uniform(*(TIGHTENS_PER_K if pair[0] == "shaft" else CLAMPS_PER_K)))
-            for pair in dict.fromkeys(pairs)
-        }
-        self.gap, self.per_K = (np.array([drawn[p][k] for p in pairs])[:, None] for k in (0, 1))
-        self.bearing = np.array([p[0] == "shaft" for p in pairs])[:, None]
+        one, other, edge = s.one[contact], s.other[contact], np.arange(len(contact))
+        code = casting[one] * (len(s.cells) + 1) + casting[other]
+        pairs, self.joint = np.unique(code, return_inverse=True)
+        bearing = pairs // (len(s.cells) + 1) == list(s.cells).index("shaft")
+        lead = sparse.csr_matrix(
+            (np.repeat([1.0, -1.0], len(edge)), (np.r_[edge, edge], np.r_[other, one])), (len(edge), s.size)
+        )
+        self.nominal_W_per_K, self.into = sparse.diags(s.between_W_per_K[contact]) @ lead, -lead.T.tocsr()
+        each = 1.0 / np.bincount(self.joint)[self.joint]
+        of_one, of_other = np.where(bearing, [[1.0], [-1.0]], 0.5)[:, self.joint] * each
+        self.warmer = sparse.csr_matrix(
+            (np.r_[of_one, of_other], (np.r_[self.joint, self.joint], np.r_[one, other])), shape=(len(pairs), s.size)
+        )
+        self.when_assembled_K = np.where(bearing, 0.0, ASSEMBLED_DEGC)[:, None]
+        self.gap = rng.uniform(*THROUGH_GAP, (len(pairs), 1))
+        share = rng.random(len(pairs))
+        self.per_K = np.where(bearing, *(low + share * (high - low) for low, high in (TIGHTENS_PER_K, CLAMPS_PER_K)))[
+            :, None
+        ]
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
-        one, other = cells_degC[self.one], cells_degC[self.other]
-        warmer_K = np.where(self.bearing, one - other, (one + other) / 2 - ASSEMBLED_DEGC)
-        flow_W = self.between_W_per_K * (contact_factor(warmer_K, self.gap, self.per_K) - 1.0) * (other - one)
-        np.add.at(heat_W, self.one, flow_W)
-        np.subtract.at(heat_W, self.other, flow_W)
+        factor = contact_factor(self.warmer @ cells_degC - self.when_assembled_K, self.gap, self.per_K)
+        heat_W += np.asarray(self.into @ ((factor - 1.0)[self.joint] * (self.nominal_W_per_K @ cells_degC)))
 
 
 def contact_factor(warmer_K: Array, gap: Array | float, per_K: Array | float) -> Array:

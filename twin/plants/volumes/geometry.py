@@ -39,7 +39,8 @@ def draw_castings(seed: int, mandrel: bool, spread: float = 1.0, finer: int = 1)
     for casting in _castings(size, sizes, counts, head_at):
         if casting.name in absent:
             continue
-        a.add(replace(casting, split=finer), halves=casting.name == "column" or (casting.name == "head" and head_halves))
+        halves = casting.name == "column" or (casting.name == "head" and head_halves)
+        a.add(replace(casting, split=finer), halves)
     a.air_J_per_K = air_J_per_K if enclosed else None
     joints = {n: g * float(np.exp(0.25 * spread * rng.standard_normal())) for n, g in _JOINTS_W_PER_K.items()}
     _join(a, joints, head_at)

@@ -18,7 +18,7 @@ def path(
     `length_m` replaces the path's own length where the casting's picture leaves that side out.
     """
     c, cells = structure.castings[casting], structure.cells[casting]
-    whole_m, pitch_m, across = (c.depth_m, c.height_m)[axis], c.pitch_m[axis], c.cells[1 - axis]
+    whole_m, pitch_m, across = (c.depth_m, c.height_m)[axis], c.pitch_m[axis], c.counts[1 - axis]
     centre_m = c.along_m[axis]
     low, high = centre_m - pitch_m / 2, centre_m + pitch_m / 2
     inside_m = np.clip(np.minimum(high, part[1] * whole_m) - np.maximum(low, part[0] * whole_m), 0.0, None)
@@ -37,7 +37,7 @@ def bending(structure: Volumes, channel: str, head: float, reach_m: float | None
     c, cells = structure.castings["column"], structure.cells["column"]
     x, z = c.along_m
     off = x - c.depth_m / 2
-    per_row = np.sum((off[: c.cells[0]]) ** 2)
+    per_row = np.sum((off[: c.counts[0]]) ** 2)
     stop_m = head * c.height_m
     below_m = np.clip(np.minimum(z + c.pitch_m[1] / 2, stop_m) - (z - c.pitch_m[1] / 2), 0.0, None)
     lever_m = np.clip(stop_m - z, 0.0, None) if reach_m is None else np.full(len(z), reach_m)

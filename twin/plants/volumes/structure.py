@@ -125,12 +125,21 @@ class Assembly:
         return self._first[name] + self.castings[name].box(depth, height)
 
     def joint(self, one: Cells, other: Cells, conductance_W_per_K: float) -> None:
-        """A contact between two groups of cells: pairwise where they are equally many, else each with each."""
-        if len(one) != len(other):
-            a, b = (g.ravel() for g in np.meshgrid(one, other, indexing="ij"))
-        else:
-            a, b = one, other
-        self._edges.append((a, b, np.full(len(a), conductance_W_per_K / len(a)), False))
+        """A contact between two groups of blocks: pairwise where they are equally many, else each with each.
+
+        Within a pair of blocks every cell with every cell.
+        """
+        ones, others = self._blocks(one), self._blocks(other)
+        pairs = list(zip(ones, others, strict=True)) if len(ones) == len(others) else [(one, other)]
+        for pair in pairs:
+            a, b = (g.ravel() for g in np.meshgrid(*pair, indexing="ij"))
+            self._edges.append((a, b, np.full(len(a), conductance_W_per_K / len(pairs) / len(a)), False))
+
+    def _blocks(self, cells: Cells) -> list[Cells]:
+        """Cells of one casting by the block they are pieces of."""
+        name = max((n for n in self._first if self._first[n] <= cells[0]), key=lambda n: self._first[n])
+        block = self.castings[name].block[cells - self._first[name]]
+        return [cells[block == k] for k in dict.fromkeys(block.tolist())]
 
     def exposed(self, cells: Cells, coefficient_W_per_m2K: float, enclosed: bool) -> None:
         """Convection at the cells' outer surface, to the enclosure's air where there is one and they are inside."""
@@ -176,6 +185,7 @@ class Assembly:
     def _bodies(self, name: str, cells: Cells) -> dict[str, Cells]:
         if name not in self.halves:
             return {name: cells}
-        front = self.castings[name].along_m[0] > self.castings[name].depth_m / 2
+        casting = self.castings[name]
+        front = (casting.block % casting.cells[0] + 0.5) * casting.split * casting.pitch_m[0] > casting.depth_m / 2
         back = {"column": "column_back"}.get(name, f"{name}_rear")
         return {f"{name}_front": cells[front], back: cells[~front]}
