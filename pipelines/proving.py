@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 
 from data.errors import InputError, WorkError
-from pipelines.proof_suite import ProofRequest, drawn, make_case, number_of
+from pipelines.proof_suite import ProofRequest, drawn, make_case, specs_of
 from pipelines.report.proof_run import ProofRun
 from twin.proof.sealing.digests import files_digest, source_digest
 from twin.proof.sealing.examining import Examinee
@@ -38,7 +39,7 @@ def seal_proof(request: ProofRequest, workers: int, done: Done | None = None) ->
     Raises:
         InputError: a seed for a sealed suite, or a folder that holds something; WorkError: it cannot be written.
     """
-    return seal(ProofFolder(request.out), drawn(request), make_case, workers, done)
+    return seal(ProofFolder(request.out), drawn(request), partial(make_case, data=request.data), workers, done)
 
 
 def run_proof(
@@ -109,7 +110,7 @@ def prove(
     folder = ProofFolder(request.out)
     if folder.is_sealed:
         held = folder.committed()
-        asked = number_of(request)
+        asked = len(specs_of(replace(request, suite="development"), 0))
         if (held["number"], held["suite"]) != (asked, request.suite):
             raise InputError(
                 f"--out {request.out}: holds a {held['suite']} proof of {held['number']} cases, asked for is a "

@@ -72,7 +72,8 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
         if not error and told["stage"] != "done":
             error = f"the process ended while {'rivals were asked' if FINDINGS in files else 'it diagnosed'}"
     run: dict[str, Any] = {
-        "seconds": told.get("seconds"), "cores": 1, "source_digest": source, "isolation": told["isolation"],
+        "seconds": told.get("seconds"), "processor_seconds": told.get("processor_seconds"), "cores": 1,
+        "source_digest": source, "isolation": told["isolation"],
         "error": None if FINDINGS in files else error, "started": started, "ended": now(),
         "rivals_error": error if FINDINGS in files else None,
     }  # fmt: skip

@@ -94,7 +94,7 @@ def _kinds(features: Features, keys: Sequence[Mapping[str, Any]]) -> list[Questi
     common = kinds.isin([k for k, n in kinds.value_counts().items() if n >= LEAST]).to_numpy()
     classes = pd.factorize(kinds[common], sort=True)[0]
     out = [Question("is physics missing", features, missing, plant)]
-    if classes.max(initial=0) > 0:
+    if classes.max(initial=0) > 1:  # of two it would be the same question again
         out.append(Question("kind of the case", features[common], classes, plant[common]))
     return [q for q in out if np.bincount(q.classes, minlength=2).min() >= LEAST]
 

@@ -1,0 +1,76 @@
+"""The whole proof in small, nothing replaced: six fixed cases sealed, answered apart by the real diagnosis, opened.
+
+It proves the chain, not the diagnosis: with six runs of four hours a case is too short to judge that. One of each:
+nothing missing, a decoy, one effect on either plant, two effects, one that no list holds.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pipelines.proof_suite import make_case
+from pipelines.proving import ProofOutcome, open_proof, run_proof
+from twin.proof.scoring.goals import GOALS
+from twin.proof.sealing.examining import Examinee
+from twin.proof.sealing.folder import ProofFolder
+from twin.proof.sealing.seal import Suite, seal
+from twin.proof.suite import small_suite
+
+pytestmark = pytest.mark.xdist_group("proof")
+WORKERS = 2
+
+
+@pytest.fixture(scope="module")
+def proof(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ProofOutcome]:
+    out = tmp_path_factory.mktemp("small") / "proof"
+    seal(ProofFolder(out), Suite("development", small_suite(), "small", secret=False), make_case, WORKERS)
+    run_proof(out, WORKERS, by=Examinee(limit_s=3600.0))  # no time is judged here
+    return out, open_proof(out, WORKERS, deals=0)
+
+
+def test_every_case_is_answered_apart_and_counts(proof: tuple[Path, ProofOutcome]) -> None:
+    out, outcome = proof
+    r = outcome.run
+    assert (r.cases, dict(r.void), dict(r.failed), r.partial) == (6, {}, {}, False)
+    assert sum(r.isolation.values()) == 6 and set(r.isolation) <= {"landlock and audit hook", "audit hook"}
+    for name in (f"case_{k:04d}" for k in range(1, 7)):
+        assert {"findings.json", "rivals.json", "run.json", "series.csv"} <= {
+            p.name for p in (out / "answers" / name).iterdir()
+        }
+        findings = json.loads((out / "answers" / name / "findings.json").read_text())
+        assert findings["simulated"] and findings["machine"] in (out / "cases" / name / "machine.yml").read_text()
+
+
+def test_the_same_specs_seal_the_same_cases(proof: tuple[Path, ProofOutcome], tmp_path: Path) -> None:
+    """Whoever has the key can draw any case again: here the first, its files compared by their digest."""
+    from twin.proof.sealing.digests import folder_digest, salted_digest
+
+    opened = json.loads((proof[0] / "opened.json").read_text())["cases"]["case_0001"]
+    committed = json.loads((proof[0] / "commitment.json").read_text())["cases"]["case_0001"]
+    answer = make_case(small_suite()[0], tmp_path / "again")
+    assert folder_digest(tmp_path / "again") == committed["case"]
+    assert salted_digest(opened["salt"], answer) == committed["answer"]
+
+
+def test_the_tables_hold_every_case_and_goal(proof: tuple[Path, ProofOutcome]) -> None:
+    out, _ = proof
+    cases = pd.read_csv(out / "outcomes.csv").set_index("case")
+    assert cases["kind"].tolist() == [s.kind for s in small_suite()]
+    assert cases["plant"].tolist() == [s.plant for s in small_suite()]
+    assert not cases["failed"].any() and cases["verdict"].notna().all() and (cases["error_before"] > 0).all()
+    assert cases["visible"].notna().sum() >= 3
+    terms = pd.read_csv(out / "terms.csv")
+    assert terms["effect"].tolist() == [e for s in small_suite() for e in (*s.effects, *s.decoys)]
+    goals = pd.read_csv(out / "goals.csv")
+    assert {g.measure for g in GOALS} <= set(goals["measure"]) and {"all", "elements", "volumes"} == set(goals["plant"])
+    compared = pd.read_csv(out / "compared.csv")
+    assert {"baseline", "ablation", "diagnosis"} <= set(compared["group"])
+
+
+def test_the_page_tells_the_root(proof: tuple[Path, ProofOutcome]) -> None:
+    text = (proof[0] / "report.html").read_text(encoding="utf-8")
+    assert proof[1].run.root in text and "SIMULATED" in text
