@@ -134,10 +134,11 @@ def _judged(
     own = [(terms[k], s) for k in others if (s := found[k]) is not None]
     part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
     try:
-        without = [settle(refitted(full, part))]
+        back = refitted(full, part)
+        # where the first fit stands at its optimum, a second one only shows whether it had stopped short
+        without = [settle(back)] if others else [settle(back, steps=4, tolerance=0.05, rounds=2), fit]
     except (InputError, WorkError):
         return _Judged()
-    without += [fit] if not others else []
     inflation = np.minimum(full.state.noise.inflation, without[0].state.noise.inflation)
     scores = [_score(w, inflation) for w in without]
     best = int(np.argmax(scores))
