@@ -20,6 +20,7 @@ from pipelines.report.write import template_environment
 __all__ = ["ProofPage", "ProofRun", "proof_page", "write_proof_report"]
 
 REPORT = "report.html"
+_MOST_MISSED = 4
 
 
 @dataclass(frozen=True)
@@ -91,10 +92,10 @@ def headline(run: ProofRun) -> str:
 
 
 def lead(goals: pd.DataFrame) -> str:
-    """What was missed, in words; then what could not be measured."""
+    """What was missed, the first in words; then what could not be measured."""
     _, missed, unknown = counted(goals)
-    short = shortfalls(goals)
-    parts = [f"Missed: {'; '.join(short)}."] if missed else []
+    more = [f"{missed - _MOST_MISSED} more, in the table"] if missed > _MOST_MISSED else []
+    parts = [f"Missed: {'; '.join([*shortfalls(goals)[:_MOST_MISSED], *more])}."] if missed else []
     if unknown:
         parts.append(f"{count(unknown, 'goal')} had no case to be judged on.")
     return " ".join(parts)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from pipelines.report.diagnosis_words import UNITS
 from pipelines.report.proof_drawing import HALF_IN, PALE, WIDE_IN, head, keys, panel, plant_keys, plant_style
@@ -38,6 +38,7 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
         ax.plot(at, shown[column], mark, color=color, ms=wide, mec=color, mew=1.2 if mark == "_" else 0, zorder=2)
     ax.set_yscale("log")
     ax.set_xlim(-1, len(shown))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
     ax.yaxis.set_minor_formatter(lambda v, _: "")
     ax.set_ylabel("left-out error, units of the noise", fontsize=8)
@@ -69,6 +70,7 @@ def amplitudes(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
         ax.plot(own["true_limits"], own["found_limits"], mark, color=color, ms=4, mec="white", mew=0.4, zorder=3)
     ax.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
     for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(lambda v, _: f"{v:g}")
         axis.set_minor_formatter(lambda v, _: "")
     ax.set_xlabel("true amplitude, in detection limits", fontsize=8, labelpad=2)
@@ -81,7 +83,7 @@ def amplitudes(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
 def ratios(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """Amplitude found by amplitude true, a row of dots per effect with its median and how many intervals hold it."""
     effects = list(dict.fromkeys(terms["effect"]))
-    tall = max(4.1, 0.2 * len(effects))
+    tall = 0.22 * len(effects) + 0.2
     fig = Figure(figsize=(HALF_IN, 0.95 + tall + 0.55))
     ax = panel(fig, 1.75, 0.95, HALF_IN - 2.45, tall)
     ax.axvspan(0.6, 1.4, color="#eef1f4", zorder=0)
@@ -97,7 +99,7 @@ def ratios(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
         if len(told):
             ax.text(1.03, y, f"{int(told.sum())}/{len(told)}", fontsize=7.5, color=SOFT,
                     transform=ax.get_yaxis_transform(), va="center")  # fmt: skip
-    ax.text(1.03, -1.0, "interval\nholds it", fontsize=7, color=SOFT, transform=ax.get_yaxis_transform(), va="bottom")
+    ax.text(1.03, -0.75, "interval\nholds it", fontsize=7, color=SOFT, transform=ax.get_yaxis_transform(), va="bottom")
     ax.set(xscale="log", xlim=(0.22, 4.6), ylim=(len(effects) - 0.5, -0.8))
     ax.set_xticks([0.25, 0.5, 1, 2, 4], ["≤ ¼", "½", "1", "2", "≥ 4"], fontsize=8)
     ax.xaxis.set_minor_locator(NullLocator())
@@ -118,7 +120,8 @@ def times(cases: pd.DataFrame, wanted_s: float, plants: Sequence[str]) -> Figure
     for plant in plants:
         own = np.sort(cases.loc[cases["plant"] == plant, "seconds"].dropna().to_numpy(float))
         if len(own):
-            ax.step(own, 100 * np.arange(1, len(own) + 1) / len(own), where="post", color=plant_style(plant)[0], lw=1.8)
+            share = 100 * np.arange(len(own) + 1) / len(own)
+            ax.step([own[0], *own], share, where="post", color=plant_style(plant)[0], lw=1.8)
     ax.set(xlim=(0, 1.06 * longest), ylim=(0, 103))
     ax.text(wanted_s, 2, f" goal {number(wanted_s, 0)} s", fontsize=8, color=SOFT, ha="left", va="bottom")
     ax.set_xlabel("time, s", fontsize=8, labelpad=2)
@@ -155,7 +158,7 @@ def worst_case(series: pd.DataFrame, windows: pd.DataFrame | None, plant: str) -
         ax.set_title(str(batch).replace("$", r"\$"), fontsize=8.5, loc="left", color=INK, pad=3)
         ax.set_xlabel("time, h", fontsize=8, labelpad=1)
         ax.locator_params(axis="y", nbins=4)
-    unit = str(series["unit"].iloc[0])
+    unit = str(series["unit"].iloc[0]).replace("degC", "K")  # of a difference
     channel = str(series["channel"].iloc[0]).replace("$", r"\$")
     head(fig, f"{channel}: recorded − simulated, {UNITS.get(unit, unit)}", (plant,))
     shaded = [("■", "the effect works", "#e3b78f")] if windows is not None else []

@@ -104,11 +104,11 @@ def reliability(table: pd.DataFrame, told: Array, error: float, plants: Sequence
     ax.hlines(y, first, last, color=BLUE, lw=2, alpha=0.25)
     ax.vlines(x, low, high, color=BLUE, lw=2, alpha=0.5)
     ax.plot(x, y, "o", color=BLUE, ms=6, mec="white", mew=0.8)
-    ax.set(xlim=(0, 103), ylim=(0, 103))
+    ax.set(xlim=(0, 103), ylim=(-3, 103))
     ax.set_ylabel("right, %", fontsize=8)
     said = f"n {int(table['n'].sum())}"
     said = f"expected calibration error {error:.3f}, {said}" if np.isfinite(error) else said
-    ax.text(0.03, 0.95, said, transform=ax.transAxes, fontsize=9, color=INK, va="top")
+    ax.set_title(said, fontsize=8.5, loc="left", color=SOFT, pad=4)
     below = panel(fig, 0.75, 4.3, HALF_IN - 1.0, 0.75)
     below.hist(100 * told, bins=np.linspace(0, 100, 41).tolist(), color=PALE)
     below.set_xlim(0, 103)
@@ -179,8 +179,8 @@ def confusion(counts: pd.DataFrame, bounds: Sequence[int], title: str, plants: S
             ax.plot([j - 0.5, j + 0.5, j + 0.5, j - 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5],
                     color=ORANGE, lw=1.0, zorder=2)  # fmt: skip
     for b in bounds:
-        ax.axhline(b - 0.5, color=PALE, lw=0.9)
-        ax.axvline(b - 0.5, color=PALE, lw=0.9)
+        ax.axhline(b - 0.5, color=PALE, lw=0.9, zorder=1.5)
+        ax.axvline(b - 0.5, color=PALE, lw=0.9, zorder=1.5)
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5))
     ax.set_xticks(range(len(columns)), [key_label(c) for c in columns], rotation=90, fontsize=7.5, color=INK)
     ax.set_yticks(range(len(rows)), [key_label(r) for r in rows], fontsize=7.5, color=INK)

@@ -58,7 +58,7 @@ def proof_parts(run: ProofRun) -> Iterator[Part]:
 
 def _rivals(run: ProofRun) -> Part:
     table, own = run.table("compared"), Part("rivals", "Rivals", "Against rivals and ablations")
-    if table.empty:
+    if not (table["group"].ne("diagnosis") & table["value"].notna()).any():
         return _absent(own, "Rivals and ablations were not scored in this run.")
     lead = (
         "Baselines start from the same first fit. Ablations drop one rule each in the first round; compare them with "
@@ -160,7 +160,7 @@ def _worst(run: ProofRun) -> Part:
         kind = str(r.get("kind") or "")
         what = f"{KIND_WORDS.get(kind, key_label(kind))}{': ' if kind and effects else ''}{effects}"
         what += f"; plant {plant_label(plant)}"
-        shown.append(Worst(k, case, what, str(r["why"]), plant_origin(plant) == "SIMULATED", drawn))
+        shown.append(Worst(k, case, what, _sentence(str(r["why"])), plant_origin(plant) == "SIMULATED", drawn))
     lead = "False alarms first, then wrong names by how sure the answer was, then what was overlooked."
     return replace(own, lead=lead, worst=tuple(shown))
 
@@ -188,6 +188,12 @@ def _cases(run: ProofRun) -> Part:
         told = "; ".join(f"{protection}: {count(n, 'case')}" for protection, n in sorted(run.isolation.items()))
         notes.insert(0, f"What kept the answering process from everything but its case: {told}.")
     return replace(own, tables=tuple(shown), notes=tuple(notes))
+
+
+def _sentence(why: str) -> str:
+    """Keys as they are read, and a capital."""
+    said = key_label(why)
+    return said[:1].upper() + said[1:]
 
 
 def _calibration_error(goals: pd.DataFrame) -> float:

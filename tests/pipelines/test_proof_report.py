@@ -187,6 +187,19 @@ def test_a_goal_that_no_case_speaks_for_is_neither_met_nor_missed(run: ProofRun)
     assert proof_page(replace(told, tables={"goals": goals})).lead == "1 goal had no case to be judged on."
 
 
+def test_many_missed_goals_are_counted_and_the_first_told() -> None:
+    goals = pd.DataFrame([_goal(measure=f"m{k}", met=k == 0) for k in range(8)])
+    run = toy_proof(5, tables={"goals": goals})
+    said = proof_page(run).lead
+    assert said.startswith("Missed: m1: 95.5 %, wanted ≥ 97 %; m2: ") and said.endswith("; 3 more, in the table.")
+
+
+def test_rivals_without_a_case_are_no_empty_picture(run: ProofRun) -> None:
+    compared = run.table("compared").assign(value=np.nan, lead=np.nan)
+    part = next(p for p in proof_page(replace(run, tables={"compared": compared})).parts if p.anchor == "rivals")
+    assert part.wide == () and part.notes == (SILENT["compared"],)
+
+
 @pytest.mark.parametrize(
     ("value", "goal", "said"),
     [(0.0061, "≤ 1 %", "0.6 %"), (0.423, "≥ 15 %", "42 %"), (0.9534, "≥ 95 %", "95.3 %"), (21.96, "≤ 30 s", "22.0 s"),
