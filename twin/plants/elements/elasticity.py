@@ -42,7 +42,7 @@ class Field:
         elements = self.mesh.elements_at(points_m)
         local = self.basis.mapping.invF(points_m.T[:, :, None], tind=elements)
         elem, count = self.basis.elem, self.basis.Nbfun
-        values = [elem.gbasis(self.basis.mapping, local, k, tind=elements)[0].value.ravel() for k in range(count)]
+        values = [np.ravel(elem.gbasis(self.basis.mapping, local, k, tind=elements)[0]) for k in range(count)]
         rows, shapes = np.tile(np.arange(len(points_m)), count), self.basis.element_dofs[:, elements].ravel()
         out = []
         for a in range(3):
@@ -116,7 +116,7 @@ def _casting(field: Field) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     lame, shear = E * nu / (1 + nu) / (1 - 2 * nu), E / 2 / (1 + nu)
     gradient = np.stack([shape[0].grad for shape in basis.basis])  # (shapes, 3, elements, points)
     warm = Basis(basis.mesh, ElementHex1(), quadrature=basis.quadrature)
-    theta = np.stack([shape[0].value for shape in warm.basis])
+    theta = np.stack([np.asarray(shape[0]) for shape in warm.basis])
     # The boxes of a grid are few in shape, so the products are taken point by point.
     G = np.einsum("iaeq,jbeq,eq->eiajb", gradient, gradient, basis.dx, optimize=True)
     K = lame * G + shear * np.swapaxes(G, 2, 4)

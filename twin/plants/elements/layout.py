@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from twin.plants.casting import Array
@@ -11,6 +13,7 @@ from twin.plants.elements.growth import growths
 from twin.plants.machine import Layout
 
 
+@lru_cache(maxsize=4)  # the same machine is asked for with and without an effect
 def draw_layout(seed: int, features: frozenset[str], spread: float = 1.0, finer: int = 1) -> Layout:
     """The castings of a seed, cut into hexahedra, with or without a test mandrel; `finer` times along each axis."""
     drawn = draw_castings(seed, "mandrel" in features, finer, spread)
