@@ -48,7 +48,7 @@ def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | No
     """
     kept = folder.path / "judged"
     kept.mkdir(exist_ok=True)
-    source = _source()
+    source = scoring_source()
     tasks = [
         (folder.cases / n, folder.answers / n, kept / f"{n}.json", kept / n, opened.answers[n], source)
         for n in opened.counting
@@ -139,7 +139,7 @@ def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
     return TrueModel(before, true, floor, gains, thresholds, tuple(plain["visible"]))
 
 
-def _source() -> str:
-    """Digest of all that a true model is worked out with."""
+def scoring_source() -> str:
+    """Digest of all that an answer is judged with."""
     root, _ = own_source()
     return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))

@@ -12,7 +12,7 @@ import pandas as pd
 from data.errors import InputError, WorkError
 from pipelines.proof_suite import ProofRequest, drawn, make_case, specs_of
 from pipelines.report.proof_run import ProofRun
-from twin.proof.sealing.digests import files_digest, source_digest
+from twin.proof.sealing.digests import files_digest
 from twin.proof.sealing.examining import Examinee
 from twin.proof.sealing.folder import ProofFolder
 from twin.proof.sealing.opening import unseal
@@ -65,7 +65,7 @@ def open_proof(
     Raises:
         InputError: not sealed, not run, incomplete, or not as it was recorded; WorkError: it cannot be written.
     """
-    from pipelines.proof_judging import judge_all
+    from pipelines.proof_judging import judge_all, scoring_source
     from pipelines.proof_tables import proof_run, tables_of
     from pipelines.report.proof import write_proof_report
     from twin.proof.sealing.leak import COLUMNS, leak_table
@@ -93,7 +93,7 @@ def open_proof(
             raise WorkError(f"{out}: cannot be written ({error.strerror}); free the folder and open again") from None
         files["report.html"] = write_proof_report(out, told)
         folder.ledger().add(
-            "scored", cases=len(judged), source=source_digest(), outcomes=files_digest(out, [files["outcomes.csv"]])
+            "scored", cases=len(judged), source=scoring_source(), outcomes=files_digest(out, [files["outcomes.csv"]])
         )
     return ProofOutcome(told, files)
 

@@ -16,7 +16,7 @@ from twin.proof.sealing.state import LATE, TWICE, state_of
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     ledger = Ledger(tmp_path / "ledger.jsonl")
-    ledger.add("sealed", root="ab", number=2)
+    ledger.add("sealed", root="ab", source="00", number=2)
     ledger.add("run", source="cd")
     ledger.add("started", case="case_0001")
     ledger.add("answered", case="case_0001", answer="ef")
@@ -69,6 +69,7 @@ def test_a_state_is_replayed_from_the_lines(path: Path) -> None:
     ledger.add("started", case="case_0002")
     state = state_of(ledger.entries, "p")
     assert (state.root, state.source, dict(state.answered)) == ("ab", "cd", {"case_0001": "ef"})
+    assert state.ran and not state_of(ledger.entries[:1], "p").ran and state_of(ledger.entries[:1], "p").source == "00"
     assert state.begun == {"case_0002"} and not state.void and state.opened is None
     ledger.add("interrupted", case="case_0002")
     ledger.add("answered", case="case_0001", answer="11")

@@ -153,7 +153,9 @@ def test_another_source_is_refused_or_drops_all(tmp_path: Path, asked: Asked, mo
     with pytest.raises(WorkError):
         run(folder, EXAMINEE)
     monkeypatch.setattr(running, "source_digest", lambda: "f" * 64)
-    with pytest.raises(InputError, match=r"1 cases were answered by source \w{12}, the source is now ffffffffffff; "):
+    with pytest.raises(
+        InputError, match=r"is to be answered by source \w{12}, the source is now ffffffffffff; .* 1 answers so"
+    ):
         run(folder, EXAMINEE)
     assert run(folder, EXAMINEE, restart=True).answered == 3
     assert (folder.path / "dropped_1" / "case_0001" / "run.json").exists()
@@ -166,9 +168,12 @@ def test_a_source_that_changes_while_a_case_is_answered(
     tmp_path: Path, asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = sealed(tmp_path / "proof")
-    digests = iter(["a" * 64, "a" * 64, "b" * 64])
+    sealed_with = str(folder.ledger().entries[0].details["source"])
+    digests = iter([sealed_with, sealed_with, "b" * 64])
     monkeypatch.setattr(running, "source_digest", lambda: next(digests))
-    with pytest.raises(InputError, match="the source changed during the run, from aaaaaaaaaaaa to bbbbbbbbbbbb; put"):
+    with pytest.raises(
+        InputError, match=r"the source changed during the run, from \w{12} to bbbbbbbbbbbb; put it back"
+    ):
         run(folder, EXAMINEE)
     assert run_order(folder) == ["case_0001"]
 
@@ -223,7 +228,7 @@ def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
         (replaced("answers/case_0002/run.json", "case", "cave"), "case_0002: is not the answer that the ledger recor"),
         (replaced("cases/case_0001/machine.yml", "20,", "21,"), "case_0001: is not as it was sealed, digest "),
         (replaced("cases/case_0003/recordings/run_1.csv", "20.1", "20.2"), "case_0003: is not as it was sealed, dig"),
-        (replaced("vault/case_0001.json", "floor_sink", "radiation"), "case_0001.json: is not the answer that was s"),
+        (replaced("vault/case_0001.json", "floor_sink", "radiation"), "case_0001.json: is not the answer to case_0001"),
         (replaced("commitment.json", '"number": 3', '"number": 2'), "commitment.json: is not as it was sealed, its "),
         (replaced("ledger.jsonl", '"answered"', '"answerer"'), "line 4: is not as it was written, the chain of hash"),
         (lambda proof: (proof / "vault" / "case_0002.json").unlink(), "case_0002.json: cannot be read ([Errno 2] No"),
@@ -238,6 +243,18 @@ def test_what_was_changed_is_named(tmp_path: Path, asked: Asked, change: Callabl
     with pytest.raises(InputError) as error:
         unseal(folder)
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_opened_proof_is_checked_again_without_its_vault(tmp_path: Path, asked: Asked) -> None:
+    folder = sealed(tmp_path / "proof")
+    run(folder, EXAMINEE)
+    first = unseal(folder)
+    for path in folder.vault.iterdir():
+        path.unlink()
+    assert unseal(folder).answers == first.answers
+    replaced("opened.json", "floor_sink", "radiation")(folder.path)
+    with pytest.raises(InputError, match=r"opened\.json: is not the answer to case_0001 that was sealed; put it back"):
+        unseal(folder)
 
 
 def test_a_case_changed_before_the_run_is_not_asked(tmp_path: Path, asked: Asked) -> None:

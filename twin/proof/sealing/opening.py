@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from data.errors import InputError
@@ -51,7 +52,7 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
     ledger = folder.ledger()
     state = state_of(ledger.entries, str(folder.path))
     _check_commitment(folder, commitment, state)
-    if state.source is None:
+    if not state.ran:
         raise InputError(f"{folder.path}: nobody was asked yet; call `thermodrift prove run {folder.path}` first")
     names = list(names_of(commitment))
     missing = [n for n in names if n not in state.answered and n not in state.void]
@@ -64,7 +65,7 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
     salts: dict[str, str] = {}
     for name in names:
         check_case(folder, name, commitment["cases"][name]["case"])
-        salts[name], answers[name] = _from_vault(folder, name, commitment["cases"][name]["answer"])
+        salts[name], answers[name] = _answer(folder, name, commitment["cases"][name]["answer"])
     void = dict(state.void) | dict.fromkeys(missing, UNANSWERED)
     for name in set(state.answered) - set(void):
         _check_answer(folder, name, state.answered[name])
@@ -96,20 +97,30 @@ def _check_commitment(folder: ProofFolder, commitment: Mapping[str, Any], state:
             )
 
 
-def _from_vault(folder: ProofFolder, name: str, expected: str) -> tuple[str, Mapping[str, Any]]:
-    path = folder.vault / f"{name}.json"
-    kept = read_json(path)
+def _answer(folder: ProofFolder, name: str, expected: str) -> tuple[str, Mapping[str, Any]]:
+    """Salt and answer of a case."""
+    path, kept = _kept(folder, name, ("cases", name))
     if salted_digest(str(kept["salt"]), kept["answer"]) != expected:
-        raise InputError(f"{path}: is not the answer that was sealed; put it back or seal a new proof")
+        raise InputError(f"{path}: is not the answer to {name} that was sealed; put it back or seal a new proof")
     return str(kept["salt"]), kept["answer"]
 
 
 def _suite_seed(folder: ProofFolder, commitment: Mapping[str, Any]) -> dict[str, Any]:
-    path = folder.vault / "suite.json"
-    kept = read_json(path)
+    path, kept = _kept(folder, "suite", ("suite",))
     if commitment["suite_seed"] not in (kept["seed"], salted_digest(str(kept["salt"]), kept["seed"])):
         raise InputError(f"{path}: is not the seed that was sealed; put it back or seal a new proof")
     return dict(kept)
+
+
+def _kept(folder: ProofFolder, name: str, keys: tuple[str, ...]) -> tuple[Path, Mapping[str, Any]]:
+    """From the vault; of a proof that was opened and handed on without it, from `opened.json`."""
+    path = folder.vault / f"{name}.json"
+    if path.exists() or not folder.opened.exists():
+        return path, read_json(path)
+    kept = read_json(folder.opened)
+    for key in keys:
+        kept = kept[key]
+    return folder.opened, kept
 
 
 def _check_answer(folder: ProofFolder, name: str, expected: str) -> None:

@@ -106,11 +106,11 @@ def _take(
 
 def _resumed(folder: ProofFolder, ledger: Ledger, state: State, source: str, restart: bool) -> State:
     """Note what happened since the last run, and drop what may not stay."""
-    if state.answered and state.source != source:
+    if state.source != source:
         if not restart:
             raise InputError(
-                f"{folder.path}: {len(state.answered)} cases were answered by source {str(state.source)[:12]}, the "
-                f"source is now {source[:12]}; put it back, or give --restart, which drops them and is recorded"
+                f"{folder.path}: is to be answered by source {state.source[:12]}, the source is now {source[:12]}; put "
+                f"it back, or give --restart, which drops the {len(state.answered)} answers so far and is recorded"
             )
         dropped = folder.path / f"dropped_{state.restarts + 1}"
         folder.answers.replace(dropped)

@@ -17,11 +17,12 @@ class State:
     """`answered`: digest of each case's answer since the last restart; `void`: why a case does not count.
 
     `begun`: cases that a process was started for and that were not finished. `source`: digest of the source that
-    answers; None before the first run.
+    answers, as it was sealed or, after a restart, begun anew; `ran` says whether anybody was asked.
     """
 
     root: str
-    source: str | None = None
+    source: str
+    ran: bool = False
     answered: Mapping[str, str] = field(default_factory=dict)
     begun: frozenset[str] = frozenset()
     void: Mapping[str, str] = field(default_factory=dict)
@@ -39,7 +40,7 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
     entries = list(entries)
     if not entries or entries[0].step != "sealed":
         raise InputError(f"{where}: its ledger does not begin with the seal; seal a new proof")
-    source, opened = None, None
+    source, ran, opened = str(entries[0].details["source"]), False, None
     answered: dict[str, str] = {}
     void: dict[str, str] = {}
     begun: set[str] = set()
@@ -47,7 +48,7 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
     for e in entries[1:]:
         case = str(e.details.get("case", ""))
         if e.step == "run":
-            source = str(e.details["source"])
+            source, ran = str(e.details["source"]), True
         elif e.step == "started":
             begun.add(case)
         elif e.step == "interrupted":
@@ -66,6 +67,5 @@ def state_of(entries: Iterable[Entry], where: str) -> State:
             answered, void, begun, restarts = {}, {}, set(), restarts + 1
         elif e.step == "opened" and opened is None:
             opened = e.at
-    return State(
-        str(entries[0].details["root"]), source, answered, frozenset(begun), void, restarts, interrupted, opened
-    )  # fmt: skip
+    root = str(entries[0].details["root"])
+    return State(root, source, ran, answered, frozenset(begun), void, restarts, interrupted, opened)
