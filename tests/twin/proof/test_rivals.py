@@ -147,6 +147,21 @@ def test_the_null_of_left_out_gains_is_the_diagnosis_own() -> None:
     np.testing.assert_allclose(again.density, done.null.density, rtol=1e-6)
 
 
+def test_a_fit_that_was_swapped_in_beside_later_effects_is_fitted_alone_again() -> None:
+    stage = Stage(floor())
+    first, *rest = stage.round.tried
+    assert first.fitted is not None and first.candidate.part is not None
+    later = first.candidate.part.model_copy(update={"law": "cabinet_heat", "at": None, "parameters": {}})
+    part = first.fitted.part
+    more = part.model_copy(update={"mechanisms": {**part.mechanisms, "later": later}})
+    swapped = replace(first, gain=1.0, fitted=replace(first.fitted, part=more))
+    rounds = (replace(stage.round, tried=(swapped, *rest)), *floor().rounds[1:])
+    again = Stage(replace(floor(), rounds=rounds)).refits[0]
+    assert again.fitted is not None
+    assert set(again.fitted.part.mechanisms) == set(part.mechanisms)
+    assert again.gain > 0.8 * first.gain
+
+
 def test_a_diagnosis_without_its_search_is_refused() -> None:
     empty = object.__new__(Diagnosis)
     object.__setattr__(empty, "search", None)

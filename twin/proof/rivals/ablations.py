@@ -11,7 +11,7 @@ from dataclasses import replace
 from scipy.stats import chi2
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
-from twin.diagnosis.rounds.refits import Tried, refit
+from twin.diagnosis.rounds.refits import Tried, refit, taken_on
 from twin.diagnosis.telling.findings import Findings
 from twin.proof.rivals.answer import Claim, Reply
 from twin.proof.rivals.in_sample import in_sample_gains, in_sample_score
@@ -43,8 +43,10 @@ def no_projection(stage: Stage) -> Reply:
     best = sorted(best, key=lambda s: (-gain[s.column], s.candidate.name))[:REFITTED]
     known = {t.candidate.name: t for t in stage.refits}
     tried = [known.get(s.candidate.name) or refit(r.before, s) for s in best]
-    fitted = [replace(t, alike=None) for t in tried if t is not None]
-    return stage.decided([replace(t, cluster=-k) for k, t in enumerate(fitted)], r.threshold)
+    fitted = stage.ranked([replace(t, alike=None, cluster=-k) for k, t in enumerate(tried) if t is not None])
+    if fitted and fitted[0].candidate.name not in known:
+        fitted[0] = taken_on(r.before, fitted[0])
+    return stage.decided(fitted, r.threshold)
 
 
 def independent_noise(stage: Stage) -> Reply:

@@ -10,7 +10,7 @@ from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.acceptance import flipped_threshold, stands_out
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
-from twin.diagnosis.rounds.refits import Tried, refit
+from twin.diagnosis.rounds.refits import Tried, refit, taken_on
 from twin.diagnosis.rounds.search import FINER, IMPROVED, LEAST, Round, Search
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
@@ -49,10 +49,18 @@ class Stage:
         """Its best full refits; one that was swapped in beside later effects is refitted as it was here."""
         out: list[Tried] = []
         for t in [t for t in self.round.tried if t.fitted is not None][:REFITS]:
-            again = refit(self.round.before, t.scored) if t.fitted is self.done.final and not self.alone else t
-            if again is not None and again.fitted is not None:
-                out.append(replace(again, cluster=t.cluster))
+            again = refit(self.round.before, t.scored) if self._swapped_in(t) else t
+            if again is not None:
+                own = again if again is t else taken_on(self.round.before, again)
+                out.append(replace(own, cluster=t.cluster))
         return tuple(out)
+
+    def _swapped_in(self, t: Tried) -> bool:
+        """Whether its fit holds more than what this round began with and itself."""
+        assert t.fitted is not None
+        before, after = self.round.before.part, t.fitted.part
+        more = set(after.mechanisms) - set(before.mechanisms) - {t.candidate.name}
+        return bool(more) or (t.candidate.part is not None and set(after.bodies) != set(before.bodies))
 
     @cached_property
     def before(self) -> Evidence:
@@ -69,6 +77,11 @@ class Stage:
     def misfits(self) -> list[list[Array]]:
         """What the refined machines of the structural null show beyond the fit."""
         return structural_misfits(self.round.before)
+
+    @cached_property
+    def rest(self) -> float:
+        """What the fit leaves, in units of what structure alone would."""
+        return remainder(replace(self.done, final=self.round.before))
 
     def bar(self, null: float) -> float:
         """The threshold with another structural null."""
@@ -88,13 +101,13 @@ class Stage:
         ranked = self.ranked(tried)
         best = ranked[0] if ranked else None
         if best is None or not self.accepts(best, threshold):
-            return Reply("undecidable" if remainder(self._ending(None)) > REST else "consistent")
+            return Reply("undecidable" if self.rest > REST else "consistent")
         if best.candidate.mechanism == COARSE:
             return Reply("consistent")  # a refinement is no finding
         claim, told = self.claim(ranked, threshold)
         if (claim.probability or 0.0) < SURE and any(self.ties(e, claim) for e in told):
             return Reply("undecidable", (claim,))
-        rest = remainder(self._ending(best))
+        rest = remainder(replace(self.done, final=best.fitted)) if best.fitted is not None else self.rest
         return Reply("partly_explained" if rest > REST else "explained", (claim,))
 
     def accepts(self, t: Tried, threshold: float) -> bool:
@@ -112,11 +125,6 @@ class Stage:
     @staticmethod
     def ties(e: Explanation, claim: Claim) -> bool:
         return not _same(e, claim.candidate) and e.alike and e.probability >= (claim.probability or 0.0) / 2
-
-    def _ending(self, t: Tried | None) -> Search:
-        """The search had it ended here."""
-        fitted = t.fitted if t is not None and t.fitted is not None else self.round.before
-        return replace(self.done, final=fitted)
 
 
 def _same(e: Explanation, c: Candidate) -> bool:
