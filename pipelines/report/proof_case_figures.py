@@ -37,6 +37,7 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
         wide = 1.6 * size if mark == "_" else size
         ax.plot(at, shown[column], mark, color=color, ms=wide, mec=color, mew=1.2 if mark == "_" else 0, zorder=2)
     ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.set_xlim(-1, len(shown))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.yaxis.set_major_formatter(lambda v, _: f"{v:g}")

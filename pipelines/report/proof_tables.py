@@ -84,23 +84,19 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
 
 
 def convergence(table: pd.DataFrame) -> Table:
-    """Errors of the plants' own numerics as grid and step are refined, with the observed order."""
-    rows = [
-        Row(
-            (
-                plant_label(str(r["plant"])),
-                str(r["refined"]),
-                f"{_float(r['size']):.3g} {r['unit']}".strip(),
-                str(r["quantity"]),
-                f"{_float(r['error']):.2g}" if math.isfinite(_float(r["error"])) else NOTHING,
-                number(_float(r["order"]), 2),
-            )
-        )
-        for r in table.to_dict("records")
-    ]
-    columns = (Column("plant"), Column("refined"), Column("to", kind="number"), Column("quantity", kind="wide"),
-               Column("error", kind="number"), Column("observed order", kind="number"))  # fmt: skip
-    return Table("Do the plants' own numerics converge?", columns, tuple(rows), True)
+    """Errors of the plants' own numerics from the coarsest to the finest, with the observed orders; a row a study."""
+    rows = []
+    for (plant, quantity, refined), own in table.groupby(["plant", "quantity", "refined"], sort=False):
+        unit = str(own["unit"].iloc[0])
+        sizes = " → ".join(f"{_float(v):g}" for v in own["size"])
+        errors = " → ".join(f"{_float(v):.2g}" for v in own["error"])
+        orders = ", ".join(number(_float(v), 2) for v in own["order"].dropna())
+        said = str(quantity).replace(", um", ", µm")
+        rows.append(Row((plant_label(str(plant)), said, str(refined), f"{sizes} {unit}", errors, orders or NOTHING)))
+    columns = (Column("plant"), Column("quantity", kind="wide"), Column("refined"), Column("size", kind="number"),
+               Column("error", kind="number"), Column("observed orders", kind="number"))  # fmt: skip
+    notes = ("An error is against a closed form or the finest of the study; the orders say how fast it falls.",)
+    return Table("Do the plants' own numerics converge?", columns, tuple(rows), True, notes=notes)
 
 
 def _range(low: object, high: object, digits: int) -> str:

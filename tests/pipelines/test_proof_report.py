@@ -16,6 +16,7 @@ from toy_proof import ROOT, toy_proof, without
 
 from data.errors import WorkError
 from pipelines.report import proof_extracts as extracts
+from pipelines.report import proof_tables as tables
 from pipelines.report.proof import headline, proof_page, write_proof_report
 from pipelines.report.proof_goals import goal_rows, shortfalls
 from pipelines.report.proof_run import TABLES, ProofRun
@@ -192,6 +193,13 @@ def test_many_missed_goals_are_counted_and_the_first_told() -> None:
     run = toy_proof(5, tables={"goals": goals})
     said = proof_page(run).lead
     assert said.startswith("Missed: m1: 95.5 %, wanted ≥ 97 %; m2: ") and said.endswith("; 3 more, in the table.")
+
+
+def test_a_convergence_study_is_one_row_with_its_orders(run: ProofRun) -> None:
+    (first, *rest) = tables.convergence(run.table("convergence")).rows
+    assert first.cells == ("A, finite elements", "temperature at the nose, K", "grid", "80 → 40 → 20 mm",
+                           "0.04 → 0.01 → 0.0025", "1.97, 1.97")  # fmt: skip
+    assert len(rest) == 3
 
 
 def test_rivals_without_a_case_are_no_empty_picture(run: ProofRun) -> None:
