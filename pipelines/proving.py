@@ -22,7 +22,7 @@ from twin.proof.sealing.state import state_of
 from twin.proof.spec import PLANT_KINDS, PlantKind
 
 Say = Callable[[str], None]
-WRITTEN = ("outcomes", "terms", "goals", "compared", "leak")  # tables that stand beside the page as CSV
+WRITTEN = ("outcomes", "terms", "goals", "compared", "leak", "convergence")  # tables that stand beside the page as CSV
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ def open_proof(
     Raises:
         InputError: not sealed, not run, incomplete, or not as it was recorded; WorkError: it cannot be written.
     """
+    from pipelines.proof_convergence import convergence_of
     from pipelines.proof_judging import judge_all, scoring_source
     from pipelines.proof_tables import proof_run, tables_of
     from pipelines.report.proof import write_proof_report
@@ -84,6 +85,9 @@ def open_proof(
                 say(f"{name}: no true model: {j.trouble}")
         say("score")
         tables = tables_of(folder, opened, judged, pd.DataFrame(columns=list(COLUMNS)) if leak is None else leak)
+        if opened.commitment["suite"] == "sealed":
+            say("convergence of the plants")
+            tables["convergence"] = convergence_of(sorted(set(tables["outcomes"]["plant"])))
         told = proof_run(opened, judged, tables)
         files = {f"{name}.csv": out / f"{name}.csv" for name in WRITTEN if name in tables}
         try:
