@@ -140,6 +140,7 @@ DIRECTIONS: dict[str, Callable[[], bool]] = {
     "mandrel": lambda: bool(moved("mandrel", "z").max() > 5),
     "unlisted_warm_speed": _unlisted_by_temperature,
     "unlisted_coolant_speed": lambda: _within("unlisted_coolant_speed", "t_column_back", -1e-6, 0.05),
+    "unlisted_feed_speed": lambda: _within("unlisted_feed_speed", "t_bed", -1e-6, 0.02),
     "wrong_parameter": lambda: _only("wrong_parameter", ""),
 }
 

@@ -12,6 +12,7 @@ EFFECTS = Registry(
         "sun": "twin.plants.effects.heat:Sun",
         "unlisted_warm_speed": "twin.plants.effects.heat:UnlistedWarmSpeed",
         "unlisted_coolant_speed": "twin.plants.effects.heat:UnlistedCoolantSpeed",
+        "unlisted_feed_speed": "twin.plants.effects.heat:UnlistedFeedSpeed",
         "radiation": "twin.plants.effects.surfaces:Radiation",
         "rotating_convection": "twin.plants.effects.surfaces:RotatingConvection",
         "natural_convection": "twin.plants.effects.surfaces:NaturalConvection",

@@ -1,4 +1,4 @@
-"""Heat from beside the spindle: floor, cabinet, guides, sun, and two that no list of mechanisms has."""
+"""Heat from beside the spindle: floor, cabinet, guides, sun, and three that no list of mechanisms has."""
 
 from __future__ import annotations
 
@@ -153,3 +153,23 @@ class UnlistedCoolantSpeed(PumpHeat):
 
     def share(self, cells_degC: Array, now: Now) -> Array:
         return now.coolant * (now.speed_rpm / self.plant.rated_rpm) ** 2
+
+
+class UnlistedFeedSpeed(_Steady):
+    """Not in any list: heat into the bed while the table moves under a turning spindle, by feed times speed."""
+
+    key = "unlisted_feed_speed"
+    has = frozenset({"feed"})
+    driver = "feed"
+    body, watts = "bed", 400.0  # at `FAST_MM_PER_MIN` and the rated speed
+    FAST_MM_PER_MIN = 8000.0
+
+    def answer(self) -> Answer:
+        values = {"power": (self.power_W, "W")}
+        return Answer(None, "node", self.body, values, words="power (feed / 8000 mm/min) (n / rated)")
+
+    def active(self, now: Now) -> NDArray[np.bool_]:
+        return (now.feed_mm_per_min != 0) & (now.speed_rpm != 0)
+
+    def share(self, cells_degC: Array, now: Now) -> Array:
+        return np.abs(now.feed_mm_per_min) / self.FAST_MM_PER_MIN * now.speed_rpm / self.plant.rated_rpm

@@ -35,7 +35,7 @@ from twin.plants.machine import FEATURES, Plant
 from twin.plants.plant import draw, posed
 from twin.plants.seeds import stream
 from twin.proof.suite.setting import setting
-from twin.proof.suite.sizes import most
+from twin.proof.suite.sizes import ALL_OR_NOTHING, most
 from twin.schema import twin_part
 
 Array = NDArray[np.float64]
@@ -101,6 +101,8 @@ class Bench:
         """The size at the detection limit: from size 1, and once more from there, as few effects are quite linear."""
         if effect == "wrong_parameter":
             return float(np.sqrt(2.0 * self.threshold) / self._doubt(effect, 1.0))
+        if effect in ALL_OR_NOTHING:
+            return self._times(self.signature(effect, 1.0))
         size = 1.0
         for _ in range(2):
             at = min(size, most(effect))
@@ -163,7 +165,7 @@ def main() -> None:
     parser.add_argument("--plant", default="volumes")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=101)
-    parser.add_argument("--effects", default=",".join(k for k in EFFECTS if k != "sensor_swap"))
+    parser.add_argument("--effects", default=",".join(EFFECTS))
     parser.add_argument("--dry", action="store_true", help="print only")
     args = parser.parse_args()
     found = []

@@ -53,7 +53,7 @@ RANGES: Mapping[str, Ranges] = MappingProxyType({
         coldest_degC=(9.0, 15.0), season_K=(10.0, 18.0), earliest_h=(6.0, 8.0), day_h=(5.0, 8.0), spread=1.0,
     ),
     "sealed": Ranges(
-        batches=(10, 14), hours=(4.5, 5.0, 6.0, 7.0), step_s=(180.0, 240.0, 300.0, 300.0, 360.0),
+        batches=(10, 13), hours=(4.5, 5.0, 6.0, 6.5), step_s=(240.0, 300.0, 300.0, 360.0),
         noise_K=(0.015, 0.06), noise_um=(0.4, 1.5), quantisation_K=(0.02, 0.05, 0.1, 0.1, 0.2),
         missing=(0.0, 0.01, 0.03), early_s=(0.0, 3.0, 10.0, 25.0), gaps=(0.0, 0.3, 0.7), absent=(0.0, 0.0, 0.08),
         file_error=(0.1, 0.4), mass_error=(0.03, 0.12),
