@@ -173,7 +173,8 @@ def test_windows_are_compared_in_time() -> None:
 
 
 def test_a_failed_diagnosis_has_found_nothing() -> None:
-    case, (own,) = scored(answer("one", term()), Stored(None, {"seconds": 300.0, "error": "time limit"}), truth(True))
+    run = {"seconds": None, "error": "no end", "started": "2026-11-22T02:06:00Z", "ended": "2026-11-22T02:11:00Z"}
+    case, (own,) = scored(answer("one", term()), Stored(None, run), truth(True))
     assert (case["failed"], case["detected"], case["first_right"], case["right"]) == (True, False, False, False)
     assert (case["verdict"], case["claims"], case["seconds"], own["found"]) == (None, None, 300.0, False)
 

@@ -81,7 +81,7 @@ def outcome(
         "simulated": key.simulated,
         "effect": "+".join(r["effect"] for r in named) or NOTHING,
         "failed": stored.failed,
-        "seconds": stored.run.get("seconds"),
+        "seconds": stored.seconds,
         "visible": bool(seen) if known else None,
         "terms": len(physics),
         "visible_terms": len(seen) if known else None,

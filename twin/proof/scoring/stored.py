@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
@@ -29,6 +31,14 @@ class Stored:
     length_s: Mapping[str, float] = field(default_factory=dict)
     body_of: Mapping[str, str] = field(default_factory=dict)
     again: Findings | None = None
+
+    @property
+    def seconds(self) -> float | None:
+        """Wall time of the diagnosis; of one that did not end, the time that it was given."""
+        told = self.run.get("seconds")
+        if told is None and self.failed and self.run.get("started") and self.run.get("ended"):
+            return (pd.Timestamp(self.run["ended"]) - pd.Timestamp(self.run["started"])).total_seconds()
+        return told
 
     @property
     def failed(self) -> bool:
