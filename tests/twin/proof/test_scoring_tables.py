@@ -118,6 +118,13 @@ def test_the_worst_come_first_with_a_reason() -> None:
     assert list(table.columns) == [*OUTCOMES, "why"]
 
 
+def test_a_listed_effect_that_is_called_unlisted_is_told_so() -> None:
+    own = stored("unlisted", finding("free_flux", parameters={}))
+    cases, _ = outcomes({"case_0001": answer("one", term())}, {"case_0001": own}, {"case_0001": truth(True)})
+    why = "cabinet_heat in plant volumes is listed and was said to be in no list, at the right place."
+    assert worst(cases)["why"].tolist() == [why]
+
+
 def test_tables_come_back_from_csv_as_they_were(tmp_path: Any) -> None:
     cases, _ = examined()
     cases.to_csv(tmp_path / "outcomes.csv", index=False)

@@ -76,6 +76,9 @@ def _why(row: pd.Series) -> str:
         return f"No physics was missing, yet {_claims(false)}{sure}."
     if _true(row["visible"]) and not _true(row["detected"]):
         return f"{what} was visible and overlooked."
+    if false and row["kind"] != "unlisted" and _true(row["flagged_unlisted"]) and not _true(row["first_right"]):
+        there = ", at the right place" if _true(row["place_exact"]) else ""
+        return f"{what} is listed and was said to be in no list{there}."
     if false and not _true(row["first_right"]):
         held = "; the truth was in the reported set" if _true(row["in_set"]) else ""
         return f"{what} was taken for something else{sure}{held}."
