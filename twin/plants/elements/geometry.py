@@ -106,7 +106,7 @@ def _boxes(m: Measures) -> list[Box]:
     at, size = (aside["motor"] - 0.1, back + 0.06 * s, over), (0.2, 0.2, 0.26)
     boxes.append(Box("motor", steel, 50 * f["motor"], at, size, (2, 2, 3)))
     at, size = (-0.23 * s, 0.07 * s, foot), (0.46 * s, 0.53 * s, 1.35 * s)
-    boxes.append(_walled("column", 620 * s * s * f["column"], at, size, (1, 2, 9)))
+    boxes.append(_walled("column", 620 * s * s * f["column"], at, size, (3, 2, 9)))
     boxes.append(_walled("bed", 1600 * s * s * f["bed"], (-0.38 * s, 0.0, 0.0), (0.76 * s, 1.85 * s, foot), (2, 8, 2)))
     at, size = (aside["table"] - 0.45 * s, axis - 0.32 * s, foot + saddle_m), (0.9 * s, 0.64 * s, 0.13 * s)
     boxes.append(Box("table", iron, 370 * s * s * f["table"], at, size, (5, 3, 1)))

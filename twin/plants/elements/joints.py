@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin.plants.casting import Array
 from twin.plants.elements.box import Piece
 from twin.plants.elements.slabs import Slabs
 from twin.plants.elements.structure import Assembly, Contact, Face
@@ -42,36 +41,33 @@ def join(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
         points_m, area_m2 = patch.gauss()
         a.contacts.append(Contact(one, other, points_m, points_m, area_m2, g[joint], held))
 
-    def seat(
-        one: str, joint: str, held: tuple[float, float, float], metal: Slabs, about_m: Array, wider: Array
-    ) -> None:  # fmt: skip
-        """Inside the head: heat passes to all the iron around, `wider` than the seat along each axis."""
-        axes = zip(mesh["head"].lines_m, about_m, wider, strict=True)
-        head = [at + (line - at) / more for line, at, more in axes]
+    def seat(one: str, joint: str, held: tuple[float, float, float], metal: Slabs, around: Piece) -> None:
+        """Inside the head: heat passes to all the iron `around`, a larger box like the seat's own."""
+        _, under, over = around
+        under, over = np.maximum(under, box.low_m), np.minimum(over, box.high_m)
+        low, high = metal.low_m.min(axis=0), metal.high_m.max(axis=0)
+        wider = (over - under) / (high - low)
+        axes = zip(mesh["head"].lines_m, low, under, wider, strict=True)
+        head = [own + (line - into) / more for line, own, into, more in axes]
         points_m, volume_m3 = metal.cut(head).gauss()
-        low, high = points_m.min(axis=0), points_m.max(axis=0)
         area_m2 = 4.0 * np.sqrt(np.prod((high - low)[:2])) * (high - low)[2] * volume_m3 / volume_m3.sum()
-        around_m = about_m + wider * (points_m - about_m)
-        a.contacts.append(Contact(one, "head", points_m, around_m, area_m2, g[joint], held))
+        a.contacts.append(Contact(one, "head", points_m, under + wider * (points_m - low), area_m2, g[joint], held))
 
     box = mesh["head"].box
-    width_m, depth_m, height_m = box.size_m
     for ring, held in (("front", _FIRM), ("rear", _SLIDING)):
         meet("shaft", ring, f"shaft-{ring}", held, mesh[ring].bore())
         own = mesh[ring].box
-        wider = np.array([0.9 * width_m, 0.4 * depth_m, 0.4 * height_m]) / own.size_m
-        middle = (own.low_m + own.high_m) / 2.0
-        seat(ring, f"{ring}-head", _FIRM, mesh[ring].volumes(), middle, wider)
+        middle, half = (own.low_m + own.high_m) / 2.0, np.array([0.45, 0.2, 0.2]) * box.size_m
+        seat(ring, f"{ring}-head", _FIRM, mesh[ring].volumes(), (1.0, middle - half, middle + half))
     meet("motor", "head", "motor-head", _FIRM, mesh["motor"].hull([(2, 0)]))
     guided = _SLIDING if "screw" in mesh else _FIRM
     meet("head", "column", "head-column", guided, mesh["head"].hull([(1, 0)]), _rails(a))
     meet("column", "bed", "column-bed", _FIRM, mesh["column"].hull([(2, 0)]))
     if "screw" in mesh:
-        screw = mesh["screw"].box
         nut = mesh["screw"].volumes().within(box.pieces(height=(0.25, 0.75)))
-        back = np.array([0.0, box.low_m[1], box.low_m[2] + height_m / 2])
-        wider = np.array([0.8 * width_m / screw.size_m[0], 0.3 * depth_m / screw.size_m[1], 1.5])
-        seat("screw", "screw-head", _NUT, nut, back, wider)
+        low, size = np.asarray(box.low_m), np.asarray(box.size_m)
+        back = 1.0, low + size * (0.1, 0.0, 0.125), low + size * (0.9, 0.3, 0.875)
+        seat("screw", "screw-head", _NUT, nut, back)
         top = mesh["screw"].box.pieces((0.9, 1.0))
         meet("screw", "column", "screw-column", _FIRM, mesh["screw"].hull([(1, 0)]), top)
     below = "saddle" if "saddle" in mesh else "bed"
