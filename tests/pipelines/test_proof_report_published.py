@@ -6,9 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from command import in_process
 from toy_proof import ROOT, toy_proof
 
 from data.errors import InputError
+from pipelines import proving
 from pipelines.report.proof_markdown import BEGIN, END, proof_markdown, publish_proof
 from pipelines.report.proof_run import ProofRun
 
@@ -75,6 +77,20 @@ def test_a_page_without_markers_or_no_page_is_one_line(tmp_path: Path, run: Proo
         publish_proof(bare, run)
     with pytest.raises(InputError, match=r"none.md: cannot be read or written \(No such file or directory\); give"):
         publish_proof(tmp_path / "none.md", run)
+
+
+def test_the_command_publishes_what_it_opened(
+    page: Path, run: ProofRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = run
+    monkeypatch.setattr(proving, "open_proof", lambda *given, **named: proving.ProofOutcome(told, {}))
+    call = in_process(monkeypatch, capsys)
+    done = call("prove", "open", "PROOF", "--publish", page)
+    assert done.code == 0, done.err
+    assert ROOT in page.read_text(encoding="utf-8") and "30 answers as a whole" in done.out
+    told = replace(run, suite="development")
+    done = call("prove", "open", "PROOF", "--publish", page)
+    assert done.code == 2 and "got a development suite, expected a sealed suite with all answers" in done.err
 
 
 def test_the_docs_page_has_its_block() -> None:

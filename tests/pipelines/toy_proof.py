@@ -105,7 +105,7 @@ def _answers(cases: int, draws: np.random.Generator, plants: Sequence[str]) -> t
             "seconds": float(draws.uniform(12, 34)),
             "probability": float(draws.beta(8, 1)) if n else np.nan, "visible": bool(shares) and max(shares) > 0.9,
             "error_before": before, "error_after": after, "error_true": true if n else np.nan, "error_floor": floor,
-            "limit_share": max(shares) if shares else np.nan,
+            "limit_share": max(shares) if shares else np.nan, "right": found_all,
         })  # fmt: skip
     return pd.DataFrame(rows), pd.DataFrame(terms)
 
