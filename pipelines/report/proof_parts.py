@@ -192,7 +192,7 @@ def _cases(run: ProofRun) -> Part:
 
 def _sentence(why: str) -> str:
     """Keys as they are read, and a capital."""
-    said = key_label(why)
+    said = key_label(why).replace("+", " + ")
     return said[:1].upper() + said[1:]
 
 

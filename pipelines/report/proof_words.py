@@ -31,8 +31,8 @@ NOT_SEALED = "A development suite: its seed is known, so these figures show the 
 PARTIAL = "Opened in part: some cases had no answer yet. These figures prove nothing."
 
 METHOD = (
-    "Cases are built on plants that share no code with the twin and use other numerics. Size, place and kind are "
-    "drawn by lot from a secret seed; nobody picks an amplitude.",
+    "Plants A and B share no code with the twin and use other numerics; what they conceal, how much and where is drawn "
+    "by lot from the suite's seed. Plants C and D, if there, are every case that real recordings give.",
     "Each answer key gets a salt; the hash of both and of the case's files goes into one list, and the hash of that "
     "list, the root, is published before any case is answered.",
     "Every case is answered in a process of its own that can read its machine file and its recordings and nothing "
