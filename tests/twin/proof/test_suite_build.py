@@ -137,7 +137,9 @@ def test_a_driver_changes_on_the_row_that_shows_it_however_early_rows_come() -> 
 def test_idle_switches_are_recorded_and_drive_nothing() -> None:
     spec = short(idle=["mist", "lamp"], gaps=0.0)
     with_, none = (draw(SEED, sizes={}, **{**spec.options, "idle": idle}) for idle in (["mist", "lamp"], []))
-    assert build(spec).answer["idle_channels"] == ["mist", "lamp"]
+    pump = replace(spec, effects={"pump_heat": 1.0}, options={**spec.options, "has": ["coolant"], "lacks": []})
+    assert build(replace(pump, effects={})).answer["idle_channels"] == ["coolant", "mist", "lamp"]
+    assert build(pump).answer["idle_channels"] == ["mist", "lamp"]
     assert {"mist", "lamp"} == set(with_.machine.names("driver")) - set(none.machine.names("driver"))
     assert any(b.values("mist").any() for b in with_.batches)
     for one, other in zip(with_.batches, none.batches, strict=True):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from data.errors import InputError
+from data.machine import Machine
 from twin.plants.effects import EFFECTS
 from twin.plants.plant import Case, draw
 from twin.plants.write import recording_texts
@@ -45,6 +46,7 @@ def without(spec: CaseSpec, *keys: str) -> CaseSpec:
 
 def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
     """The answer key: plain data, `thermodrift.proof_answer/1`."""
+    terms = [_term(spec, term) for term in case.truth["terms"]]
     return {
         "schema": SCHEMA,
         "case": spec.name,
@@ -55,11 +57,18 @@ def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
         "words": _words(case.truth["terms"]),
         "machine": case.machine.machine,
         "seed": spec.seed,
-        "terms": [_term(spec, term) for term in case.truth["terms"]],
-        "idle_channels": list(spec.options.get("idle", ())),
+        "terms": terms,
+        "idle_channels": _idle(case.machine, terms),
         "options": dict(spec.options),
         "redraw": spec.plain(),
     }
+
+
+def _idle(machine: Machine, terms: list[dict[str, Any]]) -> list[str]:
+    """Drivers that neither the machine file nor anything left out of it depends on."""
+    stated = [part.get("drivers", ()) for part in (machine.twin or {})["mechanisms"].values()]
+    used = {name for drivers in stated for name in ([drivers] if isinstance(drivers, str) else drivers)}
+    return [name for name in machine.names("driver") if name not in used | {t["driver"] for t in terms}]
 
 
 def _term(spec: CaseSpec, term: Mapping[str, Any]) -> dict[str, Any]:

@@ -47,7 +47,8 @@ def most(effect: str) -> float:
 
 
 def size(effect: str, plant: str, kind: Kind, rng: np.random.Generator) -> float:
-    """A size for a case of this kind."""
-    low, high = np.log(SHARE[kind])
-    drawn = limit(effect, plant) * float(np.exp(rng.uniform(low, high)))
-    return 1.0 if effect in ALL_OR_NOTHING else float(f"{min(drawn, most(effect)):.4g}")
+    """A size for a case of this kind; where ten times the limit is more than there is, even up to that."""
+    low, high = (share * limit(effect, plant) for share in SHARE[kind])
+    high = min(high, most(effect))
+    drawn = np.exp(rng.uniform(np.log(min(low, high / 3.0)), np.log(high)))
+    return 1.0 if effect in ALL_OR_NOTHING else float(f"{drawn:.4g}")

@@ -74,7 +74,7 @@ def small_suite() -> list[CaseSpec]:
         ("nothing", "volumes", {}, {}),
         ("decoy", "volumes", {}, {"sensor_drift": 1.5}),
         ("one", "elements", {"cabinet_heat": 2.0}, {}),
-        ("one", "volumes", {"floor_sink": 2.0}, {}),
+        ("one", "volumes", {"pump_heat": 1.0}, {}),
         ("two", "volumes", {"cabinet_heat": 2.0, "speed_shift": 2.0}, {}),
         ("unlisted", "volumes", {"unlisted_warm_speed": 3.0}, {}),
     )
