@@ -146,6 +146,16 @@ def test_a_confounded_pair_wants_the_truth_in_the_set_and_a_run_that_settles_it(
     assert (alone["set_holds_truth"], alone["false_claims"], alone["right"]) == (False, 0, False)
 
 
+def test_of_one_law_under_two_names_the_set_must_hold_the_keys_own_and_no_run_need_tell() -> None:
+    partner = {"mechanism": "nut_friction", "where": {"kind": "node", "name": "column"}}
+    key = answer("confounded", term("guide_friction", same_as=[partner], driver="feed"))
+    both = finding("nut_friction", probability=0.5, alternatives=[other("guide_friction", "column", 0.4)])
+    case, _ = scored(key, stored("undecidable", both), truth(True))
+    assert (case["first_right"], case["set_holds_truth"], case["right"], case["settled"]) == (True, True, True, None)
+    case, _ = scored(key, stored("explained", finding("nut_friction")), truth(True))
+    assert (case["first_right"], case["set_holds_truth"], case["right"]) == (True, False, False)
+
+
 def test_unlisted_physics_is_flagged_and_its_driver_named() -> None:
     key = answer("unlisted", term("odd", mechanism=None, driver="coolant, spindle_rpm"))
     said = finding("free_flux", statement="60 W into the column: it follows coolant and spindle_rpm^2", parameters={})

@@ -10,6 +10,7 @@ from tests.twin.proof.answered import BODY_OF, LENGTH_S, answer, finding, findin
 from twin.proof.scoring.amplitude import amplitude, found_amplitude, true_amplitude
 from twin.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from twin.proof.scoring.error_level import closed, error_level
+from twin.proof.scoring.names import means
 from twin.proof.scoring.overlap import always, overlap
 from twin.proof.scoring.places import exact, near
 from twin.proof.scoring.reported_set import reported_set
@@ -92,6 +93,22 @@ def test_a_product_takes_its_interval_from_the_amplitude() -> None:
     given = findings("explained", finding("radiation", parameters=area)).findings[0]
     assert true_amplitude(own) == pytest.approx(1.8)
     assert found_amplitude(given, own) == (pytest.approx(1.8), pytest.approx(1.5), pytest.approx(2.1))
+
+
+@pytest.mark.parametrize(
+    ("named", "mechanism", "driver", "same"),
+    [
+        ("screw_bearing", "guide_friction", "feed", True),
+        ("guide_friction", "nut_friction", None, True),
+        ("electrical_heat", "cabinet_heat", "coolant", True),
+        ("electrical_heat", "cabinet_heat", None, False),  # a cabinet that is always on follows no channel
+        ("hydraulic_unit", "cabinet_heat", "coolant", False),
+        ("free_shift", None, None, True),
+        ("free_flux", "sun", None, False),
+    ],
+)
+def test_one_law_may_have_several_names(named: str, mechanism: str | None, driver: str | None, same: bool) -> None:
+    assert means(named, key_term(mechanism=mechanism, driver=driver)) is same
 
 
 def test_the_reported_set_names_each_explanation_once() -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from twin.diagnosis.telling.findings import Finding, Findings
 from twin.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
-from twin.proof.scoring.names import counted_as
-from twin.proof.scoring.places import exact, near
+from twin.proof.scoring.names import means
+from twin.proof.scoring.places import exact, near, same_place
 from twin.proof.scoring.reported_set import reported_set
 
 
@@ -36,7 +36,7 @@ def spot(finding: Finding) -> Spot:
 
 def names_term(mechanism: str, place: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
     """Same mechanism, and at the place or beside it."""
-    return counted_as(mechanism) == counted_as(term.mechanism) and near(place, term, body_of)
+    return means(mechanism, term) and near(place, term, body_of)
 
 
 def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str]) -> Matches:
@@ -52,11 +52,8 @@ def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str
                 of_term[term] = n
                 free.discard(n)
 
-    def same(f: Finding, t: TrueTerm) -> bool:
-        return counted_as(f.mechanism) == counted_as(t.mechanism)
-
-    take([[same(f, t) and exact(spot(f), t) for t in key.terms] for f in given])
-    take([[same(f, t) and near(spot(f), t, body_of) for t in key.terms] for f in given])
+    take([[means(f.mechanism, t) and exact(spot(f), t) for t in key.terms] for f in given])
+    take([[names_term(f.mechanism, spot(f), t, body_of) for t in key.terms] for f in given])
     undecidable = findings is not None and findings.verdict == "undecidable"
     true_too = {n for n in free if _partner(given[n], key.terms) or (undecidable and _ties(given[n], key, body_of))}
     left = sorted(free)
@@ -72,7 +69,7 @@ def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str
 def _partner(finding: Finding, terms: Sequence[TrueTerm]) -> bool:
     """Whether these recordings cannot tell it from a true term, by the key."""
     return any(
-        counted_as(finding.mechanism) == counted_as(mechanism) and place.name == finding.where.name
+        finding.mechanism == mechanism and same_place(place, spot(finding))
         for t in terms
         for mechanism, place in t.partners
     )

@@ -15,7 +15,7 @@ from twin.proof.scoring.amplitude import found_amplitude, true_amplitude
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
 from twin.proof.scoring.error_level import closed, error_level
 from twin.proof.scoring.matching import Matches, matches, names_term, spot
-from twin.proof.scoring.names import UNLISTED, counted_as
+from twin.proof.scoring.names import UNLISTED, counted_as, means
 from twin.proof.scoring.overlap import always, overlap
 from twin.proof.scoring.places import exact, near
 from twin.proof.scoring.reported_set import reported_set
@@ -121,13 +121,13 @@ def _first(key: AnswerKey, stored: Stored, first: Finding | None) -> dict[str, A
     if first is None:
         lost = dict.fromkeys(("first_right", "in_set", "place_exact", "place_near"), False)
         return lost if key.physics else {}
-    place, said = spot(first), counted_as(first.mechanism)
+    place = spot(first)
     reported = reported_set(first)
-    same = [t for t in key.terms if counted_as(t.mechanism) == said]
+    same = [t for t in key.terms if means(first.mechanism, t)]
     at = same or list(key.physics)
     return {
         "first_right": bool(same),
-        "in_set": any(counted_as(m) == counted_as(t.mechanism) for m, _ in reported for t in key.terms),
+        "in_set": any(means(m, t) for m, _ in reported for t in key.terms),
         "set_size": len(reported),
         "place_exact": any(exact(place, t) for t in at) if key.terms else None,
         "place_near": any(near(place, t, stored.body_of) for t in at) if key.terms else None,
@@ -169,9 +169,9 @@ def _errors(findings: Findings | None, truth: TrueModel | None) -> dict[str, Any
 
 
 def _holds(findings: Findings, key: AnswerKey, stored: Stored) -> bool:
-    """Whether the reported set of a finding holds the true term, place included."""
+    """Whether the reported set of a finding holds the true term by the key's own name, place included."""
     return any(
-        names_term(m, place, t, stored.body_of)
+        counted_as(m) == counted_as(t.mechanism) and near(place, t, stored.body_of)
         for f in findings.findings
         for m, place in reported_set(f)
         for t in key.physics
@@ -179,15 +179,27 @@ def _holds(findings: Findings, key: AnswerKey, stored: Stored) -> bool:
 
 
 def _settled(key: AnswerKey, stored: Stored, findings: Findings) -> bool | None:
-    """Whether the proposed run left the truth alone in the reported set; no run was needed where it stood alone."""
-    tied = any(len(reported_set(f)) > 1 for f in findings.findings)
-    if not tied:
+    """Whether the proposed run left the truth alone in the reported set; no run was needed where it stood alone.
+
+    What is one law under several names counts as one: no run could tell it apart.
+    """
+    if not any(_tied(f, key) for f in findings.findings):
         return None
     if stored.again is None:
         return None if findings.next_experiment is not None else False
     given = stored.again.findings
-    alone = bool(given) and len(reported_set(given[0])) == 1
-    return alone and _holds(stored.again, key, stored)
+    if not given or _tied(given[0], key):
+        return False
+    return any(names_term(given[0].mechanism, spot(given[0]), t, stored.body_of) for t in key.physics)
+
+
+def _tied(finding: Finding, key: AnswerKey) -> bool:
+    """Whether its reported set holds more than one thing."""
+
+    def name(mechanism: str) -> str:
+        return next((str(t.mechanism) for t in key.physics if means(mechanism, t)), mechanism)
+
+    return len({(name(m), place) for m, place in reported_set(finding)}) > 1
 
 
 def _right(key: AnswerKey, out: Mapping[str, Any], seen: list[dict[str, Any]], found: Matches) -> bool:
@@ -241,8 +253,7 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
 
 def _named(finding: Finding, term: TrueTerm) -> str:
     """By the key's own word where both mean the same."""
-    said = counted_as(finding.mechanism)
-    return (term.mechanism or UNLISTED) if said == counted_as(term.mechanism) else said
+    return (term.mechanism or UNLISTED) if means(finding.mechanism, term) else counted_as(finding.mechanism)
 
 
 def _table(rows: list[dict[str, Any]], columns: Mapping[str, str]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from twin.proof.scoring.answer_key import Spot, TrueTerm
 
 def exact(named: Spot, term: TrueTerm) -> bool:
     """The term's own place or one of `also`. A link is the same whichever end its name begins with."""
-    return any(_same(named, place) for place in (term.where, *term.also))
+    return any(same_place(named, place) for place in (term.where, *term.also))
 
 
 def near(named: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
@@ -25,7 +25,8 @@ def near(named: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
     return bool(own & (ends | touching))
 
 
-def _same(one: Spot, other: Spot) -> bool:
+def same_place(one: Spot, other: Spot) -> bool:
+    """Of one name and, where both are told, of one kind."""
     kinds = not one.kind or not other.kind or one.kind == other.kind
     return kinds and (one.name == other.name or _parted(one) == _parted(other))
 

@@ -11,7 +11,6 @@ from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored, Screen
 from twin.mechanisms import MECHANISMS
 from twin.proof.scoring.answer_key import Spot, TrueTerm
-from twin.proof.scoring.names import counted_as
 from twin.proof.scoring.places import exact
 from twin.quantity import Value
 from twin.schema import TwinPart
@@ -66,8 +65,7 @@ def with_terms(
 
 
 def _is(term: TrueTerm, c: Candidate) -> bool:
-    same = counted_as(c.mechanism) == counted_as(term.mechanism)
-    return same and exact(Spot(c.where.kind, c.where.name), term)
+    return c.mechanism == term.mechanism and exact(Spot(c.where.kind, c.where.name), term)
 
 
 def _said(number: float, unit: str) -> str | float:
