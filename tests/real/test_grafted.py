@@ -54,7 +54,7 @@ def test_a_case_and_its_reference_differ_where_the_answer_says_and_nowhere_else(
     assert case.machine == plain.machine
     told = case.answer["graft"]["largest"]
     for channel in case.machine.channels:
-        step = case.machine.channels[channel].resolution or 1e-6
+        step = case.machine.channels[channel].resolution or 1e-4
         change = largest_change(case, channel)
         if channel not in told:
             assert change == 0.0, channel
@@ -97,7 +97,7 @@ def test_cases_are_labelled_compile_and_answer_in_plain_data() -> None:
         json.dumps(case.answer, allow_nan=False)
         key = AnswerKey.from_json(case.answer)
         assert len(key.terms) == len(CASES[name].grafts) and key.kind in KINDS and key.plant == "grafted"
-        assert all(0.3 <= t["size"] <= 3.0 for t in case.answer["terms"])
+        assert all(0.5 <= t["size"] <= 5.0 for t in case.answer["terms"])
 
 
 def test_the_same_seed_gives_the_same_case_and_another_seed_another() -> None:

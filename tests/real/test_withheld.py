@@ -77,7 +77,7 @@ def test_the_seed_picks_runs_and_hours_and_the_same_seed_the_same_ones() -> None
     one, again, other = (build("lathe_belt", DATA, seed) for seed in (4, 4, 5))
     assert [b.batch_id for b in one.batches] == [b.batch_id for b in again.batches]
     assert [b.batch_id for b in one.batches] != [b.batch_id for b in other.batches]
-    assert len(one.batches) == 6 and all(6 <= b.start.hour < 12 for b in one.batches if b.start is not None)
+    assert len(one.batches) == 8 and all(6 <= b.start.hour < 12 for b in one.batches if b.start is not None)
 
 
 def test_answers_are_plain_finite_data_and_windows_lie_in_the_runs() -> None:

@@ -166,8 +166,8 @@ def test_faults_of_a_sensor_do_what_their_equations_say(setting: Setting) -> Non
     (channel, shown), = drift.shown(0, batch).items()  # fmt: skip
     assert shown - batch.values(channel) == pytest.approx(drift.rate_K_per_h * batch.time_s / 3600.0)
     lag = SensorLag(setting, 1.0, np.random.default_rng(1))
-    lag.channel = "t_column"  # rises by 1 K/h: in the end 900 s late
-    assert (batch.values("t_column") - lag.shown(0, batch)["t_column"])[-1] == pytest.approx(0.25, abs=0.02)
+    lag.channel = "t_column"  # rises by 1 K/h: in the end 600 s late
+    assert (batch.values("t_column") - lag.shown(0, batch)["t_column"])[-1] == pytest.approx(1.0 / 6.0, abs=0.01)
     bonding = SensorBonding(setting, 1.0, np.random.default_rng(1))
     assert bonding.channel == "t_bed"  # the other has a share already
     assert bonding.shown(0, batch)["t_bed"] == pytest.approx(np.full(ROWS, 23.0 + 0.85 * 3.0))

@@ -24,7 +24,7 @@ from twin.plants.real.case import RealCase, answer
 from twin.plants.real.recordings import ORIGINS, recorded, there, thinned
 from twin.plants.seeds import stream
 
-SIZES = (0.3, 3.0)  # log-uniform between
+SIZES = (0.5, 5.0)  # log-uniform between
 FINE_S = 60.0  # grafts go on rows as fine as the recordings are
 DESCRIBED = "Real recordings on which a simulated response may be superposed."
 

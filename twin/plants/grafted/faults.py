@@ -69,7 +69,7 @@ class SensorLag(OneSensor):
 
     @property
     def lag_s(self) -> float:
-        return 900.0 * self.size
+        return 600.0 * self.size
 
     def parameters(self) -> dict[str, tuple[float, str]]:
         return {"lag": (self.lag_s, "s")}
@@ -162,7 +162,7 @@ class SpeedShift(Graft):
     def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         super().__init__(setting, size, rng)
         self.probe = str(rng.choice(setting.machine.names("error")))
-        self.shift_um = float(rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 8.0)) * size
+        self.shift_um = float(rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 4.0)) * size
 
     def shown(self, number: int, batch: Batch) -> Mapping[str, Array]:
         turns = (batch.values("spindle_rpm") / RATED_RPM) ** 2

@@ -231,7 +231,7 @@ class Draught(Heat):
         super().__init__(setting, size, rng)
         self.body = ROOM
         self.start_min, self.duration_min = int(rng.integers(60, 200)), int(rng.integers(20, 46))
-        self.factor, self.drop_K = 1.0 + size, 4.0 * size
+        self.factor, self.drop_K = 1.0 + 0.5 * size, 2.0 * size
 
     def shape(self) -> dict[str, tuple[float, str]]:
         return {

@@ -11,7 +11,7 @@ import pandas as pd
 
 from data.batch import Batch
 from data.machine import Machine
-from twin.plants.real.recordings import part_at
+from twin.plants.real.recordings import parts_at
 
 Term = dict[str, Any]
 
@@ -38,10 +38,12 @@ class KeptBack:
         part = copy.deepcopy(machine.twin) if self.twin else None
         for path in self.without:
             *keys, last = path.split(".")
-            del part_at(part, keys)[last]
+            for at in parts_at(part, keys):
+                del at[last]
         for path, new in self.instead.items():
             *keys, last = path.split(".")
-            part_at(part, keys)[last] = copy.deepcopy(new)
+            for at in parts_at(part, keys):
+                at[last] = copy.deepcopy(new)
         channels = {n: c for n, c in machine.channels.items() if n not in self.channels}
         bare = machine.model_copy(update={"twin": part, "channels": channels})
         return bare, [_without(b, self.channels) for b in batches]
