@@ -114,7 +114,8 @@ def _boxes(m: Measures) -> list[Box]:
         at, size = (-0.26 * s, axis - 0.36 * s, foot), (0.52 * s, 0.72 * s, saddle_m)
         boxes.append(Box("saddle", iron, 210 * s * s * f["saddle"], at, size, (3, 4, 1)))
     if m.screw:
-        boxes.append(bar("screw", kg, 0.0, back + 0.0175, foot + 0.58 * s, 0.035, 0.75 * s, 12))
+        across = float(np.sqrt(kg / (7850.0 * 0.75 * s)))
+        boxes.append(bar("screw", kg, 0.0, back + across / 2, foot + 0.58 * s, across, 0.75 * s, 12))
     if m.mandrel:
         boxes.append(bar("mandrel", 3.5, 0.0, axis, nose - 0.25, 0.042, 0.25, 5))
     return boxes

@@ -55,6 +55,7 @@ class Mesh:
         found = self.element[tuple(self._places(snug).T)]
         for side in product((-1e-9, 0.0, 1e-9), repeat=3):
             found = np.where(found < 0, self.element[tuple(self._places(snug + side).T)], found)
+        assert (found >= 0).all(), f"a point of {self.box.name} lies where there is no metal"
         return np.asarray(found)
 
     def interpolation(self, points_m: Array) -> sparse.csr_matrix:
