@@ -40,6 +40,7 @@ def flags(case: Case, key: str) -> dict[str, np.ndarray]:
         ("motor_loss", ("spindle_rpm",)),
         ("unlisted_warm_speed", ("spindle_rpm",)),
         ("unlisted_coolant_speed", ("coolant", "spindle_rpm")),
+        ("unlisted_feed_speed", ("feed", "spindle_rpm")),
     ],
 )
 def test_what_a_driver_switches_works_while_the_recording_shows_it_on(key: str, channels: tuple[str, ...]) -> None:
