@@ -117,7 +117,6 @@ def _casting(field: Field) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     gradient = np.stack([shape[0].grad for shape in basis.basis])  # (shapes, 3, elements, points)
     warm = Basis(basis.mesh, ElementHex1(), quadrature=basis.quadrature)
     theta = np.stack([np.asarray(shape[0]) for shape in warm.basis])
-    # The boxes of a grid are few in shape, so the products are taken point by point.
     G = np.einsum("iaeq,jbeq,eq->eiajb", gradient, gradient, basis.dx, optimize=True)
     K = lame * G + shear * np.swapaxes(G, 2, 4)
     trace = shear * np.einsum("eiajb,ab->eij", G, np.eye(3))
