@@ -76,6 +76,7 @@ class Mechanism(ABC):
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values of a shape at which a diagnosis looks for it
     all_errors: ClassVar[bool] = False  # True: one instrument shows all errors, so it may act on all of them together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
     far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one explains

@@ -113,6 +113,7 @@ class Draught(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"factor": 1.0, "drop": 0.0}
     shape = ("start", "duration")
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"start": tuple(0.5 * k for k in range(1, 13))}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
         return np.asarray(np.where(self.blows(view, p), p["factor"], 1.0))

@@ -117,10 +117,9 @@ def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, int] | N
         return None
     name = f"unlisted_{terms.place}"
     part = now.part.model_copy(update={"mechanisms": {**now.part.mechanisms, name: terms.part}})
-    inflation = now.state.noise.inflation
     try:
         fitted = settle(refitted(now, part))
-        before, after = alone(now, inflation), alone(fitted, inflation)
+        before, after = alone(now, now.memory), alone(fitted, now.memory)
     except (InputError, WorkError):
         return None
     return fitted, float(after.base_score()[0] - before.base_score()[0]), improved(before, after)

@@ -51,6 +51,7 @@ class Candidate:
     shape: tuple[str, ...] = ()
     fault: bool = False
     change: Change | None = None
+    variant_of: str = ""  # the name of what this is at another value of its shape
     parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
 
     def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:

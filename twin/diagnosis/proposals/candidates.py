@@ -50,7 +50,7 @@ def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISM
                         name = c.name
                         while name in out or name in taken:  # names of places may run into each other
                             name += "_"
-                        out[name] = replace(c, name=name)
+                        out |= {v.name: v for v in _variants(replace(c, name=name), mechanism)}
     return [out[name] for name in sorted(out)]
 
 
@@ -81,6 +81,19 @@ def _at(
                 mechanism.shape,
                 mechanism.fault,
             )
+
+
+def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
+    """The candidate at every value at which its shape is looked for: what happens at another time has no trace yet."""
+    yield c
+    if c.part is None or c.where.kind == "link":
+        return
+    for name, values in mechanism.scan.items():
+        unit = mechanism.spec(name).unit
+        for value in values:
+            given = {**c.part.parameters, name: Value(value=f"{value:g} {unit}")}
+            part = c.part.model_copy(update={"parameters": given})
+            yield replace(c, name=f"{c.name}_{name}_{value:g}".replace(".", "_"), part=part, variant_of=c.name)
 
 
 def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:

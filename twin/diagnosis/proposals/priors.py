@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.machine_size import at_size, size_of
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored
 from twin.mechanisms import MECHANISMS
-from twin.quantity import Spec, Value
+from twin.quantity import Spec, Value, convert
 
 WIDE = 1.5  # least spread of an amplitude's logarithm: machines differ by more than their handbook values
 FREEDOM = 2.0  # nats of each parameter that shapes an effect beside its size
@@ -44,7 +46,7 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
             usual = values[amplitude].value
             values[amplitude] = values[amplitude].model_copy(update={"value": _said(begin, spec.unit), "prior": usual})
     for name in c.shape:
-        spec = mechanism.spec(name)
+        spec = _stated(mechanism.spec(name), c)
         values[name] = Value(value=_said(spec.value, spec.unit), spread=_spread(spec), bounds=_bounds(spec))
     if mechanism.off is None:
         values |= {
@@ -93,9 +95,10 @@ def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
     return _said(spec.low, spec.unit), _said(spec.high, spec.unit)
 
 
-def log_prior(s: Scored, fitted: Fitted | None) -> float:
+def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> float:
     """Log density of an amplitude's size about the usual one, 0 at best; signed amplitudes by their usual spread.
 
+    Where `fitted` holds one that looks `like` this instead, the screen's amplitude grows as that one's did in its fit.
     What has more freedom costs more: a pump that always runs is a cabinet (a nat for each decade of a sample, Schwarz
     1978).
     """
@@ -112,8 +115,29 @@ def log_prior(s: Scored, fitted: Fitted | None) -> float:
         name = f"mechanisms.{c.name}.{amplitude}"
         if fitted is not None and any(p.name == name for p in fitted.problem.network.parameters):
             value = float(fitted.values[fitted.problem.network.index(name)])
+        elif fitted is not None and like is not None:
+            value = off + (value - off) * _grown(like, fitted)
         if spec.scale == "log" and spec.value and value > 0:
             out = min(out, -0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
         elif spec.scale == "linear" and spec.spread:
             out = min(out, -0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
     return out + freedom
+
+
+def _grown(like: Scored, fitted: Fitted) -> float:
+    """What its fit made of the screen's amplitude, a factor; 1 where that is not known."""
+    c = like.candidate
+    if c.mechanism not in MECHANISMS:
+        return 1.0
+    for amplitude, off in (MECHANISMS[c.mechanism].off or {}).items():
+        name = f"mechanisms.{c.name}.{amplitude}"
+        seen = like.amplitudes.get(amplitude, 0.0)
+        if seen and any(p.name == name for p in fitted.problem.network.parameters):
+            return float(np.clip((fitted.values[fitted.problem.network.index(name)] - off) / seen, 0.01, 100.0))
+    return 1.0
+
+
+def _stated(spec: Spec, c: Candidate) -> Spec:
+    """The Spec with the candidate's own value, where a shape was looked for at several."""
+    given = c.part.parameters.get(spec.name) if c.part is not None else None
+    return spec if given is None else replace(spec, value=convert(given.value, spec.unit))

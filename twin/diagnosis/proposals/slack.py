@@ -1,35 +1,81 @@
-"""What a lumped network gets wrong by itself: sensors off their body's mean, and late ones. Every fit has this slack.
+"""What a lumped network gets wrong by itself, and every fit may therefore do: it is no news.
 
-A sensor in a casting stands in a gradient that a lump does not have; without slack the difference passes for physics.
+A sensor in a casting stands in a gradient that a lump does not have, and is late; a length of an error's chain spans
+part of its body, nearer to one neighbour than the body's mean. Without slack the difference passes for physics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from twin.diagnosis.proposals.candidate import Candidate
+import numpy as np
 
-LOOSE = ("sensor_place", "sensor_lag", "time_skew")
+from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.rounds.fitted import Fitted
+
+LOOSE = ("sensor_place", "sensor_lag", "time_skew", "column_bending")
 PLACE = 0.1  # sd of the share of a neighbour's lead that a sensor sees
+SPAN = 0.15  # the same of a length of an error's chain
+NOSE = 0.5  # and of one in a small body, whose ends are as far apart as its neighbours are
+SMALL = 0.03  # of the machine's capacity: what is smaller carries no bending that an error shows
 LAG_S, LAG = 240.0, 1.5  # sd of a lag where the file states none; of the logarithm of one that it holds fixed
 SKEW = 0.1  # of the rows' step: a row is the mean about its time, which blurs a corner to both sides
 
 
-def slack(proposed: Sequence[Candidate], step_s: float) -> dict[str, float]:
-    """By name of a candidate the prior sd of its amplitude, for those that every fit has; rows are `step_s` apart."""
+def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
+    """By name of a candidate the prior sd of its amplitude, for those that every fit has."""
     out = {}
+    gains, small = _chain_gains(fitted), _small(fitted)
     for c in proposed:
         if c.mechanism == "sensor_place":
             out[c.name] = PLACE
         elif c.mechanism == "time_skew":
-            out[c.name] = SKEW * step_s
+            out[c.name] = SKEW * fitted.step_s
         elif c.mechanism == "sensor_lag":
             out[c.name] = LAG_S
         elif c.mechanism == "wrong_parameter" and c.change is not None and c.change.parameter.name.endswith(".lag"):
             out[c.name] = LAG
+        elif c.mechanism == "column_bending":
+            sides = _sides(c)
+            share = NOSE if sides & small else SPAN
+            gain = share * max(abs(gains.get((c.where.name, side), 0.0)) for side in sides)
+            if gain > 0:
+                out[c.name] = gain
     return out
 
 
-def no_news(proposed: Sequence[Candidate]) -> set[str]:
+def no_news(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
     """Those that any size is a lumped network's own fault of: never reported as found."""
-    return {c.name for c in proposed if c.mechanism == "sensor_place"}
+    small = _small(fitted)
+    return {
+        c.name
+        for c in proposed
+        if c.mechanism == "sensor_place" or (c.mechanism == "column_bending" and _sides(c) & small)
+    }
+
+
+def _sides(c: Candidate) -> set[str]:
+    assert c.part is not None and isinstance(c.part.at, dict)
+    return set(c.part.at.values())
+
+
+def _small(fitted: Fitted) -> set[str]:
+    """Bodies too small to bend what the tool hangs on."""
+    network = fitted.problem.network
+    every = network.capacity_J_per_K(fitted.values)
+    own = {name: float(every[cells].sum()) for name, cells in network.bodies.items()}
+    return {name for name, capacity in own.items() if capacity < SMALL * sum(own.values())}
+
+
+def _chain_gains(fitted: Fitted) -> dict[tuple[str, str], float]:
+    """By error and body what a kelvin of the body adds, tilts left aside; in the error's unit."""
+    network = fitted.problem.network
+    out: dict[tuple[str, str], float] = {}
+    for e in network.errors:
+        for row, gain in zip(e.rows, e.gains, strict=True):
+            if abs(float(np.sum(row))) < 1e-9:  # two sides of a tilt
+                continue
+            for name, cells in network.bodies.items():
+                if share := float(np.sum(row[cells])):
+                    out[e.channel, name] = out.get((e.channel, name), 0.0) + share * float(gain(fitted.values))
+    return out

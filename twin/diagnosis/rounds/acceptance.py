@@ -11,11 +11,13 @@ from scipy.stats import binom
 from twin.calibration.fit_problem import Array
 from twin.calibration.identifiability import Z90
 from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.writing.changes import deviations
 
 if TYPE_CHECKING:
     from twin.diagnosis.rounds.refits import Tried
 
 FLIPS = 60
+LEAST_DEVIATION = 0.02  # of a value from run to run: nobody's heat is the same to less
 
 
 def flipped_gains(evidence: Evidence, after: Evidence, alarm: Sequence[int], seed: int) -> Array:
@@ -49,7 +51,12 @@ def sign_p(better: int, n: int) -> float:
 
 def stands_out(t: Tried) -> bool:
     """Whether a signed amplitude's 90 % interval leaves out the value without an effect; of several, any one's."""
-    if t.fitted is None or t.candidate.part is None:
+    if t.fitted is None:
+        return True
+    change = t.candidate.change
+    if change is not None and change.per_batch is not None:
+        return deviations(t.fitted).get(change.parameter.name, 1.0) > LEAST_DEVIATION
+    if t.candidate.part is None:
         return True
     sd = np.sqrt(np.diag(t.fitted.state.arrow.covariance))
     fitted = {u.name: (u, z, own) for u, z, own in zip(t.fitted.problem.unknowns, t.fitted.state.z, sd, strict=True)}

@@ -16,6 +16,7 @@ from twin.calibration.fit_problem import Array
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.scoring.memory import Memory, memory_of
 from twin.schema import TwinPart
 
 NEAR, FAR = "_near", "_far"  # how pieces of a body are called
@@ -41,6 +42,12 @@ class Fitted:
     def values(self) -> Array:
         """Parameter values (n,) of the network."""
         return self.problem.values_at(self.x)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """What the rows of each channel remember of each other, in what this fit leaves over."""
+        left = self.problem.residuals(self.x, self.state.nuisance)
+        return memory_of(left, self.state.channels, len(self.problem.channels))
 
     @property
     def step_s(self) -> float:

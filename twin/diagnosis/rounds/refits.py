@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
 from data.errors import InputError, WorkError
-from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import log_prior, start_values
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 
 BEST, KINDS = 5, 12  # refits of a round: the best of all, and with the best of every other mechanism
@@ -55,14 +56,15 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
     worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
     clusters = _clusters(worth, evidence)
     chosen: list[int] = []
-    seen: set[str] = set()
+    seen: set[tuple[str, str]] = set()
     for k, s in enumerate(worth):
         if len(chosen) >= KINDS:
             break
-        new = s.candidate.mechanism not in seen
+        kind = s.candidate.mechanism, s.candidate.where.kind
+        new = kind not in seen
         if (len(chosen) < BEST or new) and not any(clusters[k] == clusters[j] for j in chosen):
             chosen.append(k)
-            seen.add(s.candidate.mechanism)
+            seen.add(kind)
     return worth, clusters, chosen
 
 
@@ -89,50 +91,52 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
         return t
 
 
-def judged(now: Fitted, t: Tried, inflation: Array | None = None) -> Tried:
+def judged(now: Fitted, t: Tried, memory: Memory | None = None) -> Tried:
     """A refit with its gain over the fit before.
 
-    Rows that repeat each other count once, for both as in the fit that leaves the whiter residuals: a missing effect
-    makes those of the other repeat themselves (as `twin.calibration.annealing.likelier`). `inflation` (K,) says
-    otherwise.
+    Rows remember each other, for both as in the fit that leaves the whiter residuals: a missing effect makes those of
+    the other repeat themselves (as `twin.calibration.annealing.likelier`). `memory` says otherwise.
     """
     assert t.fitted is not None
-    if inflation is None:
-        inflation = np.minimum(now.state.noise.inflation, t.fitted.state.noise.inflation)
-    before, after = alone(now, inflation), alone(t.fitted, inflation)
+    memory = whiter(now.memory, t.fitted.memory) if memory is None else memory
+    before, after = alone(now, memory), alone(t.fitted, memory)
     gain = float(after.base_score()[0] - before.base_score()[0])
     return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
 
 
 def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
     """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
-    whitest = [now.state.noise.inflation, *(t.fitted.state.noise.inflation for t in finalists if t.fitted)]
-    inflation = np.min(whitest, axis=0)
-    return [replace(t, alike=judged(now, t, inflation).gain) for t in finalists]
+    whitest = reduce(whiter, (t.fitted.memory for t in finalists if t.fitted), now.memory)
+    return [replace(t, alike=judged(now, t, whitest).gain) for t in finalists]
 
 
 def with_clusters(
     done: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]
 ) -> list[Tried]:
     """The others of each refitted cluster, as much worse as the screen says."""
-    best_in = {t.cluster: t for t in done}
+    best_in: dict[int, Tried] = {}
+    for t in done:
+        best_in.setdefault(t.cluster, t)
     out = []
     for k, s in enumerate(worth):
         if k not in chosen and clusters[k] in best_in:
             like = best_in[clusters[k]]
-            gain = like.gain - max(0.0, like.scored.gain - s.gain)
-            out.append(Tried(s, gain, s.improved, clusters[k], log_prior(s, like.fitted)))
+            loss = max(0.0, like.scored.gain - s.gain)
+            alike = None if like.alike is None else like.alike - loss
+            out.append(
+                Tried(s, like.gain - loss, s.improved, clusters[k], log_prior(s, like.fitted, like.scored), alike=alike)
+            )
     return out
 
 
 def improved(before: Evidence, after: Evidence) -> int:
     """Left-out batches whose squares fall, each channel in units of what is left of it afterwards."""
     left, right = before.left_out(), after.left_out()
-    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), 1.0)
+    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), QUIET)
     count = 0
     for b, a, e, f in zip(before.batches, after.batches, left, right, strict=True):
-        old = (e[:, 0] ** 2 / (before.weight * unit)[b.channel] / before.rows[b.channel]) @ before.count[b.channel]
-        new = (f[:, 0] ** 2 / (after.weight * unit)[a.channel] / after.rows[a.channel]) @ after.count[a.channel]
+        old = (e[:, 0] ** 2 / (before.weight * unit)[b.channel]).sum()
+        new = (f[:, 0] ** 2 / (after.weight * unit)[a.channel]).sum()
         count += int(new < old)
     return count
 

@@ -11,7 +11,6 @@ from functools import partial
 from pydantic import BaseModel
 
 from data.errors import InputError, WorkError
-from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import start_values
 from twin.diagnosis.proposals.values_of_part import with_parts
@@ -58,18 +57,17 @@ def second_thoughts(
                 work.append(_Work(k, r.candidate.applied(rest, values), r, dict(at)))
             except (ValueError, KeyError):
                 continue
-    inflation = final.state.noise.inflation
-    score = float(alone(final, inflation).base_score()[0])
-    done = [s for s in workers.map(partial(_changed, final, inflation, score), work) if s is not None]
+    score = float(alone(final, final.memory).base_score()[0])
+    done = [s for s in workers.map(partial(_changed, final, score), work) if s is not None]
     drops = [s for s in done if s.rival is None and s.loss < least]
     swaps = [s for s in done if s.rival is not None and s.loss < -BETTER]
     return min([*drops, *swaps], key=lambda s: s.loss, default=None)
 
 
-def _changed(final: Fitted, inflation: Array, score: float, w: _Work) -> Second | None:
+def _changed(final: Fitted, score: float, w: _Work) -> Second | None:
     try:
         fitted = settle(refitted(final, w.part, w.at), steps=4, tolerance=0.05, rounds=2)
-        loss = score - float(alone(fitted, inflation).base_score()[0])
+        loss = score - float(alone(fitted, final.memory).base_score()[0])
     except (InputError, WorkError):
         return None
     return Second(w.effect, w.rival, loss, fitted)

@@ -19,16 +19,20 @@ from twin.diagnosis.rounds.null_cache import cached_null
 from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters
 from twin.diagnosis.rounds.revise import second_thoughts
 from twin.diagnosis.rounds.workers import Workers
-from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
+from twin.diagnosis.scoring.memory import Memory
+from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, proposed, screen
 
 MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
 # refined twin has gave up to 35.
 LEAST = 40.0
 IMPROVED = 0.75  # share of the left-out batches that must improve
-RESTARTS = 2  # of a round, where a refit shows that the baseline had stopped short
+WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
+RESTARTS = 3  # times that a round is done, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
+LITTLE = 0.3  # of a gain: a baseline that stopped short by no more would have led to the same
 FINALISTS, HOPEFUL = 5, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
+MEMBERS, CLOSE = 3, 2.0  # of the best one's cluster that are refitted too: the likeliest of those that look alike
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
@@ -135,17 +139,21 @@ def _fair_round(
     now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress, cache: Path | None
 ) -> Round:
     """A round whose baseline fits as well as its best candidate's fit without the candidate: no gain by a start."""
-    for _ in range(RESTARTS + 1):
+    for _ in range(RESTARTS):
         done = one_round(now, null, seed, workers, tell, cache)
         if not done.accepted or done.best is None or done.best.fitted is None:
             return done
         tell("fair baseline", 0, 0)
         back = settle(refitted(done.best.fitted, now.part))
-        inflation = now.state.noise.inflation
-        if alone(back, inflation).base_score()[0] < alone(now, inflation).base_score()[0] + BETTER:
+        more = float(alone(back, now.memory).base_score()[0] - alone(now, now.memory).base_score()[0])
+        if more < BETTER:
+            return done
+        fair = replace(done.best, gain=done.best.gain - more)
+        done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=fair.gain > done.threshold)
+        if done.accepted and more < LITTLE * fair.gain:
             return done
         now, null = back, None
-    return one_round(now, null, seed, workers, tell, cache)
+    return done
 
 
 def one_round(
@@ -155,18 +163,19 @@ def one_round(
     every = proposed(now)
     tell("screen", 0, 0)
     seen = screen(now, every)
-    loose = no_news(every)
+    loose = no_news(every, now)
     news = [s for s in seen.scored if s.candidate.name not in loose]
     columns = {s.candidate.name: s.column for s in news if s.column >= 0}
     alarm = list(columns.values())
+    news = best_variants(news)
     if null is None:
         null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
-    inflation = now.state.noise.inflation
-    base = alone(now, inflation)
+    base = alone(now, now.memory)
+    plain = alone(now, Memory.none(len(now.problem.channels)))  # a slow misfit in full: that is what is too coarse
     worth, clusters, chosen = shortlist(news, seen.evidence)
     coarse = [
-        Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, base.mean_squares(base.left_out())[0])
+        Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, plain.mean_squares(plain.left_out())[0])
     ]
     work = [worth[k] for k in chosen] + coarse
     numbers = [clusters[k] for k in chosen] + [-1000 - k for k in range(len(coarse))]
@@ -178,18 +187,27 @@ def one_round(
     tried.sort(key=order)
     least = HOPEFUL * null.threshold(float(base.base_score()[0]))
     n_final = sum(t.gain > least for t in tried[:FINALISTS])
-    final = compared(now, list(workers.map(partial(taken_on, now), tried[:n_final])))
+    members = with_clusters(tried, worth, clusters, chosen) if n_final else []
+    close = [m for m in members if m.cluster == tried[0].cluster and -order(m)[1] > -order(tried[0])[1] - CLOSE]
+    again = [t for t in workers.map(partial(refit, now), [m.scored for m in close[:MEMBERS]]) if t is not None]
+    again = [replace(t, cluster=tried[0].cluster) for t in again]
+    final = compared(now, list(workers.map(partial(taken_on, now), [*tried[:n_final], *again])))
     tried = sorted([*final, *tried[n_final:]], key=order)
+    chosen = [*chosen, *(k for k, s in enumerate(worth) if any(s is t.scored for t in again))]
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
         least = max(null.threshold(float(base.base_score()[0])), LEAST)
         return Round(now, seen, tuple(tried), least, null, np.zeros(0), False)
-    best = tried[0]
-    after = alone(tried[0].fitted, inflation)
+    n = len(now.batches)
+    best = next((t for t in tried[:FINALISTS] if t.fitted and t.improved >= IMPROVED * n and stands_out(t)), tried[0])
+    if best.gain < max(LEAST, WORTH_A_CLAIM * tried[0].gain):
+        best = tried[0]
+    assert best.fitted is not None
+    after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
     threshold = max(null.threshold(float(after.base_score()[0])), flipped_threshold(flipped, len(now.batches)), LEAST)
-    n = len(now.batches)
-    accepted = best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best)
+    accepted = bool(best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best))
+    tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
 
 

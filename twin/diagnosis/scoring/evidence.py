@@ -3,7 +3,7 @@
 With the nuisances projected out (`whitened`) a fold is a downdate of the normal matrix, and a candidate beside the
 shared parameters a Schur complement (Frisch and Waugh 1933): hundreds of candidates cost a few matrix products.
 The score is the left-out log density with every channel's noise unknown, ``-1/2 sum_c n_c log(MSE_c)``, so that no
-channel's units or misfit decide; n_c counts rows that repeat each other once (Geyer 1992, as the calibration does).
+channel's units or misfit decide; rows that repeat each other are filtered first (`twin.diagnosis.scoring.memory`).
 Amplitudes maximise the same density of the other batches: a channel that the baseline's weights gave up counts again.
 """
 
@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from twin.calibration.fit_problem import Array
+from twin.diagnosis.scoring.memory import QUIET
 from twin.diagnosis.scoring.whitened import Whitened
 
 TINY = 1e-300
@@ -51,15 +52,14 @@ class Scores:
 
 @dataclass(frozen=True)
 class Evidence:
-    """B whitened batches; per channel (K,) the `rows` of all, those that `count` and the `weight` of each.
+    """B whitened batches; per channel (K,) the `rows` of all and the `weight` of each, its share of what noise leaves.
 
-    Mean squares are in units of the given noise, below which no channel is rewarded. Amplitudes lie within low and
+    Mean squares are in units of the given noise. Amplitudes lie within low and
     high (C,). Targets are B arrays (n_b, R): R recordings, or what stands for them, at once.
     """
 
     batches: tuple[Whitened, ...]
     rows: Array
-    count: Array
     weight: Array
     low: Array
     high: Array
@@ -149,11 +149,11 @@ class Evidence:
         volume = sum(float(np.sum(np.log1p(-self.batches[k].damping))) for k in group)
         share = least / np.maximum(self._least, TINY)
         mean = np.where(least > 0, square / np.maximum(least, TINY), 1.0)
-        return float(-0.5 * np.sum(self.count * share * np.log(np.maximum(mean, 1.0))) + volume)
+        return float(-0.5 * np.sum(self.rows * share * np.log(np.maximum(mean, QUIET))) + volume)
 
     def density(self, mean_squares: Array) -> Array:
-        """Log density (…,) in nats of mean squares (…, K); noise is not rewarded below what is given."""
-        return np.asarray(-0.5 * np.log(np.maximum(mean_squares, 1.0)) @ self.count)
+        """Log density (…,) in nats of mean squares (…, K); less than a quiet instrument's is not rewarded."""
+        return np.asarray(-0.5 * np.log(np.maximum(mean_squares, QUIET)) @ self.rows)
 
     def gains(self, targets: Sequence[Array] | None = None) -> tuple[Array, Array, Array]:
         """Of all columns one by one: gains (R, C) in nats, amplitudes (R, C), falls of batches' squares (R, B, C)."""
@@ -237,7 +237,7 @@ class Evidence:
         """Where reweighting starts (R, C): the best of plain least squares and of every channel's own optimum."""
         best = np.clip(cross.sum(axis=1) / np.maximum(square.sum(axis=0), TINY), self.low, self.high)
         most = self._of_squares(self._moved(best, own, cross, square))
-        for c in np.flatnonzero(self.count):
+        for c in np.flatnonzero(self.rows):
             g = np.clip(cross[:, c] / np.maximum(square[c], TINY), self.low, self.high)
             density = self._of_squares(self._moved(g, own, cross, square))
             best, most = np.where(density > most, g, best), np.maximum(density, most)
@@ -249,8 +249,8 @@ class Evidence:
         Reweighted iteratively; then less what noise alone would give (James and Stein 1961, positive part).
         """
         for _ in range(ROUNDS):
-            mean = np.maximum(self._moved(g, own, cross, square), self._least[:, None] + TINY)
-            weight = self.count[:, None] / mean
+            mean = np.maximum(self._moved(g, own, cross, square), QUIET * self._least[:, None] + TINY)
+            weight = self.rows[:, None] / mean
             g = np.einsum("rkc,rkc->rc", weight, cross) / np.maximum(np.einsum("rkc,kc->rc", weight, square), TINY)
             g = np.clip(g, self.low, self.high)
         if not shrink:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from twin.diagnosis.diagnosis import COLUMNS
 from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.scoring.screen import Screen
+from twin.diagnosis.scoring.screen import Screen, best_variants
 from twin.mechanisms import MECHANISMS
 
 SURE = 1.64  # sd beyond the threshold: seen in 95 of 100 such sets of runs
@@ -24,7 +24,7 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
     own = np.sqrt(sum(np.einsum("np,np->p", b.jacobian, b.jacobian) for b in evidence.batches))
     names = [u.name for u in fitted.problem.unknowns]
     rows = []
-    for s in seen.scored:
+    for s in best_variants(seen.scored):
         c = s.candidate
         if s.column < 0 or c.mechanism not in MECHANISMS or not c.amplitudes:
             continue

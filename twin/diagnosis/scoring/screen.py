@@ -19,6 +19,7 @@ from twin.diagnosis.scoring.asleep import Asleep, asleep
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.finite import differences
+from twin.diagnosis.scoring.memory import Memory
 from twin.diagnosis.scoring.whitened import Whitened, whitened
 from twin.mechanisms import MECHANISMS
 
@@ -58,7 +59,7 @@ def proposed(fitted: Fitted) -> list[Candidate]:
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
     """The evidence for all candidates that can be switched off or whose value may be doubted."""
-    line = _Line.at(fitted, every, fitted.state.noise.inflation)
+    line = _Line.at(fitted, every, fitted.memory)
     finite, refused = differences(fitted, every)
     batches = tuple(
         replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
@@ -66,17 +67,29 @@ def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
     )
     low, high = _bounds(line, every)
     low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
-    evidence = _evidence(fitted, batches, fitted.state.noise.inflation, low, high)
+    evidence = _evidence(fitted, batches, fitted.memory, low, high)
     return Screen(tuple(_scored(line, every, list(finite), evidence)), evidence, {**line.found.left_out, **refused})
 
 
-def alone(fitted: Fitted, inflation: Array) -> Evidence:
-    """How well a fit predicts batches left out, with slack and no candidates; `inflation` (K,) of what is compared."""
+def best_variants(scored: Sequence[Scored]) -> list[Scored]:
+    """Of what was looked for at several values of its shape, the best one; in the same order."""
+    best: dict[str, Scored] = {}
+    for s in scored:
+        own = s.candidate.variant_of or s.candidate.name
+        if own not in best or s.gain > best[own].gain:
+            best[own] = s
+    kept = {s.candidate.name for s in best.values()}
+    return [s for s in scored if s.candidate.name in kept]
+
+
+def alone(fitted: Fitted, memory: Memory) -> Evidence:
+    """How well a fit predicts batches left out, with slack and no candidates; `memory` of the rows of what is
+    compared."""
     every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
-    loose = slack(every, fitted.step_s)
-    line = _Line.at(fitted, [c for c in every if c.name in loose], inflation)
+    loose = slack(every, fitted)
+    line = _Line.at(fitted, [c for c in every if c.name in loose], memory)
     batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
-    return _evidence(fitted, batches, inflation, np.zeros(0), np.zeros(0))
+    return _evidence(fitted, batches, memory, np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -89,36 +102,39 @@ class _Line:
     own: dict[str, int]  # parameters that the fit has already, by name
 
     @classmethod
-    def at(cls, fitted: Fitted, every: Sequence[Candidate], inflation: Array) -> _Line:
+    def at(cls, fitted: Fitted, every: Sequence[Candidate], memory: Memory) -> _Line:
         found = asleep(fitted.machine, fitted.part, every)
         problem = on_network(fitted.problem, fitted.batches, found.network)
         own = {u.name: k for k, u in enumerate(fitted.problem.unknowns)}
         waking = sorted({j for js in found.amplitudes.values() for j in js})
         numbers = [j for j in waking if found.network.parameters[j].name not in own]
         loose = {
-            numbers.index(found.amplitudes[n][0]): sd
-            for n, sd in slack(every, fitted.step_s).items()
-            if n in found.amplitudes
+            numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every, fitted).items() if n in found.amplitudes
         }
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
-        weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
+        weight = 1.0 / fitted.state.noise.factor**2
         more = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
         every_unknown = (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers))
         columns = range(len(own), len(every_unknown))
         blocks = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), more, strict=True)  # kept from the fit
         batches = tuple(
             whitened(
-                replace(b, jacobian=np.hstack([b.jacobian, m])), v, fitted.state.z, every_unknown, columns, weight
+                replace(b, jacobian=np.hstack([b.jacobian, m])),
+                v,
+                fitted.state.z,
+                every_unknown,
+                columns,
+                weight,
+                memory,
             ).with_slack(loose)
             for (b, m), v in zip(blocks, fitted.state.nuisance, strict=True)
         )
         return cls(found, batches, numbers, own)
 
 
-def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], inflation: Array, low: Array, high: Array) -> Evidence:
-    weight = 1.0 / (fitted.state.noise.factor**2 * inflation)
-    return Evidence(batches, fitted.rows, fitted.rows / inflation, weight, low, high)
+def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], memory: Memory, low: Array, high: Array) -> Evidence:
+    return Evidence(batches, fitted.rows, memory.white / fitted.state.noise.factor**2, low, high)
 
 
 def _bounds(line: _Line, every: Sequence[Candidate]) -> tuple[Array, Array]:

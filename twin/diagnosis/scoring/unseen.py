@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from data.batch import Batch
-from twin.calibration.fit_problem import Array
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import alone
 
 FEWEST = 2  # batches on either side
 
 
-def unseen(before: Fitted, after: Fitted, inflation: Array) -> dict[str, Mapping[str, float]]:
+def unseen(before: Fitted, after: Fitted) -> dict[str, Mapping[str, float]]:
     """Gains in nats where a whole season, or the fastest runs, were left out; empty where the data allow none."""
-    one, other = alone(before, inflation), alone(after, inflation)
+    one, other = alone(before, before.memory), alone(after, before.memory)
     out: dict[str, Mapping[str, float]] = {}
     for key, groups in (("seasons_left_out", _seasons(before.batches)), ("regimes_left_out", _fast(before.batches))):
         gains = {

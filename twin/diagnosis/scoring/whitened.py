@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array, Block, Unknown
+from twin.diagnosis.scoring.memory import Memory
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Whitened:
     scale: Array  # (n,) sqrt of the rows' weights
     mixing: Array
     damping: Array
+    memory: Memory | None = None  # of each channel's rows; None: they are independent
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
@@ -74,28 +76,34 @@ class Whitened:
 
     def of(self, rows: Array) -> Array:
         """Other quantities of the same rows (n, …), in units of the given noise, whitened alike."""
-        rows = rows * self.scale.reshape(-1, *(1,) * (rows.ndim - 1))
+        rows = self._independent(rows * self.scale.reshape(-1, *(1,) * (rows.ndim - 1)))
         return np.asarray(rows - self.mixing @ (self.damping * (self.mixing.T @ rows).T).T)
+
+    def _independent(self, rows: Array) -> Array:
+        if self.memory is None:
+            return rows
+        return np.concatenate([self.memory.filtered(c, rows[at]) for c, at in self.slices])
 
 
 def whitened(
-    block: Block, nuisance: Array, z: Array, unknowns: Sequence[Unknown], columns: Sequence[int], weight: Array
-) -> Whitened:
+    block: Block, nuisance: Array, z: Array, unknowns: Sequence[Unknown], columns: Sequence[int], weight: Array,
+    memory: Memory | None = None,
+) -> Whitened:  # fmt: skip
     """A block at z and its nuisances (q,), the unknowns numbered `columns` taken as amplitudes.
 
-    z (p,) of the other unknowns in their order; `weight` (channels,) of the rows.
+    z (p,) of the other unknowns in their order; `weight` (channels,) of the rows, `memory` of each channel's.
     """
     scale = np.sqrt(weight[block.channel])
-    own = block.nuisance * scale[:, None]
+    bare = np.zeros((len(scale), 0))
+    none = Whitened(block.batch_id, scale[:0], bare, bare, block.channel, scale, bare, scale[:0], memory)
+    own = none.of(block.nuisance)
     u, s, _ = np.linalg.svd(own, full_matrices=False)
     kept = s > 1e-9
     mixing, damping = u[:, kept], 1.0 - 1.0 / np.sqrt(1.0 + s[kept] ** 2)
     chosen = np.zeros(len(unknowns), bool)
     chosen[list(columns)] = True
     spread = np.array([u.spread for u in unknowns])
-    out = Whitened(
-        block.batch_id, np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0)), block.channel, scale, mixing, damping
-    )
+    out = replace(none, mixing=mixing, damping=damping)
     rows = out.of(
         np.column_stack(
             [block.residual + block.nuisance @ nuisance, block.jacobian[:, ~chosen] * spread[~chosen],
@@ -104,6 +112,4 @@ def whitened(
     )  # fmt: skip
     p = int((~chosen).sum())
     jacobian = rows[:, 1 : 1 + p]
-    return Whitened(
-        block.batch_id, rows[:, 0] + jacobian @ z, jacobian, rows[:, 1 + p :], block.channel, scale, mixing, damping
-    )
+    return replace(out, target=rows[:, 0] + jacobian @ z, jacobian=jacobian, columns=rows[:, 1 + p :])

@@ -82,7 +82,7 @@ def found_of(
             "probability_nothing": nothing,
             "probability_unlisted": unlisted,
             "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
-            **unseen(done.before, best.tried.fitted or final, done.before.state.noise.inflation),
+            **unseen(done.before, best.tried.fitted or final),
         },
         was=was,
     )
@@ -170,7 +170,7 @@ def caps(n: int) -> tuple[str, ...]:
 def remainder(search: Search) -> float:
     """Left-out errors after all that was found over what structure alone leaves, the median over channels."""
     final, null = search.final, search.rounds[-1].null
-    left = alone(final, final.state.noise.inflation)
+    left = alone(final, final.memory)
     seen = left.mean_squares(left.left_out())[0]
     structure = np.median(null.mean_squares[:, AS_IT_IS], axis=0)
     return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
