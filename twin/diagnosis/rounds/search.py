@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -199,9 +199,7 @@ def one_round(
         least = max(null.threshold(float(base.base_score()[0])), LEAST)
         return Round(now, seen, tuple(tried), least, null, np.zeros(0), False)
     n = len(now.batches)
-    best = next((t for t in tried[:FINALISTS] if t.fitted and t.improved >= IMPROVED * n and stands_out(t)), tried[0])
-    if best.gain < max(LEAST, WORTH_A_CLAIM * tried[0].gain):
-        best = tried[0]
+    best = to_claim(tried, n)
     assert best.fitted is not None
     after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
@@ -209,6 +207,14 @@ def one_round(
     accepted = bool(best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best))
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
+
+
+def to_claim(tried: Sequence[Tried], batches: int) -> Tried:
+    """Of refits, best first, the first that improves most batches and stands out, if it gains enough; else the best."""
+    for t in tried[:FINALISTS]:
+        if t.fitted is not None and t.improved >= IMPROVED * batches and stands_out(t):
+            return t if t.gain > WORTH_A_CLAIM * tried[0].gain else tried[0]
+    return tried[0]
 
 
 def _coarse_first(tried: list[Tried]) -> list[Tried]:

@@ -55,9 +55,20 @@ class Memory:
         theta, variance = (float(v) for v in _moving_average(np.array(w), np.array(phi)))
         out = lfilter([1.0, -phi], [1.0, -theta], rows, axis=0) / np.sqrt(variance)
         # the first row has no past: of full variance, and a filter that begins as if it had always run
-        begin = rows[:1] * (1.0 - 1.0 / np.sqrt(1.0 / variance)) / np.sqrt(variance)
+        begin = rows[:1] * (1.0 / np.sqrt(variance) - 1.0)
         decay = theta ** np.arange(len(rows), dtype=float)
         return np.asarray(out - begin * decay.reshape(-1, *(1,) * (rows.ndim - 1)))
+
+    def restored(self, channel: int, rows: Array) -> Array:
+        """The rows whose innovations these are: the inverse of `filtered`."""
+        w, phi = float(self.share[channel]), float(self.keep[channel])
+        if w == 0.0 or phi == 0.0:
+            return rows
+        theta, variance = (float(v) for v in _moving_average(np.array(w), np.array(phi)))
+        decay = theta ** np.arange(len(rows), dtype=float)
+        begin = rows[:1] * (1.0 / np.sqrt(variance) - 1.0)
+        out = rows + begin * decay.reshape(-1, *(1,) * (rows.ndim - 1))
+        return np.asarray(lfilter([1.0, -theta], [1.0, -phi], out * np.sqrt(variance), axis=0))
 
 
 def whiter(one: Memory, other: Memory) -> Memory:

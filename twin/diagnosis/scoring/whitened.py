@@ -76,13 +76,22 @@ class Whitened:
 
     def of(self, rows: Array) -> Array:
         """Other quantities of the same rows (n, …), in units of the given noise, whitened alike."""
-        rows = self._independent(rows * self.scale.reshape(-1, *(1,) * (rows.ndim - 1)))
+        rows = self.innovations(rows * self.scale.reshape(-1, *(1,) * (rows.ndim - 1)))
         return np.asarray(rows - self.mixing @ (self.damping * (self.mixing.T @ rows).T).T)
 
-    def _independent(self, rows: Array) -> Array:
+    def innovations(self, rows: Array) -> Array:
+        """Rows (n, …) less what each channel's memory of the rows before foretells."""
         if self.memory is None:
             return rows
         return np.concatenate([self.memory.filtered(c, rows[at]) for c, at in self.slices])
+
+    def restored(self, rows: Array) -> Array:
+        """Rows (n, …) as they were before `of`, in units of the weighted noise."""
+        back = self.damping / (1.0 - self.damping)
+        rows = np.asarray(rows + self.mixing @ (back * (self.mixing.T @ rows).T).T)
+        if self.memory is None:
+            return rows
+        return np.concatenate([self.memory.restored(c, rows[at]) for c, at in self.slices])
 
 
 def whitened(

@@ -34,7 +34,7 @@ def in_sample_gains(evidence: Evidence, targets: Sequence[Array], columns: Seque
     low, high = evidence.low[at], evidence.high[at]
     g = np.clip(cross.sum(axis=1) / np.maximum(square.sum(axis=0), 1e-300), low, high)
     for _ in range(ROUNDS):
-        weight = evidence.count[:, None] / np.maximum(_squares(g, own, cross, square), least[:, None])
+        weight = evidence.rows[:, None] / np.maximum(_squares(g, own, cross, square), least[:, None])
         g = np.einsum("rkc,rkc->rc", weight, cross) / np.maximum(np.einsum("rkc,kc->rc", weight, square), 1e-300)
         g = np.clip(g, low, high)
     after = np.moveaxis(_squares(g, own, cross, square) / least[:, None], 1, -1)

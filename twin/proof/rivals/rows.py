@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.proposals.slack import LOOSE, no_news
+from twin.diagnosis.proposals.slack import no_news, slack
 from twin.diagnosis.rounds.search import Round
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import Scored
@@ -42,7 +42,7 @@ def plain_rows(done: Round) -> PlainRows:
     residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
     channel = np.concatenate([b.channel for b in evidence.batches])
     residual = np.concatenate(residuals)
-    columns = np.concatenate([unwhitened(b, b.columns[:, at]) / b.scale[:, None] for b in evidence.batches])
+    columns = np.concatenate([b.restored(b.columns[:, at]) / b.scale[:, None] for b in evidence.batches])
     for c in np.unique(channel):
         own = channel == c
         rms = float(np.sqrt(np.mean(residual[own] ** 2))) + TINY
@@ -57,35 +57,26 @@ def plain_rows(done: Round) -> PlainRows:
 
 def claimable(done: Round) -> list[Scored]:
     """Candidates with a signature, but those that any lumped network has some of."""
-    loose = no_news([s.candidate for s in done.screen.scored])
+    loose = no_news([s.candidate for s in done.screen.scored], done.before)
     return [s for s in done.screen.scored if s.column >= 0 and s.candidate.name not in loose]
 
 
 def beyond_slack(done: Round) -> list[Scored]:
-    """Those of them that are not late or off-centre readings, which every lumped network shows without a fault.
+    """Those of them that are not late or off-centre readings or lengths, which every lumped network shows without a
+    fault.
 
     A diagnosis fits that slack beside everything; a method that does not would name nothing else.
     """
-    return [s for s in claimable(done) if s.candidate.mechanism not in LOOSE]
-
-
-def unwhitened(b: Whitened, rows: Array) -> Array:
-    """Rows (n, C) of a whitened batch as they were, in units of the weighted noise: the inverse of `Whitened.of`."""
-    back = b.damping / (1.0 - b.damping)
-    return np.asarray(rows + b.mixing @ (back[:, None] * (b.mixing.T @ rows)))
+    loose = slack([s.candidate for s in done.screen.scored], done.before)
+    return [s for s in claimable(done) if s.candidate.name not in loose]
 
 
 def counted_in_full(evidence: Evidence) -> Evidence:
-    """The same evidence had every row noise of its own, none repeating another."""
-    inflation = evidence.rows / np.maximum(evidence.count, TINY)
-    return Evidence(
-        tuple(_stretched(b, np.sqrt(inflation)) for b in evidence.batches),
-        evidence.rows,
-        evidence.rows,
-        evidence.weight * inflation,
-        evidence.low,
-        evidence.high,
-    )
+    """The same evidence had every row noise of its own, none remembering another."""
+    memory = evidence.batches[0].memory
+    white = np.ones(len(evidence.rows)) if memory is None else memory.white
+    batches = tuple(_without_memory(b) for b in evidence.batches)
+    return replace(evidence, batches=batches, weight=evidence.weight / white)
 
 
 def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidence:
@@ -95,23 +86,22 @@ def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidenc
         still = np.zeros((len(residual), 1))
         batches.append(
             replace(
-                b, target=residual * b.scale, jacobian=still, columns=unwhitened(b, b.columns),
-                mixing=b.mixing[:, :0], damping=b.damping[:0],
+                b, target=b.innovations(residual * b.scale), jacobian=still, mixing=b.mixing[:, :0], damping=b.damping[:0],
+                columns=b.innovations(b.restored(b.columns)),
             )
         )  # fmt: skip
     return replace(evidence, batches=tuple(batches))
 
 
-def _stretched(b: Whitened, factor: Array) -> Whitened:
-    """A batch whose channels' scales are multiplied by `factor` (K,)."""
-    own = factor[b.channel]
-    spread = b.mixing * np.sqrt(1.0 / (1.0 - b.damping) ** 2 - 1.0)
-    mixing, s, _ = np.linalg.svd(spread * own[:, None], full_matrices=False)
+def _without_memory(b: Whitened) -> Whitened:
+    """A batch whose rows are taken as independent, its own unknowns integrated out again."""
+    spread = np.sqrt(1.0 / (1.0 - b.damping) ** 2 - 1.0)
+    plain = replace(b, mixing=b.mixing[:, :0], damping=b.damping[:0])
+    mixing, s, _ = np.linalg.svd(plain.restored(b.mixing * spread), full_matrices=False)
     damping = 1.0 - 1.0 / np.sqrt(1.0 + s**2)
-    rows = unwhitened(b, np.column_stack([b.target, b.jacobian, b.columns])) * own[:, None]
+    rows = b.restored(np.column_stack([b.target, b.jacobian, b.columns]))
     rows = rows - mixing @ (damping[:, None] * (mixing.T @ rows))
     p = 1 + b.jacobian.shape[1]
     return replace(
-        b, target=rows[:, 0], jacobian=rows[:, 1:p], columns=rows[:, p:], scale=b.scale * own, mixing=mixing,
-        damping=damping,
-    )  # fmt: skip
+        b, target=rows[:, 0], jacobian=rows[:, 1:p], columns=rows[:, p:], mixing=mixing, damping=damping, memory=None
+    )

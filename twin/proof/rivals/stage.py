@@ -11,7 +11,7 @@ from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.acceptance import flipped_threshold, stands_out
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import FINER, IMPROVED, LEAST, Round, Search
+from twin.diagnosis.rounds.search import FINER, IMPROVED, LEAST, Round, Search, to_claim
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.conclude import REST, SURE, remainder
@@ -65,13 +65,13 @@ class Stage:
     @cached_property
     def before(self) -> Evidence:
         """How the fit without any candidate predicts batches left out."""
-        return alone(self.round.before, self.round.before.state.noise.inflation)
+        return alone(self.round.before, self.round.before.memory)
 
     @cached_property
     def after(self) -> list[Evidence]:
         """The same of every refit, its rows counted as before."""
-        inflation = self.round.before.state.noise.inflation
-        return [alone(t.fitted, inflation) for t in self.refits if t.fitted is not None]
+        memory = self.round.before.memory
+        return [alone(t.fitted, memory) for t in self.refits if t.fitted is not None]
 
     @cached_property
     def misfits(self) -> list[list[Array]]:
@@ -99,7 +99,8 @@ class Stage:
     def decided(self, tried: Sequence[Tried], threshold: float) -> Reply:
         """The reply under the rules of a diagnosis, by other gains or another threshold."""
         ranked = self.ranked(tried)
-        best = ranked[0] if ranked else None
+        best = to_claim(ranked, len(self.round.before.batches)) if ranked else None
+        ranked = [best, *(t for t in ranked if t is not best)] if best is not None else []
         if best is None or not self.accepts(best, threshold):
             return Reply("undecidable" if self.rest > REST else "consistent")
         if best.candidate.mechanism == COARSE:

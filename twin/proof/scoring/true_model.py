@@ -17,13 +17,13 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null, structural_null
 from twin.diagnosis.rounds.parts_of_batches import enough_batches
 from twin.diagnosis.rounds.prediction import left_out_rows
+from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
 from twin.proof.scoring.true_candidate import true_candidate, with_terms
@@ -73,7 +73,7 @@ def true_model(
         return TrueModel(level, level, 1.0, (), (), ())
     every = proposed(fit)
     seen = screen(fit, every)
-    null = _null(fit, seen, no_news(every), seed)
+    null = _null(fit, seen, no_news(every, fit), seed)
     found = [true_candidate(t, seen, every) for t in key.terms]
     stated = [k for k, s in enumerate(found) if s is not None]
     full = _with(fit, key.terms, found, stated)
@@ -139,10 +139,10 @@ def _judged(
         without = [settle(back)] if others else [settle(back, steps=4, tolerance=0.05, rounds=2), fit]
     except (InputError, WorkError):
         return _Judged()
-    inflation = np.minimum(full.state.noise.inflation, without[0].state.noise.inflation)
-    scores = [_score(w, inflation) for w in without]
+    memory = whiter(full.memory, without[0].memory)
+    scores = [_score(w, memory) for w in without]
     best = int(np.argmax(scores))
-    return _beyond(without[best], full, inflation, null)
+    return _beyond(without[best], full, memory, null)
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
@@ -150,20 +150,20 @@ def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> 
     if redraw is None:
         return _Judged()
     other = _fit(*redraw(term.effect))
-    inflation = np.minimum(fit.state.noise.inflation, other.state.noise.inflation)
-    return replace(_beyond(fit, other, inflation, null), fitted=other)
+    memory = whiter(fit.memory, other.memory)
+    return replace(_beyond(fit, other, memory, null), fitted=other)
 
 
-def _beyond(before: Fitted, after: Fitted, inflation: Array, null: Null) -> _Judged:
-    density = _score(after, inflation)
-    gain, threshold = density - _score(before, inflation), float(null.threshold(density))
+def _beyond(before: Fitted, after: Fitted, memory: Memory, null: Null) -> _Judged:
+    density = _score(after, memory)
+    gain, threshold = density - _score(before, memory), float(null.threshold(density))
     old, new = _rms(before), _rms(after)
     cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
     return _Judged(gain, threshold, bool(gain > threshold and cut >= CUT))
 
 
-def _score(fitted: Fitted, inflation: Array) -> float:
-    return float(alone(fitted, inflation).base_score()[0])
+def _score(fitted: Fitted, memory: Memory) -> float:
+    return float(alone(fitted, memory).base_score()[0])
 
 
 def _rms(fitted: Fitted) -> dict[str, float]:

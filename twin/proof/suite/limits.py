@@ -74,10 +74,10 @@ class Bench:
         fitted = baseline(case.machine, twin_part(case.machine), case.batches, None, len(case.batches))
         every = proposed(fitted)
         seen = screen(fitted, every)
-        loose = no_news(every)
+        loose = no_news(every, fitted)
         columns = {s.candidate.name: s.column for s in seen.scored if s.column >= 0 and s.candidate.name not in loose}
         null = structural_null(fitted, seen.evidence, columns)
-        evidence = alone(fitted, fitted.state.noise.inflation)
+        evidence = alone(fitted, fitted.memory)
         return cls(seed, plant, options, fitted, evidence, null.threshold(float(evidence.base_score()[0])))
 
     def clean(self, sizes: Mapping[str, float]) -> list[Batch]:
