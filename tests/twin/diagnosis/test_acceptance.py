@@ -46,7 +46,7 @@ def with_drift(per_batch_K_per_h: list[float]) -> Fitted:
 def largest_flipped(done: Fitted) -> float:
     found = screen(done, proposed(done))
     columns = [s.column for s in found.scored if s.candidate.mechanism == "sensor_drift"]
-    after = alone(done, done.state.noise.inflation)
+    after = alone(done, done.memory)
     gains = flipped_gains(found.evidence, after, columns, seed=0)
     assert gains.shape == (FLIPS,)
     np.testing.assert_array_equal(gains, flipped_gains(found.evidence, after, columns, seed=0))

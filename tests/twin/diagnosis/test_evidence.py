@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from twin.calibration.fit_problem import Block, Unknown
 from twin.diagnosis.scoring.evidence import Evidence
+from twin.diagnosis.scoring.memory import QUIET
 from twin.diagnosis.scoring.whitened import whitened
 
 Array = NDArray[np.float64]
@@ -21,7 +22,7 @@ UNKNOWNS = tuple(Unknown(f"p{k}", "W", 0.0, 0.5 + 0.5 * k, scale="linear") for k
 )
 SPREAD = np.array([u.spread for u in UNKNOWNS[:P]])
 WEIGHT = np.array([1.0, 0.25, 0.5])
-COUNT = np.array([60.0, 40.0, 25.0])
+COUNT = B * np.array(ROWS, float)
 TRUE = 0.6  # amplitude of the first column
 FAR = 50.0  # bounds of an amplitude
 
@@ -44,7 +45,7 @@ def blocks(seed: int = 0, rows: NDArray[np.int64] = CHANNEL, size: float = 1.0, 
 def evidence_of(given: list[Block]) -> Evidence:
     every = tuple(whitened(b, np.zeros(Q), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT) for b in given)
     rows = B * np.bincount(given[0].channel, minlength=len(ROWS)).astype(float)
-    return Evidence(every, rows, np.where(rows > 0, COUNT, 0.0), WEIGHT, np.full(C, -FAR), np.full(C, FAR))
+    return Evidence(every, rows, WEIGHT, np.full(C, -FAR), np.full(C, FAR))
 
 
 def covariance(b: Block) -> Array:
@@ -119,7 +120,7 @@ def test_the_score_is_the_log_density_of_refits(given: list[Block], seen: Eviden
     means = squares / (B * np.array(ROWS) * WEIGHT)
     np.testing.assert_allclose(seen.mean_squares(seen.left_out())[0], means)
     bent = -0.5 * float(np.sum(refit_without(given, set())[0] ** 2))  # how far from what the machine file says
-    assert seen.base_score()[0] == pytest.approx(-0.5 * COUNT @ np.log(np.maximum(means, 1.0)) + volume + bent)
+    assert seen.base_score()[0] == pytest.approx(-0.5 * COUNT @ np.log(np.maximum(means, QUIET)) + volume + bent)
 
 
 def test_noise_below_the_given_is_not_rewarded(given: list[Block]) -> None:
@@ -133,7 +134,7 @@ def test_a_group_left_out_is_predicted_by_all_others(given: list[Block], seen: E
     squares = sum(np.bincount(CHANNEL, e**2) for e in refit_without(given, set(group))[1])
     means = squares / (len(group) * np.array(ROWS) * WEIGHT)
     volume = -0.5 * sum(np.linalg.slogdet(covariance(given[k]))[1] for k in group)
-    expected = -0.5 * (COUNT * len(group) / B) @ np.log(np.maximum(means, 1.0)) + volume
+    expected = -0.5 * (COUNT * len(group) / B) @ np.log(np.maximum(means, QUIET)) + volume
     assert seen.group_score(group) == pytest.approx(expected)
 
 
@@ -201,8 +202,8 @@ def test_gains_are_those_of_refits_with_one_column_more() -> None:
         before, after = before + np.sum(left**2), after + np.sum(right**2)
         better += int(right @ right < left @ left)
         assert scores.by_batch[k, 0] == pytest.approx(left @ left - right @ right, rel=0.02)
-    n = COUNT[0]
-    expected = 0.5 * n * (np.log(before / seen.rows[0]) - np.log(max(after / seen.rows[0], 1.0)))
+    n = seen.rows[0]
+    expected = 0.5 * n * (np.log(before / seen.rows[0]) - np.log(max(after / seen.rows[0], QUIET)))
     assert scores.gain[0] == pytest.approx(expected, rel=0.01)
     assert scores.improved[0] == better == B
     assert scores.gain[0] > 10 > scores.gain[1:].max()
@@ -219,7 +220,7 @@ def test_several_channels_are_weighed_by_what_is_left_of_each(given: list[Block]
 
     def cost(g: float) -> float:
         squares = sum(np.bincount(CHANNEL, (e - g * c[:, 0]) ** 2) for e, c in zip(inside, seen.beyond, strict=True))
-        return float(COUNT @ np.log(np.maximum(squares / (B * np.array(ROWS) * WEIGHT), 1.0)))
+        return float(COUNT @ np.log(np.maximum(squares / (B * np.array(ROWS) * WEIGHT), QUIET)))
 
     best = minimize_scalar(cost, bounds=(-2, 2), method="bounded").x
     got = seen.scores()
@@ -239,9 +240,9 @@ def test_amplitudes_stay_within_their_bounds(seen: Evidence) -> None:
 
 def test_a_column_that_only_follows_noise_gains_nothing() -> None:
     gains = np.array([evidence_of(blocks(seed, true=0.0)).scores().gain for seed in range(20)])
-    assert (gains.max(axis=1) < 4).all()
+    assert (gains.max(axis=1) < 6).all()
     assert gains.mean() < 0.1
-    assert (gains == 0).mean() > 0.5  # shrunk away
+    assert (gains < 1).mean() > 0.9  # shrunk away
 
 
 def test_many_recordings_at_once_are_each_as_alone(seen: Evidence) -> None:

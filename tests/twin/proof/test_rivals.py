@@ -16,13 +16,14 @@ from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.proposals.priors import start_values
 from twin.diagnosis.rounds.search import Search, search
 from twin.diagnosis.scoring.finite import difference
+from twin.diagnosis.scoring.memory import Memory
 from twin.diagnosis.scoring.screen import alone
 from twin.mechanisms import MECHANISMS
 from twin.proof.rivals import rivals
 from twin.proof.rivals.in_sample import in_sample_gains, in_sample_score
 from twin.proof.rivals.null_again import null_of, structural_misfits
 from twin.proof.rivals.registry import ABLATIONS, BASELINES
-from twin.proof.rivals.rows import claimable, counted_in_full, plain_rows, unwhitened, without_nuisances
+from twin.proof.rivals.rows import claimable, counted_in_full, plain_rows, without_nuisances
 from twin.proof.rivals.stage import Stage
 
 
@@ -86,7 +87,7 @@ def test_the_reference_is_what_the_search_itself_accepted() -> None:
 def test_rows_become_what_they_were_before_the_nuisances_were_integrated_out() -> None:
     batch = floor().rounds[0].screen.evidence.batches[0]
     rows = np.random.default_rng(0).standard_normal((len(batch.target), 3))
-    np.testing.assert_allclose(unwhitened(batch, batch.of(rows)), rows * batch.scale[:, None], atol=1e-9)
+    np.testing.assert_allclose(batch.restored(batch.of(rows)), rows * batch.scale[:, None], atol=1e-9)
 
 
 def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
@@ -106,10 +107,13 @@ def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
     assert np.corrcoef(change, rows.columns[:, k])[0, 1] > 0.999
 
 
-def test_rows_counted_in_full_score_as_a_fit_without_inflation() -> None:
+def test_rows_counted_in_full_score_as_a_fit_without_memory() -> None:
     fitted = floor().baseline
-    full = counted_in_full(alone(fitted, fitted.state.noise.inflation))
-    assert full.base_score()[0] == pytest.approx(alone(fitted, np.ones_like(full.rows)).base_score()[0], rel=1e-6)
+    memory = replace(fitted.memory, share=np.full(4, 0.6), keep=np.full(4, 0.8))
+    full = counted_in_full(alone(fitted, memory))
+    plain = alone(fitted, Memory.none(len(full.rows))).base_score()[0]
+    assert full.base_score()[0] == pytest.approx(plain, rel=1e-6)
+    assert abs(alone(fitted, memory).base_score()[0] - plain) > 1.0
 
 
 def test_without_nuisances_the_targets_are_the_residuals() -> None:

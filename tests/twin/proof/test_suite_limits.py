@@ -34,7 +34,7 @@ class Rows:
                 )
             )
         count = np.array([float(ROWS * BATCHES)])
-        return Evidence(tuple(batches), count, count, np.ones(1), np.zeros(0), np.zeros(0))
+        return Evidence(tuple(batches), count, np.ones(1), np.zeros(0), np.zeros(0))
 
 
 def bench(evidence: Evidence, threshold: float = THRESHOLD) -> Bench:

@@ -93,7 +93,8 @@ def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
         for value in values:
             given = {**c.part.parameters, name: Value(value=f"{value:g} {unit}")}
             part = c.part.model_copy(update={"parameters": given})
-            yield replace(c, name=f"{c.name}_{name}_{value:g}".replace(".", "_"), part=part, variant_of=c.name)
+            own, words = f"{c.name}_{name}_{value:g}".replace(".", "_"), f"{c.words}, {name} at {value:g} {unit}"
+            yield replace(c, name=own, words=words, part=part, variant_of=c.name)
 
 
 def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:
