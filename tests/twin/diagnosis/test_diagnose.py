@@ -24,7 +24,8 @@ from twin.diagnosis.telling.findings import Findings
 from twin.schema import twin_part
 
 LAMP = {"law": "cabinet_heat", "into": "shaft", "parameters": {"heat": "100 W"}}
-MOTOR = {"law": "motor_loss", "into": "head", "drivers": "rpm"}
+THREE = {part: "3 W" for part in ("idle", "linear", "quadratic")}
+MOTOR = {"law": "motor_loss", "into": "head", "drivers": "rpm", "parameters": THREE}
 PER_LEVEL_AND_KELVIN = {
     "law": "free_flux", "into": "head", "at": {"body": "head"}, "drivers": {"level": "vacuum"},
     "parameters": {"product": "6 W/K"},
@@ -52,7 +53,7 @@ def clamped_runs(hidden: dict[str, Any], count: int = 8) -> list[Batch]:
 CASES: dict[str, Callable[[], tuple[Machine, list[Batch]]]] = {
     "consistent": lambda: (two_bodies(), runs(two_bodies())),
     "explained": lambda: (two_bodies(), runs(two_bodies(), {"own": DRIFT}, count=8)),
-    "undecidable": lambda: (two_bodies(), runs(two_bodies(), {"own": MOTOR}, count=8)),
+    "undecidable": lambda: (two_bodies(), runs(two_bodies(), {"own": MOTOR}, count=6)),
     "unlisted": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN})),
     "partly_explained": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN, "lamp": LAMP})),
 }

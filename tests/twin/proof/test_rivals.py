@@ -109,7 +109,8 @@ def test_signatures_are_what_a_little_of_the_mechanism_changes() -> None:
 
 def test_rows_counted_in_full_score_as_a_fit_without_memory() -> None:
     fitted = floor().baseline
-    memory = replace(fitted.memory, share=np.full(4, 0.6), keep=np.full(4, 0.8))
+    n = len(fitted.rows)
+    memory = replace(fitted.memory, share=np.full(n, 0.6), keep=np.full(n, 0.8))
     full = counted_in_full(alone(fitted, memory))
     plain = alone(fitted, Memory.none(len(full.rows))).base_score()[0]
     assert full.base_score()[0] == pytest.approx(plain, rel=1e-6)
@@ -120,7 +121,7 @@ def test_without_nuisances_the_targets_are_the_residuals() -> None:
     done = floor().rounds[0]
     residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
     evidence = without_nuisances(done.screen.evidence, residuals)
-    square = sum(float(np.sum(r**2 * b.scale**2)) for r, b in zip(residuals, evidence.batches, strict=True))
+    square = sum(float(np.sum(b.innovations(r * b.scale) ** 2)) for r, b in zip(residuals, evidence.batches, strict=True))
     left = evidence.left_out()
     assert sum(float(np.sum(e**2)) for e in left) == pytest.approx(square)
 
