@@ -121,7 +121,8 @@ def test_without_nuisances_the_targets_are_the_residuals() -> None:
     done = floor().rounds[0]
     residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
     evidence = without_nuisances(done.screen.evidence, residuals)
-    square = sum(float(np.sum(b.innovations(r * b.scale) ** 2)) for r, b in zip(residuals, evidence.batches, strict=True))
+    pairs = zip(residuals, evidence.batches, strict=True)
+    square = sum(float(np.sum(b.innovations(r * b.scale) ** 2)) for r, b in pairs)
     left = evidence.left_out()
     assert sum(float(np.sum(e**2)) for e in left) == pytest.approx(square)
 

@@ -83,13 +83,9 @@ def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidenc
     """The same columns had no parameter, start or offset been fitted; the targets are the fit's residuals."""
     batches = []
     for b, residual in zip(evidence.batches, residuals, strict=True):
-        still = np.zeros((len(residual), 1))
-        batches.append(
-            replace(
-                b, target=b.innovations(residual * b.scale), jacobian=still, mixing=b.mixing[:, :0], damping=b.damping[:0],
-                columns=b.innovations(b.restored(b.columns)),
-            )
-        )  # fmt: skip
+        bare = replace(b, jacobian=np.zeros((len(residual), 1)), mixing=b.mixing[:, :0], damping=b.damping[:0])
+        target, columns = b.innovations(residual * b.scale), b.innovations(b.restored(b.columns))
+        batches.append(replace(bare, target=target, columns=columns))
     return replace(evidence, batches=tuple(batches))
 
 
