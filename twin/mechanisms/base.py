@@ -78,6 +78,7 @@ class Mechanism(ABC):
     together: ClassVar[int] = 1  # how many targets one instance acts on
     scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values of a shape at which a diagnosis looks for it
     all_errors: ClassVar[bool] = False  # True: one instrument shows all errors, so it may act on all of them together
+    all_air: ClassVar[bool] = False  # True: it may act on all surroundings of one recorded channel together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
     far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one explains
     only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value

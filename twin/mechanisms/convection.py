@@ -100,6 +100,7 @@ class Draught(Mechanism):
     """
 
     key = "draught"
+    all_air = True
     words = "draught from an open door or gate"
     equation = "within start <= t < start + duration: G = factor G0 and T_air = T_air0 - drop"
     source = "step model of a gate opening; h x 1.5 to 3 and 2 to 10 K for 5 to 30 min"

@@ -128,6 +128,10 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
     chosen = list(combinations(groups[target], mechanism.together))
     if target == "error" and mechanism.all_errors and len(groups[target]) > 1:
         chosen.append(tuple(groups[target]))
+    if target == "surrounding" and mechanism.all_air:
+        shared = [s.channel for s in part.surroundings.values() if s.channel]
+        every = [[n for n, s in part.surroundings.items() if s.channel == c] for c in dict.fromkeys(shared)]
+        chosen += [tuple(names) for names in every if len(names) > 1]
     return [Site(kind, first, others=tuple(others)) for first, *others in chosen]
 
 

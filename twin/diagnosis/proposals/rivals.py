@@ -14,7 +14,7 @@ DOUBTED = {"capacity", "mass", "conductance", "coefficient", "lag", "bonding", "
 
 def rivals(network: Network) -> list[Candidate]:
     """Every fixed value that a recording could prove wrong, and every heat whose size may differ from run to run."""
-    amplitudes = _amplitudes(network)
+    amplitudes = heat_amplitudes(network)
     out = []
     for j, p in enumerate(network.parameters):
         place = _where(p)
@@ -34,7 +34,7 @@ def _rival(key: str, where: Where, p: Parameter, change: Change) -> Candidate:
     return Candidate(key, where, name, f"{words}: {p.name}", change=change)
 
 
-def _amplitudes(network: Network) -> set[int]:
+def heat_amplitudes(network: Network) -> set[int]:
     """Numbers of the parameters that scale a heat."""
     out = set()
     for heat in network.heats:

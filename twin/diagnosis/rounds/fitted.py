@@ -12,6 +12,7 @@ from data.batch import Batch
 from data.machine import Machine
 from twin.calibration.annealing import SETTLED, noise_left, with_noise
 from twin.calibration.descent import State, descend, x_of, z_bounds
+from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
@@ -79,7 +80,8 @@ def refitted(
 
     What is new begins otherwise at its value in the part, which is its prior's centre where that is not stated.
 
-    The noise is estimated again before every step, so that a channel which the old fit had given up counts again.
+    The noise is estimated again before every step, so that a channel which the old fit had given up counts again; no
+    channel is given up for a start that is still far off.
 
     Raises:
         InputError: the part does not compile; WorkError: it cannot be simulated there.
@@ -102,10 +104,14 @@ def refitted(
     own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
     state = State.at(problem, z, own, old.state.noise)
     for _ in range(steps):
-        state = with_noise(problem, state, noise_left(problem, state))
+        state = with_noise(problem, state, _least(state.noise, noise_left(problem, state)))
         state = descend(problem, state, len(state.history) + 1, tolerance)
     state = with_noise(problem, state, noise_left(problem, state))
     return replace(old, part=part, problem=problem, state=state)
+
+
+def _least(one: Noise, other: Noise) -> Noise:
+    return Noise(np.minimum(one.factor, other.factor), np.minimum(one.inflation, other.inflation))
 
 
 def settle(fitted: Fitted, steps: int = 20, tolerance: float = 0.01, rounds: int = 4) -> Fitted:

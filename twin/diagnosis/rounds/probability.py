@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.diagnosis.rounds.search import Round, Tried
+from twin.diagnosis.rounds.search import IMPROVED, Round, Tried
 
 LEAST = 0.005  # probabilities below it are not told
 MOST = {1: 0.6, 2: 0.7, 3: 0.8, 4: 0.9, 5: 0.93}  # by number of batches: few agree by chance
@@ -31,11 +31,13 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the likeliest first; then of nothing, and of something that is not listed.
 
     A tempered posterior over left-out scores (pseudo-Bayes, Geisser and Eddy 1979): differences below what structure
-    alone makes decide nothing. Nothing is as likely as what only just reaches the threshold; what is
-    not listed as one in fifty of the best that is.
+    alone makes decide nothing, and what makes many batches worse explains nothing. Nothing is as likely as what only
+    just reaches the threshold; what is not listed as one in fifty of the best that is.
     """
     t = done.null.temperature
-    scores = np.array([x.standing(t) for x in done.tried])
+    batches = len(done.before.batches)
+    barred = [x for x in done.tried if x is not done.best and x.fitted is not None and x.improved < IMPROVED * batches]
+    scores = np.array([-np.inf if any(x is b for b in barred) else x.standing(t) for x in done.tried])
     nothing = done.threshold / t
     unlisted = (scores.max(initial=nothing)) - np.log(50.0)
     every = np.append(scores, [nothing, unlisted])

@@ -9,6 +9,7 @@ from functools import reduce
 import numpy as np
 
 from data.errors import InputError, WorkError
+from twin.calibration.descent import x_of, z_bounds
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import log_prior, start_values
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
@@ -54,6 +55,7 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
     A baseline bent far by what it lacks shows little in the screen, so every mechanism may send its best.
     """
     worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
+    worth = [_moved(s, evidence) for s in worth]
     clusters = _clusters(worth, evidence)
     chosen: list[int] = []
     seen: set[tuple[str, str]] = set()
@@ -68,6 +70,14 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
     return worth, clusters, chosen
 
 
+def _moved(s: Scored, evidence: Evidence) -> Scored:
+    """With the way that the parameters go when it takes over what they had been bent for."""
+    if s.column < 0:
+        return s
+    amplitude = max(s.amplitudes.values(), key=abs, default=0.0)
+    return replace(s, moves=tuple((-amplitude * evidence.shadow[:, s.column]).tolist()))
+
+
 def _promise(s: Scored) -> tuple[float, str]:
     """Best first; of those that gain alike the one with the least freedom speaks for its cluster."""
     return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
@@ -76,10 +86,22 @@ def _promise(s: Scored) -> tuple[float, str]:
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
+    at = {**_beside(s, now), **at}
     try:
         return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), at)))
     except (InputError, WorkError):
         return None
+
+
+def _beside(s: Scored, now: Fitted) -> dict[str, float]:
+    """Values of the fit's own parameters where the refit begins: the linear joint optimum.
+
+    From where they were the start would look bad in some channels, which the noise then gives up.
+    """
+    z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
+    values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
+    network = now.problem.network
+    return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}
 
 
 def taken_on(now: Fitted, t: Tried) -> Tried:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin.calibration.descent import x_of
-from twin.calibration.fit_problem import Array
+from twin.calibration.fit_problem import Array, Block
 from twin.calibration.problem import unknown
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.candidates import candidates
 from twin.diagnosis.proposals.rivals import rivals
-from twin.diagnosis.proposals.slack import LOOSE, slack
+from twin.diagnosis.proposals.slack import LOOSE, from_run_to_run, slack
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.asleep import Asleep, asleep
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
@@ -31,7 +31,7 @@ class Scored:
     """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
 
     `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
-    recalibration takes.
+    recalibration takes; `moves` (p,) is how far the fit's parameters z go beside it, where that was asked for.
     """
 
     candidate: Candidate
@@ -41,6 +41,7 @@ class Scored:
     amplitudes: dict[str, float]
     sd: float
     column: int
+    moves: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,10 +119,11 @@ class _Line:
         every_unknown = (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers))
         columns = range(len(own), len(every_unknown))
         blocks = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), more, strict=True)  # kept from the fit
+        own_sd = from_run_to_run(fitted)
         batches = tuple(
             whitened(
-                replace(b, jacobian=np.hstack([b.jacobian, m])),
-                v,
+                replace(b, jacobian=np.hstack([b.jacobian, m]), nuisance=_with_own(b, own_sd)),
+                np.append(v, np.zeros(len(own_sd))),
                 fitted.state.z,
                 every_unknown,
                 columns,
@@ -131,6 +133,11 @@ class _Line:
             for (b, m), v in zip(blocks, fitted.state.nuisance, strict=True)
         )
         return cls(found, batches, numbers, own)
+
+
+def _with_own(b: Block, sd: Mapping[int, float]) -> Array:
+    """A batch's nuisances (n, q) and, behind them, the unknowns that it may have of its own, of prior N(0, 1)."""
+    return np.hstack([b.nuisance, b.jacobian[:, list(sd)] * np.array(list(sd.values()))])
 
 
 def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], memory: Memory, low: Array, high: Array) -> Evidence:
