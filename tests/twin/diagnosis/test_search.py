@@ -142,7 +142,7 @@ def gains(r: Round) -> dict[str, float]:
 def test_a_seed_draws_only_the_null() -> None:
     one, other = first_round(0), first_round(1)
     assert list(gains(one)) == list(gains(other))
-    assert list(gains(one).values()) == pytest.approx(list(gains(other).values()), rel=1e-9)
+    assert list(gains(one).values()) == pytest.approx(list(gains(other).values()), rel=1e-6)
     assert not np.array_equal(one.null.gain, other.null.gain)
     assert not np.array_equal(one.flipped, other.flipped)
 
@@ -150,7 +150,7 @@ def test_a_seed_draws_only_the_null() -> None:
 def test_processes_do_not_matter() -> None:
     one, two = first_round(0), first_round(0, processes=2)
     assert list(gains(one)) == list(gains(two))
-    assert gains(one) == pytest.approx(gains(two), rel=1e-9)
+    assert gains(one) == pytest.approx(gains(two), rel=1e-6)
     assert two.accepted and two.threshold == pytest.approx(one.threshold)
     np.testing.assert_allclose(two.null.gain, one.null.gain)
     np.testing.assert_allclose(two.flipped, one.flipped)

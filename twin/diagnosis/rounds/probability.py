@@ -31,14 +31,14 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """Of a round's candidates, the likeliest first; then of nothing, and of something that is not listed.
 
     A tempered posterior over left-out scores (pseudo-Bayes, Geisser and Eddy 1979): differences below what structure
-    alone makes decide nothing, and what makes many batches worse explains nothing. Nothing is as likely as what only
-    just reaches the threshold; what is not listed as one in fifty of the best that is.
+    alone makes decide nothing, and what makes many batches worse explains nothing. Nothing is as likely as what is
+    accepted and only just reaches the threshold; what is not listed as one in fifty of the best that is.
     """
     t = done.null.temperature
     batches = len(done.before.batches)
     barred = [x for x in done.tried if x is not done.best and x.fitted is not None and x.improved < IMPROVED * batches]
     scores = np.array([-np.inf if any(x is b for b in barred) else x.standing(t) for x in done.tried])
-    nothing = done.threshold / t
+    nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
     unlisted = (scores.max(initial=nothing)) - np.log(50.0)
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())

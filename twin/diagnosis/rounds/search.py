@@ -32,7 +32,7 @@ RESTARTS = 3  # times that a round is done, where a refit shows that the baselin
 BETTER = 2.0  # nats by which it must have
 LITTLE = 0.3  # of a gain: a baseline that stopped short by no more would have led to the same
 FINALISTS, HOPEFUL = 5, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
-MEMBERS, CLOSE = 3, 2.0  # of the best one's cluster that are refitted too: the likeliest of those that look alike
+MEMBERS, CLOSE = 3, 2.0  # that are refitted too: of those that look like a refit the likeliest
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
@@ -187,13 +187,17 @@ def one_round(
     tried.sort(key=order)
     least = HOPEFUL * null.threshold(float(base.base_score()[0]))
     n_final = sum(t.gain > least for t in tried[:FINALISTS])
-    members = with_clusters(tried, worth, clusters, chosen) if n_final else []
-    close = [m for m in members if m.cluster == tried[0].cluster and -order(m)[1] > -order(tried[0])[1] - CLOSE]
-    again = [t for t in workers.map(partial(refit, now), [m.scored for m in close[:MEMBERS]]) if t is not None]
-    again = [replace(t, cluster=tried[0].cluster) for t in again]
-    final = compared(now, list(workers.map(partial(taken_on, now), [*tried[:n_final], *again])))
+    final = compared(now, list(workers.map(partial(taken_on, now), tried[:n_final])))
     tried = sorted([*final, *tried[n_final:]], key=order)
-    chosen = [*chosen, *(k for k, s in enumerate(worth) if any(s is t.scored for t in again))]
+    members = with_clusters(tried, worth, clusters, chosen) if n_final else []
+    close = sorted((m for m in members if -order(m)[1] > -order(tried[0])[1] - CLOSE), key=order)[:MEMBERS]
+    more = zip(close, workers.map(partial(refit, now), [m.scored for m in close]), strict=True)
+    again = [replace(t, cluster=m.cluster) for m, t in more if t is not None]
+    if again:
+        rest = [t for t in tried if not any(t is f for f in final)]
+        final = compared(now, [*final, *workers.map(partial(taken_on, now), again)])
+        tried = sorted([*final, *rest], key=order)
+        chosen = [*chosen, *(k for k, s in enumerate(worth) if any(s is m.scored for m in close))]
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
         least = max(null.threshold(float(base.base_score()[0])), LEAST)
