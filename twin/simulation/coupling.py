@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from data.errors import InputError
+from data.errors import InputError, WorkError
 from twin.simulation.balance import Balance
 from twin.simulation.mixing import Mixing
 from twin.simulation.modes import Modes, modes_of
@@ -230,9 +230,15 @@ class _Solver:
         capacity = balance.capacity_J_per_K[:, None, :, None] * np.eye(balance.network.n_cells)
         out = np.zeros(len(slope))
         for span_s in (dt_s.sum(axis=1).max(), dt_s.max()):
-            answer = np.linalg.solve(
-                balance.conductance_W_per_K + capacity / span_s, np.swapaxes(self.directions, -1, -2)[:, None]
-            )
+            try:
+                answer = np.linalg.solve(
+                    balance.conductance_W_per_K + capacity / span_s, np.swapaxes(self.directions, -1, -2)[:, None]
+                )
+            except np.linalg.LinAlgError:
+                raise WorkError(
+                    f"machine {balance.network.machine}: a body that stores next to nothing conducts next to nothing; "
+                    "check capacities and conductances"
+                ) from None
             gain = np.einsum("prk,pkn,prnk->pr", slope, self.directions, answer)
             out = np.maximum(out, gain.max(axis=1))
         return out

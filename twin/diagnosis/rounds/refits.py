@@ -86,11 +86,12 @@ def _promise(s: Scored) -> tuple[float, str]:
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
-    at = {**_beside(s, now), **at}
-    try:
-        return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), at)))
-    except (InputError, WorkError):
-        return None
+    for begin in ({**_beside(s, now), **at}, at):
+        try:
+            return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), begin)))
+        except (InputError, WorkError):
+            continue  # a linear step may lead where no machine is
+    return None
 
 
 def _beside(s: Scored, now: Fitted) -> dict[str, float]:

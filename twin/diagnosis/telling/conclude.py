@@ -22,7 +22,7 @@ from twin.diagnosis.writing.changes import deviations
 from twin.mechanisms import MECHANISMS
 from twin.schema import TwinPart
 
-REST = 3.0  # times what structure leaves: beyond it something is left, whatever it is
+REST = 4.0  # times what structure leaves: beyond it something is left, whatever it is
 AS_IT_IS = 2  # the scale of a refined machine's misfit that is its own
 SURE = 0.7  # below it the best explanation does not stand by itself
 
