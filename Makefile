@@ -10,7 +10,7 @@ run: $(READY)  ## the main job on the built-in sample year
 	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year --effort quick
 
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff check .

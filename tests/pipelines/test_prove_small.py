@@ -20,7 +20,6 @@ from twin.proof.sealing.folder import ProofFolder
 from twin.proof.sealing.seal import Suite, seal
 from twin.proof.suite import small_suite
 
-pytestmark = pytest.mark.xdist_group("proof")
 WORKERS = 2
 
 
