@@ -208,15 +208,20 @@ def one_round(
     after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
     threshold = max(null.threshold(float(after.base_score()[0])), flipped_threshold(flipped, len(now.batches)), LEAST)
-    accepted = bool(best.gain > threshold and best.improved >= IMPROVED * n and stands_out(best))
+    accepted = best.gain > threshold and agreed_on(best, n)
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
+
+
+def agreed_on(t: Tried, batches: int) -> bool:
+    """Whether most batches improve and its size stands out from nothing."""
+    return bool(t.improved >= IMPROVED * batches and stands_out(t))
 
 
 def to_claim(tried: Sequence[Tried], batches: int) -> Tried:
     """Of refits, best first, the first that improves most batches and stands out, if it gains enough; else the best."""
     for t in tried[:FINALISTS]:
-        if t.fitted is not None and t.improved >= IMPROVED * batches and stands_out(t):
+        if t.fitted is not None and agreed_on(t, batches):
             return t if t.gain > WORTH_A_CLAIM * tried[0].gain else tried[0]
     return tried[0]
 

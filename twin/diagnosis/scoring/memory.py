@@ -49,26 +49,27 @@ class Memory:
 
     def filtered(self, channel: int, rows: Array) -> Array:
         """The innovations of rows (n, …) of one channel, of variance 1 where the rows have it."""
-        w, phi = float(self.share[channel]), float(self.keep[channel])
-        if w == 0.0 or phi == 0.0:
+        phi, theta, sd = self._filter(channel)
+        if phi == 0.0:
             return rows
-        theta, variance = (float(v) for v in _moving_average(np.array(w), np.array(phi)))
-        out = lfilter([1.0, -phi], [1.0, -theta], rows, axis=0) / np.sqrt(variance)
-        # the first row has no past: of full variance, and a filter that begins as if it had always run
-        begin = rows[:1] * (1.0 / np.sqrt(variance) - 1.0)
-        decay = theta ** np.arange(len(rows), dtype=float)
-        return np.asarray(out - begin * decay.reshape(-1, *(1,) * (rows.ndim - 1)))
+        out = lfilter([1.0, -phi], [1.0, -theta], rows, axis=0) / sd
+        return np.asarray(out - _beginning(rows, theta, sd))
 
     def restored(self, channel: int, rows: Array) -> Array:
         """The rows whose innovations these are: the inverse of `filtered`."""
-        w, phi = float(self.share[channel]), float(self.keep[channel])
-        if w == 0.0 or phi == 0.0:
+        phi, theta, sd = self._filter(channel)
+        if phi == 0.0:
             return rows
-        theta, variance = (float(v) for v in _moving_average(np.array(w), np.array(phi)))
-        decay = theta ** np.arange(len(rows), dtype=float)
-        begin = rows[:1] * (1.0 / np.sqrt(variance) - 1.0)
-        out = rows + begin * decay.reshape(-1, *(1,) * (rows.ndim - 1))
-        return np.asarray(lfilter([1.0, -theta], [1.0, -phi], out * np.sqrt(variance), axis=0))
+        out = (rows + _beginning(rows, theta, sd)) * sd
+        return np.asarray(lfilter([1.0, -theta], [1.0, -phi], out, axis=0))
+
+    def _filter(self, channel: int) -> tuple[float, float, float]:
+        """φ, θ and the innovations' standard deviation of a channel; φ is 0 where its rows are independent."""
+        w, phi = self.share[channel], self.keep[channel]
+        if w == 0.0 or phi == 0.0:
+            return 0.0, 0.0, 1.0
+        theta, variance = _moving_average(np.asarray(w), np.asarray(phi))
+        return float(phi), float(theta), float(np.sqrt(variance))
 
 
 def whiter(one: Memory, other: Memory) -> Memory:
@@ -109,6 +110,15 @@ def _likelihood(rows: Array, there: NDArray[np.bool_], w: float, phi: float) -> 
     _, variance = _moving_average(one.share, one.keep)
     scale = max(square, QUIET / (1.0 - w))
     return -0.5 * n * (float(np.log(scale * variance[0])) + square / scale)
+
+
+def _beginning(rows: Array, theta: float, sd: float) -> Array:
+    """What the filter gives too much (n, …): the first row has no past, is of full variance, and echoes with θ.
+
+    The same for rows (n, …) and for their innovations, which share the first.
+    """
+    decay = theta ** np.arange(len(rows), dtype=float)
+    return np.asarray(rows[:1] * (1.0 / sd - 1.0) * decay.reshape(-1, *(1,) * (rows.ndim - 1)))
 
 
 def _moving_average(share: Array, keep: Array) -> tuple[Array, Array]:

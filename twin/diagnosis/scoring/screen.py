@@ -60,7 +60,7 @@ def proposed(fitted: Fitted) -> list[Candidate]:
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
     """The evidence for all candidates that can be switched off or whose value may be doubted."""
-    line = _Line.at(fitted, every, fitted.memory)
+    line = _Line.at(fitted, every, fitted.memory, slack(every, fitted))
     finite, refused = differences(fitted, every)
     batches = tuple(
         replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
@@ -88,7 +88,7 @@ def alone(fitted: Fitted, memory: Memory) -> Evidence:
     compared."""
     every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
     loose = slack(every, fitted)
-    line = _Line.at(fitted, [c for c in every if c.name in loose], memory)
+    line = _Line.at(fitted, [c for c in every if c.name in loose], memory, loose)
     batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
     return _evidence(fitted, batches, memory, np.zeros(0), np.zeros(0))
 
@@ -103,15 +103,14 @@ class _Line:
     own: dict[str, int]  # parameters that the fit has already, by name
 
     @classmethod
-    def at(cls, fitted: Fitted, every: Sequence[Candidate], memory: Memory) -> _Line:
+    def at(cls, fitted: Fitted, every: Sequence[Candidate], memory: Memory, sd: Mapping[str, float]) -> _Line:
+        """`sd` of those that are slack, by name."""
         found = asleep(fitted.machine, fitted.part, every)
         problem = on_network(fitted.problem, fitted.batches, found.network)
         own = {u.name: k for k, u in enumerate(fitted.problem.unknowns)}
         waking = sorted({j for js in found.amplitudes.values() for j in js})
         numbers = [j for j in waking if found.network.parameters[j].name not in own]
-        loose = {
-            numbers.index(found.amplitudes[n][0]): sd for n, sd in slack(every, fitted).items() if n in found.amplitudes
-        }
+        loose = {numbers.index(found.amplitudes[n][0]): s for n, s in sd.items() if n in found.amplitudes}
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
         weight = 1.0 / fitted.state.noise.factor**2

@@ -8,10 +8,10 @@ from functools import cached_property
 
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
-from twin.diagnosis.rounds.acceptance import flipped_threshold, stands_out
+from twin.diagnosis.rounds.acceptance import flipped_threshold
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import FINER, IMPROVED, LEAST, Round, Search, to_claim
+from twin.diagnosis.rounds.search import FINER, LEAST, Round, Search, agreed_on, to_claim
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.conclude import REST, SURE, remainder
@@ -113,7 +113,7 @@ class Stage:
 
     def accepts(self, t: Tried, threshold: float) -> bool:
         batches = len(self.round.before.batches)
-        return t.gain > threshold and t.improved >= IMPROVED * batches and stands_out(t)
+        return t.gain > threshold and agreed_on(t, batches)
 
     def claim(self, ranked: Sequence[Tried], threshold: float) -> tuple[Claim, list[Explanation]]:
         """The first with its probability and its reported set, and all explanations."""
