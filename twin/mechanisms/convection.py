@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.analytic import ZERO_DEGC_K, power
+from twin.mechanisms.analytic import ZERO_DEGC_K, power, steps_s
 from twin.mechanisms.base import Array, Mechanism, View, real
 from twin.quantity import Spec
 
@@ -96,7 +96,7 @@ class Radiation(Mechanism):
 class Draught(Mechanism):
     """An open door or gate for a while: exposures exchange more, surroundings cool. `acts_on` names either or both.
 
-    The window counts from a batch's start and holds from its first moment to before its last.
+    The window counts from a batch's start; it opens and closes within one interval of the simulation.
     """
 
     key = "draught"
@@ -117,13 +117,21 @@ class Draught(Mechanism):
     scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"start": tuple(0.5 * k for k in range(1, 13))}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
-        return np.asarray(np.where(self.blows(view, p), p["factor"], 1.0))
+        return np.asarray(1.0 + (p["factor"] - 1.0) * self.open(view, p))
 
     def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
-        return np.asarray(np.where(self.blows(view, p), -p["drop"], 0.0))
+        return np.asarray(-p["drop"] * self.open(view, p))
 
     @staticmethod
-    def blows(view: View, p: Mapping[str, Array]) -> Array:
-        """Whether, at every time."""
-        since_s = view.time_s - 3600.0 * real(p["start"])
-        return np.asarray((since_s >= 0) & (since_s < 60.0 * real(p["duration"])))
+    def open(view: View, p: Mapping[str, Array]) -> Array:
+        """How far, 0 to 1, at every time: the edges take one interval, or a fit could not move them."""
+        edge_s = np.fmax(steps_s(view), 1.0)  # where the step is not known, all but at once
+        begin_s = 3600.0 * p["start"]
+        end_s = begin_s + 60.0 * p["duration"]
+        begun, done = (_ramp(0.5 + (view.time_s - at_s) / edge_s) for at_s in (begin_s, end_s))
+        return np.asarray(begun - done)
+
+
+def _ramp(x: Array) -> Array:
+    """x within 0 to 1."""
+    return np.where(real(x) <= 0.0, 0.0, np.where(real(x) >= 1.0, 1.0, x))

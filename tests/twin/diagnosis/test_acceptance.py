@@ -10,7 +10,15 @@ from scipy.stats import binomtest, gumbel_r
 
 from tests.twin.diagnosis.small_cases import DRIFT, consistent, fitted, runs, two_bodies
 from twin.calibration.identifiability import Z90
-from twin.diagnosis.rounds.acceptance import FLIPS, flipped_gains, flipped_threshold, gumbel, sign_p, stands_out
+from twin.diagnosis.rounds.acceptance import (
+    FLIPS,
+    balanced,
+    flipped_gains,
+    flipped_threshold,
+    gumbel,
+    sign_p,
+    stands_out,
+)
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.refits import Tried, refit
 from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
@@ -24,9 +32,32 @@ def test_the_quantile_of_a_gumbel_distribution() -> None:
 
 
 def test_few_batches_have_few_patterns_of_signs() -> None:
-    gains = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=FLIPS, random_state=1))
+    gains = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=(FLIPS, 3), random_state=1))
     assert flipped_threshold(gains, 4) == gains.max()
-    assert flipped_threshold(gains, 8) == gumbel(gains) > np.median(gains)
+    assert flipped_threshold(gains, 8) == max(gumbel(gains.max(axis=1)), gains.max()) > np.median(gains)
+    assert flipped_threshold(np.zeros((0, 0)), 8) == 0.0
+
+
+def test_what_chance_makes_of_one_candidate_is_no_reason_to_doubt_another() -> None:
+    """Of 200 candidates three gain hundreds of nats in draw after draw; the share of false alarms stays for all."""
+    rng = np.random.default_rng(2)
+    scale = np.r_[np.full(3, 150.0), np.full(197, 3.0)]
+
+    def drawn(n: int) -> np.ndarray:
+        return scale * rng.gumbel(0.5, 1.0, (n, 200))
+
+    known = drawn(14)
+    every, quiet, loud = (balanced(known, which) for which in (None, 50, 1))
+    assert loud <= every
+    assert quiet < 0.15 * every
+    thresholds = np.array([balanced(known, k) for k in range(200)])
+    alarms = (drawn(4000) > thresholds).any(axis=1).mean()
+    assert alarms < 0.05  # fourteen draws know little of their own quantiles
+
+
+def test_where_all_candidates_are_alike_the_largest_gain_decides() -> None:
+    known = np.random.default_rng(3).gumbel(60.0, 20.0, (40, 50))
+    assert balanced(known, 7) == pytest.approx(balanced(known, None), rel=0.3)
 
 
 @pytest.mark.parametrize(("better", "n"), [(0, 6), (3, 6), (5, 6), (6, 6), (9, 12)])
@@ -48,7 +79,7 @@ def largest_flipped(done: Fitted) -> float:
     columns = [s.column for s in found.scored if s.candidate.mechanism == "sensor_drift"]
     after = alone(done, done.memory)
     gains = flipped_gains(found.evidence, after, columns, seed=0)
-    assert gains.shape == (FLIPS,)
+    assert gains.shape == (FLIPS, len(columns))
     np.testing.assert_array_equal(gains, flipped_gains(found.evidence, after, columns, seed=0))
     return float(gains.max())
 

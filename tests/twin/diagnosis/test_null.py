@@ -60,13 +60,21 @@ def test_the_threshold_is_beyond_all_that_was_seen() -> None:
 
 def test_amplitudes_scatter_as_those_of_the_machines_that_count() -> None:
     null = given([[1, 2, 3], [4, 5, 6]], [[-1, -2, -3], [-1, -1, -1]])
-    assert null.amplitude_sd("lamp", -2.0) == pytest.approx(np.sqrt((1.0**2 + 5.0**2) / 2))
-    assert null.amplitude_sd("sun", -2.0) == 0.0
-    assert given([[3.0]], [[-1.0]]).amplitude_sd("lamp", -1.0) == 0.0
+    assert null.scatter("lamp", -2.0) == pytest.approx(1.0 + 0.9 * 4.0)  # nine tenths of the way from 1 to 5
+    assert null.scatter("sun", -2.0) == 0.0
+    assert given([[3.0]], [[-1.0]]).scatter("lamp", -1.0) == 0.0
 
 
-def test_one_machine_alone_says_nothing() -> None:
-    assert given([[3.0]], [[-1.0]]).threshold(-1.0) == float("inf")
+def test_two_machines_say_nothing() -> None:
+    assert given([[3.0], [4.0]], [[-1.0]] * 2).threshold(-1.0) == float("inf")
+
+
+def test_a_candidate_that_structure_never_looks_like_has_a_lower_threshold() -> None:
+    gain = np.random.default_rng(0).gumbel(200.0, 40.0, 14)
+    own = np.stack([gain, np.full(14, 2.0)], axis=-1)[:, None]
+    null = replace(given([[g] for g in gain], [[-1.0]] * 14), names=("lever", "lamp"), gains=own)
+    assert null.threshold(-1.0, name="lamp") < 60 < null.threshold(-1.0, name="lever") <= null.threshold(-1.0)
+    assert null.threshold(-1.0, name="swap") == null.threshold(-1.0)
 
 
 # Refined machines
@@ -132,9 +140,11 @@ def test_it_has_every_machine_at_every_scale(machine: str) -> None:
     assert null.amplitude.shape == (TWINS, len(SCALES), len(counts)) and null.names == tuple(counts)
     assert np.isfinite(null.gain).all() and (null.gain > -1e-6).all()
     worse = null.mean_squares.mean(axis=(0, 2))
-    assert (np.diff(worse) > 0).all()  # the larger the misfit, the worse batches left out are predicted
+    assert (np.diff(worse) > -0.01).all() and worse[-1] > worse[
+        0
+    ]  # the larger the misfit, the worse batches left out are predicted
     assert (null.density[:, 0] >= null.density[:, -1]).all()
-    assert worse[0] == pytest.approx(1.0, abs=0.2) and worse[-1] > 1.03
+    assert worse[0] == pytest.approx(1.0, abs=0.2) and worse[-1] > 1.2
 
 
 def test_the_more_structure_may_leave_the_more_it_may_gain() -> None:

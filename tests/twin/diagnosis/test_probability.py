@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin.diagnosis.rounds.null import Null
+from twin.diagnosis.rounds.null import HOT, Null
 from twin.diagnosis.rounds.probability import LEAST, MOST, explanations, most_sure, told
 from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.search import Round
@@ -26,7 +26,7 @@ def done(*every: Tried, runs: int = 12, typical: float = 0.0, threshold: float =
     null = Null(np.full(shape, typical), np.zeros(shape), np.zeros((*shape, 1)), np.zeros((*shape, 0)))
     before: Any = SimpleNamespace(runs=runs, batches=())
     screen: Any = None
-    return Round(before, screen, every, threshold, null, np.zeros(0), accepted=True)
+    return Round(before, screen, every, threshold, null, np.zeros((0, 0)), accepted=True)
 
 
 def numbers(r: Round) -> tuple[list[float], float, float]:
@@ -35,9 +35,9 @@ def numbers(r: Round) -> tuple[list[float], float, float]:
 
 
 @pytest.mark.parametrize("gains", [[30.0], [30.0, 29.0, 12.0], [11.0, 11.0], [10.5, 3.0, -4.0]])
-def test_they_are_those_of_scores_in_nats(gains: list[float]) -> None:
+def test_they_are_those_of_scores_in_units_of_what_structure_makes(gains: list[float]) -> None:
     every, nothing, unlisted = numbers(done(*(tried(g, k) for k, g in enumerate(gains))))
-    weight = np.exp(np.array([*gains, THRESHOLD, max(gains)]) - max(gains))
+    weight = np.exp((np.array([*gains, THRESHOLD, max(gains)]) - max(gains)) / HOT[0])
     weight[-1] /= 50
     expected = weight / weight.sum()
     if expected[0] <= 0.99:
@@ -74,9 +74,9 @@ def test_blocks_of_two_runs_count_as_two() -> None:
 
 def test_structure_makes_small_differences_count_less() -> None:
     calm, wild = (done(tried(30.0, 0), tried(26.0, 1), typical=t) for t in (1.0, 16.0))
-    assert calm.null.temperature == 1.0 < wild.null.temperature
+    assert calm.null.temperature == HOT[0] < wild.null.temperature == HOT[1]
     odds = [np.log(p[0] / p[1]) for p in (numbers(calm)[0], numbers(wild)[0])]
-    np.testing.assert_allclose(odds, [4.0, 4.0 / wild.null.temperature])
+    np.testing.assert_allclose(odds, 4.0 / np.array(HOT))
 
 
 def test_what_cannot_be_told_from_the_best_is_alike() -> None:

@@ -71,8 +71,13 @@ def _wall(q: SimpleNamespace) -> Any:
     return q.area * np.maximum(laminar, turbulent) * U("W/m**2/K") * lead
 
 
-def _blows(q: SimpleNamespace) -> Any:
-    return (q.t >= q.start) & (q.t < q.start + q.duration)
+def _open(q: SimpleNamespace) -> Any:
+    step = q.t[1] - q.t[0]
+
+    def since(t: Any) -> Any:
+        return np.clip(((q.t - t) / step).to("dimensionless") + 0.5, 0, 1)
+
+    return since(q.start) - since(q.start + q.duration)
 
 
 def _chiller(q: SimpleNamespace) -> Any:
@@ -158,9 +163,9 @@ CASES: Mapping[str, Case] = {
     "natural_convection": Case(_wall),
     "radiation": Case(lambda q: q.emissivity * SIGMA * q.area * (q.T_surrounding**4 - q.T_body**4)),
     "draught": Case(
-        lambda q: np.where(_blows(q), q.factor, 1.0 * U.dimensionless),
+        lambda q: 1 + (q.factor - 1) * _open(q),
         {"start": 0.52, "duration": 45.0},
-        more={"surrounding_K": lambda q: np.where(_blows(q), -q.drop, 0.0 * K)},
+        more={"surrounding_K": lambda q: -q.drop * _open(q)},
     ),
     "joint_conductance": Case(lambda q: q.ratio ** q.closed[0]),
     "heat_bridge": Case(None),

@@ -205,11 +205,24 @@ def test_joint_conductance_never_turns_negative() -> None:
     assert (law("joint_conductance").factor(seen(closed=np.linspace(-3, 3, 13)), p) > 0).all()
 
 
-def test_draught_only_within_its_window() -> None:
-    view = View(time_s=np.array([3599.0, 3600.0, 4499.0, 4500.0]))
+def test_draught_only_within_its_window_opened_and_closed_in_one_interval() -> None:
+    view = View(time_s=np.arange(3480.0, 4680.0, 60.0))
     p = usual("draught", start=1.0, duration=15.0, factor=2.5, drop=6.0)
-    assert law("draught").factor(view, p) == pytest.approx([1.0, 2.5, 2.5, 1.0])
-    assert law("draught").surrounding_K(view, p) == pytest.approx([0.0, -6.0, -6.0, 0.0])
+    share = np.r_[0, 0, 0.5, np.ones(14), 0.5, 0, 0]
+    assert law("draught").factor(view, p) == pytest.approx(1 + 1.5 * share)
+    assert law("draught").surrounding_K(view, p) == pytest.approx(-6 * share)
+
+
+def test_a_fit_can_move_the_window_of_a_draught() -> None:
+    """Between two samples too the air that it takes away follows its start and its length."""
+    view = View(time_s=np.arange(0.0, 7200.0, 60.0))
+
+    def taken_K_s(start_h: float, duration_min: float) -> np.ndarray:
+        p = usual("draught", start=start_h, duration=duration_min, drop=6.0)
+        cold = 60.0 * -law("draught").surrounding_K(view, p)
+        return np.array([cold.sum(), (cold * view.time_s).sum() / cold.sum()])
+
+    assert taken_K_s(1.0 + 20 / 3600, 15.5) == pytest.approx([6 * 930.0, 3600.0 + 20 + 465], abs=1.0)
 
 
 def test_stratification_by_height() -> None:

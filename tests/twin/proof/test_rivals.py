@@ -140,10 +140,9 @@ def test_in_sample_a_fit_never_looks_worse_than_on_batches_left_out() -> None:
 def test_the_null_of_left_out_gains_is_the_diagnosis_own() -> None:
     stage = Stage(nothing())
     done = stage.round
-    columns = [s.column for s in claimable(done)]
+    columns = {s.candidate.name: s.column for s in claimable(done)}
     again = null_of(
         structural_misfits(done.before),
-        done.before.state.z,
         done.screen.evidence,
         columns,
         lambda e, targets, at: e.gains(targets)[0][:, list(at)],
@@ -151,6 +150,8 @@ def test_the_null_of_left_out_gains_is_the_diagnosis_own() -> None:
     )
     np.testing.assert_allclose(again.gain, done.null.gain, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(again.density, done.null.density, rtol=1e-6)
+    name = max(columns, key=lambda n: again.gains[:, -1, again.names.index(n)].mean())
+    assert again.threshold(-np.inf, name=name) == pytest.approx(done.null.threshold(-np.inf, name=name), rel=1e-6)
 
 
 def test_a_fit_that_was_swapped_in_beside_later_effects_is_fitted_alone_again() -> None:

@@ -16,7 +16,7 @@ from twin.diagnosis.places.where_when import Found, Located
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.refits import improved
-from twin.diagnosis.rounds.search import IMPROVED, Search
+from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.found import Found as Told
 from twin.diagnosis.telling.found import Rms, place_words
@@ -101,18 +101,26 @@ def leftover(done: Search, batches: Sequence[Batch], located: Located) -> Leftov
             continue
         if not terms.terms or terms.explained < UNLISTED_SHARE or terms.improved < IMPROVED * len(batches):
             continue
-        threshold = last.threshold
         stated = _stated(now, terms)
         if stated is None:
             continue
-        fitted, gain, better = stated
+        fitted, gain, density, better = stated
+        threshold = _threshold(last, terms.place, density)
         if gain > threshold and better >= IMPROVED * len(batches):
             return Leftover(located, place, terms, gain, threshold, fitted)
     return None
 
 
-def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, int] | None:
-    """The network with the effect as a free-form mechanism, refitted, and its gain; None where no form states it."""
+def _threshold(last: Round, place: str, density: float) -> float:
+    """What the usual listed candidate at the same place would have to gain."""
+    at = [s.candidate.name for s in last.screen.scored if s.candidate.where.name == place]
+    own = [last.null.threshold(density, name=n) for n in at if n in last.null.names]
+    return max(float(np.median(own)) if own else last.threshold, LEAST)
+
+
+def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, float, int] | None:
+    """The network with the effect as a free-form mechanism, refitted: its gain, the log density of batches left out
+    with it, and the batches that improve; None where no form states it."""
     if terms.part is None:
         return None
     name = f"unlisted_{terms.place}"
@@ -122,4 +130,5 @@ def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, int] | N
         before, after = alone(now, now.memory), alone(fitted, now.memory)
     except (InputError, WorkError):
         return None
-    return fitted, float(after.base_score()[0] - before.base_score()[0]), improved(before, after)
+    density = float(after.base_score()[0])
+    return fitted, density - float(before.base_score()[0]), density, improved(before, after)

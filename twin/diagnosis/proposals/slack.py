@@ -1,9 +1,9 @@
 """What a lumped network gets wrong by itself, and every fit may therefore do: it is no news.
 
 A sensor in a casting stands in a gradient that a lump does not have, and is late, or early where it is near the heat; a
-length of an error's chain spans part of its body, nearer to one neighbour than the body's mean; a film that is stated
-as a constant follows its temperature difference; a heat is not the same in every run to the last per cent. Without
-slack the difference passes for physics.
+length of an error's chain spans part of its body, nearer to one neighbour than the body's mean, and bodies beside the
+chain tilt it a little; a film that is stated as a constant follows its temperature difference; a heat is not the same
+in every run to the last per cent. Without slack the difference passes for physics.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.rivals import heat_amplitudes
 from twin.diagnosis.rounds.fitted import Fitted
 
-LOOSE = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "natural_convection")
+LOOSE = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
 PLACE = 0.1  # sd of the share of a neighbour's lead that a sensor sees
 SPAN = 0.15  # the same of a length of an error's chain
 NOSE = 0.5  # and of one in a small body, whose ends are as far apart as its neighbours are
+BESIDE = 0.1  # sd of what a body outside an error's chain adds to it, of the chain's largest
 SMALL = 0.03  # of the machine's capacity: what is smaller carries no bending that an error shows
 LAG_S, LAG = 240.0, 1.5  # sd of a lag where the file states none; of the logarithm of one that it holds fixed
 FILM = 0.2  # sd of a natural film's area in m2 for each W/K that the file states as a constant: about all of it
@@ -46,10 +47,12 @@ def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
         elif c.mechanism == "column_bending":
             sides = _sides(c)
             share = NOSE if sides & small else SPAN
-            gain = share * max(abs(gains.get((c.where.name, side), 0.0)) for side in sides)
-            if gain > 0:
-                out[c.name] = gain
-    return out
+            out[c.name] = share * max(abs(gains.get((c.where.name, side), 0.0)) for side in sides)
+        elif c.mechanism == "spindle_growth":
+            (body,) = _sides(c)
+            if (c.where.name, body) not in gains:
+                out[c.name] = BESIDE * max((abs(g) for (e, _), g in gains.items() if e == c.where.name), default=0.0)
+    return {name: sd for name, sd in out.items() if sd > 0}
 
 
 def no_news(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
@@ -92,12 +95,20 @@ def _air(c: Candidate) -> str:
 
 
 def _films(fitted: Fitted) -> dict[tuple[str, str], float]:
-    """By body and surrounding the conductance that the fit has between them, W/K."""
+    """By body and surrounding the conductance that the fit has between them, W/K.
+
+    What a body gives to an enclosure's air counts as given to what that air exchanges with.
+    """
     conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
+    exposures = fitted.part.exposures
+    around: dict[str, list[str]] = {}
+    for e in exposures.values():
+        around.setdefault(e.of.partition("@")[0], []).append(e.to)
     out: dict[tuple[str, str], float] = {}
-    for name, e in fitted.part.exposures.items():
-        key = e.of.partition("@")[0], e.to
-        out[key] = out.get(key, 0.0) + conductance.get(name, 0.0)
+    for name, e in exposures.items():
+        for air in around.get(e.to, [e.to]):
+            key = e.of.partition("@")[0], air
+            out[key] = out.get(key, 0.0) + conductance.get(name, 0.0)
     return out
 
 

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from twin.diagnosis.rounds.refits import Tried
 
 FLIPS = 60
+LITTLE = 20.0  # nats of one candidate below which its own scatter says nothing
 LEAST_DEVIATION = 0.02  # of a value from run to run: nobody's heat is the same to less
 
 
 def flipped_gains(evidence: Evidence, after: Evidence, alarm: Sequence[int], seed: int) -> Array:
-    """Largest gains (FLIPS,) when what the best candidate leaves over takes a random sign in every batch.
+    """Gains (FLIPS, C) of columns when what the best candidate leaves over takes a random sign in every batch.
 
     What agrees between batches is gone, what varies stays: the wild cluster bootstrap with the effect in the model
     (Cameron, Gelbach and Miller 2008), over the whole family of candidates (Westfall and Young 1993).
@@ -30,18 +31,45 @@ def flipped_gains(evidence: Evidence, after: Evidence, alarm: Sequence[int], see
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(len(left), FLIPS))
     scale = np.sqrt(evidence.weight / after.weight)
     targets = [e * scale[b.channel][:, None] * s for b, e, s in zip(evidence.batches, left, signs, strict=True)]
-    return np.asarray(evidence.gains(targets)[0][:, list(alarm)].max(axis=1))
+    return np.asarray(evidence.gains(targets)[0][:, list(alarm)])
 
 
-def flipped_threshold(gains: Array, batches: int) -> float:
-    """The gain that flipped signs exceed once in a hundred; of few batches, with few patterns, their largest."""
-    return float(gains.max()) if 2**batches <= FLIPS else gumbel(gains)
+def flipped_threshold(gains: Array, batches: int, which: int | None = None) -> float:
+    """The gain that flipped signs exceed once in a hundred; of few batches, with few patterns, their largest.
+
+    gains (FLIPS, C); `which` is the candidate's column, None of one that has none.
+    """
+    if not gains.size:
+        return 0.0
+    return float(gains.max()) if 2**batches <= FLIPS else balanced(gains, which)
 
 
-def gumbel(gain: Array, share: float = 0.99) -> float:
-    """The quantile of a largest value by a Gumbel distribution of the same mean and spread (Gumbel 1958)."""
-    scale = float(np.std(gain, ddof=1)) * np.sqrt(6.0) / np.pi
-    return float(np.mean(gain)) - scale * (np.euler_gamma + float(np.log(-np.log(share))))
+def balanced(gains: Array, which: int | None, share: float = 0.99) -> float:
+    """What the gain of one of C candidates may be by chance, all of them considered; gains (T, C) made by chance.
+
+    Structure that looks like a lever of the screw in every draw is no reason to doubt heat to the floor: each
+    candidate's gain counts in units of its own quantile, and what the largest of these reaches in draws that the
+    quantiles do not know keeps the share for all together (balanced as by Westfall and Young 1993, §2.3, with a draw
+    left out in turn). Never more than what the largest gain of all exceeds in 1 - `share` of the draws.
+    """
+    largest = gains.max(axis=1)
+    every = max(float(gumbel(largest, share)), float(largest.max()))
+    if which is None:
+        return every
+    beyond = [float((own / _own(np.delete(gains, t, axis=0), share)).max()) for t, own in enumerate(gains)]
+    factor = max(1.0, float(gumbel(np.array(beyond), share)))
+    return min(every, factor * float(_own(gains[:, which : which + 1], share)[0]))
+
+
+def _own(gains: Array, share: float) -> Array:
+    """Of gains (T, C) each candidate's quantile (C,)."""
+    return np.maximum(np.maximum(gumbel(gains, share), gains.max(axis=0)), LITTLE)
+
+
+def gumbel(gain: Array, share: float = 0.99) -> Array:
+    """The quantile (…,) of largest values (n, …) by a Gumbel distribution of their mean and spread (Gumbel 1958)."""
+    scale = np.std(gain, axis=0, ddof=1) * np.sqrt(6.0) / np.pi
+    return np.asarray(np.mean(gain, axis=0) - scale * (np.euler_gamma + np.log(-np.log(share))))
 
 
 def sign_p(better: int, n: int) -> float:

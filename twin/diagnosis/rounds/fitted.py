@@ -24,7 +24,7 @@ NEAR, FAR = "_near", "_far"  # how pieces of a body are called
 STEPS, TOLERANCE = 2, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # one is the same as itself alone: what is worked out of it may be kept by it
 class Fitted:
     """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
 

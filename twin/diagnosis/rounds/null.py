@@ -3,45 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.rounds.acceptance import gumbel
+from twin.diagnosis.rounds.acceptance import balanced, gumbel
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.refined import refined
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.finite import difference
 
-TWINS = 10  # refined machines
-SCALES = (0.1, 0.3, 1.0, 2.0, 4.0)  # of the misfit of each: real castings are finer than bars of five cells
+TWINS = 14  # refined machines
+HOT = 2.0, 4.0  # bounds of the temperature: structure scatters no score by less than two nats
+SCALES = (0.3, 1.0, 3.0, 8.0, 20.0)  # of the misfit of each: real castings are finer than bars of five cells
+AS_IT_IS = 1  # the scale that is their own
 
 
 @dataclass(frozen=True)
 class Null:
     """Recordings of T refined machines with the misfit at S scales: largest gain of any candidate (T, S) in nats, the
-    log density of batches left out (T, S) before any candidate, their mean squares (T, S, K), and the amplitudes
-    (T, S, C) that the candidates `names` would be given where none is there."""
+    log density of batches left out (T, S) before any candidate, their mean squares (T, S, K), and the amplitudes and
+    gains (T, S, C) that the candidates `names` would be given where none is there."""
 
     gain: Array
     density: Array
     mean_squares: Array
     amplitude: Array
     names: tuple[str, ...] = ()
+    gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
-    def threshold(self, density: float, share: float = 0.99) -> float:
+    def threshold(self, density: float, share: float = 0.99, name: str = "") -> float:
         """The gain that structure alone exceeds in 1 - share of the cases, where it leaves no more than `density` says.
 
         Of each machine counts the largest misfit that predicts left-out batches no worse. As there are few, a Gumbel
         distribution goes through their mean and spread.
+
+        With the `name` of a candidate what structure makes of it counts, and not of others (`balanced`).
         """
         gain = self.typical(density)
-        if len(gain) < 2:
+        if len(gain) < 3:
             return float("inf")
-        return max(gumbel(gain, share), float(gain.max()))
+        if name not in self.names or not self.gains.size:
+            return max(float(gumbel(gain, share)), float(gain.max()))
+        return balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
 
     def typical(self, density: float) -> Array:
         """The largest gain (T,) of each machine at that misfit."""
@@ -50,15 +57,21 @@ class Null:
     @property
     def temperature(self) -> float:
         """Nats of score that count as one when explanations are compared: a share of what structure alone gains."""
-        typical = self.typical(float(np.median(self.density)))
-        return float(np.clip(np.median(typical) / 4.0, 1.0, 3.0)) if self.gain.size else 1.0
+        typical = self.typical(self.as_it_is)
+        return float(np.clip(np.median(typical) / 4.0, *HOT)) if self.gain.size else HOT[0]
 
-    def amplitude_sd(self, name: str, density: float) -> float:
-        """How far structure and noise alone scatter a candidate's amplitude; 0 where that is not known."""
+    @property
+    def as_it_is(self) -> float:
+        """The usual log density where the misfit is that of the refined machines themselves."""
+        return float(np.median(self.density[:, min(AS_IT_IS, self.density.shape[1] - 1)])) if self.density.size else 0.0
+
+    def scatter(self, name: str, density: float) -> float:
+        """By how much structure and noise alone move a candidate's amplitude in nine of ten machines, where they leave
+        no more than `density` says; 0 where that is not known."""
         if name not in self.names or len(self.gain) < 2:
             return 0.0
         own = self.amplitude[np.arange(len(self.gain)), self._scale(density), self.names.index(name)]
-        return float(np.sqrt(np.mean(own**2)))
+        return float(np.quantile(np.abs(own), 0.9))
 
     def _scale(self, density: float) -> NDArray[np.int64]:
         """Of each machine (T,) the largest misfit that predicts left-out batches no worse."""
@@ -77,7 +90,8 @@ def structural_null(
     """Refined machines driven as the recordings were, their left-out gains by the same evidence in one step each.
 
     Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers, by
-    candidate, the columns whose gain would be an alarm.
+    candidate, the columns whose gain would be an alarm. A machine's parameters are what the machine file thinks
+    possible, not those of the fit: bent by what is missing, they would be what a candidate is rewarded for.
     """
     rng = np.random.default_rng(seed)
     base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
@@ -88,22 +102,23 @@ def structural_null(
             rows = difference(fitted, part, base)
         except (InputError, WorkError):
             continue  # a draw that no machine has
+        z = rng.standard_normal(evidence.batches[0].jacobian.shape[1])
         for b, (whitened, misfit) in enumerate(zip(evidence.batches, rows, strict=True)):
             noise = rng.standard_normal(len(misfit))
-            targets[b] += [whitened.of(scale * misfit + noise) for scale in SCALES]
+            plain = whitened.jacobian @ z
+            targets[b] += [plain + whitened.of(scale * misfit + noise) for scale in SCALES]
         if progress:
             progress(k + 1, TWINS)
-    z = np.zeros(evidence.batches[0].jacobian.shape[1])
-    z[: len(fitted.state.z)] = fitted.state.z
-    shifted = [np.stack(t, axis=1) + (b.jacobian @ z)[:, None] for b, t in zip(evidence.batches, targets, strict=True)]
-    gain, amplitude, _ = evidence.gains(shifted)
+    drawn = [np.stack(t, axis=1) for t in targets]
+    gain, amplitude, _ = evidence.gains(drawn)
     columns = list(counts.values())
-    squares = evidence.mean_squares(evidence.left_out(shifted))
+    squares = evidence.mean_squares(evidence.left_out(drawn))
     shape = (-1, len(SCALES))
     return Null(
         gain[:, columns].max(axis=1, initial=0.0).reshape(shape),
-        evidence.base_score(shifted).reshape(shape),
+        evidence.base_score(drawn).reshape(shape),
         squares.reshape(*shape, squares.shape[1]),
         amplitude[:, columns].reshape(*shape, len(columns)),
         tuple(counts),
+        gain[:, columns].reshape(*shape, len(columns)),
     )

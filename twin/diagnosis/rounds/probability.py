@@ -36,8 +36,13 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """
     t = done.null.temperature
     batches = len(done.before.batches)
-    barred = [x for x in done.tried if x is not done.best and x.fitted is not None and x.improved < IMPROVED * batches]
-    scores = np.array([-np.inf if any(x is b for b in barred) else x.standing(t) for x in done.tried])
+    refits = [x for x in done.tried if x.fitted is not None]
+    kept = {x.cluster for x in refits if x is done.best or x.improved >= IMPROVED * batches}
+    barred = {x.cluster for x in refits} - kept
+    alone = [x.fitted is not None and x is not done.best and x.improved < IMPROVED * batches for x in done.tried]
+    scores = np.array(
+        [-np.inf if x.cluster in barred or a else x.standing(t) for x, a in zip(done.tried, alone, strict=True)]
+    )
     nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
     unlisted = (scores.max(initial=nothing)) - np.log(50.0)
     every = np.append(scores, [nothing, unlisted])

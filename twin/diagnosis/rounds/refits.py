@@ -17,7 +17,7 @@ from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 
-BEST, KINDS = 5, 12  # refits of a round: the best of all, and with the best of every other mechanism
+BEST, KINDS = 5, 8  # refits of a round: the best of all, and with the best of every other mechanism
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80

@@ -15,6 +15,7 @@ from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.acceptance import flipped_gains, flipped_threshold, sign_p, stands_out
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null
+from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
 from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters
 from twin.diagnosis.rounds.revise import second_thoughts
@@ -28,15 +29,17 @@ MOST_EFFECTS = 4
 LEAST = 40.0
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
-RESTARTS = 3  # times that a round is done, where a refit shows that the baseline had stopped short
+RESTARTS = 2  # times that a round is done, where a refit shows that the baseline had stopped short
 BETTER = 2.0  # nats by which it must have
 LITTLE = 0.3  # of a gain: a baseline that stopped short by no more would have led to the same
-FINALISTS, HOPEFUL = 5, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
-MEMBERS, CLOSE = 3, 2.0  # that are refitted too: of those that look like a refit the likeliest
+FINALISTS, HOPEFUL = 4, 0.25  # refits taken on to their optimum, if they gain this share of the structural null's
+MEMBERS = 2  # that are refitted too: of those that look like a refit the likeliest
+CLOSE, ALIKE = 2.0, 0.15  # if they stand no further below the best, or one step in the screen made the difference
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
+Order = Callable[[Tried], tuple[bool, float]]
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,15 @@ class Round:
     flipped: Array
     accepted: bool
     sign_p: float = 1.0
+    beside: Null | None = None  # the null of the best where the fit has it
+    density: float = 0.0  # of batches left out, in nats, where the fit has it
+
+    @property
+    def scatter(self) -> float:
+        """By how much structure alone moves the best's amplitude, in its unit; 0 where that is not known."""
+        if self.beside is None or self.best is None:
+            return 0.0
+        return self.beside.scatter(self.best.candidate.name, self.density)
 
     @property
     def best(self) -> Tried | None:
@@ -88,11 +100,9 @@ def search(
 def _forward(baseline: Fitted, seed: int, workers: Workers, tell: Progress, cache: Path | None) -> Search:
     """One effect after the other."""
     now, rounds = baseline, []
-    null: Null | None = None
     effects = 0
     while True:
-        done = _fair_round(now, null, seed, workers, tell, cache)
-        null = done.null
+        done = _fair_round(now, seed, workers, tell, cache)
         rounds.append(done)
         if not rounds[:-1]:
             baseline = done.before
@@ -135,12 +145,10 @@ def _rival(t: Tried, e: Tried) -> bool:
     return t.candidate.part is not None and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
 
 
-def _fair_round(
-    now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress, cache: Path | None
-) -> Round:
+def _fair_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: Path | None) -> Round:
     """A round whose baseline fits as well as its best candidate's fit without the candidate: no gain by a start."""
     for _ in range(RESTARTS):
-        done = one_round(now, null, seed, workers, tell, cache)
+        done = one_round(now, seed, workers, tell, cache)
         if not done.accepted or done.best is None or done.best.fitted is None:
             return done
         tell("fair baseline", 0, 0)
@@ -152,13 +160,11 @@ def _fair_round(
         done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=fair.gain > done.threshold)
         if done.accepted and more < LITTLE * fair.gain:
             return done
-        now, null = back, None
+        now = back
     return done
 
 
-def one_round(
-    now: Fitted, null: Null | None, seed: int, workers: Workers, tell: Progress, cache: Path | None = None
-) -> Round:
+def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: Path | None = None) -> Round:
     """Screen, cluster, refit, score, decide."""
     every = proposed(now)
     tell("screen", 0, 0)
@@ -168,8 +174,7 @@ def one_round(
     columns = {s.candidate.name: s.column for s in news if s.column >= 0}
     alarm = list(columns.values())
     news = best_variants(news)
-    if null is None:
-        null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
+    null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
     base = alone(now, now.memory)
     plain = alone(now, Memory.none(len(now.problem.channels)))  # a slow misfit in full: that is what is too coarse
@@ -185,12 +190,12 @@ def one_round(
         if t is not None:
             tried.append(replace(t, cluster=numbers[n]))
     tried.sort(key=order)
-    least = HOPEFUL * null.threshold(float(base.base_score()[0]))
-    n_final = sum(t.gain > least for t in tried[:FINALISTS])
+    before = float(base.base_score()[0])
+    n_final = sum(t.gain > HOPEFUL * null.threshold(before, name=t.candidate.name) for t in tried[:FINALISTS])
     final = compared(now, list(workers.map(partial(taken_on, now), tried[:n_final])))
     tried = sorted([*final, *tried[n_final:]], key=order)
     members = with_clusters(tried, worth, clusters, chosen) if n_final else []
-    close = sorted((m for m in members if -order(m)[1] > -order(tried[0])[1] - CLOSE), key=order)[:MEMBERS]
+    close = sorted((m for m in members if _close(m, tried, order)), key=order)[:MEMBERS]
     more = zip(close, workers.map(partial(refit, now), [m.scored for m in close]), strict=True)
     again = [replace(t, cluster=m.cluster) for m, t in more if t is not None]
     if again:
@@ -200,17 +205,32 @@ def one_round(
         chosen = [*chosen, *(k for k, s in enumerate(worth) if any(s is m.scored for m in close))]
     tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
-        least = max(null.threshold(float(base.base_score()[0])), LEAST)
-        return Round(now, seen, tuple(tried), least, null, np.zeros(0), False)
+        name = tried[0].candidate.name if tried else ""
+        least = max(null.threshold(before, name=name), LEAST)
+        return Round(now, seen, tuple(tried), least, null, np.zeros((0, 0)), False)
     n = len(now.batches)
     best = to_claim(tried, n)
     assert best.fitted is not None
     after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
-    threshold = max(null.threshold(float(after.base_score()[0])), flipped_threshold(flipped, len(now.batches)), LEAST)
-    accepted = best.gain > threshold and agreed_on(best, n)
+    agreed = agreed_on(best, n)
+    beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > LEAST else None
+    own, density = (null, float(after.base_score()[0])) if beside is None else beside
+    structure = own.threshold(density, name=best.candidate.name)
+    if best.candidate.mechanism == "coarse_network":
+        structure = 0.0  # it claims no physics: what structure makes is what it is for
+    which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
+    threshold = max(structure, flipped_threshold(flipped, n, which), LEAST)
+    accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
-    return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n))
+    return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+
+
+def _close(member: Tried, tried: Sequence[Tried], order: Order) -> bool:
+    """Whether it might be the best of all, were it refitted."""
+    like = next(t for t in tried if t.cluster == member.cluster)
+    standing = -order(member)[1] > -order(tried[0])[1] - CLOSE
+    return standing or (like is tried[0] and like.gain - member.gain < ALIKE * like.gain)
 
 
 def agreed_on(t: Tried, batches: int) -> bool:
@@ -232,6 +252,6 @@ def _coarse_first(tried: list[Tried]) -> list[Tried]:
     return finer[:1] + [t for t in tried if t not in finer[:1]]
 
 
-def _order(temperature: float) -> Callable[[Tried], tuple[bool, float]]:
+def _order(temperature: float) -> Order:
     """Refits first, then by what is left-out and plausible."""
     return lambda t: (t.fitted is None, -t.standing(temperature))

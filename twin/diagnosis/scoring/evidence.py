@@ -21,6 +21,7 @@ from twin.diagnosis.scoring.memory import QUIET
 from twin.diagnosis.scoring.whitened import Whitened
 
 TINY = 1e-300
+Prior = tuple[Array, Array]  # (R, C), (C,): how far columns move parameters back to their prior, and its square
 ROUNDS = 3  # of reweighting in a fold, from the optimum on all batches
 
 
@@ -166,31 +167,31 @@ class Evidence:
         )
         square = self._squares
         sums = own.sum(axis=1), cross.sum(axis=1), square.sum(axis=0)
-        best = self._first_amplitude(*sums)
+        prior = z.T @ self.shadow, np.einsum("pc,pc->c", self.shadow, self.shadow)
+        best = self._first_amplitude(*sums, prior)
         left = self.left_out(targets)
         before = np.zeros(own[:, 0].shape)
         after = np.zeros(cross[:, 0].shape)
         falls = np.zeros((len(best), len(self.batches), best.shape[1]))
         for k, (b, fold, e) in enumerate(zip(self.batches, self.folds, left, strict=True)):
             rest = sums[0] - own[:, k], sums[1] - cross[:, k], sums[2] - square[k]
-            g = self._amplitude(best, *rest)
+            g = self._amplitude(best, *rest, prior)
             change = -2.0 * g[:, None] * self._products(b, e, fold.left) + g[:, None] ** 2 * fold.square
             seen = self._by_channel(b, e**2).T
             before += seen
             after += seen[..., None] + change
             falls[:, k] = -change.sum(axis=1)
         gain = self._of_squares(after) - self._of_squares(before[..., None])
-        kept = self._amplitude(best, *sums)  # the parameters move back by as much as the column takes over
-        relief = kept * (z.T @ self.shadow) - 0.5 * kept**2 * np.einsum("pc,pc->c", self.shadow, self.shadow)
-        return gain + relief, self._amplitude(best, *sums, shrink=False), falls
+        relief = _relief(self._amplitude(best, *sums, prior), prior)
+        return gain + relief, self._amplitude(best, *sums, prior, shrink=False), falls
 
     def scores(self) -> Scores:
         """All columns one by one for the recordings."""
         gain, amplitude, falls = self.gains()
-        inside = np.maximum(self._squares.sum(axis=(0, 1)), TINY)
+        inside = np.maximum(self._squares.sum(axis=(0, 1)) + np.einsum("pc,pc->c", self.shadow, self.shadow), TINY)
         every = sum(np.einsum("nc,nc->c", b.columns, b.columns) for b in self.batches)
         z = self._parameters()[:, 0]
-        along = sum(
+        along = z @ self.shadow + sum(
             c.T @ (b.target - b.jacobian @ z) for b, c in zip(self.batches, self.beyond, strict=True)
         )  # fmt: skip
         return Scores(
@@ -233,32 +234,41 @@ class Evidence:
         mean = np.moveaxis(square, 1, -1) / np.maximum(self._least, TINY)
         return self.density(mean)
 
-    def _first_amplitude(self, own: Array, cross: Array, square: Array) -> Array:
+    def _first_amplitude(self, own: Array, cross: Array, square: Array, prior: Prior) -> Array:
         """Where reweighting starts (R, C): the best of plain least squares and of every channel's own optimum."""
-        best = np.clip(cross.sum(axis=1) / np.maximum(square.sum(axis=0), TINY), self.low, self.high)
-        most = self._of_squares(self._moved(best, own, cross, square))
+        plain = (cross.sum(axis=1) + prior[0]) / np.maximum(square.sum(axis=0) + prior[1], TINY)
+        best = np.clip(plain, self.low, self.high)
+        most = self._of_squares(self._moved(best, own, cross, square)) + _relief(best, prior)
         for c in np.flatnonzero(self.rows):
             g = np.clip(cross[:, c] / np.maximum(square[c], TINY), self.low, self.high)
-            density = self._of_squares(self._moved(g, own, cross, square))
+            density = self._of_squares(self._moved(g, own, cross, square)) + _relief(g, prior)
             best, most = np.where(density > most, g, best), np.maximum(density, most)
         return np.asarray(best)
 
-    def _amplitude(self, g: Array, own: Array, cross: Array, square: Array, shrink: bool = True) -> Array:
+    def _amplitude(self, g: Array, own: Array, cross: Array, square: Array, prior: Prior, shrink: bool = True) -> Array:
         """Amplitudes (R, C) of the highest density within the bounds, from sums (R, K), (R, K, C), (K, C).
 
-        Reweighted iteratively; then less what noise alone would give (James and Stein 1961, positive part).
+        Reweighted iteratively, the parameters' prior beside the channels; then less what noise alone would give
+        (James and Stein 1961, positive part).
         """
         for _ in range(ROUNDS):
             mean = np.maximum(self._moved(g, own, cross, square), QUIET * self._least[:, None] + TINY)
             weight = self.rows[:, None] / mean
-            g = np.einsum("rkc,rkc->rc", weight, cross) / np.maximum(np.einsum("rkc,kc->rc", weight, square), TINY)
+            along = np.einsum("rkc,rkc->rc", weight, cross) + prior[0]
+            g = along / np.maximum(np.einsum("rkc,kc->rc", weight, square) + prior[1], TINY)
             g = np.clip(g, self.low, self.high)
         if not shrink:
             return np.asarray(g)
-        won = 2.0 * (self._of_squares(self._moved(g, own, cross, square)) - self._of_squares(own[..., None]))
+        seen = self._of_squares(self._moved(g, own, cross, square)) - self._of_squares(own[..., None])
+        won = 2.0 * (seen + _relief(g, prior))
         return np.where(won > 1.0, g * (1.0 - 1.0 / np.maximum(won, 1.0)), 0.0)
 
     @staticmethod
     def _moved(g: Array, own: Array, cross: Array, square: Array) -> Array:
         """Squares (R, K, C) at amplitudes (R, C)."""
         return np.maximum(own[..., None] - 2.0 * g[:, None] * cross + g[:, None] ** 2 * square, 0.0)
+
+
+def _relief(g: Array, prior: Prior) -> Array:
+    """Nats (R, C) that the parameters' prior gives back when columns of amplitudes g take over what bent them."""
+    return np.asarray(g * prior[0] - 0.5 * g**2 * prior[1])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -49,7 +50,7 @@ class Memory:
 
     def filtered(self, channel: int, rows: Array) -> Array:
         """The innovations of rows (n, …) of one channel, of variance 1 where the rows have it."""
-        phi, theta, sd = self._filter(channel)
+        phi, theta, sd = _filter(float(self.share[channel]), float(self.keep[channel]))
         if phi == 0.0:
             return rows
         out = lfilter([1.0, -phi], [1.0, -theta], rows, axis=0) / sd
@@ -57,19 +58,20 @@ class Memory:
 
     def restored(self, channel: int, rows: Array) -> Array:
         """The rows whose innovations these are: the inverse of `filtered`."""
-        phi, theta, sd = self._filter(channel)
+        phi, theta, sd = _filter(float(self.share[channel]), float(self.keep[channel]))
         if phi == 0.0:
             return rows
         out = (rows + _beginning(rows, theta, sd)) * sd
         return np.asarray(lfilter([1.0, -theta], [1.0, -phi], out, axis=0))
 
-    def _filter(self, channel: int) -> tuple[float, float, float]:
-        """φ, θ and the innovations' standard deviation of a channel; φ is 0 where its rows are independent."""
-        w, phi = self.share[channel], self.keep[channel]
-        if w == 0.0 or phi == 0.0:
-            return 0.0, 0.0, 1.0
-        theta, variance = _moving_average(np.asarray(w), np.asarray(phi))
-        return float(phi), float(theta), float(np.sqrt(variance))
+
+@lru_cache(maxsize=256)
+def _filter(share: float, keep: float) -> tuple[float, float, float]:
+    """φ, θ and the innovations' standard deviation of a channel; φ is 0 where its rows are independent."""
+    if share == 0.0 or keep == 0.0:
+        return 0.0, 0.0, 1.0
+    theta, variance = _moving_average(np.asarray(share), np.asarray(keep))
+    return keep, float(theta), float(np.sqrt(variance))
 
 
 def whiter(one: Memory, other: Memory) -> Memory:
@@ -104,12 +106,10 @@ def memory_of(residuals: Sequence[Array], channels: Sequence[NDArray[np.int64]],
 
 def _likelihood(rows: Array, there: NDArray[np.bool_], w: float, phi: float) -> float:
     """Log likelihood of series of one channel (n, B), ended by rows that are not `there`, the variance at its best."""
-    one = Memory(np.array([w]), np.array([phi]))
     n = int(there.sum())
-    square = float(np.sum(one.filtered(0, rows)[there] ** 2)) / n
-    _, variance = _moving_average(one.share, one.keep)
+    square = float(np.sum(Memory(np.array([w]), np.array([phi])).filtered(0, rows)[there] ** 2)) / n
     scale = max(square, QUIET / (1.0 - w))
-    return -0.5 * n * (float(np.log(scale * variance[0])) + square / scale)
+    return -0.5 * n * (float(np.log(scale)) + 2.0 * float(np.log(_filter(w, phi)[2])) + square / scale)
 
 
 def _beginning(rows: Array, theta: float, sd: float) -> Array:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from twin.calibration.descent import x_of
-from twin.calibration.fit_problem import Array, Block
+from twin.calibration.fit_problem import Array, Block, Unknown
 from twin.calibration.problem import unknown
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.candidates import candidates
@@ -60,11 +61,12 @@ def proposed(fitted: Fitted) -> list[Candidate]:
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
     """The evidence for all candidates that can be switched off or whose value may be doubted."""
-    line = _Line.at(fitted, every, fitted.memory, slack(every, fitted))
+    line = _Line.at(fitted, every, slack(every, fitted))
+    found = line.whitened(fitted.memory)
     finite, refused = differences(fitted, every)
     batches = tuple(
         replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
-        for k, b in enumerate(line.batches)
+        for k, b in enumerate(found)
     )
     low, high = _bounds(line, every)
     low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
@@ -86,24 +88,37 @@ def best_variants(scored: Sequence[Scored]) -> list[Scored]:
 def alone(fitted: Fitted, memory: Memory) -> Evidence:
     """How well a fit predicts batches left out, with slack and no candidates; `memory` of the rows of what is
     compared."""
+    batches = _slackened(fitted).whitened(memory)
+    return _evidence(fitted, tuple(replace(b, columns=b.columns[:, :0]) for b in batches), memory, *np.zeros((2, 0)))
+
+
+@lru_cache(maxsize=8)
+def _slackened(fitted: Fitted) -> _Line:
+    """With nothing asleep but what is slack. The last fits' are kept: each is judged with several memories."""
     every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
     loose = slack(every, fitted)
-    line = _Line.at(fitted, [c for c in every if c.name in loose], memory, loose)
-    batches = tuple(replace(b, columns=b.columns[:, :0]) for b in line.batches)
-    return _evidence(fitted, batches, memory, np.zeros(0), np.zeros(0))
+    return _Line.at(fitted, [c for c in every if c.name in loose], loose)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A linearisation with candidates asleep: whitened batches, and the parameter number of every column."""
+    """A linearisation with candidates asleep, and the parameter number of every column.
+
+    The blocks' jacobians (n, p + C) have the columns of `unknowns`, first the fit's own.
+    """
 
     found: Asleep
-    batches: tuple[Whitened, ...]
+    blocks: tuple[Block, ...]
+    nuisance: tuple[Array, ...]
+    z: Array
+    weight: Array
+    unknowns: tuple[Unknown, ...]
     numbers: list[int]
     own: dict[str, int]  # parameters that the fit has already, by name
+    loose: Mapping[int, float]  # prior sd of the columns that are slack
 
     @classmethod
-    def at(cls, fitted: Fitted, every: Sequence[Candidate], memory: Memory, sd: Mapping[str, float]) -> _Line:
+    def at(cls, fitted: Fitted, every: Sequence[Candidate], sd: Mapping[str, float]) -> _Line:
         """`sd` of those that are slack, by name."""
         found = asleep(fitted.machine, fitted.part, every)
         problem = on_network(fitted.problem, fitted.batches, found.network)
@@ -113,25 +128,30 @@ class _Line:
         loose = {numbers.index(found.amplitudes[n][0]): s for n, s in sd.items() if n in found.amplitudes}
         z = carried_z(fitted.problem, problem, fitted.state.z)
         nuisance = carried_nuisances(fitted.problem, problem, fitted.state.nuisance)
-        weight = 1.0 / fitted.state.noise.factor**2
         more = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
-        every_unknown = (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers))
-        columns = range(len(own), len(every_unknown))
-        blocks = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), more, strict=True)  # kept from the fit
         own_sd = from_run_to_run(fitted)
-        batches = tuple(
-            whitened(
-                replace(b, jacobian=np.hstack([b.jacobian, m]), nuisance=_with_own(b, own_sd)),
-                np.append(v, np.zeros(len(own_sd))),
-                fitted.state.z,
-                every_unknown,
-                columns,
-                weight,
-                memory,
-            ).with_slack(loose)
-            for (b, m), v in zip(blocks, fitted.state.nuisance, strict=True)
+        kept = fitted.problem.linearise(fitted.x, fitted.state.nuisance)  # from the fit
+        return cls(
+            found,
+            tuple(
+                replace(b, jacobian=np.hstack([b.jacobian, m]), nuisance=_with_own(b, own_sd))
+                for b, m in zip(kept, more, strict=True)
+            ),
+            tuple(np.append(v, np.zeros(len(own_sd))) for v in fitted.state.nuisance),
+            fitted.state.z,
+            1.0 / fitted.state.noise.factor**2,
+            (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers)),
+            numbers,
+            own,
+            loose,
         )
-        return cls(found, batches, numbers, own)
+
+    def whitened(self, memory: Memory) -> tuple[Whitened, ...]:
+        columns = range(len(self.own), len(self.unknowns))
+        return tuple(
+            whitened(b, v, self.z, self.unknowns, columns, self.weight, memory).with_slack(self.loose)
+            for b, v in zip(self.blocks, self.nuisance, strict=True)
+        )
 
 
 def _with_own(b: Block, sd: Mapping[int, float]) -> Array:

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from twin.calibration.identifiability import Z90, Interval
+from twin.calibration.identifiability import Interval
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.null import AS_IT_IS
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure, told
 from twin.diagnosis.rounds.search import Round, Search
 from twin.diagnosis.scoring.screen import alone
@@ -23,7 +24,6 @@ from twin.mechanisms import MECHANISMS
 from twin.schema import TwinPart
 
 REST = 4.0  # times what structure leaves: beyond it something is left, whatever it is
-AS_IT_IS = 2  # the scale of a refined machine's misfit that is its own
 SURE = 0.7  # below it the best explanation does not stand by itself
 
 
@@ -131,16 +131,15 @@ def _parameters(
 
 
 def _widened(i: Interval, parameter: str, done: Round) -> Estimate:
-    """The interval of an amplitude, as wide as refined machines scatter it: a lumped network does not know better."""
+    """The interval of an amplitude, as wide as structure that leaves as much scatters it."""
     best = done.best
     if best is None or list(best.candidate.amplitudes) != [parameter]:  # several trade with each other
         return Estimate(i.value, i.unit, i.low, i.high)
-    density = float(np.median(done.null.density))
-    sd = Z90 * done.null.amplitude_sd(best.candidate.name, density)
+    more = done.scatter
     if i.low > 0 and i.value > 0:
-        up = float(np.hypot(np.log(i.high / i.value), sd / i.value))
+        up = float(np.hypot(np.log(i.high / i.value), more / i.value))
         return Estimate(i.value, i.unit, i.value * float(np.exp(-up)), i.value * float(np.exp(up)))
-    half = float(np.hypot((i.high - i.low) / 2.0, sd))
+    half = float(np.hypot((i.high - i.low) / 2.0, more))
     return Estimate(i.value, i.unit, i.value - half, i.value + half)
 
 

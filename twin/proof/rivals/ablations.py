@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
+from twin.diagnosis.rounds.search import LEAST
 from twin.diagnosis.telling.findings import Findings
 from twin.proof.rivals.answer import Claim, Reply
 from twin.proof.rivals.in_sample import in_sample_gains, in_sample_score
@@ -61,16 +62,19 @@ def in_sample(stage: Stage) -> Reply:
     """Gains on the recordings that were fitted; nothing is left out, the null by the same statistic."""
     r = stage.round
 
-    columns = [s.column for s in claimable(r)]
-    null = null_of(stage.misfits, r.before.state.z, r.screen.evidence, columns, in_sample_gains, in_sample_score)
+    columns = {s.candidate.name: s.column for s in claimable(r)}
+    null = null_of(stage.misfits, r.screen.evidence, columns, in_sample_gains, in_sample_score)
     before = float(in_sample_score(stage.before)[0])
     gains = [float(in_sample_score(after)[0]) - before for after in stage.after]
     tried = [
         replace(t, gain=gain, alike=None, improved=len(r.before.batches))
         for t, gain in zip(stage.refits, gains, strict=True)
     ]
-    best = stage.ranked(tried)[0].gain if tried else 0.0
-    return stage.decided(tried, stage.bar(null.threshold(before + best)))
+    if not tried:
+        return stage.decided([], LEAST)
+    best = stage.ranked(tried)[0]
+    name = best.candidate.name
+    return stage.decided(tried, stage.bar(null.threshold(before + best.gain, name=name), name))
 
 
 def no_structural_null(stage: Stage) -> Reply:

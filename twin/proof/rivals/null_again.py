@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -33,9 +33,9 @@ def structural_misfits(fitted: Fitted) -> list[list[Array]]:
 
 
 def null_of(
-    misfits: Sequence[Sequence[Array]], z: Array, evidence: Evidence, columns: Sequence[int], gains: Gains, score: Score
+    misfits: Sequence[Sequence[Array]], evidence: Evidence, columns: Mapping[str, int], gains: Gains, score: Score
 ) -> Null:
-    """`twin.diagnosis.rounds.null.structural_null` by `gains` of these columns and `score`; `z` (p,) of the fit."""
+    """`twin.diagnosis.rounds.null.structural_null` by `gains` of these columns, numbered by candidate, and `score`."""
     rng = np.random.default_rng(SEED)
     shape = (len(misfits), len(SCALES))
     none = np.zeros((0, 0, 0))
@@ -43,12 +43,13 @@ def null_of(
         return Null(np.zeros(shape), np.zeros(shape), none, none)
     targets: list[list[Array]] = [[] for _ in evidence.batches]
     for rows in misfits:
+        z = rng.standard_normal(evidence.batches[0].jacobian.shape[1])
         for drawn, b, misfit in zip(targets, evidence.batches, rows, strict=True):
-            noise = rng.standard_normal(len(misfit))
-            drawn += [b.of(scale * misfit + noise) for scale in SCALES]
-    stacked = []
-    for b, drawn in zip(evidence.batches, targets, strict=True):
-        own = min(len(z), b.jacobian.shape[1])
-        stacked.append(np.stack(drawn, axis=1) + (b.jacobian[:, :own] @ z[:own])[:, None])
-    gain = gains(evidence, stacked, columns).max(axis=1, initial=0.0)
-    return Null(gain.reshape(shape), score(evidence, stacked).reshape(shape), none, none)
+            plain, noise = b.jacobian @ z, rng.standard_normal(len(misfit))
+            drawn += [plain + b.of(scale * misfit + noise) for scale in SCALES]
+    stacked = [np.stack(drawn, axis=1) for drawn in targets]
+    gain = gains(evidence, stacked, list(columns.values()))
+    largest, density = gain.max(axis=1, initial=0.0), score(evidence, stacked)
+    return Null(
+        largest.reshape(shape), density.reshape(shape), none, none, tuple(columns), gain.reshape(*shape, len(columns))
+    )

@@ -83,11 +83,11 @@ class Stage:
         """What the fit leaves, in units of what structure alone would."""
         return remainder(replace(self.done, final=self.round.before))
 
-    def bar(self, null: float) -> float:
+    def bar(self, null: float, name: str) -> float:
         """The threshold with another structural null."""
-        flipped = self.round.flipped  # none where nothing was refitted
-        signs = flipped_threshold(flipped, len(self.round.before.batches)) if len(flipped) else 0.0
-        return max(null, signs, LEAST)
+        names, flipped = self.round.null.names, self.round.flipped  # none where nothing was refitted
+        which = names.index(name) if name in names else None
+        return max(null, flipped_threshold(flipped, len(self.round.before.batches), which), LEAST)
 
     def ranked(self, tried: Sequence[Tried]) -> list[Tried]:
         """By gain and what is plausible, a finer network first where it gains nearly as much."""

@@ -80,9 +80,7 @@ def true_model(
     if full is None:
         full, stated = fit, []
     judged = [
-        _judged(fit, full, key.terms, found, [j for j in stated if j != k], null)
-        if k in stated
-        else _redrawn(fit, t, redraw, null)
+        _judged(fit, full, key.terms, found, k, stated, null) if k in stated else _redrawn(fit, t, redraw, null)
         for k, t in enumerate(key.terms)
     ]
     others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
@@ -127,10 +125,12 @@ def _judged(
     full: Fitted,
     terms: Sequence[TrueTerm],
     found: Sequence[Scored | None],
-    others: Sequence[int],
+    which: int,
+    stated: Sequence[int],
     null: Null,
 ) -> _Judged:
     """One term with the others in: the better of two fits without it is what it must beat."""
+    others = [k for k in stated if k != which]
     own = [(terms[k], s) for k in others if (s := found[k]) is not None]
     part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
     try:
@@ -142,7 +142,8 @@ def _judged(
     memory = whiter(full.memory, without[0].memory)
     scores = [_score(w, memory) for w in without]
     best = int(np.argmax(scores))
-    return _beyond(without[best], full, memory, null)
+    s = found[which]
+    return _beyond(without[best], full, memory, null, s.candidate.name if s is not None else "")
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
@@ -154,9 +155,9 @@ def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> 
     return replace(_beyond(fit, other, memory, null), fitted=other)
 
 
-def _beyond(before: Fitted, after: Fitted, memory: Memory, null: Null) -> _Judged:
+def _beyond(before: Fitted, after: Fitted, memory: Memory, null: Null, name: str = "") -> _Judged:
     density = _score(after, memory)
-    gain, threshold = density - _score(before, memory), float(null.threshold(density))
+    gain, threshold = density - _score(before, memory), float(null.threshold(density, name=name))
     old, new = _rms(before), _rms(after)
     cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
     return _Judged(gain, threshold, bool(gain > threshold and cut >= CUT))

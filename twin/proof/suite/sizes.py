@@ -24,6 +24,7 @@ MOST = 10.0
 BOUNDS: Mapping[str, float] = MappingProxyType(
     {
         "time_skew": 1.8,  # a clock's error stays within what is simulated
+        "preload_feedback": 4.0,  # beyond it a bearing heats without an end
         "wrong_parameter": 3.0,  # a joint that is off by a factor of 64
     }
 )
