@@ -18,6 +18,7 @@ from data.recording import read_batches
 from twin.plants.plant import draw
 from twin.proof.spec import CaseSpec
 from twin.proof.suite import Built, batches_of, build, small_suite, without, write_built
+from twin.proof.suite.build import HOTTEST_DEGC
 from twin.proof.suite.setting import setting
 from twin.proof.suite.suite import case
 from twin.quantity import convert
@@ -163,3 +164,14 @@ def test_real_recordings_need_their_folder() -> None:
     spec = CaseSpec("case_0003", "one", "grafted", SEED, options={"case": "lathe_sun"})
     with pytest.raises(InputError, match="case_0003: plant grafted needs real recordings; give their folder"):
         build(spec)
+
+
+@pytest.mark.parametrize("plant", ["elements", "volumes"])
+def test_a_bearing_that_would_seize_is_drawn_weaker_and_the_answer_says_so(plant: str) -> None:
+    """Preload that tightens with its own heat runs away: recordings of 300 degC are of no machine."""
+    built = build(short(plant=plant, effects={"preload_feedback": 12.0}, hours=5.0))
+    (term,) = built.answer["terms"]
+    assert term["size"] < 12.0
+    assert term["size"] == built.answer["redraw"]["effects"]["preload_feedback"]
+    hottest = max(float(np.nanmax(b.values(c))) for b in batches_of(built) for c in b.names("temperature"))
+    assert 40.0 < hottest <= HOTTEST_DEGC
