@@ -14,6 +14,7 @@ from data.errors import WorkError
 from tests.twin.diagnosis.small_cases import cold_floor, consistent
 from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.proposals.priors import start_values
+from twin.diagnosis.rounds.null import structural_misfits
 from twin.diagnosis.rounds.search import Search, search
 from twin.diagnosis.scoring.finite import difference
 from twin.diagnosis.scoring.memory import Memory
@@ -21,7 +22,7 @@ from twin.diagnosis.scoring.screen import alone
 from twin.mechanisms import MECHANISMS
 from twin.proof.rivals import rivals
 from twin.proof.rivals.in_sample import in_sample_gains, in_sample_score
-from twin.proof.rivals.null_again import null_of, structural_misfits
+from twin.proof.rivals.null_again import null_of
 from twin.proof.rivals.registry import ABLATIONS, BASELINES
 from twin.proof.rivals.rows import claimable, counted_in_full, plain_rows, without_nuisances
 from twin.proof.rivals.stage import Stage

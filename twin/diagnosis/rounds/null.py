@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
-from twin.diagnosis.rounds.acceptance import balanced, gumbel
+from twin.diagnosis.rounds.acceptance import balanced
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.refined import refined
 from twin.diagnosis.scoring.evidence import Evidence
@@ -47,7 +47,7 @@ class Null:
         if len(gain) < 3:
             return float("inf")
         if name not in self.names or not self.gains.size:
-            return max(float(gumbel(gain, share)), float(gain.max()))
+            return balanced(gain[:, None], None, share)
         return balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
 
     def typical(self, density: float) -> Array:
@@ -93,23 +93,7 @@ def structural_null(
     candidate, the columns whose gain would be an alarm. A machine's parameters are what the machine file thinks
     possible, not those of the fit: bent by what is missing, they would be what a candidate is rewarded for.
     """
-    rng = np.random.default_rng(seed)
-    base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
-    targets: list[list[Array]] = [[] for _ in base]
-    for k in range(TWINS):
-        try:
-            part = refined(fitted.part, fitted.problem.network, fitted.values, seed + k)
-            rows = difference(fitted, part, base)
-        except (InputError, WorkError):
-            continue  # a draw that no machine has
-        z = rng.standard_normal(evidence.batches[0].jacobian.shape[1])
-        for b, (whitened, misfit) in enumerate(zip(evidence.batches, rows, strict=True)):
-            noise = rng.standard_normal(len(misfit))
-            plain = whitened.jacobian @ z
-            targets[b] += [plain + whitened.of(scale * misfit + noise) for scale in SCALES]
-        if progress:
-            progress(k + 1, TWINS)
-    drawn = [np.stack(t, axis=1) for t in targets]
+    drawn = recordings(structural_misfits(fitted, seed, progress), evidence, seed)
     gain, amplitude, _ = evidence.gains(drawn)
     columns = list(counts.values())
     squares = evidence.mean_squares(evidence.left_out(drawn))
@@ -122,3 +106,32 @@ def structural_null(
         tuple(counts),
         gain[:, columns].reshape(*shape, len(columns)),
     )
+
+
+def structural_misfits(
+    fitted: Fitted, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> list[list[Array]]:
+    """Of each refined machine what it shows beyond the fit, (n_b,) of every batch in units of the given noise."""
+    base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
+    out = []
+    for k in range(TWINS):
+        try:
+            part = refined(fitted.part, fitted.problem.network, fitted.values, seed + k)
+            out.append(difference(fitted, part, base))
+        except (InputError, WorkError):
+            continue  # a draw that no machine has
+        if progress:
+            progress(k + 1, TWINS)
+    return out
+
+
+def recordings(misfits: Sequence[Sequence[Array]], evidence: Evidence, seed: int = 0) -> list[Array]:
+    """Targets (n_b, T S) of every batch: T machines with parameters of their own, each at every scale, and noise."""
+    rng = np.random.default_rng(seed)
+    targets: list[list[Array]] = [[] for _ in evidence.batches]
+    for rows in misfits:
+        z = rng.standard_normal(evidence.batches[0].jacobian.shape[1])
+        for own, whitened, misfit in zip(targets, evidence.batches, rows, strict=True):
+            plain, noise = whitened.jacobian @ z, rng.standard_normal(len(misfit))
+            own += [plain + whitened.of(scale * misfit + noise) for scale in SCALES]
+    return [np.stack(t, axis=1) for t in targets]

@@ -33,11 +33,7 @@ def null_beside(before: Fitted, after: Fitted, c: Candidate, seed: int) -> tuple
     every = proposed(after)
     seen, loose = screen(after, every), no_news(every, after)
     evidence = _as_column(seen.evidence, after, own)
-    columns = {
-        s.candidate.name: s.column
-        for s in seen.scored
-        if s.column >= 0 and s.candidate.name not in loose and s.candidate.name != c.name
-    }
+    columns = seen.columns({*loose, c.name})
     columns[c.name] = evidence.batches[0].columns.shape[1] - 1
     return structural_null(after, evidence, columns, seed), float(alone(after, after.memory).base_score()[0])
 

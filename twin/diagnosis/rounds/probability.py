@@ -36,13 +36,13 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     """
     t = done.null.temperature
     batches = len(done.before.batches)
+
+    def agrees(x: Tried) -> bool:
+        return x is done.best or x.fitted is None or x.improved >= IMPROVED * batches
+
     refits = [x for x in done.tried if x.fitted is not None]
-    kept = {x.cluster for x in refits if x is done.best or x.improved >= IMPROVED * batches}
-    barred = {x.cluster for x in refits} - kept
-    alone = [x.fitted is not None and x is not done.best and x.improved < IMPROVED * batches for x in done.tried]
-    scores = np.array(
-        [-np.inf if x.cluster in barred or a else x.standing(t) for x, a in zip(done.tried, alone, strict=True)]
-    )
+    barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}
+    scores = np.array([x.standing(t) if agrees(x) and x.cluster not in barred else -np.inf for x in done.tried])
     nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
     unlisted = (scores.max(initial=nothing)) - np.log(50.0)
     every = np.append(scores, [nothing, unlisted])

@@ -171,7 +171,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     seen = screen(now, every)
     loose = no_news(every, now)
     news = [s for s in seen.scored if s.candidate.name not in loose]
-    columns = {s.candidate.name: s.column for s in news if s.column >= 0}
+    columns = seen.columns(loose)
     alarm = list(columns.values())
     news = best_variants(news)
     null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))

@@ -95,6 +95,11 @@ class Evidence:
         return np.asarray(cho_solve(self.factor, cross))
 
     @cached_property
+    def _shadow_square(self) -> Array:
+        """(C,): what the prior of the parameters takes for that."""
+        return np.einsum("pc,pc->c", self.shadow, self.shadow)
+
+    @cached_property
     def beyond(self) -> list[Array]:
         """Every batch's columns (n, C) beyond what the parameters of the whole fit can do."""
         return [b.columns - b.jacobian @ self.shadow for b in self.batches]
@@ -167,7 +172,7 @@ class Evidence:
         )
         square = self._squares
         sums = own.sum(axis=1), cross.sum(axis=1), square.sum(axis=0)
-        prior = z.T @ self.shadow, np.einsum("pc,pc->c", self.shadow, self.shadow)
+        prior = z.T @ self.shadow, self._shadow_square
         best = self._first_amplitude(*sums, prior)
         left = self.left_out(targets)
         before = np.zeros(own[:, 0].shape)
@@ -188,7 +193,7 @@ class Evidence:
     def scores(self) -> Scores:
         """All columns one by one for the recordings."""
         gain, amplitude, falls = self.gains()
-        inside = np.maximum(self._squares.sum(axis=(0, 1)) + np.einsum("pc,pc->c", self.shadow, self.shadow), TINY)
+        inside = np.maximum(self._squares.sum(axis=(0, 1)) + self._shadow_square, TINY)
         every = sum(np.einsum("nc,nc->c", b.columns, b.columns) for b in self.batches)
         z = self._parameters()[:, 0]
         along = z @ self.shadow + sum(

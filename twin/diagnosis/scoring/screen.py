@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -52,6 +52,11 @@ class Screen:
     scored: tuple[Scored, ...]
     evidence: Evidence
     left_out: dict[str, str]
+
+    def columns(self, loose: Collection[str]) -> dict[str, int]:
+        """By name of a candidate its column, for those that have one and are not `loose`: their gain is an alarm."""
+        names = ((s.candidate.name, s.column) for s in self.scored if s.column >= 0)
+        return {name: column for name, column in names if name not in loose}
 
 
 def proposed(fitted: Fitted) -> list[Candidate]:

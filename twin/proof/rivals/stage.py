@@ -9,6 +9,7 @@ from functools import cached_property
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.acceptance import flipped_threshold
+from twin.diagnosis.rounds.null import structural_misfits
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
 from twin.diagnosis.rounds.search import FINER, LEAST, Round, Search, agreed_on, to_claim
@@ -17,7 +18,6 @@ from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.conclude import REST, SURE, remainder
 from twin.diagnosis.telling.findings import Findings
 from twin.proof.rivals.answer import WITHIN, Claim, Reply
-from twin.proof.rivals.null_again import structural_misfits
 
 COARSE = "coarse_network"
 REFITS = 10  # what gains less would not come first by any other count

@@ -104,7 +104,7 @@ def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
 
 
 def _null(fit: Fitted, seen: Screen, loose: set[str], seed: int) -> Null:
-    columns = {s.candidate.name: s.column for s in seen.scored if s.column >= 0 and s.candidate.name not in loose}
+    columns = seen.columns(loose)
     return structural_null(fit, seen.evidence, columns, seed)
 
 

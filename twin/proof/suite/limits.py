@@ -76,7 +76,7 @@ class Bench:
         every = proposed(fitted)
         seen = screen(fitted, every)
         loose = no_news(every, fitted)
-        columns = {s.candidate.name: s.column for s in seen.scored if s.column >= 0 and s.candidate.name not in loose}
+        columns = seen.columns(loose)
         null = structural_null(fitted, seen.evidence, columns)
         evidence = alone(fitted, fitted.memory)
         return cls(seed, plant, options, fitted, evidence, null.threshold(float(evidence.base_score()[0])))
