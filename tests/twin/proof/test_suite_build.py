@@ -175,3 +175,9 @@ def test_a_bearing_that_would_seize_is_drawn_weaker_and_the_answer_says_so(plant
     assert term["size"] == built.answer["redraw"]["effects"]["preload_feedback"]
     hottest = max(float(np.nanmax(b.values(c))) for b in batches_of(built) for c in b.names("temperature"))
     assert 40.0 < hottest <= HOTTEST_DEGC
+
+
+def test_a_sensor_that_is_absent_is_no_seized_bearing() -> None:
+    built = build(short(effects={"preload_feedback": 0.5}, absent=0.5))
+    assert any(np.isnan(b.values(c)).all() for b in batches_of(built) for c in b.names("temperature"))
+    assert built.answer["terms"][0]["size"] == 0.5
