@@ -18,6 +18,7 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
+from twin.compile import compile_network
 from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.drafting.draft import drafted_part
 from twin.diagnosis.next_run.next_experiment import Proposal
@@ -27,7 +28,7 @@ from twin.diagnosis.places.where_when import Located, locate
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
 from twin.diagnosis.rounds.fitted import Fitted, settle
-from twin.diagnosis.rounds.parts_of_batches import enough_batches
+from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
 from twin.diagnosis.rounds.search import Round, Search, search
 from twin.diagnosis.rounds.workers import Workers
@@ -83,6 +84,8 @@ def diagnose(
             words += draft.words
         else:
             part = twin_part(machine)
+        batches, remarks = usable_batches(compile_network(machine, part=part), batches)
+        words += remarks
         recordings = tuple(b.batch_id for b in batches)
         batches, remarks = enough_batches(batches)
         words += remarks

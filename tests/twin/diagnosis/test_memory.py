@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twin.diagnosis.scoring.memory import Memory, memory_of, whiter
+from twin.diagnosis.scoring.memory import ROWS, SHARES, Memory, _likeliest, _likelihood, memory_of, whiter
 
 Array = NDArray[np.float64]
 N = 80
@@ -73,3 +73,15 @@ def test_the_whiter_of_two_is_chosen_channel_by_channel() -> None:
     other = Memory(np.array([0.9, 0.1]), np.array([0.9, 0.1]))
     both = whiter(one, other)
     assert both.share.tolist() == [0.5, 0.1] and both.keep.tolist() == [0.5, 0.1]
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
+@pytest.mark.parametrize("rows", [1.5, 6.0, 40.0])
+def test_going_uphill_finds_what_the_whole_grid_has(share: float, rows: float) -> None:
+    phi = float(np.exp(-1.0 / rows))
+    given = Memory(np.array([share]), np.array([phi]))
+    series = given.restored(0, np.random.default_rng(int(10 * rows)).standard_normal((120, 8)))
+    there = np.ones(series.shape, bool)
+    keeps = np.exp(-1.0 / np.array(ROWS))
+    every = max(_likelihood(series, there, w, float(k)) for w in SHARES for k in keeps)
+    assert _likeliest(series, there)[0] == pytest.approx(every, abs=0.5)

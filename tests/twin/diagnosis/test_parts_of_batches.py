@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch, Finding
+from data.errors import InputError
 from tests.twin.diagnosis.small_cases import runs, two_bodies
-from twin.diagnosis.rounds.parts_of_batches import ENOUGH, SHORTEST_ROWS, enough_batches
+from twin.compile import compile_network
+from twin.diagnosis.rounds.parts_of_batches import ENOUGH, SHORTEST_ROWS, enough_batches, usable_batches
 
 
 def some(count: int) -> list[Batch]:
@@ -74,3 +76,31 @@ def test_a_run_too_short_to_cut_stays_whole() -> None:
     short = replace(given, table=given.table.iloc[:30])
     out, words = enough_batches([short])
     assert out == [short] and words[0].startswith("1 run only: cut into 1 block")
+
+
+def with_hole(batch: Batch) -> Batch:
+    """Without the room's temperature for twenty minutes."""
+    table = batch.table.copy()
+    table.loc[(table["time_s"] > 1200) & (table["time_s"] < 2400 + 300), "room"] = np.nan
+    return replace(batch, table=table)
+
+
+def test_a_hole_that_cannot_be_bridged_costs_its_run_alone() -> None:
+    known = two_bodies()
+    network = compile_network(known)
+    every = runs(known, count=6)
+    given = [with_hole(every[0]), *every[1:]]
+    kept, words = usable_batches(network, given)
+    assert [b.batch_id for b in kept] == [b.batch_id for b in every[1:]]
+    assert len(words) == 1
+    assert words[0].startswith(f"left out: batch {every[0].batch_id}: channel 'room' has no value from ")
+    assert usable_batches(network, every) == (every, ())
+
+
+def test_where_few_are_left_the_first_hole_is_told() -> None:
+    known = two_bodies()
+    every = runs(known, count=6)
+    for holes in (3, 6):
+        given = [with_hole(b) if k < holes else b for k, b in enumerate(every)]
+        with pytest.raises(InputError, match=f"^batch {every[0].batch_id}: channel 'room' has no value from "):
+            usable_batches(compile_network(known), given)

@@ -10,6 +10,9 @@ import numpy as np
 import pandas as pd
 
 from data.batch import Batch
+from data.errors import InputError
+from twin.network import Network
+from twin.simulation.inputs import inputs_of
 
 ENOUGH = 4
 SHORTEST_ROWS = 24
@@ -32,6 +35,27 @@ def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ..
         "turn; blocks of one run share its weather and its state, so no probability above 0.9 is told",
     )
     return out, words
+
+
+def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
+    """Those that the network can be driven with, and of the others why not: a hole in one run spoils no other.
+
+    Raises:
+        InputError: fewer than four are left, or fewer than half; the first reason.
+    """
+    kept: list[Batch] = []
+    words: list[str] = []
+    reasons: list[InputError] = []
+    for batch in batches:
+        try:
+            inputs_of(network, [batch])
+            kept.append(batch)
+        except InputError as error:
+            reasons.append(error)
+            words.append(f"left out: {error}")
+    if reasons and len(kept) < max(ENOUGH, len(batches) / 2):
+        raise reasons[0]
+    return kept, tuple(words)
 
 
 def _cut(batch: Batch, n: int) -> list[Batch]:

@@ -17,7 +17,8 @@ from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 
-BEST, KINDS = 5, 8  # refits of a round: the best of all, and with the best of every other mechanism
+BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
+SHARP, WELL = 3, 0.1  # more of other mechanisms, where rows count in full, if they gain this share of the best there
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80
@@ -68,6 +69,34 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
             chosen.append(k)
             seen.add(kind)
     return worth, clusters, chosen
+
+
+def with_sharp(
+    first: tuple[list[Scored], list[int], list[int]], sharp: Sequence[Scored], evidence: Evidence
+) -> tuple[list[Scored], list[int], list[int]]:
+    """A shortlist with the best of other mechanisms where every row counts in full.
+
+    What is missing makes rows remember each other; filtered by that memory, its own trace may be gone.
+    """
+    worth, clusters, chosen = first
+    seen = {(worth[k].candidate.mechanism, worth[k].candidate.where.kind) for k in chosen}
+    more: list[Scored] = []
+    for s in sorted(sharp, key=_promise):
+        kind = s.candidate.mechanism, s.candidate.where.kind
+        if len(more) >= SHARP or s.gain < max(WORTH, WELL * sharp[0].gain):
+            break
+        if kind not in seen and s.column >= 0:
+            seen.add(kind)
+            more.append(_moved(s, evidence))
+    names = {s.candidate.name for s in more}
+    kept = [k for k, s in enumerate(worth) if s.candidate.name not in names]
+    numbers = [kept.index(k) for k in chosen]  # none of those is of another mechanism
+    last = max(clusters, default=-1)
+    return (
+        [worth[k] for k in kept] + more,
+        [clusters[k] for k in kept] + [last + 1 + k for k in range(len(more))],
+        numbers + [len(kept) + k for k in range(len(more))],
+    )
 
 
 def _moved(s: Scored, evidence: Evidence) -> Scored:

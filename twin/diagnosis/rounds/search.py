@@ -17,11 +17,11 @@ from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
-from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters
+from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters, with_sharp
 from twin.diagnosis.rounds.revise import second_thoughts
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.memory import Memory
-from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, proposed, screen
+from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, proposed, screens
 
 MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
@@ -168,7 +168,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     """Screen, cluster, refit, score, decide."""
     every = proposed(now)
     tell("screen", 0, 0)
-    seen = screen(now, every)
+    none = Memory.none(len(now.problem.channels))
+    seen, sharp = screens(now, every, [now.memory, none])
     loose = no_news(every, now)
     news = [s for s in seen.scored if s.candidate.name not in loose]
     columns = seen.columns(loose)
@@ -177,8 +178,9 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
     base = alone(now, now.memory)
-    plain = alone(now, Memory.none(len(now.problem.channels)))  # a slow misfit in full: that is what is too coarse
-    worth, clusters, chosen = shortlist(news, seen.evidence)
+    plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
+    sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
+    worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
     coarse = [
         Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, plain.mean_squares(plain.left_out())[0])
     ]

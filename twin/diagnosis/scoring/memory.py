@@ -97,11 +97,29 @@ def memory_of(residuals: Sequence[Array], channels: Sequence[NDArray[np.int64]],
         for k, s in enumerate(series):
             rows[: len(s), k] = s
         there = np.arange(len(rows))[:, None] < lengths
-        likely = _likelihood(rows, there, 0.0, 0.0) + WORTH
-        for w, phi in product(SHARES, np.exp(-1.0 / np.array(ROWS)).tolist()):
-            if (here := _likelihood(rows, there, w, phi)) > likely:
-                likely, share[c], keep[c] = here, w, phi
+        likely, w, phi = _likeliest(rows, there)
+        if likely > _likelihood(rows, there, 0.0, 0.0) + WORTH:
+            share[c], keep[c] = w, phi
     return Memory(share, keep)
+
+
+def _likeliest(rows: Array, there: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """The highest log likelihood on the grid of shares and reaches, and where: a coarse look, then uphill."""
+    keeps = np.exp(-1.0 / np.array(ROWS)).tolist()
+    seen: dict[tuple[int, int], float] = {}
+
+    def at(point: tuple[int, int]) -> float:
+        if point not in seen:
+            seen[point] = _likelihood(rows, there, SHARES[point[0]], keeps[point[1]])
+        return seen[point]
+
+    best = max(product(range(1, len(SHARES), 3), range(1, len(ROWS), 2)), key=at)
+    while True:
+        i, j = best
+        near = product(range(max(i - 1, 0), min(i + 2, len(SHARES))), range(max(j - 1, 0), min(j + 2, len(ROWS))))
+        if (up := max(near, key=at)) == best:
+            return at(best), SHARES[i], keeps[j]
+        best = up
 
 
 def _likelihood(rows: Array, there: NDArray[np.bool_], w: float, phi: float) -> float:

@@ -66,17 +66,25 @@ def proposed(fitted: Fitted) -> list[Candidate]:
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
     """The evidence for all candidates that can be switched off or whose value may be doubted."""
+    return screens(fitted, every, [fitted.memory])[0]
+
+
+def screens(fitted: Fitted, every: Sequence[Candidate], memories: Sequence[Memory]) -> list[Screen]:
+    """The same with the rows' memory as given, from one linearisation."""
     line = _Line.at(fitted, every, slack(every, fitted))
-    found = line.whitened(fitted.memory)
     finite, refused = differences(fitted, every)
-    batches = tuple(
-        replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
-        for k, b in enumerate(found)
-    )
     low, high = _bounds(line, every)
     low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
-    evidence = _evidence(fitted, batches, fitted.memory, low, high)
-    return Screen(tuple(_scored(line, every, list(finite), evidence)), evidence, {**line.found.left_out, **refused})
+    out = []
+    for memory in memories:
+        batches = tuple(
+            replace(b, columns=np.column_stack([b.columns, *(b.of(d[k]) for d in finite.values())]))
+            for k, b in enumerate(line.whitened(memory))
+        )
+        evidence = _evidence(fitted, batches, memory, low, high)
+        scored = _scored(line, every, list(finite), evidence)
+        out.append(Screen(tuple(scored), evidence, {**line.found.left_out, **refused}))
+    return out
 
 
 def best_variants(scored: Sequence[Scored]) -> list[Scored]:

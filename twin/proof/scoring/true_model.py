@@ -17,14 +17,16 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from twin.compile import compile_network
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null, structural_null
-from twin.diagnosis.rounds.parts_of_batches import enough_batches
+from twin.diagnosis.rounds.null_beside import null_beside
+from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import left_out_rows
 from twin.diagnosis.scoring.memory import Memory, whiter
-from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
+from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
 from twin.proof.scoring.true_candidate import true_candidate, with_terms
 from twin.schema import TwinPart, twin_part
@@ -73,14 +75,15 @@ def true_model(
         return TrueModel(level, level, 1.0, (), (), ())
     every = proposed(fit)
     seen = screen(fit, every)
-    null = _null(fit, seen, no_news(every, fit), seed)
     found = [true_candidate(t, seen, every) for t in key.terms]
     stated = [k for k, s in enumerate(found) if s is not None]
     full = _with(fit, key.terms, found, stated)
     if full is None:
         full, stated = fit, []
     judged = [
-        _judged(fit, full, key.terms, found, k, stated, null) if k in stated else _redrawn(fit, t, redraw, null)
+        _judged(fit, full, key.terms, found, k, stated, seed)
+        if k in stated
+        else _redrawn(fit, t, redraw, _null(fit, seed))
         for k, t in enumerate(key.terms)
     ]
     others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
@@ -98,14 +101,16 @@ class _Judged:
 
 
 def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
-    ordered = sorted(batches, key=lambda b: b.batch_id)
-    parts, _ = enough_batches(ordered)
-    return baseline(machine, twin_part(machine), parts, None, len(ordered))
+    part = twin_part(machine)
+    usable, _ = usable_batches(compile_network(machine, part=part), sorted(batches, key=lambda b: b.batch_id))
+    parts, _ = enough_batches(usable)
+    return baseline(machine, part, parts, None, len(usable))
 
 
-def _null(fit: Fitted, seen: Screen, loose: set[str], seed: int) -> Null:
-    columns = seen.columns(loose)
-    return structural_null(fit, seen.evidence, columns, seed)
+def _null(fit: Fitted, seed: int) -> Null:
+    every = proposed(fit)
+    seen = screen(fit, every)
+    return structural_null(fit, seen.evidence, seen.columns(no_news(every, fit)), seed)
 
 
 def _with(
@@ -127,7 +132,7 @@ def _judged(
     found: Sequence[Scored | None],
     which: int,
     stated: Sequence[int],
-    null: Null,
+    seed: int,
 ) -> _Judged:
     """One term with the others in: the better of two fits without it is what it must beat."""
     others = [k for k in stated if k != which]
@@ -143,7 +148,12 @@ def _judged(
     scores = [_score(w, memory) for w in without]
     best = int(np.argmax(scores))
     s = found[which]
-    return _beyond(without[best], full, memory, null, s.candidate.name if s is not None else "")
+    assert s is not None
+    beside = null_beside(without[best], full, s.candidate, seed)
+    if beside is None:  # a value that is doubted, labels that are swapped
+        null = _null(without[best], seed)
+        return _beyond(without[best], full, memory, null.threshold(_score(full, memory), name=s.candidate.name))
+    return _beyond(without[best], full, memory, beside[0].threshold(beside[1], name=s.candidate.name))
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
@@ -152,12 +162,11 @@ def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> 
         return _Judged()
     other = _fit(*redraw(term.effect))
     memory = whiter(fit.memory, other.memory)
-    return replace(_beyond(fit, other, memory, null), fitted=other)
+    return replace(_beyond(fit, other, memory, null.threshold(_score(other, memory))), fitted=other)
 
 
-def _beyond(before: Fitted, after: Fitted, memory: Memory, null: Null, name: str = "") -> _Judged:
-    density = _score(after, memory)
-    gain, threshold = density - _score(before, memory), float(null.threshold(density, name=name))
+def _beyond(before: Fitted, after: Fitted, memory: Memory, threshold: float) -> _Judged:
+    gain = _score(after, memory) - _score(before, memory)
     old, new = _rms(before), _rms(after)
     cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
     return _Judged(gain, threshold, bool(gain > threshold and cut >= CUT))

@@ -1,0 +1,48 @@
+"""Which candidates are refitted: the best, the best of other mechanisms, and what only sharp rows show."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from twin.diagnosis.proposals.candidate import Candidate, Where
+from twin.diagnosis.rounds.refits import SHARP, WELL, with_sharp
+from twin.diagnosis.scoring.screen import Scored
+
+EVIDENCE: Any = SimpleNamespace(shadow=np.arange(12.0).reshape(3, 4))
+
+
+def scored(mechanism: str, gain: float, place: str = "head", column: int = 1) -> Scored:
+    candidate = Candidate(mechanism, Where("node", place), f"{mechanism}_{place}", "")
+    return Scored(candidate, gain, 10, 0.0, {"size": 2.0}, 1.0, column)
+
+
+FIRST = ([scored("sun", 90.0), scored("draught", 60.0), scored("sun", 50.0, "bed")], [0, 1, 0], [0, 1])
+
+
+def names(done: tuple[list[Scored], list[int], list[int]]) -> list[str]:
+    return [done[0][k].candidate.name for k in done[2]]
+
+
+def test_what_rows_in_full_show_of_another_mechanism_is_refitted_too() -> None:
+    done = with_sharp(FIRST, [scored("sun", 900.0), scored("radiation", 200.0)], EVIDENCE)
+    assert names(done) == ["sun_head", "draught_head", "radiation_head"]
+    assert len(set(done[1][k] for k in done[2])) == 3  # a cluster of its own
+    np.testing.assert_allclose(done[0][-1].moves, -2.0 * EVIDENCE.shadow[:, 1])  # begins at the joint optimum there
+
+
+def test_what_gains_little_beside_the_best_is_not() -> None:
+    sharp = [scored("sun", 900.0), scored("radiation", 0.9 * WELL * 900.0)]
+    assert with_sharp(FIRST, sharp, EVIDENCE) == FIRST
+
+
+def test_there_are_few_of_them_and_each_candidate_stands_once() -> None:
+    worth = [*FIRST[0], scored("floor_sink", 3.0)]
+    sharp = [scored(m, 500.0 - k) for k, m in enumerate(["floor_sink", "radiation", "sensor_lag", "speed_shift"])]
+    done = with_sharp((worth, [0, 1, 0, 2], [0, 1]), sharp, EVIDENCE)
+    assert len(done[2]) == 2 + SHARP
+    every = [s.candidate.name for s in done[0]]
+    assert len(every) == len(set(every)) == len(done[1])
+    assert names(done)[2] == "floor_sink_head"
