@@ -84,13 +84,17 @@ def settled(
     tolerance: float = 1e-6,
     progress: Callable[[str], None] | None = None,
     reweight: bool = False,
+    noise: Noise | None = None,
 ) -> tuple[State, str]:
-    """Where `fit` ends, with the linearisation there, and what is to be said of it; arguments and errors as there."""
+    """Where `fit` ends, with the linearisation there, and what is to be said of it; arguments and errors as there.
+
+    `noise` is what it begins with; left out, the noise as given.
+    """
     if not problem.unknowns:
         raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
     limits = max_iterations, tolerance
     with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
-        first = _first(problem, *limits, reweight, progress)
+        first = _first(problem, noise, *limits, reweight, progress)
         best, notes = _best_start(problem, first, starts, seed, *limits, progress)
         if reweight:
             best, changed = _with_noise(problem, best, *limits, progress)
@@ -112,6 +116,7 @@ def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
 
 def _first(
     problem: Problem,
+    noise: Noise | None,
     max_iterations: int,
     tolerance: float,
     reweight: bool,
@@ -120,7 +125,7 @@ def _first(
     """The prior's mean, or what lies below it with the noise estimated on the way."""
     z, nuisance = _starts(problem.unknowns, 1, 0)[0], [np.zeros(q) for q in problem.nuisance_sizes]
     try:
-        state = State.at(problem, z, nuisance, Noise.as_given(len(problem.channels)))
+        state = State.at(problem, z, nuisance, noise or Noise.as_given(len(problem.channels)))
     except WorkError as error:
         raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
     if not reweight:

@@ -148,7 +148,7 @@ def _diagnosis(
     final = left.fitted if left is not None and left.fitted is not None else done.final
     before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
     named = [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
-    fit = result(final.problem, final.state, TOLERANCE, "")
+    fit = result(final.problem, replace(final.state, noise=final.noise), TOLERANCE, "")
     intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)

@@ -84,8 +84,8 @@ def test_it_begins_where_it_is_told() -> None:
 
 def test_a_better_part_leaves_less_noise() -> None:
     before, after = cold_floor(), with_the_floor()
-    assert before.state.noise.factor.max() > 10
-    assert after.state.noise.factor.max() < 1.3
+    assert before.noise.factor.max() > 10
+    assert after.noise.factor.max() < 1.3
     assert (after.rows == before.rows).all() and after.rows.sum() == sum(map(len, after.state.channels))
 
 
@@ -124,7 +124,7 @@ def own_start_estimated(done: Fitted, k: int, values: Array) -> Array:
     own: Array = np.zeros(done.problem.nuisance_sizes[k])
     for _ in range(5):
         (block,) = one.linearise(x, [own])
-        weight = done.state.noise.weight[block.channel]
+        weight = done.noise.weight[block.channel]
         normal = (block.nuisance.T * weight) @ block.nuisance + np.eye(len(own))
         own = np.asarray(
             np.linalg.solve(normal, (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own)), float

@@ -125,7 +125,7 @@ def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) ->
     rivals = list(tied(bare).values())
     run = menu(rivals[0].machine, rivals[0].batches, ["rpm"])[number]
     truth, other = (_Model.of(f, [run], ()) for f in rivals)
-    weight = np.min([f.state.noise.weight for f in rivals], axis=0)
+    weight = np.min([f.noise.weight for f in rivals], axis=0)
 
     def left(model: _Model) -> float:
         block, spread = model.blocks[0], np.array([u.spread for u in model.problem.unknowns])
@@ -138,7 +138,7 @@ def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) ->
         return float(np.sum((aim - system @ np.linalg.lstsq(system, aim, rcond=None)[0]) ** 2))
 
     seen = foreseen(rivals, [run]).nats[..., 0]
-    own, count = left(truth), run.rows * sum(1 / np.max([f.state.noise.inflation for f in rivals], axis=0))
+    own, count = left(truth), run.rows * sum(1 / np.max([f.noise.inflation for f in rivals], axis=0))
     assert seen[0, 1] == pytest.approx(0.5 * (left(other) - own) / (1 + own / count), rel=1e-6)
     assert (own > 1.0) == bare  # a hot body without a sensor: no rival knows where it starts
     assert (np.diagonal(seen) == 0).all()

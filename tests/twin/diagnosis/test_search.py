@@ -81,7 +81,7 @@ def test_where_nothing_is_missing_nothing_is_accepted() -> None:
     done = found("nothing")
     assert len(done.rounds) == 1 and not done.accepted
     assert done.final.part == done.baseline.part == fitted(two_bodies(), recordings("nothing")).part
-    assert done.final.state.noise.factor.max() < 1.2
+    assert done.final.noise.factor.max() < 1.2
 
 
 @pytest.mark.parametrize("seed", range(2, 4))
@@ -117,7 +117,7 @@ def test_two_effects_at_once_are_both_found() -> None:
     assert intervals["exposures.head-floor_sink_head_room.conductance"].value == pytest.approx(8.0, rel=0.05)
     assert intervals["mechanisms.speed_shift_z_rpm.shift"].value == pytest.approx(6.0, rel=0.05)
     assert [r.accepted for r in done.rounds] == [True, True, False]
-    assert done.final.state.noise.factor.max() < 1.2
+    assert done.final.noise.factor.max() < 1.2
 
 
 def test_the_best_is_first_and_slack_is_no_news() -> None:

@@ -6,15 +6,26 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.rounds.refits import SHARP, WELL, with_sharp
 from twin.diagnosis.scoring.screen import Scored
 
-EVIDENCE: Any = SimpleNamespace(shadow=np.arange(12.0).reshape(3, 4))
+
+def likeness(columns: list[int]) -> NDArray[np.float64]:
+    return np.equal.outer(columns, columns).astype(float)
 
 
-def scored(mechanism: str, gain: float, place: str = "head", column: int = 1) -> Scored:
+EVIDENCE: Any = SimpleNamespace(shadow=np.arange(60.0).reshape(3, 20), likeness=likeness)
+
+
+COLUMNS = {"sun": 1, "draught": 2, "radiation": 3, "floor_sink": 4, "sensor_lag": 5, "speed_shift": 6}
+
+
+def scored(mechanism: str, gain: float, place: str = "head", alike: str = "") -> Scored:
+    """`alike`: of the same signature as that mechanism."""
+    column = COLUMNS[alike or mechanism] + 10 * (place != "head")
     candidate = Candidate(mechanism, Where("node", place), f"{mechanism}_{place}", "")
     return Scored(candidate, gain, 10, 0.0, {"size": 2.0}, 1.0, column)
 
@@ -30,12 +41,17 @@ def test_what_rows_in_full_show_of_another_mechanism_is_refitted_too() -> None:
     done = with_sharp(FIRST, [scored("sun", 900.0), scored("radiation", 200.0)], EVIDENCE)
     assert names(done) == ["sun_head", "draught_head", "radiation_head"]
     assert len(set(done[1][k] for k in done[2])) == 3  # a cluster of its own
-    np.testing.assert_allclose(done[0][-1].moves, -2.0 * EVIDENCE.shadow[:, 1])  # begins at the joint optimum there
+    np.testing.assert_allclose(done[0][-1].moves, -2.0 * EVIDENCE.shadow[:, 3])  # begins at the joint optimum there
 
 
 def test_what_gains_little_beside_the_best_is_not() -> None:
     sharp = [scored("sun", 900.0), scored("radiation", 0.9 * WELL * 900.0)]
     assert with_sharp(FIRST, sharp, EVIDENCE) == FIRST
+
+
+def test_what_looks_like_one_that_is_refitted_is_not() -> None:
+    sharp = [scored("sun", 900.0), scored("radiation", 800.0, alike="sun"), scored("floor_sink", 200.0)]
+    assert names(with_sharp(FIRST, sharp, EVIDENCE)) == ["sun_head", "draught_head", "floor_sink_head"]
 
 
 def test_there_are_few_of_them_and_each_candidate_stands_once() -> None:

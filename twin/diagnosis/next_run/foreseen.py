@@ -225,7 +225,7 @@ def _with_sensors(network: Network, places: Sequence[str]) -> Network:
 def _worst(rivals: Sequence[Fitted], places: int) -> tuple[Array, float]:
     """The weight of a row of each channel by the rival that knows it worst, 0 where nothing was recorded; new sensors
     are as good as the usual one. And how many independent values a row of all channels holds."""
-    noises = [f.state.noise for f in rivals]
+    noises = [f.noise for f in rivals]
     recorded = rivals[0].rows > 0
     weight = np.where(recorded, np.min([n.weight for n in noises], axis=0), 0.0)
     count = np.where(recorded, 1.0 / np.max([n.inflation for n in noises], axis=0), 0.0)

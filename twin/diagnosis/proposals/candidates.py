@@ -10,10 +10,11 @@ from itertools import combinations, product
 from data.machine import Machine
 from twin.compiling.scope import several
 from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
+from twin.diagnosis.proposals.pieces import pieces_of
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, PortRole, Target
 from twin.quantity import Value, same_dimension
-from twin.schema import MechanismPart, TwinPart
+from twin.schema import Link, MechanismPart, TwinPart
 
 KIND: Mapping[Target, Kind] = {
     "node": "node", "start": "node", "surrounding": "node", "heat": "node", "link": "link", "exposure": "link",
@@ -114,7 +115,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
     if target == "exposure" and "surrounding" in mechanism.acts_at and "expand" in mechanism.effects():
         return []  # it stands between a surrounding and all that it surrounds
     if target in ("node", "start"):
-        return [Site(kind, name) for name in part.bodies]
+        return [Site(kind, name) for name in _own(part)]
     if target == "heat":
         return [
             Site(kind, name, _outlets(given))
@@ -190,9 +191,15 @@ def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) 
     if role == "neighbour" and site.name in part.bodies:
         return linked(part, site.name)
     if role == "unlinked":
-        later = list(part.bodies)[list(part.bodies).index(site.name) + 1 :]
-        return [name for name in later if name not in linked(part, site.name)]
-    return list(part.bodies)
+        own = _own(part)
+        return [name for name in own[own.index(site.name) + 1 :] if name not in linked(part, site.name)]
+    return _own(part)
+
+
+def _own(part: TwinPart) -> list[str]:
+    """The machine's bodies: physics at a piece that a finer network invented would be the network's, not hers."""
+    pieces = pieces_of(part)
+    return [name for name in part.bodies if name not in pieces]
 
 
 def _near(part: TwinPart, places: Sequence[str]) -> bool:
@@ -202,20 +209,27 @@ def _near(part: TwinPart, places: Sequence[str]) -> bool:
 
 
 def linked(part: TwinPart, body: str) -> list[str]:
-    """The bodies that a body has a link with, in the file's order."""
-    ends = [tuple(place.partition("@")[0] for place in link.between) for link in part.links.values()]
+    """The bodies that a body has a link with, in the file's order; a piece of a body counts as the body."""
+    whole = pieces_of(part)
+    ends = [tuple(whole.get(name, name) for name in _ends(link)) for link in part.links.values()]
+    body = whole.get(body, body)
     near = {b if a == body else a for a, b in ends if body in (a, b)}
     return [name for name in part.bodies if name in near and name != body]
+
+
+def _ends(link: Link) -> list[str]:
+    return [place.partition("@")[0] for place in link.between]
 
 
 def _there_already(part: TwinPart, c: Candidate) -> bool:
     """Whether the machine file has this law at this place with these drivers: its values are the baseline's to fit."""
     assert c.part is not None
+    pieces = pieces_of(part)
     for given in part.mechanisms.values():
         if given.law != c.mechanism or _channels(given) != _channels(c.part):
             continue
         if c.part.into is not None:
-            if c.part.into in _outlets(given):
+            if c.part.into in [pieces.get(name, name) for name in _outlets(given)]:
                 return True
         elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at)) or (
             c.part.acts_on is None and given.at == c.part.at

@@ -10,33 +10,63 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.candidates import linked
-from twin.diagnosis.rounds.fitted import FAR, NEAR, Fitted
+from twin.diagnosis.proposals.pieces import FAR, NEAR, pieces_of
+from twin.diagnosis.rounds.fitted import Fitted
+from twin.mechanisms import MECHANISMS
 from twin.quantity import Value
-from twin.schema import Body, Link
+from twin.schema import Body, Link, MechanismPart
 
 SHARE = 0.15  # of the body's capacity
 STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
 SPREAD = 1.0  # of the logarithm of both
 SHORTCUTS = 1  # from one neighbour to another, the best conducting two
+HEATS = 1  # into a body that may enter half of it, one that was found first
+HALVES = 0.5  # times all that leaves the body per kelvin: how well they conduct to each other, to begin with
 THROUGH = 1  # links of a body that heat may enter a piece through, the best conducting
 FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
 
 def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, worse: float = 9.0) -> list[Candidate]:
-    """Refinements at the sensors whose left-out mean square (in units of the given noise's) is `worse` and largest."""
+    """Refinements at the sensors whose left-out mean square (in units of the given noise's) is `worse` and largest,
+    and where a heat that was found enters: a sensor near it sees more of it than its body's mean."""
+    part = fitted.part
     names = [r.channel for r in fitted.problem.network.readings]
     ranked = sorted(range(len(names)), key=lambda k: -np.nan_to_num(mean_squares[k]))
     out = []
-    for k in ranked[:most]:
-        if mean_squares[k] > worse:
+    for n, k in enumerate(ranked):
+        body = part.sensors[names[k]].at.partition("@")[0]
+        if mean_squares[k] > worse and n < most:
             out += list(_of_sensor(fitted, names[k]))
+        elif mean_squares[k] > worse and any(body in _into(part.mechanisms[name]) for name in _found(fitted)):
+            out += [c for c in _of_sensor(fitted, names[k]) if any(p.startswith("mechanisms.") for p in c.parts)]
     return out
+
+
+def _found(fitted: Fitted) -> list[str]:
+    """The mechanisms that the machine file has not got."""
+    known = (fitted.machine.twin or {}).get("mechanisms", fitted.part.mechanisms if not fitted.machine.twin else {})
+    return [name for name in fitted.part.mechanisms if name not in known]
+
+
+def _into(given: MechanismPart) -> dict[str, Any]:
+    """The bodies that its heat enters whole, or what is left of it, and how the part says so with another's name."""
+    if isinstance(given.into, str):
+        return {given.into: given.into}
+    return {body: share for body, share in (given.into or {}).items() if share == "rest"}
+
+
+def _entering(given: MechanismPart, body: str, place: str) -> MechanismPart:
+    """The mechanism with its heat into a place of the body."""
+    if isinstance(given.into, str):
+        return given.model_copy(update={"into": place})
+    return given.model_copy(update={"into": {place if b == body else b: s for b, s in (given.into or {}).items()}})
 
 
 def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
@@ -80,6 +110,20 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             f"{words}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
         )
+    for key in [k for k in (*_found(fitted), *part.mechanisms) if body in _into(part.mechanisms[k])][:HEATS]:
+        given, half = part.mechanisms[key], f"{body}@0.25"
+        cut = Value(value=f"{HALVES * leaves:.4g} W/K", spread=SPREAD)
+        yield Candidate(
+            "coarse_network",
+            where,
+            f"coarse_network_{channel}_{key}",
+            f"a half of the {body} with {channel}, which {MECHANISMS[given.law].words} enters",
+            parts={
+                f"bodies.{body}": part.bodies[body].model_copy(update={"shape": "bar", "cells": 2, "conductance": cut}),
+                f"sensors.{channel}": sensor.model_copy(update={"at": half}),
+                f"mechanisms.{key}": _entering(given, body, half),
+            },
+        )
 
 
 def _piece(
@@ -99,24 +143,35 @@ def _piece(
 
 
 def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: float) -> Iterator[Candidate]:
-    """Heat that crosses a body from one neighbour to another without warming all of it."""
-    part = fitted.part
-    near = sorted(linked(part, body), key=lambda b: -max(_conductance(fitted, k) for k in part.links
-                                                         if set(_ends(part.links[k])) == {b, body}))  # fmt: skip
-    for one, other in list(combinations(near, 2))[:SHORTCUTS]:
-        if other in linked(part, one):
+    """Heat that crosses a body from one neighbour to another without warming all of it, or a neighbour from its own."""
+    best = _nearest(fitted, body)
+    across = [(one, body, other) for one, other in combinations(best, 2)]
+    through = [(one, best[0], body) for one in _nearest(fitted, best[0]) if one != body] if best else []
+    for one, between, other in (*across[:SHORTCUTS], *through[:SHORTCUTS]):
+        if other in linked(fitted.part, one):
             continue
         yield Candidate(
             "coarse_network",
             where,
             f"coarse_network_{channel}_{one}_{other}",
-            f"heat that crosses the {body} from {one} to {other}",
+            f"heat that crosses the {between} from {one} to {other}",
             parts={
                 f"links.{one}-{other}": Link(
                     between=(one, other), conductance=Value(value=f"{0.1 * leaves:.4g} W/K", spread=1.5 * SPREAD)
                 )
             },
         )
+
+
+def _nearest(fitted: Fitted, body: str) -> list[str]:
+    """The body's neighbours, the best conducting first."""
+    links, whole = fitted.part.links, pieces_of(fitted.part)
+
+    def conductance(other: str) -> float:
+        pair = {body, other}
+        return max(_conductance(fitted, k) for k in links if {whole.get(n, n) for n in _ends(links[k])} == pair)
+
+    return sorted(linked(fitted.part, body), key=lambda other: -conductance(other))
 
 
 def _ends(link: Link) -> list[str]:

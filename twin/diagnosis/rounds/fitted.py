@@ -10,17 +10,17 @@ import numpy as np
 
 from data.batch import Batch
 from data.machine import Machine
-from twin.calibration.annealing import SETTLED, noise_left, with_noise
 from twin.calibration.descent import State, descend, x_of, z_bounds
 from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
+from twin.diagnosis.proposals.pieces import pieces_of
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
-from twin.diagnosis.scoring.memory import Memory, memory_of
+from twin.diagnosis.scoring.filtered import Filtered, memory_left, own_first, settled
+from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.schema import TwinPart
 
-NEAR, FAR = "_near", "_far"  # how pieces of a body are called
 STEPS, TOLERANCE = 2, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
@@ -47,8 +47,15 @@ class Fitted:
     @cached_property
     def memory(self) -> Memory:
         """What the rows of each channel remember of each other, in what this fit leaves over."""
-        left = self.problem.residuals(self.x, self.state.nuisance)
-        return memory_of(left, self.state.channels, len(self.problem.channels))
+        return memory_left(self.problem, self.state.z, self.state.nuisance)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """What this fit leaves over in each channel, and how many rows count as one."""
+        left = Filtered(self.problem, self.memory).noise_at(
+            self.state.z, self.state.nuisance, self.state.arrow.effective_parameters()
+        )
+        return replace(left, inflation=self.memory.inflation)
 
     @property
     def step_s(self) -> float:
@@ -61,18 +68,6 @@ class Fitted:
         return np.bincount(np.concatenate(self.state.channels), minlength=len(self.problem.channels)).astype(float)
 
 
-def pieces_of(part: TwinPart) -> dict[str, str]:
-    """The bodies that are pieces of others around or far from a sensor, as a finer network states them."""
-    out = {}
-    for name in part.bodies:
-        for end in (NEAR, FAR):
-            if name.endswith(end):
-                ends = next((link.between for link in part.links.values() if link.between[0] == name), None)
-                if ends is not None:
-                    out[name] = ends[1]
-    return out
-
-
 def refitted(
     old: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = STEPS, tolerance: float = TOLERANCE
 ) -> Fitted:
@@ -80,8 +75,8 @@ def refitted(
 
     What is new begins otherwise at its value in the part, which is its prior's centre where that is not stated.
 
-    The noise is estimated again before every step, so that a channel which the old fit had given up counts again; no
-    channel is given up for a start that is still far off.
+    Noise and memory are estimated again before every step; no channel counts as noisier, and no row remembers longer,
+    than in the old fit: none is given up for a start that is still far off.
 
     Raises:
         InputError: the part does not compile; WorkError: it cannot be simulated there.
@@ -99,29 +94,26 @@ def refitted(
             z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
     z = np.clip(z, *z_bounds(problem.unknowns))
     nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
-    state = State.at(problem, z, nuisance, old.state.noise)
-    still = np.zeros(len(z))  # what each batch has of its own follows first: its steps are safe
-    own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
-    state = State.at(problem, z, own, old.state.noise)
+    noise = Noise(old.noise.factor, np.ones(len(problem.channels)))
+    nuisance = own_first(Filtered(problem, old.memory), z, nuisance, noise)
+    filtered, state = _counted(old, problem, z, nuisance, noise, old.state.arrow.effective_parameters())
     for _ in range(steps):
-        state = with_noise(problem, state, _least(state.noise, noise_left(problem, state)))
-        state = descend(problem, state, len(state.history) + 1, tolerance)
-    state = with_noise(problem, state, noise_left(problem, state))
+        state = descend(filtered, state, 1, tolerance)
+        parameters = state.arrow.effective_parameters()
+        filtered, state = _counted(old, problem, state.z, state.nuisance, state.noise, parameters)
     return replace(old, part=part, problem=problem, state=state)
 
 
-def _least(one: Noise, other: Noise) -> Noise:
-    return Noise(np.minimum(one.factor, other.factor), np.minimum(one.inflation, other.inflation))
+def _counted(
+    old: Fitted, problem: CalibrationProblem, z: Array, nuisance: list[Array], noise: Noise, parameters: float
+) -> tuple[Filtered, State]:
+    """The state there with rows that remember no longer, and channels no noisier, than in the old fit and so far."""
+    filtered = Filtered(problem, whiter(old.memory, memory_left(problem, z, nuisance)))
+    here = filtered.noise_at(z, nuisance, parameters)
+    least = replace(noise, factor=np.minimum(here.factor, noise.factor))
+    return filtered, State.at(filtered, z, nuisance, least)
 
 
-def settle(fitted: Fitted, steps: int = 20, tolerance: float = 0.01, rounds: int = 4) -> Fitted:
-    """The same fit taken on to its optimum, the noise estimated until it stands."""
-    problem, state = fitted.problem, fitted.state
-    for _ in range(rounds):
-        state = descend(problem, state, len(state.history) + steps, tolerance)
-        noise = noise_left(problem, state)
-        change = noise.change(state.noise)
-        state = with_noise(problem, state, noise)
-        if change < SETTLED:
-            break
-    return replace(fitted, state=state)
+def settle(fitted: Fitted, steps: int = 4, tolerance: float = 0.01, rounds: int = 10) -> Fitted:
+    """The same fit taken on to its optimum, noise and memory estimated until it stands."""
+    return replace(fitted, state=settled(fitted.problem, fitted.state, steps, tolerance, rounds))

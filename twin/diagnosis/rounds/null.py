@@ -18,8 +18,10 @@ from twin.diagnosis.scoring.finite import difference
 
 TWINS = 14  # refined machines
 HOT = 2.0, 4.0  # bounds of the temperature: structure scatters no score by less than two nats
-SCALES = (0.3, 1.0, 3.0, 8.0, 20.0)  # of the misfit of each: real castings are finer than bars of five cells
+SCALES = (0.3, 1.0, 3.0, 8.0)  # of the misfit of each: real castings are finer than bars of five cells
 AS_IT_IS = 1  # the scale that is their own
+MARGIN = 1.25  # on a quantile that so few machines tell
+WIDER = 2.0  # an amplitude's scatter in plants of other numerics than in bars of five cells
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,14 @@ class Null:
         distribution goes through their mean and spread.
 
         With the `name` of a candidate what structure makes of it counts, and not of others (`balanced`).
+        There is a `MARGIN` on either.
         """
         gain = self.typical(density)
         if len(gain) < 3:
             return float("inf")
         if name not in self.names or not self.gains.size:
-            return balanced(gain[:, None], None, share)
-        return balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
+            return MARGIN * balanced(gain[:, None], None, share)
+        return MARGIN * balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
 
     def typical(self, density: float) -> Array:
         """The largest gain (T,) of each machine at that misfit."""
@@ -66,12 +69,15 @@ class Null:
         return float(np.median(self.density[:, min(AS_IT_IS, self.density.shape[1] - 1)])) if self.density.size else 0.0
 
     def scatter(self, name: str, density: float) -> float:
-        """By how much structure and noise alone move a candidate's amplitude in nine of ten machines, where they leave
-        no more than `density` says; 0 where that is not known."""
+        """By how much structure and noise move a candidate's amplitude in nine of ten machines, where they leave no more
+        than `density` says; 0 where that is not known.
+
+        An amplitude that cannot be negative shows half of that: of it one machine in twenty goes beyond.
+        """
         if name not in self.names or len(self.gain) < 2:
             return 0.0
         own = self.amplitude[np.arange(len(self.gain)), self._scale(density), self.names.index(name)]
-        return float(np.quantile(np.abs(own), 0.9))
+        return WIDER * float(np.quantile(np.abs(own), 0.9 if (own < 0).any() else 0.95))
 
     def _scale(self, density: float) -> NDArray[np.int64]:
         """Of each machine (T,) the largest misfit that predicts left-out batches no worse."""

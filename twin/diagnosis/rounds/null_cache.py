@@ -68,7 +68,7 @@ def _numbers(fitted: Fitted, evidence: Evidence) -> Iterator[np.ndarray]:
     """All that a null is made of; of the evidence's rows their sums, which tell as much."""
     inputs, state = fitted.problem.inputs, fitted.state
     yield from (inputs.time_s, inputs.n_intervals, inputs.clock_h, *inputs.drivers.values(), *inputs.recorded.values())
-    yield from (fitted.values, *state.nuisance, state.noise.factor, fitted.memory.share, fitted.memory.keep)
+    yield from (fitted.values, *state.nuisance, fitted.noise.factor, fitted.memory.share, fitted.memory.keep)
     for m in fitted.problem.measured:
         yield from (m.row, m.channel, m.value)
     yield from (evidence.rows, evidence.weight, evidence.low, evidence.high)

@@ -31,9 +31,12 @@ class LeftOutRows:
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted by all others."""
     problem, state = fitted.problem, fitted.state
-    weight = state.noise.weight
+    weight = 1.0 / fitted.noise.factor**2
     blocks = list(problem.linearise(fitted.x, state.nuisance))
-    rows = [whitened(b, v, state.z, problem.unknowns, (), weight) for b, v in zip(blocks, state.nuisance, strict=True)]
+    rows = [
+        whitened(b, v, state.z, problem.unknowns, (), weight, fitted.memory)
+        for b, v in zip(blocks, state.nuisance, strict=True)
+    ]
     own = [w.jacobian.T @ w.jacobian for w in rows]
     to = [w.jacobian.T @ w.target for w in rows]
     information, total = np.sum(own, axis=0) + np.eye(len(state.z)), np.sum(to, axis=0)
@@ -44,9 +47,9 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
     for k, (block, w) in enumerate(zip(blocks, rows, strict=True)):
         z = np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high)
         moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
-        scaled = block.nuisance * w.scale[:, None]
-        normal = scaled.T @ scaled + np.eye(scaled.shape[1])
-        nuisance: Array = np.asarray(np.linalg.solve(normal, scaled.T @ (moved * w.scale)), float)
+        known, aim = (w.innovations((rows.T * w.scale).T) for rows in (block.nuisance, moved))
+        normal = known.T @ known + np.eye(known.shape[1])
+        nuisance: Array = np.asarray(np.linalg.solve(normal, known.T @ aim), float)
         one = problem.only([k])
         residual = one.residuals(x_of(problem.unknowns, z), [nuisance])[0]
         m = problem.measured[k]

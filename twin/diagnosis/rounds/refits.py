@@ -18,7 +18,7 @@ from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 
 BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
-SHARP, WELL = 3, 0.1  # more of other mechanisms, where rows count in full, if they gain this share of the best there
+SHARP, WELL = 4, 0.1  # more of other mechanisms, one of a kind of place, if they gain this share where rows count
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80
@@ -45,9 +45,14 @@ class Tried:
     def candidate(self) -> Candidate:
         return self.scored.candidate
 
+    @property
+    def level(self) -> float:
+        """The gain that ranks it."""
+        return self.gain if self.alike is None else self.alike
+
     def standing(self, temperature: float) -> float:
         """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
-        return (self.gain if self.alike is None else self.alike) / temperature + self.log_prior
+        return self.level / temperature + self.log_prior
 
 
 def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
@@ -79,14 +84,19 @@ def with_sharp(
     What is missing makes rows remember each other; filtered by that memory, its own trace may be gone.
     """
     worth, clusters, chosen = first
+    first_names = {worth[k].candidate.name for k in chosen}
     seen = {(worth[k].candidate.mechanism, worth[k].candidate.where.kind) for k in chosen}
+    ranked = [s for s in sorted(sharp, key=_promise) if s.column >= 0 and s.gain > WORTH][:LOOKED_AT]
+    own = _clusters(ranked, evidence)
+    known = {own[k] for k, s in enumerate(ranked) if s.candidate.name in first_names}
     more: list[Scored] = []
-    for s in sorted(sharp, key=_promise):
+    for k, s in enumerate(ranked):
         kind = s.candidate.mechanism, s.candidate.where.kind
-        if len(more) >= SHARP or s.gain < max(WORTH, WELL * sharp[0].gain):
+        places = {m.candidate.where.kind for m in more}
+        if len(more) >= SHARP or s.gain < WELL * ranked[0].gain:
             break
-        if kind not in seen and s.column >= 0:
-            seen.add(kind)
+        if kind not in seen and own[k] not in known and kind[1] not in places:
+            known.add(own[k])
             more.append(_moved(s, evidence))
     names = {s.candidate.name for s in more}
     kept = [k for k, s in enumerate(worth) if s.candidate.name not in names]

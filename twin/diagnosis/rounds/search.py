@@ -25,8 +25,10 @@ from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, 
 
 MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
-# refined twin has gave up to 35.
-LEAST = 40.0
+# refined twin has gave up to 61 where the structural null foresaw less.
+LEAST = 70.0
+LEAST_FINER = 40.0  # of a finer network, which claims no physics
+IN_DOUBT = 20.0  # nats of a refit from which a finer network might be why
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
 RESTARTS = 2  # times that a round is done, where a refit shows that the baseline had stopped short
@@ -181,16 +183,11 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
     sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
     worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
-    coarse = [
-        Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, plain.mean_squares(plain.left_out())[0])
-    ]
-    work = [worth[k] for k in chosen] + coarse
-    numbers = [clusters[k] for k in chosen] + [-1000 - k for k in range(len(coarse))]
-    tried: list[Tried] = []
-    for n, t in enumerate(workers.map(partial(refit, now), work)):
-        tell("refit", n + 1, len(work))
-        if t is not None:
-            tried.append(replace(t, cluster=numbers[n]))
+    tried = _refits(now, [worth[k] for k in chosen], [clusters[k] for k in chosen], workers, tell)
+    if any(t.gain > IN_DOUBT for t in tried):
+        left = plain.mean_squares(plain.left_out())[0]
+        coarse = [Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, left)]
+        tried += _refits(now, coarse, [-1000 - k for k in range(len(coarse))], workers, tell)
     tried.sort(key=order)
     before = float(base.base_score()[0])
     n_final = sum(t.gain > HOPEFUL * null.threshold(before, name=t.candidate.name) for t in tried[:FINALISTS])
@@ -205,7 +202,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         final = compared(now, [*final, *workers.map(partial(taken_on, now), again)])
         tried = sorted([*final, *rest], key=order)
         chosen = [*chosen, *(k for k, s in enumerate(worth) if any(s is m.scored for m in close))]
-    tried = _coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
+    tried = coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
         name = tried[0].candidate.name if tried else ""
         least = max(null.threshold(before, name=name), LEAST)
@@ -218,14 +215,26 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     agreed = agreed_on(best, n)
     beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > LEAST else None
     own, density = (null, float(after.base_score()[0])) if beside is None else beside
-    structure = own.threshold(density, name=best.candidate.name)
+    structure, least = own.threshold(density, name=best.candidate.name), LEAST
     if best.candidate.mechanism == "coarse_network":
-        structure = 0.0  # it claims no physics: what structure makes is what it is for
+        structure, least = 0.0, LEAST_FINER  # what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    threshold = max(structure, flipped_threshold(flipped, n, which), LEAST)
+    threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+
+
+def _refits(
+    now: Fitted, work: Sequence[Scored], clusters: Sequence[int], workers: Workers, tell: Progress
+) -> list[Tried]:
+    """Those that can be simulated, in full."""
+    out = []
+    for n, t in enumerate(workers.map(partial(refit, now), work)):
+        tell("refit", n + 1, len(work))
+        if t is not None:
+            out.append(replace(t, cluster=clusters[n]))
+    return out
 
 
 def _close(member: Tried, tried: Sequence[Tried], order: Order) -> bool:
@@ -248,9 +257,10 @@ def to_claim(tried: Sequence[Tried], batches: int) -> Tried:
     return tried[0]
 
 
-def _coarse_first(tried: list[Tried]) -> list[Tried]:
+def coarse_first(tried: list[Tried]) -> list[Tried]:
     """A finer network is the simpler explanation: physics goes first only where it gains clearly more."""
-    finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.gain > FINER * tried[0].gain > 0]
+    enough = FINER * (tried[0].level if tried else 0.0)
+    finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.level > enough > 0]
     return finer[:1] + [t for t in tried if t not in finer[:1]]
 
 

@@ -152,7 +152,7 @@ class _Line:
             ),
             tuple(np.append(v, np.zeros(len(own_sd))) for v in fitted.state.nuisance),
             fitted.state.z,
-            1.0 / fitted.state.noise.factor**2,
+            1.0 / fitted.noise.factor**2,
             (*fitted.problem.unknowns, *(unknown(found.network.parameters[j]) for j in numbers)),
             numbers,
             own,
@@ -173,7 +173,7 @@ def _with_own(b: Block, sd: Mapping[int, float]) -> Array:
 
 
 def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], memory: Memory, low: Array, high: Array) -> Evidence:
-    return Evidence(batches, fitted.rows, memory.white / fitted.state.noise.factor**2, low, high)
+    return Evidence(batches, fitted.rows, memory.white / fitted.noise.factor**2, low, high)
 
 
 def _bounds(line: _Line, every: Sequence[Candidate]) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from twin.diagnosis.rounds.acceptance import flipped_threshold
 from twin.diagnosis.rounds.null import structural_misfits
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import FINER, LEAST, Round, Search, agreed_on, to_claim
+from twin.diagnosis.rounds.search import LEAST, Round, Search, agreed_on, coarse_first, to_claim
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.conclude import REST, SURE, remainder
@@ -93,8 +93,7 @@ class Stage:
         """By gain and what is plausible, a finer network first where it gains nearly as much."""
         temperature = self.round.null.temperature
         order = sorted(tried, key=lambda t: -t.standing(temperature))
-        finer = [t for t in order if t.candidate.mechanism == COARSE and t.gain > FINER * order[0].gain > 0]
-        return finer[:1] + [t for t in order if t not in finer[:1]]
+        return coarse_first(order)
 
     def decided(self, tried: Sequence[Tried], threshold: float) -> Reply:
         """The reply under the rules of a diagnosis, by other gains or another threshold."""
