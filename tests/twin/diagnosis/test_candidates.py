@@ -17,6 +17,8 @@ from tests.twin.diagnosis.small_cases import equipped, fitted, four_bodies, runs
 from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.candidates import candidates, linked
+from twin.diagnosis.proposals.coarse import coarse_candidates
+from twin.diagnosis.proposals.pieces import pieces_of
 from twin.diagnosis.proposals.rivals import rivals
 from twin.diagnosis.rounds.search import search
 from twin.mechanisms import MECHANISMS
@@ -44,6 +46,21 @@ def test_heat_goes_into_every_body_that_has_not_got_it() -> None:
     (found,) = (c for c in of(four_bodies(), "floor_sink") if c.where.name == "bed")
     assert found.part is not None and found.part.at == {"body": "bed", "room": "room"}
     assert found.where.kind == "node" and not found.fault
+
+
+def test_pieces_that_a_finer_network_invents_are_no_places() -> None:
+    now = fitted(four_bodies(), runs(four_bodies(), count=4))
+    before = {c.name for c in candidates(now.machine, now.part)}
+    for c in coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0])):
+        part = c.applied(now.part)
+        after = candidates(now.machine, part)
+        pieces = pieces_of(part)
+        for other in after:
+            ports = other.part.at if other.part is not None and isinstance(other.part.at, dict) else {}
+            assert other.where.name not in pieces and not pieces.keys() & set(ports.values()), other.name
+        assert all(linked(part, b) == linked(now.part, b) for b in BODIES) or not pieces
+        new = {o.name for o in after} - before
+        assert not any(o.startswith(("heat_bridge", "cabinet_heat")) for o in new), new
 
 
 def test_the_same_law_by_another_driver_is_news() -> None:

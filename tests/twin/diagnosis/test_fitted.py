@@ -151,3 +151,19 @@ def test_the_table_is_the_rms_of_the_rows() -> None:
             assert own.loc[name, "rms"] == pytest.approx(float(np.sqrt(np.mean(error**2))))
             assert own.loc[name, "rows"] == len(error)
     assert dict(zip(done.rms["channel"], done.rms["unit"], strict=True)) == {"t_shaft": "K", "t_head": "K", "z": "um"}
+
+
+def test_a_heat_that_was_found_may_enter_half_of_its_body() -> None:
+    found = MechanismPart(law="cabinet_heat", into="bed", parameters={"heat": Value(value="50 W", spread=1.0)})
+    now = fitted(four_bodies(), runs(four_bodies(), count=4))
+    part = now.part.model_copy(update={"mechanisms": {**now.part.mechanisms, "found": found}})
+    before = refitted(now, part)
+    squares = np.full(4, 100.0)
+    (cut,) = [c for c in coarse_candidates(before, squares, most=0) if "found" in c.name]
+    after = refitted(before, cut.applied(part))
+    assert after.part.bodies["bed"].cells == 2 and after.part.sensors["t_bed"].at == "bed@0.25"
+    assert after.part.mechanisms["found"].into == "bed@0.25"
+    cells = after.problem.network.bodies["bed"]
+    capacity = after.problem.network.capacity_J_per_K(after.values)[cells]
+    assert capacity[0] == pytest.approx(capacity[1])  # what is cut off is not added
+    assert coarse_candidates(now, squares, most=0) == []

@@ -12,7 +12,7 @@ from tests.twin.diagnosis.small_cases import consistent, fitted, four_bodies, ru
 from twin.calibration.descent import x_of
 from twin.compile import compile_network
 from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.rounds.null import MARGIN, SCALES, TWINS, Null, structural_null
+from twin.diagnosis.rounds.null import MARGIN, SCALES, TWINS, WIDER, Null, structural_null
 from twin.diagnosis.rounds.refined import CELLS, refined
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
 from twin.diagnosis.scoring.screen import Screen, proposed, screen
@@ -60,7 +60,9 @@ def test_the_threshold_is_beyond_all_that_was_seen() -> None:
 
 def test_amplitudes_scatter_as_those_of_the_machines_that_count() -> None:
     null = given([[1, 2, 3], [4, 5, 6]], [[-1, -2, -3], [-1, -1, -1]])
-    assert null.scatter("lamp", -2.0) == pytest.approx(1.0 + 0.9 * 4.0)  # nine tenths of the way from 1 to 5
+    assert null.scatter("lamp", -2.0) == pytest.approx(WIDER * (1.0 + 0.95 * 4.0))  # all positive: that is half of it
+    signed = replace(null, amplitude=null.amplitude * np.array([1.0, -1.0])[:, None, None])
+    assert signed.scatter("lamp", -2.0) == pytest.approx(WIDER * (1.0 + 0.9 * 4.0))  # nine tenths from 1 to 5
     assert null.scatter("sun", -2.0) == 0.0
     assert given([[3.0]], [[-1.0]]).scatter("lamp", -1.0) == 0.0
 

@@ -73,7 +73,7 @@ def test_blocks_of_two_runs_count_as_two() -> None:
 
 
 def test_structure_makes_small_differences_count_less() -> None:
-    calm, wild = (done(tried(30.0, 0), tried(26.0, 1), typical=t) for t in (1.0, 16.0))
+    calm, wild = (done(tried(30.0, 0), tried(26.0, 1), typical=t) for t in (1.0, 100.0))
     assert calm.null.temperature == HOT[0] < wild.null.temperature == HOT[1]
     odds = [np.log(p[0] / p[1]) for p in (numbers(calm)[0], numbers(wild)[0])]
     np.testing.assert_allclose(odds, 4.0 / np.array(HOT))
@@ -86,7 +86,7 @@ def test_what_cannot_be_told_from_the_best_is_alike() -> None:
 
 
 def test_only_alternatives_worth_a_line_are_told() -> None:
-    every, _, _ = explanations(done(*(tried(30.0 - 0.1 * k, k) for k in range(9)), tried(5.0, 9)))
+    every, _, _ = explanations(done(*(tried(90.0 - 0.1 * k, k) for k in range(9)), tried(5.0, 9)))
     assert [e.tried.gain for e in told(every)] == [e.tried.gain for e in every[1:6]]
     assert all(e.probability >= LEAST for e in told(every, most=20)) and len(told(every, most=20)) == 8
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.diagnosis.proposals.candidate import Candidate, Where
+from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
 from twin.diagnosis.rounds.refits import SHARP, WELL, with_sharp
 from twin.diagnosis.scoring.screen import Scored
 
@@ -20,13 +20,14 @@ def likeness(columns: list[int]) -> NDArray[np.float64]:
 EVIDENCE: Any = SimpleNamespace(shadow=np.arange(60.0).reshape(3, 20), likeness=likeness)
 
 
-COLUMNS = {"sun": 1, "draught": 2, "radiation": 3, "floor_sink": 4, "sensor_lag": 5, "speed_shift": 6}
+KINDS: dict[str, Kind] = {"sun": "node", "draught": "node"}
+COLUMNS = {"sun": 1, "draught": 2, "radiation": 3, "floor_sink": 4, "time_skew": 5, "speed_shift": 6}
 
 
 def scored(mechanism: str, gain: float, place: str = "head", alike: str = "") -> Scored:
     """`alike`: of the same signature as that mechanism."""
     column = COLUMNS[alike or mechanism] + 10 * (place != "head")
-    candidate = Candidate(mechanism, Where("node", place), f"{mechanism}_{place}", "")
+    candidate = Candidate(mechanism, Where(KINDS.get(mechanism, "error"), place), f"{mechanism}_{place}", "")
     return Scored(candidate, gain, 10, 0.0, {"size": 2.0}, 1.0, column)
 
 
@@ -44,6 +45,12 @@ def test_what_rows_in_full_show_of_another_mechanism_is_refitted_too() -> None:
     np.testing.assert_allclose(done[0][-1].moves, -2.0 * EVIDENCE.shadow[:, 3])  # begins at the joint optimum there
 
 
+def test_only_errors_send_theirs() -> None:
+    sharp = [scored("sun", 900.0), scored("draught", 500.0, "bed"), scored("radiation", 200.0)]
+    assert names(with_sharp(FIRST, sharp, EVIDENCE))[2:] == ["radiation_head"]
+    assert with_sharp(FIRST, [scored("sun", 800.0, alike="radiation")], EVIDENCE) == FIRST
+
+
 def test_what_gains_little_beside_the_best_is_not() -> None:
     sharp = [scored("sun", 900.0), scored("radiation", 0.9 * WELL * 900.0)]
     assert with_sharp(FIRST, sharp, EVIDENCE) == FIRST
@@ -56,7 +63,7 @@ def test_what_looks_like_one_that_is_refitted_is_not() -> None:
 
 def test_there_are_few_of_them_and_each_candidate_stands_once() -> None:
     worth = [*FIRST[0], scored("floor_sink", 3.0)]
-    sharp = [scored(m, 500.0 - k) for k, m in enumerate(["floor_sink", "radiation", "sensor_lag", "speed_shift"])]
+    sharp = [scored(m, 500.0 - k) for k, m in enumerate(["floor_sink", "radiation", "time_skew", "speed_shift"])]
     done = with_sharp((worth, [0, 1, 0, 2], [0, 1]), sharp, EVIDENCE)
     assert len(done[2]) == 2 + SHARP
     every = [s.candidate.name for s in done[0]]

@@ -123,7 +123,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
             if "heat_W" in MECHANISMS[given.law].effects() and given.law in (mechanism.multiplies or (given.law,))
         ]
     groups: dict[Target, Mapping[str, object]] = {
-        "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
+        "link": _own_links(part), "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
         "surrounding": part.surroundings,
     }  # fmt: skip
     chosen = list(combinations(groups[target], mechanism.together))
@@ -206,6 +206,12 @@ def _near(part: TwinPart, places: Sequence[str]) -> bool:
     """Whether two bodies are linked or have a common neighbour."""
     one, other = set(linked(part, places[0])), set(linked(part, places[-1]))
     return bool(one & other) or places[-1] in one
+
+
+def _own_links(part: TwinPart) -> dict[str, Link]:
+    """Those between the machine's bodies."""
+    whole = pieces_of(part)
+    return {k: link for k, link in part.links.items() if len({whole.get(n, n) for n in _ends(link)}) > 1}
 
 
 def linked(part: TwinPart, body: str) -> list[str]:

@@ -12,13 +12,14 @@ from data.errors import InputError, WorkError
 from twin.calibration.descent import x_of, z_bounds
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import log_prior, start_values
+from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 
 BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
-SHARP, WELL = 4, 0.1  # more of other mechanisms, one of a kind of place, if they gain this share where rows count
+SHARP, WELL = 2, 0.1  # more at errors, where every row counts in full, if they gain this share of the best there
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80
@@ -79,9 +80,10 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
 def with_sharp(
     first: tuple[list[Scored], list[int], list[int]], sharp: Sequence[Scored], evidence: Evidence
 ) -> tuple[list[Scored], list[int], list[int]]:
-    """A shortlist with the best of other mechanisms where every row counts in full.
+    """A shortlist with the best at errors of other mechanisms where every row counts in full.
 
-    What is missing makes rows remember each other; filtered by that memory, its own trace may be gone.
+    What is missing makes rows remember each other; filtered by that memory, the sharp trace of a shift or of a clock
+    that is late may be gone. (A slow one, unfiltered, passes for thousands of rows.)
     """
     worth, clusters, chosen = first
     first_names = {worth[k].candidate.name for k in chosen}
@@ -92,10 +94,10 @@ def with_sharp(
     more: list[Scored] = []
     for k, s in enumerate(ranked):
         kind = s.candidate.mechanism, s.candidate.where.kind
-        places = {m.candidate.where.kind for m in more}
         if len(more) >= SHARP or s.gain < WELL * ranked[0].gain:
             break
-        if kind not in seen and own[k] not in known and kind[1] not in places:
+        if kind[1] == "error" and kind not in seen and own[k] not in known:
+            seen.add(kind)
             known.add(own[k])
             more.append(_moved(s, evidence))
     names = {s.candidate.name for s in more}
@@ -125,6 +127,12 @@ def _promise(s: Scored) -> tuple[float, str]:
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
+    if s.candidate.mechanism == "sensor_swap":  # the fit has bent all it could towards the wrong labels
+        try:
+            part = s.candidate.applied(now.part, values)
+            return judged(now, Tried(s, 0.0, 0, 0, 0.0, baseline(now.machine, part, now.batches, None, now.runs)))
+        except (InputError, WorkError):
+            return None
     for begin in ({**_beside(s, now), **at}, at):
         try:
             return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), begin)))

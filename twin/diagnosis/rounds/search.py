@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.calibration.fit_problem import Array
+from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.coarse import coarse_candidates
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.acceptance import flipped_gains, flipped_threshold, sign_p, stands_out
@@ -20,6 +21,7 @@ from twin.diagnosis.rounds.null_cache import cached_null
 from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters, with_sharp
 from twin.diagnosis.rounds.revise import second_thoughts
 from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.scoring.finite import suspects
 from twin.diagnosis.scoring.memory import Memory
 from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, proposed, screens
 
@@ -183,10 +185,15 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
     sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
     worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
-    tried = _refits(now, [worth[k] for k in chosen], [clusters[k] for k in chosen], workers, tell)
+    names = {worth[k].candidate.name for k in chosen}
+    swapped = [_unscreened(c) for c in suspects(now, every) if c.name not in names]
+    work = [*(worth[k] for k in chosen), *swapped]
+    tried = _refits(
+        now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell
+    )
     if any(t.gain > IN_DOUBT for t in tried):
         left = plain.mean_squares(plain.left_out())[0]
-        coarse = [Scored(c, 0.0, 0, 0.0, {}, 0.0, -1) for c in coarse_candidates(now, left)]
+        coarse = [_unscreened(c) for c in coarse_candidates(now, left)]
         tried += _refits(now, coarse, [-1000 - k for k in range(len(coarse))], workers, tell)
     tried.sort(key=order)
     before = float(base.base_score()[0])
@@ -223,6 +230,10 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+
+
+def _unscreened(c: Candidate) -> Scored:
+    return Scored(c, 0.0, 0, 0.0, {}, 0.0, -1)
 
 
 def _refits(

@@ -1,0 +1,35 @@
+"""Sensors under each other's names are seen before a fit bends towards them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.twin.diagnosis.small_cases import consistent, fitted, four_bodies, runs
+from twin.diagnosis.rounds.refits import refit
+from twin.diagnosis.scoring.finite import suspects
+from twin.diagnosis.scoring.screen import Scored, proposed
+
+PAIRS = [("t_spindle", "t_head"), ("t_head", "t_bed")]
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_pair_that_was_exchanged_comes_first(pair: tuple[str, str]) -> None:
+    known = four_bodies()
+    given = runs(known, {"swap": {"law": "sensor_swap", "acts_on": list(pair)}})
+    now = fitted(known, given)
+    first = suspects(now, proposed(now))[0]
+    assert first.part is not None and first.part.acts_on == pair
+    # a refit from where the fit has been bent to would not come back: it begins at the machine file's values
+    done = refit(now, Scored(first, 0.0, 0, 0.0, {}, 0.0, -1))
+    assert done is not None and done.fitted is not None and done.gain > 100.0
+    right = fitted(known, runs(known))
+    np.testing.assert_allclose(done.fitted.noise.factor, right.noise.factor, rtol=0.2)
+
+
+def test_labels_that_are_right_are_not_suspect() -> None:
+    now = consistent()
+    assert suspects(now, proposed(now)) == []
+    known = four_bodies()
+    now = fitted(known, runs(known, seed=2))
+    assert suspects(now, proposed(now)) == []
