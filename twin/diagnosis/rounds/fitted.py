@@ -21,7 +21,7 @@ from twin.diagnosis.scoring.filtered import Filtered, memory_left, own_first, se
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.schema import TwinPart
 
-STEPS, TOLERANCE = 2, 0.1  # of a refit: whether a candidate is in the running needs no more
+STEPS, TOLERANCE = 1, 0.1  # of a refit: whether a candidate is in the running needs no more
 
 
 @dataclass(frozen=True, eq=False)  # one is the same as itself alone: what is worked out of it may be kept by it

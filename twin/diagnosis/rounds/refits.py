@@ -127,7 +127,7 @@ def _promise(s: Scored) -> tuple[float, str]:
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
-    if s.candidate.mechanism == "sensor_swap":  # the fit has bent all it could towards the wrong labels
+    if s.candidate.mechanism == "sensor_swap" and s.column < 0:  # a suspect: the fit was bent towards wrong labels
         try:
             part = s.candidate.applied(now.part, values)
             return judged(now, Tried(s, 0.0, 0, 0, 0.0, baseline(now.machine, part, now.batches, None, now.runs)))
@@ -135,7 +135,8 @@ def refit(now: Fitted, s: Scored) -> Tried | None:
             return None
     for begin in ({**_beside(s, now), **at}, at):
         try:
-            return judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, s.candidate.applied(now.part, values), begin)))
+            fitted = refitted(now, s.candidate.applied(now.part, values), begin)
+            return judged(now, Tried(s, 0.0, 0, 0, 0.0, fitted), roughly=True)
         except (InputError, WorkError):
             continue  # a linear step may lead where no machine is
     return None
@@ -161,15 +162,15 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
         return t
 
 
-def judged(now: Fitted, t: Tried, memory: Memory | None = None) -> Tried:
-    """A refit with its gain over the fit before.
+def judged(now: Fitted, t: Tried, memory: Memory | None = None, roughly: bool = False) -> Tried:
+    """A refit with its gain over the fit before; `roughly` with the slack of that fit.
 
     Rows remember each other, for both as in the fit that leaves the whiter residuals: a missing effect makes those of
     the other repeat themselves (as `twin.calibration.annealing.likelier`). `memory` says otherwise.
     """
     assert t.fitted is not None
     memory = whiter(now.memory, t.fitted.memory) if memory is None else memory
-    before, after = alone(now, memory), alone(t.fitted, memory)
+    before, after = alone(now, memory), alone(t.fitted, memory, now if roughly else None)
     gain = float(after.base_score()[0] - before.base_score()[0])
     return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
 

@@ -29,7 +29,6 @@ MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
 # refined twin has gave up to 61 where the structural null foresaw less.
 LEAST = 70.0
-LEAST_FINER = 40.0  # of a finer network, which claims no physics
 IN_DOUBT = 20.0  # nats of a refit from which a finer network might be why
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
@@ -185,8 +184,9 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
     sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
     worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
-    names = {worth[k].candidate.name for k in chosen}
-    swapped = [_unscreened(c) for c in suspects(now, every) if c.name not in names]
+    swapped = [_unscreened(c) for c in suspects(now, every)]
+    suspect = {s.candidate.name for s in swapped}
+    chosen = [k for k in chosen if worth[k].candidate.name not in suspect]
     work = [*(worth[k] for k in chosen), *swapped]
     tried = _refits(
         now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell
@@ -222,11 +222,11 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     agreed = agreed_on(best, n)
     beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > LEAST else None
     own, density = (null, float(after.base_score()[0])) if beside is None else beside
-    structure, least = own.threshold(density, name=best.candidate.name), LEAST
+    structure = own.threshold(density, name=best.candidate.name)
     if best.candidate.mechanism == "coarse_network":
-        structure, least = 0.0, LEAST_FINER  # what structure makes is what it is for
+        structure = 0.0  # it claims no physics: what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    threshold = max(structure, flipped_threshold(flipped, n, which), least)
+    threshold = max(structure, flipped_threshold(flipped, n, which), LEAST)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)

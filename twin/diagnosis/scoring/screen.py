@@ -98,10 +98,14 @@ def best_variants(scored: Sequence[Scored]) -> list[Scored]:
     return [s for s in scored if s.candidate.name in kept]
 
 
-def alone(fitted: Fitted, memory: Memory) -> Evidence:
+def alone(fitted: Fitted, memory: Memory, like: Fitted | None = None) -> Evidence:
     """How well a fit predicts batches left out, with slack and no candidates; `memory` of the rows of what is
-    compared."""
-    batches = _slackened(fitted).whitened(memory)
+    compared.
+
+    With `like` the slack's traces are those of that fit: near enough to rank, and half the time.
+    """
+    line = _slackened(fitted) if like is None else _slackened(like).under(fitted)
+    batches = line.whitened(memory)
     return _evidence(fitted, tuple(replace(b, columns=b.columns[:, :0]) for b in batches), memory, *np.zeros((2, 0)))
 
 
@@ -157,6 +161,23 @@ class _Line:
             numbers,
             own,
             loose,
+        )
+
+    def under(self, fitted: Fitted) -> _Line:
+        """The same columns beside another fit of the same rows."""
+        p, own_sd = len(self.own), from_run_to_run(fitted)
+        kept = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), self.blocks, strict=True)
+        return replace(
+            self,
+            blocks=tuple(
+                replace(b, jacobian=np.hstack([b.jacobian, o.jacobian[:, p:]]), nuisance=_with_own(b, own_sd))
+                for b, o in kept
+            ),
+            nuisance=tuple(np.append(v, np.zeros(len(own_sd))) for v in fitted.state.nuisance),
+            z=fitted.state.z,
+            weight=1.0 / fitted.noise.factor**2,
+            unknowns=(*fitted.problem.unknowns, *self.unknowns[p:]),
+            own={u.name: k for k, u in enumerate(fitted.problem.unknowns)},
         )
 
     def whitened(self, memory: Memory) -> tuple[Whitened, ...]:
