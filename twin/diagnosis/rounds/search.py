@@ -29,6 +29,7 @@ MOST_EFFECTS = 4
 # Nats below which nothing is claimed: on development plants that lacked nothing, castings and levers that no
 # refined twin has gave up to 61 where the structural null foresaw less.
 LEAST = 70.0
+LEAST_FINER = 40.0  # of a finer network, which claims no physics
 IN_DOUBT = 20.0  # nats of a refit from which a finer network might be why
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
@@ -222,11 +223,11 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     agreed = agreed_on(best, n)
     beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > LEAST else None
     own, density = (null, float(after.base_score()[0])) if beside is None else beside
-    structure = own.threshold(density, name=best.candidate.name)
+    structure, least = own.threshold(density, name=best.candidate.name), LEAST
     if best.candidate.mechanism == "coarse_network":
-        structure = 0.0  # it claims no physics: what structure makes is what it is for
+        structure, least = 0.0, LEAST_FINER  # what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    threshold = max(structure, flipped_threshold(flipped, n, which), LEAST)
+    threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
