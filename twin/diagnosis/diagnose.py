@@ -34,7 +34,7 @@ from twin.diagnosis.rounds.search import Round, Search, search
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.limits import limits
 from twin.diagnosis.telling import tables as made
-from twin.diagnosis.telling.conclude import REST, caps, found_of, remainder, rms_of, verdict_of
+from twin.diagnosis.telling.conclude import REST, caps, found_of, remainder, rms_of, slow_remainder, verdict_of
 from twin.diagnosis.telling.findings import (
     DetectionLimit,
     Finding,
@@ -164,7 +164,7 @@ def _diagnosis(
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    rest = remainder(done)
+    rest = max(remainder(done), slow_remainder(rms))
     listed = [f for f in found if f.mechanism not in UNLISTED]
     verdict = verdict_of(listed, left is not None, rest)
     if rest > REST:

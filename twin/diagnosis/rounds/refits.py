@@ -127,7 +127,7 @@ def _promise(s: Scored) -> tuple[float, str]:
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     values, at = start_values(s, now)
-    if s.candidate.mechanism == "sensor_swap" and s.column < 0:  # a suspect: the fit was bent towards wrong labels
+    if s.candidate.mechanism == "sensor_swap":  # the fit was bent towards the wrong labels
         try:
             part = s.candidate.applied(now.part, values)
             return judged(now, Tried(s, 0.0, 0, 0, 0.0, baseline(now.machine, part, now.batches, None, now.runs)))

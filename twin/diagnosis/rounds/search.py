@@ -175,7 +175,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     none = Memory.none(len(now.problem.channels))
     seen, sharp = screens(now, every, [now.memory, none])
     loose = no_news(every, now)
-    news = [s for s in seen.scored if s.candidate.name not in loose]
+    # Labels that are exchanged are plainly wrong before a fit (`suspects`); after it, two that are right may gain.
+    news = [s for s in seen.scored if s.candidate.name not in loose and s.candidate.mechanism != "sensor_swap"]
     columns = seen.columns(loose)
     alarm = list(columns.values())
     news = best_variants(news)
@@ -186,8 +187,6 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
     worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
     swapped = [_unscreened(c) for c in suspects(now, every)]
-    suspect = {s.candidate.name for s in swapped}
-    chosen = [k for k in chosen if worth[k].candidate.name not in suspect]
     work = [*(worth[k] for k in chosen), *swapped]
     tried = _refits(
         now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell

@@ -15,7 +15,7 @@ from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
 from twin.schema import TwinPart
 
-SUSPECTS, PLAINLY = 2, 4.0  # pairs of sensors, and by what factor their mean squares together would fall
+SUSPECTS, PLAINLY = 2, 100.0  # pairs of sensors, and by what factor their mean squares together would fall
 
 
 def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:

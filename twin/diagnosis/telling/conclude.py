@@ -23,6 +23,7 @@ from twin.diagnosis.writing.changes import deviations
 from twin.mechanisms import MECHANISMS
 from twin.schema import TwinPart
 
+STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in the median channel of plants
 REST = 4.0  # times what structure leaves: beyond it something is left, whatever it is
 SURE = 0.7  # below it the best explanation does not stand by itself
 
@@ -167,12 +168,20 @@ def caps(n: int) -> tuple[str, ...]:
 
 
 def remainder(search: Search) -> float:
-    """Left-out errors after all that was found over what structure alone leaves, the median over channels."""
+    """Left-out errors after all that was found over what structure alone leaves, the median over channels.
+
+    Of rows filtered by their memory: a slow misfit has little that is new in any row (see `slow_remainder`).
+    """
     final, null = search.final, search.rounds[-1].null
     left = alone(final, final.memory)
     seen = left.mean_squares(left.left_out())[0]
     structure = np.median(null.mean_squares[:, AS_IT_IS], axis=0)
     return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
+
+
+def slow_remainder(rms: Sequence[Rms]) -> float:
+    """The same of the rows as they are, over what a network of castings usually leaves."""
+    return float(np.nanmedian([r.after / r.noise for r in rms if r.noise > 0] or [0.0])) / STRUCTURE
 
 
 def verdict_of(found: Sequence[Found], more: bool, rest: float) -> Verdict:

@@ -1,0 +1,27 @@
+"""What is left after all that was found: the verdict never calls a large slow misfit consistent."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from twin.diagnosis.telling.conclude import REST, STRUCTURE, slow_remainder, verdict_of
+from twin.diagnosis.telling.found import Rms
+
+
+def test_a_slow_misfit_counts_by_its_size() -> None:
+    rms = [
+        Rms("t_head", "K", 9.0, 2.0, 0.1, sensor=True),
+        Rms("z", "um", 9.0, 30.0, 1.0),
+        Rms("x", "um", 9.0, 1.0, 1.0),
+    ]
+    assert slow_remainder(rms) == pytest.approx(20.0 / STRUCTURE)  # the median channel
+    assert slow_remainder([Rms("z", "um", 9.0, 5.0, math.nan)]) == 0.0
+    assert slow_remainder([]) == 0.0
+
+
+@pytest.mark.parametrize(("rest", "verdict"), [(0.9 * REST, "consistent"), (1.1 * REST, "undecidable")])
+def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(rest: float, verdict: str) -> None:
+    assert verdict_of([], False, rest) == verdict
+    assert verdict_of([], True, rest) == "unlisted"
