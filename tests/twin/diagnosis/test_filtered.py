@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tests.twin.diagnosis.small_cases import cold_floor, consistent, fitted, four_bodies
 from tests.twin.recordings import empty_batches, recorded
 from twin.calibration.annealing import noise_left
+from twin.calibration.descent import x_of
 from twin.calibration.least_squares import settled as annealed
 from twin.compile import compile_network
 from twin.diagnosis.rounds import refined
@@ -55,9 +56,9 @@ def test_noise_is_that_of_the_rows_and_not_less_than_given() -> None:
     done = cold_floor()
     none = Filtered(done.problem, Memory.none(len(done.problem.channels)))
     raw = noise_left(done.problem, done.state).factor
-    np.testing.assert_allclose(
-        none.noise_at(done.state.z, done.state.nuisance, done.state.arrow.effective_parameters()).factor, raw, rtol=1e-6
-    )
+    left = done.problem.residuals(done.x, done.state.nuisance)
+    noise = none.noise_of(left, done.state.arrow.effective_parameters())
+    np.testing.assert_allclose(noise.factor, raw, rtol=1e-6)
     assert (consistent().noise.factor >= 1.0).all()
     # of the rows, not of their innovations: a slow misfit is as large as it looks
     assert cold_floor().noise.factor.max() > 5.0 and cold_floor().memory.inflation.max() > 5.0
@@ -67,7 +68,7 @@ def test_it_ends_where_it_stands() -> None:
     done = consistent()
     again = settled(done.problem, done.state, steps=4, tolerance=0.01, rounds=10)
     assert np.abs(again.z - done.state.z).max() < 0.1
-    memory = memory_left(done.problem, again.z, again.nuisance)
+    memory = memory_left(done.problem, done.problem.residuals(x_of(done.problem.unknowns, again.z), again.nuisance))
     np.testing.assert_array_equal(memory.share, done.memory.share)
 
 

@@ -211,19 +211,20 @@ def _near(part: TwinPart, places: Sequence[str]) -> bool:
 def _own_links(part: TwinPart) -> dict[str, Link]:
     """Those between the machine's bodies."""
     whole = pieces_of(part)
-    return {k: link for k, link in part.links.items() if len({whole.get(n, n) for n in _ends(link)}) > 1}
+    return {k: link for k, link in part.links.items() if len({whole.get(n, n) for n in ends_of(link)}) > 1}
 
 
 def linked(part: TwinPart, body: str) -> list[str]:
     """The bodies that a body has a link with, in the file's order; a piece of a body counts as the body."""
     whole = pieces_of(part)
-    ends = [tuple(whole.get(name, name) for name in _ends(link)) for link in part.links.values()]
+    ends = [tuple(whole.get(name, name) for name in ends_of(link)) for link in part.links.values()]
     body = whole.get(body, body)
     near = {b if a == body else a for a, b in ends if body in (a, b)}
     return [name for name in part.bodies if name in near and name != body]
 
 
-def _ends(link: Link) -> list[str]:
+def ends_of(link: Link) -> list[str]:
+    """The bodies that a link is between, without the places in them."""
     return [place.partition("@")[0] for place in link.between]
 
 

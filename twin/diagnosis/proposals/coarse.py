@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
-from twin.diagnosis.proposals.candidates import linked
+from twin.diagnosis.proposals.candidates import ends_of, linked
 from twin.diagnosis.proposals.pieces import FAR, NEAR, pieces_of
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.mechanisms import MECHANISMS
@@ -41,25 +40,29 @@ def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, w
     ranked = sorted(range(len(names)), key=lambda k: -np.nan_to_num(mean_squares[k]))
     out = []
     for n, k in enumerate(ranked):
+        if not mean_squares[k] > worse:
+            continue
         body = part.sensors[names[k]].at.partition("@")[0]
-        if mean_squares[k] > worse and n < most:
+        if n < most:
             out += list(_of_sensor(fitted, names[k]))
-        elif mean_squares[k] > worse and any(body in _into(part.mechanisms[name]) for name in _found(fitted)):
+        elif any(body in _into(part.mechanisms[name]) for name in _found(fitted)):
             out += [c for c in _of_sensor(fitted, names[k]) if any(p.startswith("mechanisms.") for p in c.parts)]
     return out
 
 
 def _found(fitted: Fitted) -> list[str]:
     """The mechanisms that the machine file has not got."""
-    known = (fitted.machine.twin or {}).get("mechanisms", fitted.part.mechanisms if not fitted.machine.twin else {})
+    if not fitted.machine.twin:
+        return []  # it states nothing: all is drafted
+    known = fitted.machine.twin.get("mechanisms") or {}
     return [name for name in fitted.part.mechanisms if name not in known]
 
 
-def _into(given: MechanismPart) -> dict[str, Any]:
-    """The bodies that its heat enters whole, or what is left of it, and how the part says so with another's name."""
+def _into(given: MechanismPart) -> list[str]:
+    """The bodies that its heat enters whole, or what is left of it."""
     if isinstance(given.into, str):
-        return {given.into: given.into}
-    return {body: share for body, share in (given.into or {}).items() if share == "rest"}
+        return [given.into]
+    return [body for body, share in (given.into or {}).items() if share == "rest"]
 
 
 def _entering(given: MechanismPart, body: str, place: str) -> MechanismPart:
@@ -98,9 +101,9 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
     words = f"a piece of the {body} of its own around {channel}"
     yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
     ranked = sorted(part.links, key=lambda k: -_conductance(fitted, k))  # heat comes through the best ones
-    for key in [k for k in ranked if body in _ends(part.links[k])][:THROUGH]:
+    for key in [k for k in ranked if body in ends_of(part.links[k])][:THROUGH]:
         link = part.links[key]
-        ends = _ends(link)
+        ends = ends_of(link)
         moved = tuple(near if end == body else place for end, place in zip(ends, link.between, strict=True))
         other = ends[1 - ends.index(body)]
         yield Candidate(
@@ -169,13 +172,9 @@ def _nearest(fitted: Fitted, body: str) -> list[str]:
 
     def conductance(other: str) -> float:
         pair = {body, other}
-        return max(_conductance(fitted, k) for k in links if {whole.get(n, n) for n in _ends(links[k])} == pair)
+        return max(_conductance(fitted, k) for k in links if {whole.get(n, n) for n in ends_of(links[k])} == pair)
 
     return sorted(linked(fitted.part, body), key=lambda other: -conductance(other))
-
-
-def _ends(link: Link) -> list[str]:
-    return [place.partition("@")[0] for place in link.between]
 
 
 def _conductance(fitted: Fitted, key: str) -> float:

@@ -17,7 +17,7 @@ from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.diagnosis.proposals.pieces import pieces_of
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
-from twin.diagnosis.scoring.filtered import Filtered, memory_left, own_first, settled
+from twin.diagnosis.scoring.filtered import Filtered, left_where_own_follow, memory_left, settled
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.schema import TwinPart
 
@@ -47,15 +47,19 @@ class Fitted:
     @cached_property
     def memory(self) -> Memory:
         """What the rows of each channel remember of each other, in what this fit leaves over."""
-        return memory_left(self.problem, self.state.z, self.state.nuisance)
+        return memory_left(self.problem, self._left)
 
     @cached_property
     def noise(self) -> Noise:
         """What this fit leaves over in each channel, and how many rows count as one."""
-        left = Filtered(self.problem, self.memory).noise_at(
-            self.state.z, self.state.nuisance, self.state.arrow.effective_parameters()
+        filtered = Filtered(self.problem, self.memory)
+        return replace(
+            filtered.noise_of(self._left, self.state.arrow.effective_parameters()), inflation=self.memory.inflation
         )
-        return replace(left, inflation=self.memory.inflation)
+
+    @cached_property
+    def _left(self) -> list[Array]:
+        return self.problem.residuals(self.x, self.state.nuisance)
 
     @property
     def step_s(self) -> float:
@@ -94,24 +98,26 @@ def refitted(
             z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
     z = np.clip(z, *z_bounds(problem.unknowns))
     nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
-    noise = Noise(old.noise.factor, np.ones(len(problem.channels)))
-    nuisance = own_first(Filtered(problem, old.memory), z, nuisance, noise)
-    filtered, state = _counted(old, problem, z, nuisance, noise, old.state.arrow.effective_parameters())
+    state = State.at(
+        Filtered(problem, old.memory), z, nuisance, Noise(old.noise.factor, np.ones(len(problem.channels)))
+    )
+    left = left_where_own_follow(problem, state)
+    filtered, state = _counted(old, problem, state, left, old.state.arrow.effective_parameters())
     for _ in range(steps):
         state = descend(filtered, state, 1, tolerance)
-        parameters = state.arrow.effective_parameters()
-        filtered, state = _counted(old, problem, state.z, state.nuisance, state.noise, parameters)
+        left = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
+        filtered, state = _counted(old, problem, state, left, state.arrow.effective_parameters())
     return replace(old, part=part, problem=problem, state=state)
 
 
 def _counted(
-    old: Fitted, problem: CalibrationProblem, z: Array, nuisance: list[Array], noise: Noise, parameters: float
+    old: Fitted, problem: CalibrationProblem, state: State, left: list[Array], parameters: float
 ) -> tuple[Filtered, State]:
-    """The state there with rows that remember no longer, and channels no noisier, than in the old fit and so far."""
-    filtered = Filtered(problem, whiter(old.memory, memory_left(problem, z, nuisance)))
-    here = filtered.noise_at(z, nuisance, parameters)
-    least = replace(noise, factor=np.minimum(here.factor, noise.factor))
-    return filtered, State.at(filtered, z, nuisance, least)
+    """The state with rows that remember no longer, and channels no noisier, than in the old fit and in what is left."""
+    filtered = Filtered(problem, whiter(old.memory, memory_left(problem, left)))
+    here = filtered.noise_of(left, parameters)
+    noise = replace(state.noise, factor=np.minimum(here.factor, state.noise.factor))
+    return filtered, State.at(filtered, state.z, state.nuisance, noise)
 
 
 def settle(fitted: Fitted, steps: int = 4, tolerance: float = 0.01, rounds: int = 10) -> Fitted:

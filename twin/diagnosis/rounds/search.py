@@ -183,7 +183,6 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
     base = alone(now, now.memory)
-    plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
     sharp_news = best_variants([s for s in sharp.scored if s.candidate.name not in loose])
     worth, clusters, chosen = with_sharp(shortlist(news, seen.evidence), sharp_news, sharp.evidence)
     swapped = [_unscreened(c) for c in suspects(now, every)]
@@ -192,6 +191,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell
     )
     if any(t.gain > IN_DOUBT for t in tried):
+        plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
         left = plain.mean_squares(plain.left_out())[0]
         coarse = [_unscreened(c) for c in coarse_candidates(now, left)]
         tried += _refits(now, coarse, [-1000 - k for k in range(len(coarse))], workers, tell)

@@ -17,7 +17,7 @@ from twin.calibration.descent import State, descend, x_of
 from twin.calibration.fit_noise import Noise
 from twin.calibration.fit_problem import Array, Block, Problem, Unknown
 from twin.calibration.problem import CalibrationProblem
-from twin.diagnosis.scoring.memory import Memory, memory_of
+from twin.diagnosis.scoring.memory import Memory, memory_of, slices_of
 
 STANDS = 0.1  # of a prior's standard deviation: a round that moves no parameter further is the last
 
@@ -51,45 +51,47 @@ class Filtered:
         every = zip(self.problem.residuals(x, nuisance), self.problem.measured, strict=True)
         return [self._innovations(rows, m.channel) for rows, m in every]
 
-    def noise_at(self, z: Array, nuisance: Sequence[Array], parameters: float = 0.0) -> Noise:
-        """The standard deviation of the rows of each channel, at least the given noise; `parameters` were fitted."""
-        square, rows = np.zeros(len(self.channels)), np.zeros(len(self.channels))
-        for left, m in zip(self.residuals(x_of(self.unknowns, z), nuisance), self.problem.measured, strict=True):
-            square += np.bincount(m.channel, weights=left**2, minlength=len(square))
-            rows += np.bincount(m.channel, minlength=len(rows))
+    def noise_of(self, left: Sequence[Array], parameters: float = 0.0) -> Noise:
+        """The standard deviation of the innovations of each channel in rows left over (n_b,), at least the given
+        noise; `parameters` were fitted."""
+        own = [self._innovations(rows, m.channel) for rows, m in zip(left, self.problem.measured, strict=True)]
+        square = square_sums(self.problem, own)
+        rows = np.bincount(np.concatenate([m.channel for m in self.problem.measured]), minlength=len(square))
         left_over = max(1.0 - parameters / max(1.0, rows.sum()), 0.1)
         factor = np.sqrt(square / (np.maximum(rows, 1.0) * left_over))
         return Noise(np.maximum(factor, 1.0), np.ones(len(factor)))
 
     def _innovations(self, rows: Array, channel: NDArray[np.int64]) -> Array:
-        starts = np.flatnonzero(np.diff(channel, prepend=-1))
-        ends = np.append(starts[1:], len(channel))
-        every = zip(channel[starts].tolist(), starts.tolist(), ends.tolist(), strict=True)
-        return np.concatenate([self.memory.filtered(c, rows[a:b]) for c, a, b in every])
+        return np.concatenate([self.memory.filtered(c, rows[at]) for c, at in slices_of(channel)])
 
 
-def memory_left(problem: CalibrationProblem, z: Array, nuisance: Sequence[Array]) -> Memory:
-    """What the rows of each channel remember of each other at a point."""
-    left = problem.residuals(x_of(problem.unknowns, z), nuisance)
+def square_sums(problem: CalibrationProblem, rows: Sequence[Array]) -> Array:
+    """Sums (K,) over each channel of the squares of every batch's rows (n_b,)."""
+    k = len(problem.channels)
+    every = [np.bincount(m.channel, r**2, k) for m, r in zip(problem.measured, rows, strict=True)]
+    return np.asarray(np.sum(every, axis=0))
+
+
+def memory_left(problem: CalibrationProblem, left: Sequence[Array]) -> Memory:
+    """What the rows of each channel remember of each other in rows left over (n_b,)."""
     return memory_of(left, [m.channel for m in problem.measured], len(problem.channels))
 
 
-def own_first(problem: Problem, z: Array, nuisance: Sequence[Array], noise: Noise) -> list[Array]:
-    """Where each batch's own unknowns follow to at z: their steps are safe."""
-    state = State.at(problem, z, list(nuisance), noise)
-    still = np.zeros(len(z))
-    return [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
+def left_where_own_follow(problem: Problem, state: State) -> list[Array]:
+    """The rows (n_b,) that would be left once each batch's own unknowns follow to the state's z: these act linearly."""
+    still = np.zeros(len(state.z))
+    blocks = problem.linearise(x_of(problem.unknowns, state.z), state.nuisance)
+    return [b.residual - b.nuisance @ c.step(still) for b, c in zip(blocks, state.arrow.corners, strict=True)]
 
 
 def settled(problem: CalibrationProblem, state: State, steps: int, tolerance: float, rounds: int) -> State:
     """Down from a state, memory and noise estimated anew in every round of so many steps, until they stand."""
     for _ in range(rounds):
-        filtered = Filtered(problem, memory_left(problem, state.z, state.nuisance))
-        noise = filtered.noise_at(state.z, state.nuisance, state.arrow.effective_parameters())
-        start = State.at(filtered, state.z, state.nuisance, noise)
-        new = descend(filtered, start, steps, tolerance)
-        stands = bool(np.abs(new.z - state.z).max(initial=0.0) < STANDS)
-        state = new
-        if stands:
+        left = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
+        filtered = Filtered(problem, memory_left(problem, left))
+        noise = filtered.noise_of(left, state.arrow.effective_parameters())
+        before = state.z
+        state = descend(filtered, State.at(filtered, before, state.nuisance, noise), steps, tolerance)
+        if np.abs(state.z - before).max(initial=0.0) < STANDS:
             break
     return state

@@ -13,6 +13,7 @@ from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
+from twin.diagnosis.scoring.filtered import square_sums
 from twin.schema import TwinPart
 
 SUSPECTS, PLAINLY = 2, 100.0  # pairs of sensors, and by what factor their mean squares together would fall
@@ -71,11 +72,7 @@ def suspects(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
 
 def _squares(fitted: Fitted, rows: Sequence[Array]) -> Array:
     """Mean squares (K,) of each channel, at least the given noise's."""
-    count = len(fitted.problem.channels)
-    square = np.sum(
-        [np.bincount(m.channel, r**2, count) for m, r in zip(fitted.problem.measured, rows, strict=True)], 0
-    )
-    return np.asarray(np.maximum(square / np.maximum(fitted.rows, 1.0), 1.0))
+    return np.asarray(np.maximum(square_sums(fitted.problem, rows) / np.maximum(fitted.rows, 1.0), 1.0))
 
 
 def _exchanged(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array] | None:

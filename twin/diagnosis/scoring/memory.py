@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -50,28 +50,31 @@ class Memory:
 
     def filtered(self, channel: int, rows: Array) -> Array:
         """The innovations of rows (n, …) of one channel, of variance 1 where the rows have it."""
-        phi, theta, sd = _filter(float(self.share[channel]), float(self.keep[channel]))
+        phi, theta, sd = self._filter[channel]
         if phi == 0.0:
             return rows
-        out = lfilter([1.0, -phi], [1.0, -theta], rows, axis=0) / sd
-        return np.asarray(out - _beginning(rows, theta, sd))
+        return _passed([1.0 / sd, -phi / sd], [1.0, -theta], rows)
 
     def restored(self, channel: int, rows: Array) -> Array:
         """The rows whose innovations these are: the inverse of `filtered`."""
-        phi, theta, sd = _filter(float(self.share[channel]), float(self.keep[channel]))
+        phi, theta, sd = self._filter[channel]
         if phi == 0.0:
             return rows
-        out = (rows + _beginning(rows, theta, sd)) * sd
-        return np.asarray(lfilter([1.0, -theta], [1.0, -phi], out, axis=0))
+        return _passed([sd, -theta * sd], [1.0, -phi], rows)
+
+    @cached_property
+    def _filter(self) -> list[tuple[float, float, float]]:
+        """φ, θ and the innovations' standard deviation of each channel; φ is 0 where its rows are independent."""
+        theta, variance = _moving_average(self.share, self.keep)
+        phi = np.where(self.share > 0.0, self.keep, 0.0)
+        return list(zip(phi.tolist(), theta.tolist(), np.sqrt(variance).tolist(), strict=True))
 
 
-@lru_cache(maxsize=256)
-def _filter(share: float, keep: float) -> tuple[float, float, float]:
-    """φ, θ and the innovations' standard deviation of a channel; φ is 0 where its rows are independent."""
-    if share == 0.0 or keep == 0.0:
-        return 0.0, 0.0, 1.0
-    theta, variance = _moving_average(np.asarray(share), np.asarray(keep))
-    return keep, float(theta), float(np.sqrt(variance))
+def slices_of(channel: NDArray[np.int64]) -> list[tuple[int, slice]]:
+    """Every channel's number and rows, of the channels (n,) of rows in their order."""
+    starts = np.flatnonzero(np.diff(channel, prepend=-1))
+    ends = np.append(starts[1:], len(channel))
+    return [(c, slice(a, b)) for c, a, b in zip(channel[starts].tolist(), starts.tolist(), ends.tolist(), strict=True)]
 
 
 def whiter(one: Memory, other: Memory) -> Memory:
@@ -81,62 +84,48 @@ def whiter(one: Memory, other: Memory) -> Memory:
 
 
 def memory_of(residuals: Sequence[Array], channels: Sequence[NDArray[np.int64]], n_channels: int) -> Memory:
-    """The likeliest memory of what a fit leaves over.
+    """The likeliest memory of what a fit leaves over, of all shares and reaches on the grid.
 
     Args:
         residuals: (n_b,) of every batch in units of the given noise, in time order within each channel.
         channels: (n_b,) the channel of each row.
     """
-    share, keep = np.zeros(n_channels), np.zeros(n_channels)
-    for c in range(n_channels):
-        series = [r[at == c] for r, at in zip(residuals, channels, strict=True)]
-        lengths = np.array([len(s) for s in series])
-        if lengths.sum() < FEWEST:
-            continue
-        rows = np.zeros((lengths.max(), len(series)))
-        for k, s in enumerate(series):
-            rows[: len(s), k] = s
-        there = np.arange(len(rows))[:, None] < lengths
-        likely, w, phi = _likeliest(rows, there)
-        if likely > _likelihood(rows, there, 0.0, 0.0) + WORTH:
-            share[c], keep[c] = w, phi
-    return Memory(share, keep)
+    lengths = np.array([np.bincount(at, minlength=n_channels) for at in channels]).T
+    rows = np.zeros((lengths.max(initial=0), n_channels, len(lengths.T)))
+    there = np.arange(len(rows))[:, None, None] < lengths
+    for b, (left, at) in enumerate(zip(residuals, channels, strict=True)):
+        rows[:, :, b].T[there[:, :, b].T] = left[np.argsort(at, kind="stable")]
+    w, rows_to_1_e = np.array([(0.0, 1.0), *product(SHARES, ROWS)]).T
+    keep = np.where(w > 0.0, np.exp(-1.0 / rows_to_1_e), 0.0)
+    likely = _likelihoods(rows, there, w, keep)
+    best = 1 + np.argmax(likely[1:], axis=0)
+    found = (lengths.sum(axis=1) >= FEWEST) & (likely[best, np.arange(n_channels)] > likely[0] + WORTH)
+    return Memory(np.where(found, w[best], 0.0), np.where(found, keep[best], 0.0))
 
 
-def _likeliest(rows: Array, there: NDArray[np.bool_]) -> tuple[float, float, float]:
-    """The highest log likelihood on the grid of shares and reaches, and where: a coarse look, then uphill."""
-    keeps = np.exp(-1.0 / np.array(ROWS)).tolist()
-    seen: dict[tuple[int, int], float] = {}
+def _likelihoods(rows: Array, there: NDArray[np.bool_], w: Array, keep: Array) -> Array:
+    """Log likelihood (G, K) of series (n, K, B) with each of G memories, the variance at its best.
 
-    def at(point: tuple[int, int]) -> float:
-        if point not in seen:
-            seen[point] = _likelihood(rows, there, SHARES[point[0]], keeps[point[1]])
-        return seen[point]
-
-    best = max(product(range(1, len(SHARES), 3), range(1, len(ROWS), 2)), key=at)
-    while True:
-        i, j = best
-        near = product(range(max(i - 1, 0), min(i + 2, len(SHARES))), range(max(j - 1, 0), min(j + 2, len(ROWS))))
-        if (up := max(near, key=at)) == best:
-            return at(best), SHARES[i], keeps[j]
-        best = up
-
-
-def _likelihood(rows: Array, there: NDArray[np.bool_], w: float, phi: float) -> float:
-    """Log likelihood of series of one channel (n, B), ended by rows that are not `there`, the variance at its best."""
-    n = int(there.sum())
-    square = float(np.sum(Memory(np.array([w]), np.array([phi])).filtered(0, rows)[there] ** 2)) / n
-    scale = max(square, QUIET / (1.0 - w))
-    return -0.5 * n * (float(np.log(scale)) + 2.0 * float(np.log(_filter(w, phi)[2])) + square / scale)
-
-
-def _beginning(rows: Array, theta: float, sd: float) -> Array:
-    """What the filter gives too much (n, …): the first row has no past, is of full variance, and echoes with θ.
-
-    The same for rows (n, …) and for their innovations, which share the first.
+    Each series ends with the last row that is `there`.
     """
-    decay = theta ** np.arange(len(rows), dtype=float)
-    return np.asarray(rows[:1] * (1.0 / sd - 1.0) * decay.reshape(-1, *(1,) * (rows.ndim - 1)))
+    theta, variance = _moving_average(w, keep)
+    squares, n = np.zeros((len(w), rows.shape[1])), there.sum(axis=(0, 2))
+    now = np.zeros((len(w), *rows.shape[1:]))
+    for t, (row, known) in enumerate(zip(rows, there, strict=True)):
+        if t == 0:
+            now += row
+        else:
+            now *= theta[:, None, None]
+            now += (row - keep[:, None, None] * rows[t - 1]) / np.sqrt(variance)[:, None, None]
+        squares += np.einsum("gkb,gkb,kb->gk", now, now, known)
+    mean = squares / np.maximum(n, 1)
+    scale = np.maximum(mean, (QUIET / (1.0 - w))[:, None])
+    return np.asarray(-0.5 * n * (np.log(scale) + np.log(variance)[:, None] + mean / scale))
+
+
+def _passed(ahead: list[float], back: list[float], rows: Array) -> Array:
+    """Rows (n, …) through a filter that passes the first, which has no past and is of full variance, as it is."""
+    return np.asarray(lfilter(ahead, back, rows, axis=0, zi=rows[:1] * (1.0 - ahead[0]))[0])
 
 
 def _moving_average(share: Array, keep: Array) -> tuple[Array, Array]:

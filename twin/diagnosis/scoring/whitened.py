@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array, Block, Unknown
-from twin.diagnosis.scoring.memory import Memory
+from twin.diagnosis.scoring.memory import Memory, slices_of
+
+SEEN = 1e-9  # sum of squares below which a direction of the nuisances, of variance 1, shows in no row
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,7 @@ class Whitened:
     @cached_property
     def slices(self) -> list[tuple[int, slice]]:
         """Every channel's number and rows."""
-        ends = [*self.starts[1:].tolist(), len(self.channel)]
-        return [(c, slice(a, b)) for c, a, b in zip(self.channels.tolist(), self.starts.tolist(), ends, strict=True)]
+        return slices_of(self.channel)
 
     def with_slack(self, loose: Mapping[int, float]) -> Whitened:
         """The same batch in which some columns are shared unknowns too, of the prior sd given, about 0."""
@@ -106,9 +107,9 @@ def whitened(
     bare = np.zeros((len(scale), 0))
     none = Whitened(block.batch_id, scale[:0], bare, bare, block.channel, scale, bare, scale[:0], memory)
     own = none.of(block.nuisance)
-    u, s, _ = np.linalg.svd(own, full_matrices=False)
-    kept = s > 1e-9
-    mixing, damping = u[:, kept], 1.0 - 1.0 / np.sqrt(1.0 + s[kept] ** 2)
+    square, turn = np.linalg.eigh(own.T @ own)  # what rounding makes of small ones is damped by no more than that
+    kept = square > SEEN
+    mixing, damping = own @ (turn[:, kept] / np.sqrt(square[kept])), 1.0 - 1.0 / np.sqrt(1.0 + square[kept])
     chosen = np.zeros(len(unknowns), bool)
     chosen[list(columns)] = True
     spread = np.array([u.spread for u in unknowns])
