@@ -69,12 +69,13 @@ class Sun(Mechanism):
     source = "Monteith and Unsworth 2013, Principles of Environmental Physics, ch. 5: half sine of a clear day"
     signature = "one face and a sideways tilt, at the same time of day"
     acts_at = ("node",)
+    # Within a midsummer's day at 60 degrees: with free hours a heat that goes on by night would pass for sunlight.
     parameters = (
         Spec("irradiance", "W/m**2", "at its highest, on the face", 150.0, 0.7, 0.0, 1400.0),
         Spec("area", "m**2", "sunlit surface", 1.0, 0.5, 0.0, 200.0),
         Spec("absorptivity", "1", "share of the sunlight that the paint absorbs", 0.5, 0.8, 0.01, 1.0, "logit"),
-        Spec("rise", "h", "time of day at which the sun reaches the face", 8.0, 1.5, 0.0, 24.0, "linear"),
-        Spec("set", "h", "time of day at which it leaves the face", 16.0, 1.5, 0.0, 24.0, "linear"),
+        Spec("rise", "h", "time of day at which the sun reaches the face", 8.0, 1.5, 3.0, 18.0, "linear"),
+        Spec("set", "h", "time of day at which it leaves the face", 16.0, 1.5, 7.0, 22.0, "linear"),
     )
     off: ClassVar[Mapping[str, float]] = {"irradiance": 0.0}
     shape = ("rise", "set")
