@@ -21,6 +21,7 @@ from twin.diagnosis.telling.found import Found, Other, Rms, beside_words, place_
 from twin.diagnosis.telling.honest_digits import Estimate
 from twin.diagnosis.writing.changes import deviations
 from twin.mechanisms import MECHANISMS
+from twin.quantity import Spec
 from twin.schema import TwinPart
 
 STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in the median channel of plants
@@ -124,24 +125,24 @@ def _parameters(
     for spec in mechanism.parameters if mechanism else ():
         at = _network_name(final, c.name, spec.name, c.where.name)
         if at is not None and at in intervals:
-            out[spec.name] = _widened(intervals[at], spec.name, done)
+            out[spec.name] = _widened(intervals[at], spec, done)
         elif at is not None:
             p = network.parameters[network.index(at)]
             out[spec.name] = Estimate(p.value, p.unit)
     return out, {}
 
 
-def _widened(i: Interval, parameter: str, done: Round) -> Estimate:
+def _widened(i: Interval, spec: Spec, done: Round) -> Estimate:
     """The interval of an amplitude, as wide as structure that leaves as much scatters it."""
     best = done.best
-    if best is None or list(best.candidate.amplitudes) != [parameter]:  # several trade with each other
+    if best is None or list(best.candidate.amplitudes) != [spec.name]:  # several trade with each other
         return Estimate(i.value, i.unit, i.low, i.high)
     more = done.scatter
-    if i.low > 0 and i.value > 0:
+    if i.low > 0 and i.value > more:
         up = float(np.hypot(np.log(i.high / i.value), more / i.value))
         return Estimate(i.value, i.unit, i.value * float(np.exp(-up)), i.value * float(np.exp(up)))
-    half = float(np.hypot((i.high - i.low) / 2.0, more))
-    return Estimate(i.value, i.unit, i.value - half, i.value + half)
+    low, high = float(np.hypot(i.value - i.low, more)), float(np.hypot(i.high - i.value, more))
+    return Estimate(i.value, i.unit, max(i.value - low, spec.low), min(i.value + high, spec.high))
 
 
 def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:
