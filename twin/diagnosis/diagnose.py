@@ -23,7 +23,7 @@ from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.drafting.draft import drafted_part
 from twin.diagnosis.next_run.next_experiment import Proposal
 from twin.diagnosis.next_run.settling import settling_run
-from twin.diagnosis.places.leftover import Leftover, leftover
+from twin.diagnosis.places.leftover import Leftover, instead, leftover
 from twin.diagnosis.places.where_when import Located, locate
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
@@ -93,20 +93,22 @@ def diagnose(
         final = settle(done.final) if done.accepted else done.final
         done = replace(done, final=final)
         tell("left out", 0, 0)
-        first = None if final is done.baseline else workers.beside(partial(_map_of, done.baseline, batches))
+        beside = None if final is done.baseline else workers.beside(partial(_located, done.baseline, batches))
         located = _located(final, batches, tell)
         left = leftover(done, batches, located) if isinstance(located, Located) else None
-        mapped = first() if first is not None else located.map if isinstance(located, Located) else located
-    if isinstance(mapped, str):
-        words.append(f"no map of where and when: {mapped}")
-    mapped_table = None if isinstance(mapped, str) else mapped
+        first = located if beside is None else beside()
+        if _physics(done) and isinstance(first, Located):
+            done, left = instead(done, left, batches, first) or (done, left)
+    if isinstance(first, str):
+        words.append(f"no map of where and when: {first}")
+    mapped = first.map if isinstance(first, Located) else None
     return _diagnosis(
         machine,
         part,
         recordings,
         done,
         stages(done),
-        mapped_table,
+        mapped,
         left,
         tuple(words),
         drafted,
@@ -128,9 +130,9 @@ def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = N
         return str(error)
 
 
-def _map_of(fitted: Fitted, batches: Sequence[Batch]) -> pd.DataFrame | str:
-    located = _located(fitted, batches)
-    return located if isinstance(located, str) else located.map
+def _physics(done: Search) -> list[Round]:
+    """The rounds that found an effect, and not merely a network too coarse."""
+    return [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
 
 
 def _diagnosis(
@@ -145,9 +147,9 @@ def _diagnosis(
     drafted: bool,
     seconds: float,
 ) -> Diagnosis:
-    final = left.fitted if left is not None and left.fitted is not None else done.final
+    final = left.fitted if left is not None else done.final
     before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
-    named = [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
+    named = _physics(done)
     fit = result(final.problem, replace(final.state, noise=final.noise), TOLERANCE, "")
     intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
     rms_table = made.rms_table(before, after, final)

@@ -1,4 +1,4 @@
-"""What no listed mechanism explains, as a regression over a driver and a temperature.
+"""What no listed mechanism explains, as a regression over one or two drivers and a temperature.
 
 A diagnosis writes these when nothing of the registry fits. They hold where they were fitted, and say nothing beyond.
 """
@@ -15,16 +15,17 @@ from twin.quantity import Spec
 
 REFERENCE_DEGC = 20.0  # ISO 1
 SECOND_ORDER = "Box and Wilson 1951, J. R. Stat. Soc. B 13, 1: second-order regression over what is known"
-ANY = {"level": "1"}
+ANY = {"level": "1", "other": "1"}
 
 
 class FreeFlux(Mechanism):
-    """Heat into a body; each coefficient is per unit of the driver in the unit that its channel has."""
+    """Heat into a body; each coefficient is per unit of its driver in the unit that the channel has."""
 
     key = "free_flux"
     words = "heat of no listed mechanism"
     equation = (
-        "P = constant + linear u + square u^2 + (per_K + product u) (T - 20 degC); u is 0 where no driver is named"
+        "P = constant + linear u + square u^2 + cross u v + (per_K + product u) (T - 20 degC); "
+        "u level, v other, 0 where not named"
     )
     source = SECOND_ORDER
     signature = "whatever the body's temperature lacks, as far as a driver and the temperature itself tell it"
@@ -35,19 +36,17 @@ class FreeFlux(Mechanism):
     ports = ("body",)
     parameters = (
         Spec("constant", "W", "heat at rest at 20 degC", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("linear", "W", "heat per unit of the driver", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("square", "W", "heat per unit of the driver squared", 0.0, 50.0, -1e6, 1e6, "linear"),
+        Spec("linear", "W", "heat per unit of the level", 0.0, 50.0, -1e6, 1e6, "linear"),
+        Spec("square", "W", "heat per unit of the level squared", 0.0, 50.0, -1e6, 1e6, "linear"),
+        Spec("cross", "W", "heat per unit of both drivers", 0.0, 50.0, -1e6, 1e6, "linear"),
         Spec("per_K", "W/K", "heat per kelvin of the body above 20 degC", 0.0, 2.0, -1e5, 1e5, "linear"),
-        Spec("product", "W/K", "heat per kelvin and unit of the driver", 0.0, 2.0, -1e5, 1e5, "linear"),
+        Spec("product", "W/K", "heat per kelvin and unit of the level", 0.0, 2.0, -1e5, 1e5, "linear"),
     )
     off: ClassVar[Mapping[str, float]] = {s.name: 0.0 for s in parameters}
     proposable = False  # it would explain anything
 
     def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
-        u, over_K = view.driver.get("level", 0.0), view.degC["body"] - REFERENCE_DEGC
-        return np.asarray(
-            p["constant"] + p["linear"] * u + p["square"] * u**2 + (p["per_K"] + p["product"] * u) * over_K
-        )
+        return np.asarray(p["constant"] + _second_order(view, p, view.degC["body"] - REFERENCE_DEGC))
 
 
 class FreeShift(Mechanism):
@@ -55,7 +54,9 @@ class FreeShift(Mechanism):
 
     key = "free_shift"
     words = "displacement of no listed mechanism"
-    equation = "error = linear u + square u^2 + (per_K + product u) θ_body; u is 0 where no driver is named"
+    equation = (
+        "error = linear u + square u^2 + cross u v + (per_K + product u) θ_body; u level, v other, 0 where not named"
+    )
     source = SECOND_ORDER
     signature = "whatever the error lacks beside the temperatures, as far as a driver and one body's rise tell it"
     acts_at = ("error",)
@@ -64,15 +65,20 @@ class FreeShift(Mechanism):
     any_unit: ClassVar[frozenset[str]] = frozenset(ANY)
     ports = ("body",)
     parameters = (
-        Spec("linear", "um", "displacement per unit of the driver", 0.0, 5.0, -1e5, 1e5, "linear"),
-        Spec("square", "um", "displacement per unit of the driver squared", 0.0, 5.0, -1e5, 1e5, "linear"),
+        Spec("linear", "um", "displacement per unit of the level", 0.0, 5.0, -1e5, 1e5, "linear"),
+        Spec("square", "um", "displacement per unit of the level squared", 0.0, 5.0, -1e5, 1e5, "linear"),
+        Spec("cross", "um", "displacement per unit of both drivers", 0.0, 5.0, -1e5, 1e5, "linear"),
         Spec("per_K", "um/K", "displacement per kelvin of the body's rise", 0.0, 2.0, -1e4, 1e4, "linear"),
-        Spec("product", "um/K", "displacement per kelvin and unit of the driver", 0.0, 2.0, -1e4, 1e4, "linear"),
+        Spec("product", "um/K", "displacement per kelvin and unit of the level", 0.0, 2.0, -1e4, 1e4, "linear"),
     )
     off: ClassVar[Mapping[str, float]] = {s.name: 0.0 for s in parameters}
     proposable = False  # it would explain anything
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "body"}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
-        u, rise_K = view.driver.get("level", 0.0), view.rise_K["body"]
-        return np.asarray(p["linear"] * u + p["square"] * u**2 + (p["per_K"] + p["product"] * u) * rise_K)
+        return np.asarray(_second_order(view, p, view.rise_K["body"]))
+
+
+def _second_order(view: View, p: Mapping[str, Array], over_K: Array) -> Array:
+    u, v = view.driver.get("level", 0.0), view.driver.get("other", 0.0)
+    return p["linear"] * u + p["square"] * u**2 + p["cross"] * u * v + (p["per_K"] + p["product"] * u) * over_K

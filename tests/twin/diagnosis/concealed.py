@@ -82,10 +82,11 @@ def chain(**changes: Any) -> Machine:
     return machine(CHAIN, **changes)
 
 
-def flux(body: str, driver: str | None = "coolant", **values: str) -> dict[str, Any]:
+def flux(body: str, driver: str | None = "coolant", other: str | None = None, **values: str) -> dict[str, Any]:
     """Heat into a body, of no listed mechanism."""
+    drivers = {role: name for role, name in (("level", driver), ("other", other)) if name}
     return {"flux": {"law": "free_flux", "into": body, "at": {"body": body}, "parameters": values,
-                     **({"drivers": {"level": driver}} if driver else {})}}  # fmt: skip
+                     **({"drivers": drivers} if drivers else {})}}  # fmt: skip
 
 
 def shift(error: str, body: str = "head", driver: str | None = "coolant", **values: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -118,6 +119,19 @@ def test_no_listed_mechanism_is_said_with_its_size() -> None:
         assert len(told) == 1 and "no listed mechanism" in told[0].statement
         product = told[0].parameters["product"]
         assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
+
+
+def test_what_listed_mechanisms_only_share_in_is_told_whole() -> None:
+    """By vacuum and speed together: a switched heat of the library takes over some of it."""
+    by_both = {
+        "law": "free_flux", "into": "head", "at": {"body": "head"}, "drivers": {"level": "rpm", "other": "vacuum"},
+        "parameters": {"cross": "0.03 W"},
+    }  # fmt: skip
+    done = diagnose(clamped("1"), clamped_runs({"own": by_both}, unit="1"))
+    (found,) = done.findings.findings
+    assert (done.findings.verdict, found.mechanism, found.where.name) == ("unlisted", "free_flux", "head")
+    assert found.parameters["cross"].value == pytest.approx(0.03, rel=0.1)
+    assert re.search(r"[1-9]\d W into the head \(it follows rpm vacuum\)", found.statement)
 
 
 def test_part_of_it_has_a_name_of_its_own() -> None:

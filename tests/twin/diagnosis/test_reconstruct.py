@@ -35,6 +35,8 @@ def size(part: MechanismPart | None, parameter: str) -> float:
          "W into column per K of column above 20 degC, in proportion to rpm (at 5000 rpm)"),
         (flux("saddle", "rpm", square="-4e-6 W"), "saddle", "square", -4e-6,
          "W out of saddle with the square of rpm (at 5000 rpm)"),
+        (flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", "cross", 0.012,
+         "W into bed in proportion to rpm (at 5000 rpm) while coolant is on"),
         (shift("z", linear="8 um"), "z", "linear", 8.0, "µm of z while coolant is on"),
         (shift("y", "column", "rpm", product="0.0005 um/K"), "y", "product", 0.0005,
          "µm of y per K of column's rise, in proportion to rpm (at 5000 rpm)"),
@@ -123,6 +125,16 @@ def test_left_out_score_is_the_predictive_density() -> None:
 
     for terms in ([1], [1, 4], [0, 1, 4]):
         assert scores.gain(terms) == pytest.approx(left_out(terms) - left_out([]), abs=1e-3)
+
+
+def test_what_is_exchanged_anyway_hides_nothing() -> None:
+    """A term that is large and always in does not use up the room for others, nor count as what they explain."""
+    scores, *_ = _toy(3, {1: 0.8, 4: -0.5, 6: 30.0})
+    others = [k for k in range(8) if k != 6]
+    assert scores.chosen(range(8), most=1) == [6]
+    assert sorted(scores.chosen(others, beside=[6])) == [1, 4]
+    assert scores.explained([1, 4], [6])[0] > 0.8 > scores.explained([0, 2], [6])[0]
+    assert scores.gain([6]) > 20.0 * (scores.gain([1, 4, 6]) - scores.gain([6])) > 0.0
 
 
 def test_terms_that_are_there_and_no_others() -> None:

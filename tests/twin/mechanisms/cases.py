@@ -142,7 +142,8 @@ def _charge_strain(q: SimpleNamespace) -> Any:
 
 
 def _free(q: SimpleNamespace, over: Any) -> Any:
-    return q.linear * q.level + q.square * q.level**2 + (q.per_K + q.product * q.level) * over
+    by_driver = q.linear * q.level + q.square * q.level**2 + q.cross * q.level * q.other
+    return by_driver + (q.per_K + q.product * q.level) * over
 
 
 def _friction(q: SimpleNamespace) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,8 @@ def free_shift(m: Mechanism) -> None:
     view = View(rise_K={"body": np.array([0.0, 4.0, 4.0])}, driver={"level": np.array([2.0, 2.0, 0.0])})
     told = usual(m, linear=1.5, square=-0.5, per_K=2.0, product=0.25)
     assert m.displacement(view, told).tolist() == [1.0, 11.0, 8.0]
+    beside = replace(view, driver={**view.driver, "other": np.array([0.0, 1.0, 1.0])})
+    assert m.displacement(beside, usual(m, cross=3.0)).tolist() == [0.0, 6.0, 0.0]
 
 
 def charge_strain(m: Mechanism) -> None:

@@ -68,37 +68,38 @@ class LeftOutTerms:
         """That of one set."""
         return float(self.gains(np.array([terms], np.int64))[0]) if len(terms) else 0.0
 
-    def chosen(self, allowed: Sequence[int], most: int = MOST) -> list[int]:
+    def chosen(self, allowed: Sequence[int], most: int = MOST, beside: Sequence[int] = ()) -> list[int]:
         """The best terms while every further one gains enough: one, the best pair, then what goes best with those.
 
-        All pairs are tried, since a difference of two temperatures shows in neither alone.
+        All pairs are tried, since a difference of two temperatures shows in neither alone. `beside` are in all along
+        and not among what is returned.
         """
         terms: list[int] = []
-        gain = 0.0
+        gain, without = 0.0, self.gain(beside)
         trial: list[int] = []
         for size in range(1, min(most, len(allowed)) + 1):
-            trial = self._pair(allowed) if size == 2 else self._extended(trial, allowed)
-            reached = self.gain(trial)
+            trial = self._pair(allowed, beside) if size == 2 else self._extended(trial, allowed, beside)
+            reached = self.gain([*beside, *trial]) - without
             if reached >= gain + (size - len(terms)) * max(LEAST, SHARE * gain):
                 terms, gain = trial, reached
         return terms
 
-    def _pair(self, allowed: Sequence[int]) -> list[int]:
-        sets = np.array(list(combinations(allowed, 2)), np.int64)
-        return [int(q) for q in sets[self.gains(sets).argmax()]]
+    def _pair(self, allowed: Sequence[int], beside: Sequence[int]) -> list[int]:
+        pairs = list(combinations(allowed, 2))
+        return list(pairs[int(self.gains(np.array([[*beside, *pair] for pair in pairs], np.int64)).argmax())])
 
-    def _extended(self, terms: Sequence[int], allowed: Sequence[int]) -> list[int]:
+    def _extended(self, terms: Sequence[int], allowed: Sequence[int], beside: Sequence[int]) -> list[int]:
         """With one more term, then each exchanged for a better one; the earlier of equals."""
-        out = self._best([*terms, -1], len(terms), allowed)
+        out = self._best([*terms, -1], len(terms), allowed, beside)
         for k in range(len(out) - 1):
-            out = self._best(out, k, allowed)
+            out = self._best(out, k, allowed, beside)
         return out
 
-    def _best(self, terms: Sequence[int], k: int, allowed: Sequence[int]) -> list[int]:
+    def _best(self, terms: Sequence[int], k: int, allowed: Sequence[int], beside: Sequence[int]) -> list[int]:
         """The terms with the k-th exchanged for the best."""
         others = [*terms[:k], *terms[k + 1 :]]
         free = [q for q in allowed if q not in others]
-        best = free[int(self.gains(np.array([[*others, q] for q in free], np.int64)).argmax())]
+        best = free[int(self.gains(np.array([[*beside, *others, q] for q in free], np.int64)).argmax())]
         return [*terms[:k], best, *terms[k + 1 :]]
 
     def coefficients(self, terms: Sequence[int]) -> tuple[Array, Array]:
@@ -108,9 +109,12 @@ class LeftOutTerms:
         covariance = np.linalg.inv(own[0][at[:, None], at] + np.diag(self._flat[at]))
         return covariance @ pull[0, at], covariance
 
-    def explained(self, terms: Sequence[int]) -> tuple[float, int]:
-        """Share of the left-out misfit beyond noise that the terms explain, and in how many batches it falls."""
-        before, after = self._squares([]), self._squares(terms)
+    def explained(self, terms: Sequence[int], beside: Sequence[int] = ()) -> tuple[float, int]:
+        """Share of the left-out misfit beyond noise that the terms explain, and in how many batches it falls.
+
+        `beside` are in all along.
+        """
+        before, after = self._squares(beside), self._squares([*beside, *terms])
         noise = float(self.rows.sum())
         misfit = max(float(before.sum()) - noise, 1e-9)
         share = (before.sum() - max(float(after.sum()), noise)) / misfit

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.refits import improved
 from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search
+from twin.diagnosis.scoring.memory import whiter
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.found import Found as Told
 from twin.diagnosis.telling.found import Rms, place_words
@@ -24,19 +26,20 @@ from twin.diagnosis.telling.honest_digits import Estimate, listed
 from twin.schema import TwinPart
 
 UNLISTED_SHARE = 0.3  # of the left-out misfit that terms must explain
+LEADS = 1.25  # times the gain of all listed effects: what no list has is claimed in their place only beyond it
 
 
 @dataclass(frozen=True)
 class Leftover:
-    """An effect of no listed mechanism: its place and series, what it follows, and the network with it, if it can be
-    stated; `gain` in nats on batches left out, against `threshold`."""
+    """An effect of no listed mechanism: its place and series, what it follows, and the network with it; `gain` in nats
+    on batches left out, against `threshold`."""
 
     located: Located
     place: Found
     terms: Reconstruction
     gain: float
     threshold: float
-    fitted: Fitted | None
+    fitted: Fitted
 
     @property
     def flux(self) -> pd.DataFrame:
@@ -52,22 +55,16 @@ class Leftover:
         """As a finding: the words "no listed mechanism", the regression, the watts."""
         heat = self.terms.kind == "heat"
         where = Where("node" if heat else "error", self.terms.place)
-        own = {c.term.name: Estimate(c.value, c.unit, c.value - 1.64 * c.sd, c.value + 1.64 * c.sd)
-               for c in self.terms.terms}  # fmt: skip
-        if self.fitted is not None:
-            head = f"mechanisms.{self.name}."
-            stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
-            own = {n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()} or own
-        series = self.place.series.mean
-        mean = float(np.sqrt(np.mean(series**2)))
+        head = f"mechanisms.{self.name}."
+        stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
         windows = tuple(self.located.windows(self.place))
         return Told(
             mechanism="free_flux" if heat else "free_shift",
             where=where,
             place=place_words(where, part),
-            parameters=own,
+            parameters={n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()},
             probability=min(0.95, self.terms.improved / self.terms.batches),
-            name=self.name if self.fitted is not None else "",
+            name=self.name,
             beside=f"it follows {listed([c.term.name for c in self.terms.terms])}",
             regime="at times" if windows else "always",
             windows=windows,
@@ -81,7 +78,7 @@ class Leftover:
                 "explained_share": self.terms.explained,
                 "follows": self.terms.words,
             },
-            size=None if self.fitted is not None else Estimate(mean, self.place.unit),
+            size=Estimate(float(np.sqrt(np.mean(self.place.series.mean**2))), self.place.unit),
         )
 
 
@@ -109,6 +106,26 @@ def leftover(done: Search, batches: Sequence[Batch], located: Located) -> Leftov
         if gain > threshold and better >= IMPROVED * len(batches):
             return Leftover(located, place, terms, gain, threshold, fitted)
     return None
+
+
+def instead(
+    done: Search, left: Leftover | None, batches: Sequence[Batch], first: Located
+) -> tuple[Search, Leftover] | None:
+    """One effect of no listed mechanism in place of all that was accepted, and the search without that; None where it
+    does not predict batches left out by far better, or as well as it and they together do.
+
+    A listed mechanism may take over a part of what it is not; only the search's baseline, which `first` is of, shows it
+    whole.
+    """
+    bare = replace(done, final=done.baseline, rounds=(replace(done.rounds[0], accepted=False),), dropped=())
+    own = leftover(bare, batches, first)
+    if own is None:
+        return None
+    both = done.final if left is None else left.fitted
+    memory = reduce(whiter, (f.memory for f in (done.baseline, both, own.fitted)))
+    nothing, listed, alone_ = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
+    needed = nothing + LEADS * (listed - nothing) if left is None else listed - LEAST
+    return (bare, own) if alone_ > needed else None
 
 
 def _threshold(last: Round, place: str, density: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,10 @@ class PlaceSearch:
     bases: tuple[Basis, ...]
     noise: Noise
     _known: dict[tuple[Held, ...], tuple[FreeSeries, ...]] = field(default_factory=dict, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is long and quickly worked out anew."""
+        return {"fitted": self.fitted, "bases": self.bases, "noise": self.noise, "_known": {}}
 
     @cached_property
     def grams(self) -> Array:

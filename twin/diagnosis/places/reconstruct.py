@@ -1,13 +1,16 @@
 """Not in the library: what a missing heat or displacement follows, as a few terms over drivers, states and products.
 
 The terms compete in the recordings themselves and not in the reconstructed series: each becomes heat at the place, its
-forced response, rows of every channel, and is scored on batches left out.
+forced response, rows of every channel, and is scored on batches left out. Heat that bodies exchange in proportion to
+their difference is a coarse network's matter: where it shows it is free, and what else the heat follows is sought
+beside it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +45,8 @@ class Coefficient:
 class Reconstruction:
     """What an unlisted effect follows. `gain` in nats of left-out log score over leaving it out.
 
-    `explained` is the share of the left-out misfit beyond noise that the terms explain, `improved` of `batches` fall.
+    `explained` is the share of the left-out misfit beyond noise that the terms explain, `improved` of `batches` fall;
+    both beside what is exchanged, where that shows.
     `part` states the effect as a mechanism of law free_flux or free_shift, where `part_gain` is nearly as good.
     """
 
@@ -79,14 +83,16 @@ def reconstruct(
     heat = found.kind == "heat"
     terms, rows = (_heat if heat else _shift)(located, found, batches)
     scores = _scores(located, found, rows)
-    every = range(len(terms))
-    best = scores.chosen(every, most)
-    gain = scores.gain(best)
-    stated, stated_gain = _stated(scores, terms, most)
+    best = scores.chosen(range(len(terms)), most)
+    exchange = [k for k in best if terms[k].exchange]
+    if exchange:
+        best = scores.chosen([k for k, t in enumerate(terms) if not t.exchange], most, exchange)
+    gain = scores.gain([*exchange, *best]) - scores.gain(exchange)
+    stated, stated_gain = _stated(scores, terms, most, exchange)
     if best and set(best) != set(stated) and stated_gain >= AS_GOOD * gain:
         best, gain = stated, stated_gain
-    share, improved = scores.explained(best)
-    told_by = _coefficients(scores, terms, best, found)
+    share, improved = scores.explained(best, exchange)
+    told_by = _coefficients(scores, terms, best, exchange, found)
     part = _part(located, found, told_by) if best and set(best) == set(stated) else None
     return Reconstruction(found.kind, found.place, told_by, gain, share, improved, len(batches), part, stated_gain)
 
@@ -134,30 +140,31 @@ def _scores(located: Located, found: Found, rows: Sequence[Array]) -> LeftOutTer
     return LeftOutTerms(np.stack(grams), fitted.z, np.array(expected))
 
 
-def _stated(scores: LeftOutTerms, terms: Sequence[Term], most: int) -> tuple[list[int], float]:
-    """The best terms that one mechanism can state: of one driver and one body."""
+def _stated(scores: LeftOutTerms, terms: Sequence[Term], most: int, beside: Sequence[int]) -> tuple[list[int], float]:
+    """The best terms that one mechanism can state, and their gain: of a driver, a second one with it, and one body."""
     best: list[int] = []
-    gain = 0.0
-    drivers = dict.fromkeys(t.driver for t in terms if t.role and t.driver) or {"": None}
-    bodies = dict.fromkeys(t.body for t in terms if t.role and t.body) or {"": None}
-    for driver in drivers:
-        for body in bodies:
-            allowed = [
-                k for k, t in enumerate(terms) if t.role and t.driver in ("", driver) and t.body in ("", body)
-            ]  # fmt: skip
-            chosen = scores.chosen(allowed, most)
-            reached = scores.gain(chosen)
-            if reached > gain:
-                best, gain = chosen, reached
+    gain, without = 0.0, scores.gain(beside)
+    stated = {k: t for k, t in enumerate(terms) if t.role}
+    drivers = dict.fromkeys((t.driver, t.other) for t in stated.values())
+    bodies = dict.fromkeys(t.body for t in stated.values())
+    for (driver, other), body in product(drivers, bodies):
+        allowed = [
+            k for k, t in stated.items()
+            if t.driver in ("", driver) and t.other in ("", other) and t.body in ("", body)
+        ]  # fmt: skip
+        chosen = scores.chosen(allowed, most, beside)
+        reached = scores.gain([*beside, *chosen]) - without
+        if reached > gain:
+            best, gain = chosen, reached
     return best, gain
 
 
 def _coefficients(
-    scores: LeftOutTerms, terms: Sequence[Term], chosen: Sequence[int], found: Found
+    scores: LeftOutTerms, terms: Sequence[Term], chosen: Sequence[int], beside: Sequence[int], found: Found
 ) -> tuple[Coefficient, ...]:
-    values, covariance = scores.coefficients(chosen)
+    values, covariance = scores.coefficients([*chosen, *beside])
     out = []
-    for k, value, sd in zip(chosen, values, np.sqrt(np.diagonal(covariance)), strict=True):
+    for k, value, sd in zip(chosen, values, np.sqrt(np.diagonal(covariance)), strict=False):
         unit = terms[k].unit(found.unit)
         words = told(terms[k], float(value), found.unit, found.place, found.kind == "heat")
         out.append(Coefficient(terms[k], float(value), float(sd), unit, words))
@@ -174,6 +181,7 @@ def _part(located: Located, found: Found, coefficients: Sequence[Coefficient]) -
         value, spread = c.value / top, max(c.sd, 0.3 * abs(c.value)) / top
         parameters[c.term.role] = Value(value=f"{value:.6g} {unit}", spread=f"{spread:.3g} {unit}")
     driver = next((c.term.driver for c in coefficients if c.term.driver), None)
+    other = next((c.term.other for c in coefficients if c.term.other), None)
     some_body = found.place if heat else next(iter(located.point.problem.network.bodies))
     body = next((c.term.body for c in coefficients if c.term.body), some_body)
     return MechanismPart(
@@ -181,7 +189,7 @@ def _part(located: Located, found: Found, coefficients: Sequence[Coefficient]) -
         at={"body": body},
         into=found.place if heat else None,
         acts_on=None if heat else found.place,
-        drivers={"level": driver} if driver else None,
+        drivers={role: name for role, name in (("level", driver), ("other", other)) if name} or None,
         parameters=parameters,
         words=listed([c.words for c in coefficients]),
     )

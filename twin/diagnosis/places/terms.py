@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ class Term:
     """One term: its series and how it is read. The coefficient is in `unit` per unit of the series.
 
     `role` is the parameter of `free_flux` or `free_shift` that states it, empty where none does; `driver` what it
-    follows and `body` whose temperature.
+    follows, `other` a second driver beside it, and `body` whose temperature. `exchange`: heat that flows between
+    places as ever, which a network's own conductances may have too large or too small.
     """
 
     name: str
@@ -33,7 +35,9 @@ class Term:
     role: str = ""
     driver: str = ""
     body: str = ""
-    top: float = 1.0  # of the driver, by which its series is divided
+    top: float = 1.0  # of the driver, or of both, by which its series is divided
+    other: str = ""
+    exchange: bool = False
 
     def unit(self, of: str) -> str:
         return f"{of}/{self.per}" if self.per else of
@@ -101,11 +105,12 @@ def heat_terms(body: str, neighbours: Sequence[str], states: States) -> list[Ter
     )  # fmt: skip
     leads = [above]
     for room, degC in states.rooms.items():
-        leads.append(Term(f"T_{body} - T_{room}", f"per K of {body} above {room}", own - degC, "K"))
+        leads.append(Term(f"T_{body} - T_{room}", f"per K of {body} above {room}", own - degC, "K", exchange=True))
         out.append(Term(f"T_{room} - {REFERENCE_DEGC:g}", f"per K of {room} above {REFERENCE_DEGC:g} degC",
                         degC - REFERENCE_DEGC, "K"))  # fmt: skip
     for n in neighbours:
-        leads.append(Term(f"T_{n} - T_{body}", f"per K of {n} above {body}", states.bodies[n] - own, "K"))
+        lead = Term(f"T_{n} - T_{body}", f"per K of {n} above {body}", states.bodies[n] - own, "K", exchange=True)
+        leads.append(lead)
     out += leads
     for lead in leads:
         out += _products(lead, states.drivers)
@@ -126,22 +131,39 @@ def _driven(drivers: Sequence[Level]) -> list[Term]:
     for d in drivers:
         u = d.series / d.top
         if d.switched:
-            out.append(Term(d.name, f"while {d.name} is on", u, role="linear", driver=d.name, top=d.top))
+            out.append(Term(d.name, _following(d), u, role="linear", driver=d.name, top=d.top))
             continue
-        out.append(Term(d.name, f"in proportion to {d.words}", u, role="linear", driver=d.name, top=d.top))
+        out.append(Term(d.name, _following(d), u, role="linear", driver=d.name, top=d.top))
         out.append(Term(f"{d.name}^2", f"with the square of {d.words}", u**2, role="square", driver=d.name, top=d.top))
         out.append(Term(f"sqrt|{d.name}|", f"with the root of {d.words}", np.sqrt(np.abs(u)), driver=d.name))
         out.append(Term(f"{d.name} on", f"while {d.name} is on", (u != 0).astype(float), driver=d.name))
+    for one, other in combinations(sorted(drivers, key=lambda d: d.switched), 2):
+        tail = f"{_following(one)}{' and' if one.switched == other.switched else ''} {_following(other)}"
+        both = one.series / one.top * (other.series / other.top)
+        out.append(
+            Term(f"{one.name} {other.name}", tail, both, role="cross", driver=one.name, top=one.top * other.top,
+                 other=other.name)
+        )  # fmt: skip
     return out
+
+
+def _following(d: Level) -> str:
+    return f"while {d.name} is on" if d.switched else f"in proportion to {d.words}"
 
 
 def _products(lead: Term, drivers: Sequence[Level]) -> Iterator[Term]:
     role = "product" if lead.role == "per_K" else ""
     for d in drivers:
         u = d.series / d.top
-        tail = f"while {d.name} is on" if d.switched else f"in proportion to {d.words}"
         yield Term(
-            f"{d.name} ({lead.name})", f"{lead.tail}, {tail}", u * lead.series, "K", role, d.name, lead.body, d.top
+            f"{d.name} ({lead.name})",
+            f"{lead.tail}, {_following(d)}",
+            u * lead.series,
+            "K",
+            role,
+            d.name,
+            lead.body,
+            d.top,
         )
         if not d.switched:
             on = (u != 0).astype(float)

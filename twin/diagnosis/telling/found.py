@@ -52,8 +52,9 @@ class Found:
     `mechanism` is a registry key or a rival's, `place` and `beside` come from `place_words` and `beside_words`. For a
     wrong parameter `parameters` are by path ("exposures.front-air.conductance") and `was` has the file's values; for
     what varies between runs the one estimate is its sd, as a share where the unit is 1. `size` is what sentences call
-    the effect's size where no parameter is (mean watts of a `free_flux`). `separates`: the run that would tell the
-    alternatives apart ("a night switched off"), `caps`: what keeps the probability from being higher ("3 runs only").
+    the effect's size where no parameter is (root mean square watts of a `free_flux`). `separates`: the run that would
+    tell the alternatives apart ("a night switched off"), `caps`: what keeps the probability from being higher ("3 runs
+    only").
     """
 
     mechanism: str
