@@ -123,9 +123,9 @@ def instead(
         return None
     both = done.final if left is None else left.fitted
     memory = reduce(whiter, (f.memory for f in (done.baseline, both, own.fitted)))
-    nothing, listed, alone_ = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
-    needed = nothing + LEADS * (listed - nothing) if left is None else listed - LEAST
-    return (bare, own) if alone_ > needed else None
+    none, them, it = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
+    needed = none + LEADS * (them - none) if left is None else them - LEAST
+    return (bare, own) if it > needed else None
 
 
 def _threshold(last: Round, place: str, density: float) -> float:
