@@ -130,10 +130,9 @@ def _driven(drivers: Sequence[Level]) -> list[Term]:
     out = []
     for d in drivers:
         u = d.series / d.top
-        if d.switched:
-            out.append(Term(d.name, _following(d), u, role="linear", driver=d.name, top=d.top))
-            continue
         out.append(Term(d.name, _following(d), u, role="linear", driver=d.name, top=d.top))
+        if d.switched:
+            continue
         out.append(Term(f"{d.name}^2", f"with the square of {d.words}", u**2, role="square", driver=d.name, top=d.top))
         out.append(Term(f"sqrt|{d.name}|", f"with the root of {d.words}", np.sqrt(np.abs(u)), driver=d.name))
         out.append(Term(f"{d.name} on", f"while {d.name} is on", (u != 0).astype(float), driver=d.name))
@@ -155,16 +154,8 @@ def _products(lead: Term, drivers: Sequence[Level]) -> Iterator[Term]:
     role = "product" if lead.role == "per_K" else ""
     for d in drivers:
         u = d.series / d.top
-        yield Term(
-            f"{d.name} ({lead.name})",
-            f"{lead.tail}, {_following(d)}",
-            u * lead.series,
-            "K",
-            role,
-            d.name,
-            lead.body,
-            d.top,
-        )
+        yield Term(f"{d.name} ({lead.name})", f"{lead.tail}, {_following(d)}", u * lead.series, "K", role,
+                   driver=d.name, body=lead.body, top=d.top)  # fmt: skip
         if not d.switched:
             on = (u != 0).astype(float)
             yield Term(f"({d.name} on) ({lead.name})", f"{lead.tail}, while {d.name} is on", on * lead.series, "K",

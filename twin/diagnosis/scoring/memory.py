@@ -111,12 +111,13 @@ def _likelihoods(rows: Array, there: NDArray[np.bool_], w: Array, keep: Array) -
     theta, variance = _moving_average(w, keep)
     squares, n = np.zeros((len(w), rows.shape[1])), there.sum(axis=(0, 2))
     now = np.zeros((len(w), *rows.shape[1:]))
+    phi, back, sd = (v[:, None, None] for v in (keep, theta, np.sqrt(variance)))
     for t, (row, known) in enumerate(zip(rows, there, strict=True)):
         if t == 0:
             now += row
         else:
-            now *= theta[:, None, None]
-            now += (row - keep[:, None, None] * rows[t - 1]) / np.sqrt(variance)[:, None, None]
+            now *= back
+            now += (row - phi * rows[t - 1]) / sd
         squares += np.einsum("gkb,gkb,kb->gk", now, now, known)
     mean = squares / np.maximum(n, 1)
     scale = np.maximum(mean, (QUIET / (1.0 - w))[:, None])
