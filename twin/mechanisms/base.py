@@ -81,6 +81,8 @@ class Mechanism(ABC):
     all_air: ClassVar[bool] = False  # True: it may act on all surroundings of one recorded channel together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
     far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one explains
+    of_network: ClassVar[bool] = False  # True: what it says is how the network is drawn, which no real body is
+    goes_with: ClassVar[tuple[str, ...]] = ()  # laws of which one is at its place, wherever there is such a machine
     only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 

@@ -60,6 +60,7 @@ class BearingLoad(Mechanism):
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
     )
     signature = "rise proportional to speed"
+    goes_with = ("bearing_viscous",)  # Palmgren 1959: M = M0 + M1, no bearing has one part alone
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (

@@ -20,6 +20,7 @@ class HeatBridge(Mechanism):
 
     key = "heat_bridge"
     far_apart = True
+    of_network = True
     words = "heat path between two bodies"
     equation = "P = conductance (T_other - T_body)"
     source = "Fourier 1822; Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, sec. 3.1, 1 to 50 W/K"

@@ -18,6 +18,7 @@ class JointConductance(Mechanism):
     """
 
     key = "joint_conductance"
+    of_network = True
     only_driven = True
     words = "joint that conducts better or worse than assumed"
     equation = "G = G0 ratio^closed; closed is 1 where no driver is named"

@@ -7,7 +7,7 @@ import pytest
 
 from tests.twin.diagnosis.small_cases import consistent, fitted, four_bodies, runs
 from twin.diagnosis.rounds.refits import refit
-from twin.diagnosis.scoring.finite import suspects
+from twin.diagnosis.scoring.exchanged import suspects
 from twin.diagnosis.scoring.screen import Scored, proposed
 
 PAIRS = [("t_spindle", "t_head"), ("t_head", "t_bed")]

@@ -13,9 +13,11 @@ from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value, convert
+from twin.schema import TwinPart
 
 WIDE = 1.5  # least spread of an amplitude's logarithm: machines differ by more than their handbook values
 FREEDOM = 2.0  # nats of each parameter that shapes an effect beside its size
+ALONE = 3.0  # nats of a law whose companion is not at its place
 LEAST = 1e-3  # of the usual value: where a fit of a positive amplitude begins at the lowest
 
 
@@ -96,7 +98,8 @@ def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
 
 
 def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> float:
-    """Log density of an amplitude's size about the usual one, 0 at best; signed amplitudes by their usual spread.
+    """Log density of an effect's size about the usual one, 0 at best; signed amplitudes by their usual spread. Of
+    several amplitudes the likeliest: they are parts of one effect, and any may be none.
 
     Where `fitted` holds one that looks `like` this instead, the screen's amplitude grows as that one's did in its fit.
     What has more freedom costs more: a pump that always runs is a cabinet (a nat for each decade of a sample, Schwarz
@@ -107,8 +110,10 @@ def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> f
         return 0.0
     mechanism = MECHANISMS[c.mechanism]
     freedom = -FREEDOM * len(c.shape)
+    if fitted is not None and mechanism.goes_with and _alone(c, fitted.part):
+        freedom -= ALONE
     size = size_of(fitted) if fitted is not None else 1.0
-    out = 0.0
+    sizes: list[float] = []
     for amplitude, off in (mechanism.off or {}).items():
         spec = at_size(mechanism.spec(amplitude), size)
         value = off + s.amplitudes.get(amplitude, 0.0)
@@ -118,10 +123,19 @@ def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> f
         elif fitted is not None and like is not None:
             value = off + (value - off) * _grown(like, fitted)
         if spec.scale == "log" and spec.value and value > 0:
-            out = min(out, -0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
+            sizes.append(-0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
         elif spec.scale == "linear" and spec.spread:
-            out = min(out, -0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
-    return out + freedom
+            sizes.append(-0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
+    return max(sizes, default=0.0) + freedom
+
+
+def _alone(c: Candidate, part: TwinPart) -> bool:
+    """Whether a law stands where none is that goes with it."""
+    return not any(
+        given.law in MECHANISMS[c.mechanism].goes_with
+        and c.where.name in (given.into if isinstance(given.into, Mapping) else [given.into])
+        for given in part.mechanisms.values()
+    )
 
 
 def _grown(like: Scored, fitted: Fitted) -> float:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from data.errors import InputError, WorkError
 from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
@@ -13,10 +11,7 @@ from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.carried import carried_nuisances, carried_z, on_network
-from twin.diagnosis.scoring.filtered import square_sums
 from twin.schema import TwinPart
-
-SUSPECTS, PLAINLY = 2, 100.0  # pairs of sensors, and by what factor their mean squares together would fall
 
 
 def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
@@ -51,28 +46,6 @@ def difference(fitted: Fitted, part: TwinPart, before: Sequence[Array]) -> list[
     x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
     after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
     return [b - a for b, a in zip(before, after, strict=True)]
-
-
-def suspects(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
-    """Sensors that would fit better under each other's names where the machine file's own values are, the best first.
-
-    A fit bends all it can towards the wrong labels; before it, they are plainly wrong.
-    """
-    problem = fitted.problem
-    x = x_of(problem.unknowns, np.zeros(len(problem.unknowns)))
-    plain = problem.residuals(x, [np.zeros(q) for q in problem.nuisance_sizes])
-    square = _squares(fitted, plain)
-    out = []
-    for c in proposed:
-        if c.mechanism == "sensor_swap" and (change := _exchanged(fitted, c, plain)) is not None:
-            other = _squares(fitted, [r - d for r, d in zip(plain, change, strict=True)])
-            out.append((float(np.sum(np.log(square) - np.log(other))), c))
-    return [c for ratio, c in sorted(out, key=lambda q: -q[0]) if ratio > np.log(PLAINLY)][:SUSPECTS]
-
-
-def _squares(fitted: Fitted, rows: Sequence[Array]) -> Array:
-    """Mean squares (K,) of each channel, at least the given noise's."""
-    return np.asarray(np.maximum(square_sums(fitted.problem, rows) / np.maximum(fitted.rows, 1.0), 1.0))
 
 
 def _exchanged(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array] | None:
