@@ -122,6 +122,10 @@ class Mechanism(ABC):
         """Added to the start temperature of every place of `into`, K."""
         raise NotImplementedError
 
+    def at_work(self, view: View, p: Mapping[str, Array]) -> Array | None:
+        """How far it works, 0 to 1, where it states windows of its own; None: while its drivers run, or always."""
+        return None
+
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         """A structural mechanism's work: the twin part with its bodies, links, exposures or chain links added.
 

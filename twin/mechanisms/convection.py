@@ -117,14 +117,13 @@ class Draught(Mechanism):
     scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"start": tuple(0.5 * k for k in range(1, 13))}
 
     def factor(self, view: View, p: Mapping[str, Array]) -> Array:
-        return np.asarray(1.0 + (p["factor"] - 1.0) * self.open(view, p))
+        return np.asarray(1.0 + (p["factor"] - 1.0) * self.at_work(view, p))
 
     def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
-        return np.asarray(-p["drop"] * self.open(view, p))
+        return np.asarray(-p["drop"] * self.at_work(view, p))
 
-    @staticmethod
-    def open(view: View, p: Mapping[str, Array]) -> Array:
-        """How far, 0 to 1, at every time: the edges take one interval, or a fit could not move them."""
+    def at_work(self, view: View, p: Mapping[str, Array]) -> Array:
+        """How far it is open, 0 to 1, at every time: the edges take one interval, or a fit could not move them."""
         edge_s = np.fmax(steps_s(view), 1.0)  # where the step is not known, all but at once
         begin_s = 3600.0 * p["start"]
         end_s = begin_s + 60.0 * p["duration"]

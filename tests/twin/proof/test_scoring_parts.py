@@ -77,6 +77,8 @@ def test_overlap_is_the_intersection_over_the_union() -> None:
         ("speed_shift", {"shift": 8.0, "rated": 12000.0}, 2.0),
         ("rotating_convection", {"gain": 4.0, "rated": 6000.0}, 4.0),
         ("motor_loss", {"idle": 10.0, "linear": 60.0, "quadratic": 80.0, "rated": 12000.0}, 60.0),
+        ("draught", {"factor": 1.5, "drop": 3.0}, 4.5),
+        ("draught", {"drop": 4.0}, 4.0),  # at a room alone nothing is multiplied
         ("column_bending", {}, None),
         ("sensor_swap", {}, None),
         ("wrong_parameter", {"factor": 0.25}, None),

@@ -20,6 +20,7 @@ from twin.diagnosis.rounds.refits import improved
 from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search
 from twin.diagnosis.scoring.memory import whiter
 from twin.diagnosis.scoring.screen import alone
+from twin.diagnosis.telling.activity import FOLLOWING, by_watts
 from twin.diagnosis.telling.found import Found as Told
 from twin.diagnosis.telling.found import Rms, place_words
 from twin.diagnosis.telling.honest_digits import Estimate, listed
@@ -57,7 +58,10 @@ class Leftover:
         where = Where("node" if heat else "error", self.terms.place)
         head = f"mechanisms.{self.name}."
         stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
-        windows = tuple(self.located.windows(self.place))
+        regime, windows = by_watts(self.fitted, self.name, FOLLOWING)
+        if not heat:  # a displacement: where the map shows it
+            windows = tuple(self.located.windows(self.place))
+            regime = "at times" if windows else "always"
         return Told(
             mechanism="free_flux" if heat else "free_shift",
             where=where,
@@ -66,7 +70,7 @@ class Leftover:
             probability=min(0.95, self.terms.improved / self.terms.batches),
             name=self.name,
             beside=f"it follows {listed([c.term.name for c in self.terms.terms])}",
-            regime="at times" if windows else "always",
+            regime=regime,
             windows=windows,
             rms=tuple(rms),
             caps=caps,

@@ -43,10 +43,17 @@ class _Work:
 
 
 def second_thoughts(
-    final: Fitted, effects: list[Tried], rivals: list[list[Tried]], original: TwinPart, least: float, workers: Workers
+    final: Fitted,
+    effects: list[Tried],
+    rivals: list[list[Tried]],
+    original: TwinPart,
+    least: float,
+    temperature: float,
+    workers: Workers,
 ) -> Second | None:
     """The best change of the set of effects, or None: an effect dropped whose loss is below `least` nats, or a rival
-    in its place that gains. Effects and rivals as the rounds tried them."""
+    in its place that gains more than it is less plausible, `temperature` nats for each of log prior. Effects and rivals
+    as the rounds tried them."""
     work = []
     for k, t in enumerate(effects):
         rest = without(final.part, t.candidate, original)
@@ -60,7 +67,11 @@ def second_thoughts(
     score = float(alone(final, final.memory).base_score()[0])
     done = [s for s in workers.map(partial(_changed, final, score), work) if s is not None]
     drops = [s for s in done if s.rival is None and s.loss < least]
-    swaps = [s for s in done if s.rival is not None and s.loss < -BETTER]
+    swaps = [
+        s
+        for s in done
+        if s.rival is not None and s.loss + temperature * (effects[s.effect].log_prior - s.rival.log_prior) < -BETTER
+    ]
     return min([*drops, *swaps], key=lambda s: s.loss, default=None)
 
 

@@ -130,7 +130,9 @@ def revised(done: Search, workers: Workers, tell: Progress) -> Search:
         tell("second thoughts", 0, 0)
         effects = [t for k in rounds if (t := done.rounds[k].best) is not None]
         rivals = [[t for t in done.rounds[k].tried[1:] if _rival(t, e)] for k, e in zip(rounds, effects, strict=True)]
-        change = second_thoughts(done.final, effects, rivals, done.baseline.part, LEAST, workers)
+        change = second_thoughts(
+            done.final, effects, rivals, done.baseline.part, LEAST, done.rounds[0].null.temperature, workers
+        )
         if change is None:
             return done
         at = rounds[change.effect]
@@ -228,7 +230,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     if best.candidate.mechanism == "coarse_network":
         structure = 0.0  # what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    threshold = max(structure, flipped_threshold(flipped, n, which), least_of(best, n))
+    least = least_of(best, n if agreed else best.improved)
+    threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)

@@ -2,37 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from twin.compiling.scope import several
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
+from twin.mechanisms import MECHANISMS
+from twin.mechanisms.base import View
+from twin.schema import MechanismPart, TwinPart
 from twin.simulation import simulate
 
 AT_WORK = 0.1  # of the largest watts
+FOLLOWING = 0.02  # the same of what follows drivers whatever they are: a motor that idles drives it too
 ALWAYS = 0.95  # of the time
 
 Windows = tuple[tuple[str, float, float], ...]
 
 
 def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
-    """The regime ("spindle_rpm > 0", "always", "at times") and windows (batch, start s, end s), none where always."""
-    drivers = c.part.drivers if c.part is not None else None
-    channels = [drivers] if isinstance(drivers, str) else list((drivers or {}).values())
-    switched = [n for n in channels if fitted.batches[0].channels[n].role == "driver"]
-    if switched:
-        on = {b.batch_id: b.values(switched[0]) != 0 for b in fitted.batches}
-        times = {b.batch_id: b.time_s for b in fitted.batches}
-        return f"{switched[0]} > 0", _windows(on, times)
-    if c.part is None or not _has_heat(fitted, c.name):
+    """The regime ("spindle_rpm > 0", "always", "at times") and windows (batch, start s, end s), none where always.
+
+    By what the law itself says, else while its drivers run, those of the heat that it multiplies included, else by the
+    watts that it makes.
+    """
+    if c.part is None:
         return "always", ()
-    nuisance = fitted.state.nuisance
+    if (stated := _stated(fitted, c)) is not None:
+        return "at times", stated
+    roles = fitted.batches[0].channels
+    switched = [n for n in _drivers(c.part, fitted.part) if roles[n].role == "driver"]
+    if switched:
+        on = {b.batch_id: np.all([b.values(n) != 0 for n in switched], axis=0) for b in fitted.batches}
+        times = {b.batch_id: b.time_s for b in fitted.batches}
+        return " and ".join(f"{n} > 0" for n in switched), _windows(on, times)
+    return by_watts(fitted, c.name, AT_WORK)
+
+
+def by_watts(fitted: Fitted, name: str, share: float) -> tuple[str, Windows]:
+    """The same by a heat's size, where it is above a share of its largest; always, where it is none."""
+    if not any(h.law.name == name for h in fitted.problem.network.heats):
+        return "always", ()
     problem = fitted.problem
+    nuisance = fitted.state.nuisance
     start, offset = problem.own(nuisance)
     run = simulate(problem.network, fitted.values, problem.own_heat(nuisance), start, keep_cells=True, offsets_K=offset)
-    watts = np.abs(run.heat_W[c.name][0])
-    on_rows = (watts > AT_WORK * watts[run.valid].max(initial=0.0)) & run.valid
+    watts = np.abs(run.heat_W[name][0])
+    on_rows = (watts > share * watts[run.valid].max(initial=0.0)) & run.valid
     if on_rows[run.valid].mean() > ALWAYS:
         return "always", ()
     on = {b: on_rows[k, run.valid[k]] for k, b in enumerate(run.batch_ids)}
@@ -40,8 +57,29 @@ def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
     return "at times", _windows(on, times)
 
 
-def _has_heat(fitted: Fitted, name: str) -> bool:
-    return any(h.law.name == name for h in fitted.problem.network.heats)
+def _stated(fitted: Fitted, c: Candidate) -> Windows | None:
+    """The windows of a law that says itself when it works."""
+    if c.mechanism not in MECHANISMS:
+        return None
+    law, network = MECHANISMS[c.mechanism], fitted.problem.network
+    values = {p.name: v for p, v in zip(network.parameters, fitted.values, strict=True)}
+    own = {s.name: np.asarray(values.get(f"mechanisms.{c.name}.{s.name}", s.value)) for s in law.parameters}
+    on = {}
+    for b in fitted.batches:
+        at_work = law().at_work(View(time_s=b.time_s), own)
+        if at_work is None:
+            return None
+        on[b.batch_id] = at_work >= 0.5
+    return _windows(on, {b.batch_id: b.time_s for b in fitted.batches})
+
+
+def _drivers(given: MechanismPart, part: TwinPart) -> Sequence[str]:
+    """The channels that drive a law, or else the heats that it acts on."""
+    own = given.drivers
+    if own:
+        return [own] if isinstance(own, str) else list(own.values())
+    acted_on = [part.mechanisms[n] for n in several(given.acts_on) if n in part.mechanisms]
+    return list(dict.fromkeys(n for other in acted_on for n in _drivers(other, part)))
 
 
 def _windows(on: Mapping[str, np.ndarray], time_s: Mapping[str, np.ndarray]) -> Windows:

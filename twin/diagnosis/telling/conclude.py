@@ -28,6 +28,7 @@ STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in t
 # Times what structure leaves, beyond which something is left, whatever it is. Development plants that lacked nothing
 # left up to 3.5 times in filtered rows and up to 5 in plain ones; it is the map of what is left that tells less.
 REST = 8.0
+UNSEEN = 1.0 - 1e-9  # of a prior's spread: a parameter that does nothing at this place (no draught blows at a room)
 SURE = 0.7  # below it the best explanation does not stand by itself
 
 
@@ -59,7 +60,7 @@ def found_of(
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
     final = search.final
-    parameters, was = _parameters(final, best, intervals, done)
+    parameters, was = parameters_told(final, c, intervals, done.scatter)
     regime, windows = activity(final, c)
     given = c.part
     return Found(
@@ -105,11 +106,11 @@ def _other(e: Explanation, part: TwinPart) -> Other:
     return Other(c.mechanism, c.where, _place_of(c, part), e.probability, beside, e.alike)
 
 
-def _parameters(
-    final: Fitted, best: Explanation, intervals: Mapping[str, Interval], done: Round
+def parameters_told(
+    final: Fitted, c: Candidate, intervals: Mapping[str, Interval], scatter: float
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """Fitted values of what was found, in their units, and those that the machine file had."""
-    c = best.tried.candidate
+    """Fitted values of what was found, in their units, and those that the machine file had; `scatter` of the only
+    amplitude that structure alone makes, in its unit. What does nothing at the candidate's place is not told."""
     network = final.problem.network
     if c.change is not None:
         name = c.change.parameter.name
@@ -127,19 +128,19 @@ def _parameters(
     for spec in mechanism.parameters if mechanism else ():
         at = _network_name(final, c.name, spec.name, c.where.name)
         if at is not None and at in intervals:
-            out[spec.name] = _widened(intervals[at], spec, done)
+            if intervals[at].prior_shrinkage > UNSEEN:
+                continue
+            out[spec.name] = _widened(intervals[at], spec, scatter if list(c.amplitudes) == [spec.name] else 0.0)
         elif at is not None:
             p = network.parameters[network.index(at)]
             out[spec.name] = Estimate(p.value, p.unit)
     return out, {}
 
 
-def _widened(i: Interval, spec: Spec, done: Round) -> Estimate:
-    """The interval of an amplitude, as wide as structure that leaves as much scatters it."""
-    best = done.best
-    if best is None or list(best.candidate.amplitudes) != [spec.name]:  # several trade with each other
+def _widened(i: Interval, spec: Spec, more: float) -> Estimate:
+    """The interval of a parameter, as wide as structure scatters it by `more`."""
+    if not more:
         return Estimate(i.value, i.unit, i.low, i.high)
-    more = done.scatter
     if i.low > 0 and i.value > more:
         up = float(np.hypot(np.log(i.high / i.value), more / i.value))
         return Estimate(i.value, i.unit, i.value * float(np.exp(-up)), i.value * float(np.exp(up)))

@@ -49,13 +49,13 @@ PRODUCTS: Mapping[str, Callable[[Values], float]] = {
 
 
 def amplitude(mechanism: str, values: Values) -> float | None:
-    """The one number; None where these values do not tell it."""
+    """The one number; None where these values do not tell it. Of several amplitudes one that is not told is off."""
     if mechanism not in MECHANISMS:
         return None
     off = dict(MECHANISMS[mechanism].off or {})
     try:
         if mechanism in PRODUCTS:
-            return PRODUCTS[mechanism](values)
+            return PRODUCTS[mechanism]({**(off if off.keys() & values.keys() else {}), **values})
         first = next(iter(off))
         return values[first] - off[first]
     except (KeyError, StopIteration, ZeroDivisionError):
