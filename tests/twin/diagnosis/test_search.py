@@ -15,7 +15,8 @@ from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.diagnosis.proposals.slack import no_news
-from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search, one_round, search
+from twin.diagnosis.rounds.search import IMPROVED, Round, Search, one_round, search
+from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import proposed
 
@@ -71,7 +72,7 @@ def test_a_cold_floor_is_found_with_its_size() -> None:
 def test_what_is_accepted_clears_every_bar() -> None:
     for r in found("floor and shift").accepted:
         assert r.best is not None
-        assert r.best.gain > r.threshold >= LEAST
+        assert r.best.gain > r.threshold >= EVEN
         assert r.best.improved >= IMPROVED * COUNT
         assert r.threshold >= (r.beside or r.null).threshold(r.density, name=r.best.candidate.name)
         assert r.sign_p < 0.2

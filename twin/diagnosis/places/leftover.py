@@ -17,7 +17,8 @@ from twin.diagnosis.places.where_when import Found, Located
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.refits import improved
-from twin.diagnosis.rounds.search import IMPROVED, LEAST, Round, Search
+from twin.diagnosis.rounds.search import IMPROVED, Round, Search
+from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.scoring.memory import whiter
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.activity import FOLLOWING, by_watts
@@ -128,7 +129,7 @@ def instead(
     both = done.final if left is None else left.fitted
     memory = reduce(whiter, (f.memory for f in (done.baseline, both, own.fitted)))
     none, them, it = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
-    needed = none + LEADS * (them - none) if left is None else them - LEAST
+    needed = none + LEADS * (them - none) if left is None else them - EVEN
     return (bare, own) if it > needed else None
 
 
@@ -136,7 +137,7 @@ def _threshold(last: Round, place: str, density: float) -> float:
     """What the usual listed candidate at the same place would have to gain."""
     at = [s.candidate.name for s in last.screen.scored if s.candidate.where.name == place]
     own = [last.null.threshold(density, name=n) for n in at if n in last.null.names]
-    return max(float(np.median(own)) if own else last.threshold, LEAST)
+    return max(float(np.median(own)) if own else last.threshold, EVEN)
 
 
 def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, float, int] | None:

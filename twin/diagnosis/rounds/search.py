@@ -20,18 +20,13 @@ from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
 from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters, with_sharp
 from twin.diagnosis.rounds.revise import second_thoughts
+from twin.diagnosis.rounds.trust import EVEN, least_gain
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.exchanged import suspects
 from twin.diagnosis.scoring.memory import Memory
 from twin.diagnosis.scoring.screen import Scored, Screen, alone, best_variants, proposed, screens
-from twin.mechanisms import MECHANISMS
 
 MOST_EFFECTS = 4
-# Nats below which nothing is claimed. On development plants claims that were false gained 43 to 315, two in three of
-# them with batches that did not improve; of 33 that were true four gained less than 180 and four left such batches.
-LEAST = 90.0
-OF_NETWORK = 3.0  # times that of what says how the network is drawn: castings have no links
-LEAST_FINER = 40.0  # of a finer network, which claims no physics
 IN_DOUBT = 20.0  # nats of a refit from which a finer network might be why
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
@@ -131,7 +126,7 @@ def revised(done: Search, workers: Workers, tell: Progress) -> Search:
         effects = [t for k in rounds if (t := done.rounds[k].best) is not None]
         rivals = [[t for t in done.rounds[k].tried[1:] if _rival(t, e)] for k, e in zip(rounds, effects, strict=True)]
         change = second_thoughts(
-            done.final, effects, rivals, done.baseline.part, LEAST, done.rounds[0].null.temperature, workers
+            done.final, effects, rivals, done.baseline.part, EVEN, done.rounds[0].null.temperature, workers
         )
         if change is None:
             return done
@@ -216,7 +211,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     tried = coarse_first([*tried, *sorted(with_clusters(tried, worth, clusters, chosen), key=order)])
     if not tried or tried[0].fitted is None:
         name = tried[0].candidate.name if tried else ""
-        least = max(null.threshold(before, name=name), LEAST)
+        least = max(null.threshold(before, name=name), EVEN)
         return Round(now, seen, tuple(tried), least, null, np.zeros((0, 0)), False)
     n = len(now.batches)
     best = to_claim(tried, n)
@@ -224,13 +219,13 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
     agreed = agreed_on(best, n)
-    beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > LEAST else None
+    beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > EVEN else None
     own, density = (null, float(after.base_score()[0])) if beside is None else beside
     structure = own.threshold(density, name=best.candidate.name)
     if best.candidate.mechanism == "coarse_network":
         structure = 0.0  # what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    least = least_of(best, n if agreed else best.improved)
+    least = least_gain(best, n if agreed else best.improved)
     threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
@@ -268,18 +263,9 @@ def agreed_on(t: Tried, batches: int) -> bool:
 def to_claim(tried: Sequence[Tried], batches: int) -> Tried:
     """Of refits, best first, the first that improves most batches, stands out and gains enough; else the best."""
     for t in tried[:FINALISTS]:
-        if t.fitted is not None and agreed_on(t, batches) and t.gain > least_of(t, batches):
+        if t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t, batches):
             return t if t.gain > WORTH_A_CLAIM * tried[0].gain else tried[0]
     return tried[0]
-
-
-def least_of(t: Tried, batches: int) -> float:
-    """Nats below which a candidate is not accepted: the more, the more batches do not improve."""
-    if t.candidate.mechanism == "coarse_network":
-        return LEAST_FINER
-    law = t.candidate.mechanism
-    times = OF_NETWORK if law in MECHANISMS and MECHANISMS[law].of_network else 1.0
-    return LEAST * (times + batches - t.improved)
 
 
 def coarse_first(tried: list[Tried]) -> list[Tried]:

@@ -13,6 +13,7 @@ from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import AS_IT_IS
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure, told
 from twin.diagnosis.rounds.search import Round, Search
+from twin.diagnosis.rounds.trust import trust
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.scoring.unseen import unseen
 from twin.diagnosis.telling.activity import activity
@@ -60,6 +61,7 @@ def found_of(
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
     final = search.final
+    trusted = trust(best.tried, len(final.batches))
     parameters, was = parameters_told(final, c, intervals, done.scatter)
     regime, windows = activity(final, c)
     given = c.part
@@ -68,10 +70,10 @@ def found_of(
         where=c.where,
         place=_place_of(c, part),
         parameters=parameters,
-        probability=min(sum(e.probability for e in same), most_sure(final.runs)),
+        probability=trusted * min(sum(e.probability for e in same), most_sure(final.runs)),
         name=c.name if c.part is not None else "",
         beside=beside_words(given, c.where, part) if given is not None else "",
-        others=tuple(_other(e, part) for e in told([best, *rest])),
+        others=tuple(_other(e, part, trusted) for e in told([best, *rest])),
         regime=regime,
         windows=windows,
         rms=tuple(rms),
@@ -84,8 +86,8 @@ def found_of(
             "batches": len(final.batches),
             "sign_test_p": done.sign_p,
             "absorbed_share": best.tried.scored.absorbed,
-            "probability_nothing": nothing,
-            "probability_unlisted": unlisted,
+            "probability_nothing": 1.0 - trusted * (1.0 - nothing),
+            "probability_unlisted": trusted * unlisted,
             "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
             **unseen(done.before, best.tried.fitted or final),
         },
@@ -100,10 +102,10 @@ def _place_of(c: Candidate, part: TwinPart) -> str:
     return place_words(c.where, part)
 
 
-def _other(e: Explanation, part: TwinPart) -> Other:
+def _other(e: Explanation, part: TwinPart, trusted: float) -> Other:
     c = e.tried.candidate
     beside = beside_words(c.part, c.where, part) if c.part is not None else ""
-    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, beside, e.alike)
+    return Other(c.mechanism, c.where, _place_of(c, part), trusted * e.probability, beside, e.alike)
 
 
 def parameters_told(
@@ -124,14 +126,16 @@ def parameters_told(
             return {}, was
         return {name: Estimate(found.value, found.unit, found.low, found.high)}, was
     out: dict[str, Estimate] = {}
-    mechanism = MECHANISMS.get(c.mechanism) if c.mechanism in MECHANISMS else None
-    for spec in mechanism.parameters if mechanism else ():
-        at = _network_name(final, c.name, spec.name, c.where.name)
-        if at is not None and at in intervals:
-            if intervals[at].prior_shrinkage > UNSEEN:
-                continue
-            out[spec.name] = _widened(intervals[at], spec, scatter if list(c.amplitudes) == [spec.name] else 0.0)
-        elif at is not None:
+    specs = MECHANISMS[c.mechanism].parameters if c.mechanism in MECHANISMS else ()
+    places = {s: _network_name(final, c.name, s.name, c.where.name) for s in specs}
+    idle = {s for s, at in places.items() if at and at in intervals and intervals[at].prior_shrinkage > UNSEEN}
+    sizes = [s for s in specs if s.name in c.amplitudes and s not in idle]
+    for spec, at in places.items():
+        if at is None or spec in idle:
+            continue
+        if at in intervals:
+            out[spec.name] = _widened(intervals[at], spec, scatter if sizes == [spec] else 0.0)
+        else:
             p = network.parameters[network.index(at)]
             out[spec.name] = Estimate(p.value, p.unit)
     return out, {}

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import LEAST
+from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.telling.findings import Findings
 from twin.proof.rivals.answer import Claim, Reply
 from twin.proof.rivals.in_sample import in_sample_gains, in_sample_score
@@ -71,7 +71,7 @@ def in_sample(stage: Stage) -> Reply:
         for t, gain in zip(stage.refits, gains, strict=True)
     ]
     if not tried:
-        return stage.decided([], LEAST)
+        return stage.decided([], EVEN)
     best = stage.ranked(tried)[0]
     name = best.candidate.name
     return stage.decided(tried, stage.bar(null.threshold(before + best.gain, name=name), name))

@@ -12,7 +12,8 @@ from twin.diagnosis.rounds.acceptance import flipped_threshold
 from twin.diagnosis.rounds.null import structural_misfits
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import LEAST, Round, Search, agreed_on, coarse_first, to_claim
+from twin.diagnosis.rounds.search import Round, Search, agreed_on, coarse_first, to_claim
+from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.telling.conclude import REST, SURE, remainder
@@ -87,7 +88,7 @@ class Stage:
         """The threshold with another structural null."""
         names, flipped = self.round.null.names, self.round.flipped  # none where nothing was refitted
         which = names.index(name) if name in names else None
-        return max(null, flipped_threshold(flipped, len(self.round.before.batches), which), LEAST)
+        return max(null, flipped_threshold(flipped, len(self.round.before.batches), which), EVEN)
 
     def ranked(self, tried: Sequence[Tried]) -> list[Tried]:
         """By gain and what is plausible, a finer network first where it gains nearly as much."""
@@ -120,7 +121,7 @@ class Stage:
         first = ranked[0].candidate
         p = min(sum(e.probability for e in told if _same(e, first)), most_sure(self.round.before.runs))
         alike = tuple(e.tried.candidate for e in told if not _same(e, first) and e.probability >= WITHIN * p)
-        return Claim(first, p, alike), told
+        return Claim(first, p * trust(ranked[0], len(self.round.before.batches)), alike), told
 
     @staticmethod
     def ties(e: Explanation, claim: Claim) -> bool:
