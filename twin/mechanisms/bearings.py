@@ -32,6 +32,7 @@ class BearingViscous(Mechanism):
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
     )
     signature = "rise at the nose grows with speed as n^1.3 to n^1.7"
+    goes_with = ("bearing_load",)  # Palmgren 1959: M = M0 + M1, no bearing has one part alone
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (
@@ -60,7 +61,7 @@ class BearingLoad(Mechanism):
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
     )
     signature = "rise proportional to speed"
-    goes_with = ("bearing_viscous",)  # Palmgren 1959: M = M0 + M1, no bearing has one part alone
+    goes_with = ("bearing_viscous",)
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (

@@ -49,5 +49,9 @@ def test_so_does_what_says_how_a_network_or_a_lever_is_drawn() -> None:
     assert least_gain(tried("time_skew", 1.0, kind="error"), BATCHES) == EVEN  # and a clock's fault is no lever
 
 
+def test_exchanged_labels_must_be_plain() -> None:
+    assert least_gain(tried("sensor_swap", 1.0, kind="sensor"), BATCHES) > 280.0
+
+
 def test_a_finer_network_claims_nothing() -> None:
     assert least_gain(tried("coarse_network", 1.0, 9), BATCHES) == LEAST_FINER

@@ -20,7 +20,7 @@ from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
 from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters, with_sharp
 from twin.diagnosis.rounds.revise import second_thoughts
-from twin.diagnosis.rounds.trust import EVEN, least_gain
+from twin.diagnosis.rounds.trust import EVEN, LEAST_FINER, least_gain
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.exchanged import suspects
 from twin.diagnosis.scoring.memory import Memory
@@ -37,6 +37,7 @@ FINALISTS, HOPEFUL = 4, 0.25  # refits taken on to their optimum, if they gain t
 MEMBERS = 2  # that are refitted too: of those that look like a refit the likeliest
 CLOSE, ALIKE = 2.0, 0.15  # if they stand no further below the best, or one step in the screen made the difference
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
+APART = 0.4  # of a finer network's gain: what gains as much beside an effect is none of it, and comes first
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
@@ -215,6 +216,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         return Round(now, seen, tuple(tried), least, null, np.zeros((0, 0)), False)
     n = len(now.batches)
     best = to_claim(tried, n)
+    if best.gain > least_gain(best, n) and best.candidate.mechanism != "coarse_network":
+        best = _apart(now, best, tried, n) or best
     assert best.fitted is not None
     after = alone(best.fitted, now.memory)
     flipped = flipped_gains(seen.evidence, after, alarm, seed)
@@ -230,6 +233,22 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]
     return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+
+
+def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tried | None:
+    """A finer network that the best effect does not explain, taken on; None where there is none.
+
+    What heat or a lever really adds makes a network look too coarse, and with it in that is over; castings stay too
+    coarse whatever is added, and an effect is better judged where they are not.
+    """
+    finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.fitted is not None]
+    agreed = [t for t in finer if t.gain > LEAST_FINER and agreed_on(t, batches)]
+    for first in sorted(agreed, key=lambda t: -t.gain)[:2]:
+        assert best.fitted is not None
+        beside = refit(best.fitted, first.scored)
+        if beside is not None and beside.gain > max(APART * first.gain, LEAST_FINER):
+            return taken_on(now, first)
+    return None
 
 
 def _unscreened(c: Candidate) -> Scored:
