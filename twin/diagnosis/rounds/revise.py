@@ -5,6 +5,7 @@ Forward steps can name a substitute that a later effect makes needless (Efroymso
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -66,13 +67,18 @@ def second_thoughts(
                 continue
     score = float(alone(final, final.memory).base_score()[0])
     done = [s for s in workers.map(partial(_changed, final, score), work) if s is not None]
-    drops = [s for s in done if s.rival is None and s.loss < least]
-    swaps = [
-        s
-        for s in done
-        if s.rival is not None and s.loss + temperature * (effects[s.effect].log_prior - s.rival.log_prior) < -BETTER
-    ]
-    return min([*drops, *swaps], key=lambda s: s.loss, default=None)
+    return best_change(done, effects, least, temperature)
+
+
+def best_change(done: Sequence[Second], effects: Sequence[Tried], least: float, temperature: float) -> Second | None:
+    """Of changes that were fitted the one that costs least, if it may be made; as `second_thoughts`."""
+
+    def due(s: Second) -> bool:
+        if s.rival is None:
+            return s.loss < least
+        return s.loss + temperature * (effects[s.effect].log_prior - s.rival.log_prior) < -BETTER
+
+    return min((s for s in done if due(s)), key=lambda s: s.loss, default=None)
 
 
 def _changed(final: Fitted, score: float, w: _Work) -> Second | None:

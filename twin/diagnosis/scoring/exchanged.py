@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,13 @@ STEPS = 3  # of reweighting: what no step can fit counts less
 
 
 def suspects(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates whose two sensors would fit better under each other's names, the best first."""
+    """Candidates whose two sensors would fit better under each other's names, the best first.
+
+    Labels come before physics: none, where a fit holds an effect already that the machine file has not.
+    """
+    stated = (fitted.machine.twin or {}).get("mechanisms")
+    if stated is not None and set(fitted.part.mechanisms) - set(stated):
+        return []
     line = _Line.at(fitted)
     out = []
     for c in proposed:
@@ -86,13 +93,20 @@ class _Line:
         return cls(problem.measured, problem.noise, size, columns, residuals, numbers, plain)
 
     def gain(self, one: int, other: int) -> float:
-        """Nats by which two channels named the other way round fit better; both are compared at their common rows."""
+        """Nats by which two channels named the other way round fit better; both are compared at their common rows,
+        unless all rows as they are fit better anyway."""
         named, exchanged = [list(b) for b in self.plain], [list(b) for b in self.plain]
         for b, pieces in enumerate(self._common(one, other)):
             for k, columns, right, wrong in pieces:
                 named[b][k] = _Channel.of(columns, right)
                 exchanged[b][k] = _Channel.of(columns, wrong)
-        return self._cost(named) - self._cost(exchanged)
+        cost = self._cost(exchanged)
+        plain = self.cost_as_named - cost
+        return plain if plain < 0 else self._cost(named) - cost
+
+    @cached_property
+    def cost_as_named(self) -> float:
+        return self._cost(self.plain)
 
     def _common(self, one: int, other: int) -> Iterator[list[tuple[int, Array, Array, Array]]]:
         """Of every batch, for both channels: number, columns, and residuals as named and exchanged."""
