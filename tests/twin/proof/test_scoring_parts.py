@@ -88,6 +88,27 @@ def test_an_effect_has_one_size(mechanism: str, values: dict[str, float], expect
     assert amplitude(mechanism, values) == (None if expected is None else pytest.approx(expected))
 
 
+def test_a_size_is_never_taken_from_the_key() -> None:
+    """A key may state one as another parameter than the law does: watts of sunlight, by which no finding is right."""
+    own = key_term(mechanism="sun", parameters={"power": {"value": 90.0, "unit": "W"}})
+    irradiance = {"value": 100.0, "unit": "W/m**2", "interval90": [80.0, 125.0]}
+    told = {
+        "irradiance": irradiance,
+        "area": {"value": 1.0, "unit": "m**2"},
+        "absorptivity": {"value": 0.5, "unit": "1"},
+    }
+    given = findings("explained", finding("sun", parameters=told)).findings[0]
+    assert found_amplitude(given, own) == (pytest.approx(50.0), pytest.approx(40.0), pytest.approx(62.5))
+    speed = key_term(
+        mechanism="speed_shift",
+        parameters={"shift": {"value": 8.0, "unit": "um"}, "rated": {"value": 12000.0, "unit": "rpm"}},
+    )
+    shift = findings("explained", finding("speed_shift", parameters={"shift": {"value": 4.0, "unit": "um"}})).findings[
+        0
+    ]
+    assert found_amplitude(shift, speed)[0] == pytest.approx(1.0)  # at 6000 rpm, its rated speed the key's
+
+
 def test_a_product_takes_its_interval_from_the_amplitude() -> None:
     values = {"area": {"value": 2.0, "unit": "m**2"}, "emissivity": {"value": 0.9, "unit": "1"}}
     own = key_term(mechanism="radiation", parameters=values)

@@ -29,6 +29,9 @@ STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in t
 # Times what structure leaves, beyond which something is left, whatever it is. Development plants that lacked nothing
 # left up to 3.5 times in filtered rows and up to 5 in plain ones; it is the map of what is left that tells less.
 REST = 8.0
+# Of an amplitude, how far off a lumped network is beside all that its fit and the structural null know of: with it
+# nine in ten of 52 intervals told on development plants held the true amplitude, without it 63 in a hundred.
+LUMPED = 0.35
 UNSEEN = 1.0 - 1e-9  # of a prior's spread: a parameter that does nothing at this place (no draught blows at a room)
 SURE = 0.7  # below it the best explanation does not stand by itself
 
@@ -134,7 +137,10 @@ def parameters_told(
         if at is None or spec in idle:
             continue
         if at in intervals:
-            out[spec.name] = _widened(intervals[at], spec, scatter if sizes == [spec] else 0.0)
+            more = scatter if sizes == [spec] else 0.0
+            if spec in sizes and not MECHANISMS[c.mechanism].fault:
+                more = float(np.hypot(more, LUMPED * abs(intervals[at].value)))
+            out[spec.name] = _widened(intervals[at], spec, more)
         else:
             p = network.parameters[network.index(at)]
             out[spec.name] = Estimate(p.value, p.unit)

@@ -71,11 +71,12 @@ def true_amplitude(term: TrueTerm) -> float | None:
 def found_amplitude(finding: Finding, scale_of: TrueTerm) -> tuple[float | None, float | None, float | None]:
     """Value, low and high of a finding's 90 % interval, in what the key states; the interval None where none is told.
 
-    A product's interval is that of its first amplitude, the other values held; several amplitudes have none.
+    Of the key only what sets the scale is taken (a rated speed), never a size. A product's interval is that of its
+    first amplitude, the other values held; several amplitudes have none.
     """
     given = {name: v for name, (v, _) in (scale_of.parameters or {}).items()}
     told = {name: p.value for name, p in finding.parameters.items() if p.value is not None}
-    fixed = {name: v for name, v in given.items() if name not in told and name not in _amplitudes(finding.mechanism)}
+    fixed = {name: v for name, v in given.items() if name in _beside(finding.mechanism) and name not in told}
     values = {**fixed, **told}
     value = amplitude(finding.mechanism, values)
     free = [name for name in _amplitudes(finding.mechanism) if name in told]
@@ -89,3 +90,10 @@ def found_amplitude(finding: Finding, scale_of: TrueTerm) -> tuple[float | None,
 
 def _amplitudes(mechanism: str) -> tuple[str, ...]:
     return tuple(MECHANISMS[mechanism].off or {}) if mechanism in MECHANISMS else ()
+
+
+def _beside(mechanism: str) -> set[str]:
+    """A law's parameters beside its amplitudes."""
+    if mechanism not in MECHANISMS:
+        return set()
+    return {s.name for s in MECHANISMS[mechanism].parameters} - set(_amplitudes(mechanism))
