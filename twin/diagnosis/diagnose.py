@@ -34,7 +34,7 @@ from twin.diagnosis.rounds.search import Round, Search, search
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.limits import limits
 from twin.diagnosis.telling import tables as made
-from twin.diagnosis.telling.conclude import REST, caps, found_of, remainder, rms_of, slow_remainder, verdict_of
+from twin.diagnosis.telling.conclude import caps, found_of, most_left, remainder, rms_of, slow_remainder, verdict_of
 from twin.diagnosis.telling.findings import (
     DetectionLimit,
     Finding,
@@ -168,8 +168,8 @@ def _diagnosis(
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
     rest = max(remainder(done), slow_remainder(rms))
     listed = [f for f in found if f.mechanism not in UNLISTED]
-    verdict = verdict_of(listed, left is not None, rest)
-    if rest > REST:
+    verdict = verdict_of(listed, left is not None, rest, final.runs)
+    if rest > most_left(final.runs):
         words += (
             f"left-out errors are {rest:.1f} times what a coarse network alone would leave (median over channels)",
         )

@@ -68,7 +68,7 @@ def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:
 def test_what_is_usual_on_a_board_is_plausible_there_and_absurd_on_a_machine() -> None:
     board, machine = standing(of_grams()), cold_floor()
     seen = bridge(3e-3)
-    assert log_prior(seen, board) > -0.5 > -4.0 > log_prior(seen, machine)
+    assert log_prior(seen, board) > -0.5 > -8.0 > log_prior(seen, machine)
     assert log_prior(bridge(5.0), machine) > -0.5
 
 

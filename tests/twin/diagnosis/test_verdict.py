@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from twin.diagnosis.telling.conclude import REST, STRUCTURE, slow_remainder, verdict_of
+from twin.diagnosis.telling.conclude import REST, REST_OF_FEW, STRUCTURE, slow_remainder, verdict_of
 from twin.diagnosis.telling.found import Rms
 
 
@@ -21,7 +21,13 @@ def test_a_slow_misfit_counts_by_its_size() -> None:
     assert slow_remainder([]) == 0.0
 
 
-@pytest.mark.parametrize(("rest", "verdict"), [(0.9 * REST, "consistent"), (1.1 * REST, "undecidable")])
-def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(rest: float, verdict: str) -> None:
-    assert verdict_of([], False, rest) == verdict
-    assert verdict_of([], True, rest) == "unlisted"
+@pytest.mark.parametrize(
+    ("rest", "runs", "verdict"),
+    [
+        (0.9 * REST, 12, "consistent"), (1.1 * REST, 12, "undecidable"),
+        (0.9 * REST, 4, "undecidable"), (0.9 * REST_OF_FEW, 4, "consistent"),
+    ],
+)  # fmt: skip
+def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(rest: float, runs: int, verdict: str) -> None:
+    assert verdict_of([], False, rest, runs) == verdict
+    assert verdict_of([], True, rest, runs) == "unlisted"

@@ -17,7 +17,6 @@ from twin.schema import TwinPart
 
 WIDE = 1.5  # least spread of an amplitude's logarithm: machines differ by more than their handbook values
 FREEDOM = 2.0  # nats of each parameter that shapes an effect beside its size
-FREE = 5.0  # degrees of freedom of what is known of a size
 ALONE = 3.0  # nats of a law whose companion is not at its place
 LEAST = 1e-3  # of the usual value: where a fit of a positive amplitude begins at the lowest
 
@@ -124,15 +123,10 @@ def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> f
         elif fitted is not None and like is not None:
             value = off + (value - off) * _grown(like, fitted)
         if spec.scale == "log" and spec.value and value > 0:
-            sizes.append(_student(float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)))
+            sizes.append(-0.5 * (float(np.log(value / spec.value)) / max(WIDE, spec.spread or 0.0)) ** 2)
         elif spec.scale == "linear" and spec.spread:
-            sizes.append(_student((value - off) / (5.0 * spec.spread)))
+            sizes.append(-0.5 * min(((value - off) / (5.0 * spec.spread)) ** 2, 50.0))
     return max(sizes, default=0.0) + freedom
-
-
-def _student(z: float) -> float:
-    """Log density of Student's t about its peak: handbooks are far off more often than a normal law allows."""
-    return -0.5 * (FREE + 1.0) * float(np.log1p(z * z / FREE))
 
 
 def _alone(c: Candidate, part: TwinPart) -> bool:

@@ -16,7 +16,7 @@ from twin.diagnosis.rounds.search import Round, Search, agreed_on, coarse_first,
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
-from twin.diagnosis.telling.conclude import REST, SURE, remainder
+from twin.diagnosis.telling.conclude import SURE, most_left, remainder
 from twin.diagnosis.telling.findings import Findings
 from twin.proof.rivals.answer import WITHIN, Claim, Reply
 
@@ -102,14 +102,14 @@ class Stage:
         best = to_claim(ranked, len(self.round.before.batches)) if ranked else None
         ranked = [best, *(t for t in ranked if t is not best)] if best is not None else []
         if best is None or not self.accepts(best, threshold):
-            return Reply("undecidable" if self.rest > REST else "consistent")
+            return Reply("undecidable" if self.rest > most_left(self.round.before.runs) else "consistent")
         if best.candidate.mechanism == COARSE:
             return Reply("consistent")  # a refinement is no finding
         claim, told = self.claim(ranked, threshold)
         if (claim.probability or 0.0) < SURE and any(self.ties(e, claim) for e in told):
             return Reply("undecidable", (claim,))
         rest = remainder(replace(self.done, final=best.fitted)) if best.fitted is not None else self.rest
-        return Reply("partly_explained" if rest > REST else "explained", (claim,))
+        return Reply("partly_explained" if rest > most_left(self.round.before.runs) else "explained", (claim,))
 
     def accepts(self, t: Tried, threshold: float) -> bool:
         batches = len(self.round.before.batches)
