@@ -135,7 +135,7 @@ def test_the_twin_and_the_sample_machine_agree(tmp_path: Path) -> None:
     )[::fine, 0]  # fmt: skip
     order = [sample_machine.NODE[c] for c in one.simulation.network.cells]
     np.testing.assert_allclose(cells[0, 0], nodes[:, order], atol=0.02)
-    speed = np.r_[given.drivers["spindle_rpm"][:1], given.drivers["spindle_rpm"]]  # of the interval before each row
+    speed = np.r_[given.drivers["spindle_rpm"], given.drivers["spindle_rpm"][-1:]]  # from each row on
     error_um = sample_machine.displacement_um(nodes - nodes[0], speed)
     for channel in "xyz":
         np.testing.assert_allclose(one.batch.values(channel), error_um[channel], atol=0.06)

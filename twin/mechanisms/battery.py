@@ -90,8 +90,8 @@ class ChargeStrain(Mechanism):
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "body"}
 
     def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
-        step_s = np.diff(view.time_s, axis=-1)  # a row's driver is that of the interval which ends there
-        each_Ah = view.driver["current"][..., 1:] * step_s / 3600.0
+        step_s = np.diff(view.time_s, axis=-1)  # a row's driver holds from there on
+        each_Ah = view.driver["current"][..., :-1] * step_s / 3600.0
         drawn_Ah = np.concatenate([np.zeros((*each_Ah.shape[:-1], 1)), -np.cumsum(each_Ah, axis=-1)], axis=-1)
         share = (p["start"] + drawn_Ah) / p["capacity"]
         strain = course(share, np.zeros(1), *(p[f"f{k}"] for k in range(1, STRAINS + 1)))

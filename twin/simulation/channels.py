@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from twin.mechanisms.base import View
 from twin.network import Law, Network, Port
 from twin.simulation.air import Air
-from twin.simulation.inputs import Inputs
+from twin.simulation.inputs import Inputs, intervals_at_rows
 from twin.simulation.law_calls import STEP, parameters_of, stepped
 from twin.simulation.sources import Places
 
@@ -101,9 +101,9 @@ class Rows:
 
     @cached_property
     def _drivers(self) -> dict[str, Array]:
-        """By channel, in the interval that ends at each row; at the first row in the first interval."""
-        before = np.maximum(np.arange(self.time_s.shape[1]) * self.every - 1, 0)
-        return {channel: series[:, before] for channel, series in self.inputs.drivers.items()}
+        """By channel in the interval that begins at each row (`intervals_at_rows`)."""
+        at = intervals_at_rows(self.inputs.time_s.shape[1] - 1, self.every)
+        return {channel: series[:, at] for channel, series in self.inputs.drivers.items()}
 
     @cached_property
     def _air(self) -> list[Array]:

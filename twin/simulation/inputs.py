@@ -271,3 +271,12 @@ def _clock_h(batch: Batch) -> float:
         return math.nan
     midnight = batch.start.normalize()
     return float((batch.start - midnight).total_seconds() / 3600.0)
+
+
+def intervals_at_rows(intervals: int, every: int) -> NDArray[np.int64]:
+    """Numbers (K,) of the intervals that begin at the rows of the recordings, every `every`th; of the last row that
+    before it.
+
+    A row shows what holds from there on, and a shaft that moves with the speed has moved in the row that shows it.
+    """
+    return np.minimum(np.arange(0, intervals + 1, every), intervals - 1)

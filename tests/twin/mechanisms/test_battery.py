@@ -43,7 +43,7 @@ def test_strain_follows_the_charge_at_each_row() -> None:
     m = ChargeStrain()
     view = View(
         rise_K={"body": np.array([0.0, 1.0, 2.0, 3.0, 4.0])},
-        driver={"current": np.array([-1.0, -1.0, -1.0, 0.0, 2.0])},  # of the interval that ends at each row
+        driver={"current": np.array([-1.0, -1.0, 0.0, 2.0, 2.0])},
         time_s=HOURS_S,
     )
     assert m.displacement(view, straight(m, "f", 400.0)) == pytest.approx([0, 100, 200, 200, 0])

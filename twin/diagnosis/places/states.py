@@ -11,6 +11,7 @@ from twin.calibration.fit_problem import Array
 from twin.diagnosis.places.terms import States, levels
 from twin.diagnosis.places.where_when import Located
 from twin.network import Network
+from twin.simulation.inputs import intervals_at_rows
 
 
 def states_of_heat(located: Located, batches: Sequence[Batch]) -> States:
@@ -25,11 +26,11 @@ def states_of_heat(located: Located, batches: Sequence[Batch]) -> States:
 
 
 def states_of_shift(located: Located, batches: Sequence[Batch]) -> States:
-    """At the rows of the recordings, (B, K), drivers in the interval that ends there; bodies' rises."""
+    """At the rows of the recordings, (B, K), drivers as there; bodies' rises."""
     problem = located.point.problem
     inputs, every = problem.inputs, problem.inputs.every
-    before = np.maximum(np.arange(0, inputs.time_s.shape[1], every) - 1, 0)
-    drivers = [d.at(before) for d in levels(batches, inputs.time_s.shape[1] - 1, every)]
+    intervals = inputs.time_s.shape[1] - 1
+    drivers = [d.at(intervals_at_rows(intervals, every)) for d in levels(batches, intervals, every)]
     degC = _bodies_degC(located)[..., ::every]
     time_s = inputs.time_s[:, ::every]
     rises = dict(zip(problem.network.bodies, degC - degC[..., :1], strict=True))

@@ -26,8 +26,8 @@ from twin.quantity import Spec
 from twin.schema import TwinPart
 
 STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in the median channel of plants
-# Times what structure leaves, beyond which something is left, whatever it is: 106 development plants, of 11 to 13 runs each,
-# that lacked nothing left up to 3.5 times in filtered rows and up to 5.0 in plain ones. Few runs prove less.
+# Times what structure leaves, beyond which something is left, whatever it is: 106 development plants that lacked
+# nothing, of 11 to 13 runs, left up to 3.5 times in filtered rows and up to 5.0 in plain ones. Few runs prove less.
 REST, REST_OF_FEW, FEW = 6.0, 4.0, 6
 # Of an amplitude, how far off a lumped network is beside all that its fit and the structural null know of: with it
 # nine in ten of 52 intervals told on development plants held the true amplitude, without it 63 in a hundred.

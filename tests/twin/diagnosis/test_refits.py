@@ -1,0 +1,56 @@
+"""Where refits begin, and which of two is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.twin.diagnosis.small_cases import SHIFT, fitted, four_bodies, runs
+from twin.diagnosis.rounds import refits
+from twin.diagnosis.rounds.refits import Tried, refit, taken_on
+from twin.diagnosis.scoring.screen import Scored, proposed, screen
+
+
+@pytest.fixture(scope="module")
+def shifted() -> tuple[Any, Scored, Scored]:
+    """A fit that lacks a shift of its error, the shift, and a heat."""
+    known = four_bodies()
+    now = fitted(known, runs(known, {"shift": SHIFT}))
+    every = screen(now, proposed(now)).scored
+    shift = next(s for s in every if s.candidate.mechanism == "speed_shift")
+    return now, shift, next(s for s in every if s.candidate.mechanism == "cabinet_heat")
+
+
+def test_at_an_error_the_better_of_two_beginnings_counts(
+    shifted: tuple[Any, Scored, Scored], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, shift, heat = shifted
+    begun: list[str] = []
+    afresh = refits._afresh
+
+    def watched(now: Any, part: Any, begin: Any) -> Any:
+        begun.append("afresh")
+        return afresh(now, part, begin)
+
+    monkeypatch.setattr(refits, "_afresh", watched)
+    got = refit(now, shift)
+    assert got is not None and got.gain > 100.0 and begun == ["afresh"]
+    plain = replace(shift, candidate=replace(shift.candidate, where=replace(shift.candidate.where, kind="node")))
+    once = refit(now, plain)
+    assert once is not None and got.gain >= once.gain
+    refit(now, heat)
+    assert begun == ["afresh"]  # what acts on temperatures begins where the fit is
+
+
+def test_a_fit_is_not_taken_on_to_where_it_predicts_worse(
+    shifted: tuple[Any, Scored, Scored], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, shift, _ = shifted
+    good = refit(now, shift)
+    assert good is not None
+    monkeypatch.setattr(refits, "settle", lambda *_, **__: now)  # as if the way down led back to the fit before
+    kept = taken_on(now, good)
+    assert kept.fitted is good.fitted and kept.gain > 50.0
+    assert isinstance(kept, Tried)
