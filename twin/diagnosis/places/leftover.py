@@ -59,8 +59,9 @@ class Leftover:
         where = Where("node" if heat else "error", self.terms.place)
         head = f"mechanisms.{self.name}."
         stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
-        regime, windows = by_watts(self.fitted, self.name, FOLLOWING)
-        if not heat:  # a displacement: where the map shows it
+        if heat:
+            regime, windows = by_watts(self.fitted, self.name, FOLLOWING)
+        else:  # where the map shows it
             windows = tuple(self.located.windows(self.place))
             regime = "at times" if windows else "always"
         return Told(
