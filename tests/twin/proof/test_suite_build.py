@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from data.recording import read_batches
 from twin.plants.plant import draw
 from twin.proof.spec import CaseSpec
 from twin.proof.suite import Built, batches_of, build, small_suite, without, write_built
-from twin.proof.suite.build import HOTTEST_DEGC
+from twin.proof.suite.build import HOTTEST_DEGC, WEAKER
 from twin.proof.suite.setting import setting
 from twin.proof.suite.suite import case
 from twin.quantity import convert
@@ -175,6 +176,15 @@ def test_a_bearing_that_would_seize_is_drawn_weaker_and_the_answer_says_so(plant
     assert term["size"] == built.answer["redraw"]["effects"]["preload_feedback"]
     hottest = max(float(np.nanmax(b.values(c))) for b in batches_of(built) for c in b.names("temperature"))
     assert 40.0 < hottest <= HOTTEST_DEGC
+
+
+def test_a_machine_that_is_too_hot_by_itself_is_drawn_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = sys.modules["twin.proof.suite.build"]  # the package has a function of this name
+    monkeypatch.setattr(own, "_seized", lambda _: True)
+    monkeypatch.setattr(own, "TIMES", 3)
+    built = build(short(effects={"preload_feedback": 1.0}, hours=2.0))
+    assert built.answer["terms"][0]["size"] == pytest.approx(WEAKER**3)
+    assert built.answer["redraw"]["effects"]["preload_feedback"] == built.answer["terms"][0]["size"]
 
 
 def test_a_sensor_that_is_absent_is_no_seized_bearing() -> None:
