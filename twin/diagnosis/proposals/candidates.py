@@ -118,7 +118,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
         return [Site(kind, name) for name in _own(part)]
     if target == "heat":
         return [
-            Site(kind, name, _outlets(given))
+            Site(kind, name, outlets_of(given))
             for name, given in part.mechanisms.items()
             if "heat_W" in MECHANISMS[given.law].effects() and given.law in (mechanism.multiplies or (given.law,))
         ]
@@ -136,7 +136,8 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
     return [Site(kind, first, others=tuple(others)) for first, *others in chosen]
 
 
-def _outlets(given: MechanismPart) -> tuple[str, ...]:
+def outlets_of(given: MechanismPart) -> tuple[str, ...]:
+    """The bodies that a mechanism's heat goes into."""
     if isinstance(given.into, Mapping):
         return tuple(given.into)
     return (given.into,) if given.into else (given.at,) if isinstance(given.at, str) else ()
@@ -236,7 +237,7 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
         if given.law != c.mechanism or _channels(given) != _channels(c.part):
             continue
         if c.part.into is not None:
-            if c.part.into in [pieces.get(name, name) for name in _outlets(given)]:
+            if c.part.into in [pieces.get(name, name) for name in outlets_of(given)]:
                 return True
         elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at)) or (
             c.part.acts_on is None and given.at == c.part.at

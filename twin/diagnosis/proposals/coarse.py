@@ -45,12 +45,12 @@ def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, w
         body = part.sensors[names[k]].at.partition("@")[0]
         if n < most:
             out += list(_of_sensor(fitted, names[k]))
-        elif any(body in _into(part.mechanisms[name]) for name in _found(fitted)):
+        elif any(body in _into(part.mechanisms[name]) for name in found_since(fitted)):
             out += [c for c in _of_sensor(fitted, names[k]) if any(p.startswith("mechanisms.") for p in c.parts)]
     return out
 
 
-def _found(fitted: Fitted) -> list[str]:
+def found_since(fitted: Fitted) -> list[str]:
     """The mechanisms that the machine file has not got."""
     if not fitted.machine.twin:
         return []  # it states nothing: all is drafted
@@ -113,7 +113,7 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
             f"{words}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
         )
-    for key in [k for k in (*_found(fitted), *part.mechanisms) if body in _into(part.mechanisms[k])][:HEATS]:
+    for key in [k for k in (*found_since(fitted), *part.mechanisms) if body in _into(part.mechanisms[k])][:HEATS]:
         given, half = part.mechanisms[key], f"{body}@0.25"
         cut = Value(value=f"{HALVES * leaves:.4g} W/K", spread=SPREAD)
         yield Candidate(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.candidates import outlets_of
 from twin.diagnosis.proposals.machine_size import at_size, size_of
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored
@@ -132,8 +133,7 @@ def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> f
 def _alone(c: Candidate, part: TwinPart) -> bool:
     """Whether a law stands where none is that goes with it."""
     return not any(
-        given.law in MECHANISMS[c.mechanism].goes_with
-        and c.where.name in (given.into if isinstance(given.into, Mapping) else [given.into])
+        given.law in MECHANISMS[c.mechanism].goes_with and c.where.name in outlets_of(given)
         for given in part.mechanisms.values()
     )
 

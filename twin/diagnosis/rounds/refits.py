@@ -143,7 +143,7 @@ def refit(now: Fitted, s: Scored) -> Tried | None:
             if s.candidate.where.kind != "error":
                 return done
             again = judged(now, replace(done, fitted=_afresh(now, part, begin)), roughly=True)
-            return max(done, again, key=lambda t: t.gain)
+            return max(done, again, key=lambda one: one.gain)
         except (InputError, WorkError):
             continue  # a linear step may lead where no machine is
     return None
@@ -179,7 +179,7 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
     assert t.fitted is not None
     try:
         done = judged(now, replace(t, fitted=settle(t.fitted, steps=4, tolerance=0.05, rounds=2)))
-        return done if done.gain >= t.gain else max(done, judged(now, t), key=lambda t: t.gain)
+        return done if done.gain >= t.gain else max(done, judged(now, t), key=lambda one: one.gain)
     except (InputError, WorkError):
         return t
 

@@ -228,7 +228,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     if best.candidate.mechanism == "coarse_network":
         structure = 0.0  # what structure makes is what it is for
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
-    least = least_gain(best, n if agreed else best.improved)
+    least = least_gain(best, n if agreed else best.improved)  # else the bar of one that all batches agree on
     threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
     tried = [best, *(t for t in tried if t is not best)]

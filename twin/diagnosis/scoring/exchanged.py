@@ -19,6 +19,7 @@ from twin.calibration.descent import x_of
 from twin.calibration.fit_problem import Array
 from twin.calibration.measured import Measured
 from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.coarse import found_since
 from twin.diagnosis.rounds.baseline import MISFIT, SMOOTH
 from twin.diagnosis.rounds.fitted import Fitted
 
@@ -33,8 +34,7 @@ def suspects(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
 
     Labels come before physics: none, where a fit holds an effect already that the machine file has not.
     """
-    stated = (fitted.machine.twin or {}).get("mechanisms")
-    if stated is not None and set(fitted.part.mechanisms) - set(stated):
+    if found_since(fitted):
         return []
     line = _Line.at(fitted)
     out = []
