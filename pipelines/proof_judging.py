@@ -135,8 +135,8 @@ def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
         return math.nan if value is None else value
 
     before, true, floor = (number(plain[k]) for k in ("error_before", "error_true", "error_floor"))
-    gains, thresholds = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats"))
-    return TrueModel(before, true, floor, gains, thresholds, tuple(plain["visible"]))
+    gains, thresholds, bars = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats", "bar_nats"))
+    return TrueModel(before, true, floor, gains, thresholds, bars, tuple(plain["visible"]))
 
 
 def scoring_source() -> str:

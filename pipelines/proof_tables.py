@@ -14,6 +14,7 @@ from twin.proof.scoring.compared import compared
 from twin.proof.scoring.goal_table import goal_table
 from twin.proof.scoring.outcomes import outcomes
 from twin.proof.scoring.reliability import reliability
+from twin.proof.scoring.shortfall import claims, missed
 from twin.proof.scoring.tables import confusion, worst
 from twin.proof.sealing.folder import ProofFolder
 from twin.proof.sealing.ledger import Entry
@@ -41,6 +42,8 @@ def tables_of(
         "reliability": reliability(cases)[0],
         "confusion_mechanism": confusion(terms, "mechanism"),
         "confusion_place": confusion(terms, "place"),
+        "missed": missed(terms),
+        "claims": claims(keys, stored),
         "leak": leak,
         "worst": ten,
         "series": _series(folder, ten["case"].tolist()),

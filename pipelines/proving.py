@@ -22,7 +22,8 @@ from twin.proof.sealing.state import state_of
 from twin.proof.spec import PLANT_KINDS, PlantKind
 
 Say = Callable[[str], None]
-WRITTEN = ("outcomes", "terms", "goals", "compared", "leak", "convergence")  # tables that stand beside the page as CSV
+# Tables that stand beside the page as CSV.
+WRITTEN = ("outcomes", "terms", "missed", "claims", "goals", "compared", "leak", "convergence")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pandas as pd
 
 from data.atomic_file import write_atomic
 from data.errors import InputError
+from pipelines.report import proof_shortfall as shortfall
 from pipelines.report import proof_words as words
 from pipelines.report.proof import headline
 from pipelines.report.proof_goals import Cell, goal_rows, shortfalls
@@ -59,6 +60,7 @@ def proof_markdown(run: ProofRun | None) -> str:
     short = shortfalls(goals)
     missed = [*(f"- {said}" for said in short), *_by_plant(goals, run.plants)]
     lines += ["", "Goals that are missed:", "", *missed] if missed else ["", "No goal is missed on any plant."]
+    lines += _shortfall(run)
     return "\n".join(lines) + "\n"
 
 
@@ -70,6 +72,22 @@ def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
         met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)
         interval, n = g.whole.interval or NOTHING, g.whole.n or NOTHING
         out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, g.plants)]))
+    return out
+
+
+def _shortfall(run: ProofRun) -> list[str]:
+    """Why goals are missed: reasons by plant, and false claims by mechanism."""
+    missed, claims, own = run.table("missed"), run.table("claims"), []
+    if len(missed):
+        own.append(shortfall.reasons(missed, run.plants))
+    if len(claims) and not claims["true"].all():
+        own.append(shortfall.false_claims(claims, run.plants))
+    out = ["", " ".join(shortfall.sentences(run))] if own else []
+    for table in own:
+        heads = [f"{c.title} ({c.unit})" if c.unit else c.title for c in table.columns]
+        rule = ["---:" if c.kind == "number" else "---" for c in table.columns]
+        out += ["", f"{table.caption}, {words.origin(run.plants)}:", "", _line(heads), _line(rule)]
+        out += [_line([str(cell) for cell in row.cells]) for row in table.rows]
     return out
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from pipelines.report import proof_case_figures as by_case
 from pipelines.report import proof_extracts as extracts
 from pipelines.report import proof_figures as figures
+from pipelines.report import proof_shortfall as shortfall
 from pipelines.report import proof_tables as tables
 from pipelines.report.layout import Table
 from pipelines.report.proof_drawing import picture
@@ -52,7 +53,7 @@ class Part:
 
 def proof_parts(run: ProofRun) -> Iterator[Part]:
     """Every section, in the page's order."""
-    for make in (_rivals, _confusion, _detection, _improvement, _amplitude, _reliability, _worst, _cases):
+    for make in (_rivals, _confusion, _detection, _shortfall, _improvement, _amplitude, _reliability, _worst, _cases):
         yield make(run)
 
 
@@ -94,6 +95,19 @@ def _detection(run: ProofRun) -> Part:
         return _absent(own, "No concealed effect has a known detection limit in this run.")
     lead = "Sizes go from below the detection limit to ten times it, so the first column should be mostly missed."
     return replace(own, lead=lead, wide=(_shown(run, figures.detection(table, run.plants), own.title),))
+
+
+def _shortfall(run: ProofRun) -> Part:
+    own = Part("shortfall", "Shortfall", "What was missed, what was claimed wrongly, and why")
+    missed, claims = run.table("missed"), run.table("claims")
+    shown: list[Table] = []
+    if len(missed):
+        shown += [shortfall.reasons(missed, run.plants), shortfall.missed_effects(missed, run.plants)]
+    if len(claims) and not claims["true"].all():
+        shown.append(shortfall.false_claims(claims, run.plants))
+    if not shown:
+        return _absent(own, "No visible effect was missed and no claim was false, or none was scored.")
+    return replace(own, lead=" ".join(shortfall.sentences(run)), tables=tuple(shown))
 
 
 def _improvement(run: ProofRun) -> Part:

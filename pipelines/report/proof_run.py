@@ -22,6 +22,9 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "reliability": ("low", "high", "claimed", "right", "low90", "high90", "n"),
     "confusion_mechanism": ("true", "named", "count"),
     "confusion_place": ("true", "named", "count"),
+    "missed": ("case", "plant", "kind", "effect", "place", "gain_nats", "bar_nats", "named_mechanism", "named_place",
+               "told_gain_nats", "reason"),
+    "claims": ("case", "plant", "kind", "mechanism", "place", "probability", "gain_nats", "true"),
     "leak": ("question", "auc", "low90", "high90", "chance", "p", "n"),
     "convergence": ("plant", "quantity", "refined", "size", "unit", "error", "order"),  # refined: grid or step
     "worst": ("case", "plant", "effect", "why"),

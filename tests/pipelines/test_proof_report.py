@@ -16,6 +16,7 @@ from toy_proof import ROOT, toy_proof, without
 
 from data.errors import WorkError
 from pipelines.report import proof_extracts as extracts
+from pipelines.report import proof_shortfall as shortfall
 from pipelines.report import proof_tables as tables
 from pipelines.report.proof import headline, proof_page, write_proof_report
 from pipelines.report.proof_goals import goal_rows, shortfalls
@@ -25,6 +26,7 @@ from twin.proof.scoring.compared import COLUMNS as COMPARED
 from twin.proof.scoring.goal_table import GOAL_COLUMNS
 from twin.proof.scoring.outcomes import OUTCOMES, TERMS
 from twin.proof.scoring.reliability import COLUMNS
+from twin.proof.scoring.shortfall import CLAIMS, LITTLE, MISSED
 from twin.proof.sealing.leak import COLUMNS as LEAK
 
 ANCHORS = (
@@ -32,6 +34,7 @@ ANCHORS = (
     "rivals",
     "confusion",
     "detection",
+    "shortfall",
     "improvement",
     "amplitude",
     "reliability",
@@ -44,6 +47,7 @@ SILENT = {
     "terms": "No concealed effect has a known detection limit in this run.",
     "goals": "The goals were not scored in this run.",
     "reliability": "No finding told a probability in this run.",
+    "missed": "No visible effect was missed and no claim was false, or none was scored.",
     "worst": "Every answer was right, or none was judged.",
     "leak": "The leak test was not run.",
     "convergence": "convergence was not studied in this run.",
@@ -155,7 +159,28 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_the_scoring_gives_every_column_that_the_page_reads() -> None:
     assert set(TABLES["outcomes"]) <= set(OUTCOMES) and set(TABLES["terms"]) <= set(TERMS)
     assert set(TABLES["goals"]) <= set(GOAL_COLUMNS) and set(TABLES["reliability"]) <= set(COLUMNS)
+    assert (set(TABLES["missed"]), set(TABLES["claims"])) == (set(TABLES["missed"]) & set(MISSED), set(CLAIMS))
     assert set(TABLES["leak"]) <= set(LEAK) and set(TABLES["compared"]) <= set(COMPARED)
+
+
+# shortfall
+
+
+def test_what_was_missed_and_claimed_falsely_is_told_with_who_owes_it(run: ProofRun, text: str) -> None:
+    missed, claims = run.table("missed"), run.table("claims")
+    assert len(missed) and (~claims["true"].astype(bool)).any()
+    plain = re.sub(r"<[^>]*>", " ", text)
+    false = int((~claims["true"].astype(bool)).sum())
+    assert f"{false} of {len(claims)} claims are not so." in plain
+    terms = run.table("terms")
+    seen = terms[terms["visible"].eq(True) & ~terms["decoy"].astype(bool)]
+    enough = int((seen["gain_nats"] > seen["bar_nats"]).sum())
+    assert f"Of {len(seen)} visible effects that the library lists, {enough} gain what a claim takes" in plain
+    little = int((missed["reason"] == LITTLE).sum())
+    assert f"{len(missed)} of {len(seen)} visible effects have no claim; in {little} of them the recordings do" in plain
+    table = shortfall.reasons(missed, ("elements", "volumes"))
+    assert [row.cells[1] for row in table.rows] == ["the recordings", "the recordings", "the search", "the search"]
+    assert table.rows[0].cells[0] == LITTLE and table.rows[0].cells[-1] == f"{little}"
 
 
 # goals

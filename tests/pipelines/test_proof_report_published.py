@@ -13,6 +13,7 @@ from data.errors import InputError
 from pipelines import proving
 from pipelines.report.proof_markdown import BEGIN, END, proof_markdown, publish_proof
 from pipelines.report.proof_run import ProofRun
+from twin.proof.scoring.shortfall import SILENT
 
 DOCS = Path(__file__).parents[2] / "docs" / "proof.md"
 
@@ -48,6 +49,19 @@ def test_a_plant_that_alone_misses_a_goal_is_named(run: ProofRun) -> None:
     assert "Goals that are missed:\n\n- plant A alone, place exact: 90.0 %, wanted ≥ 92 %\n" in text
     met = proof_markdown(replace(run, tables=dict(run.tables) | {"goals": goals.assign(met=True)}))
     assert "No goal is missed on any plant." in met
+
+
+def test_the_block_says_what_was_missed_and_claimed_falsely_and_why() -> None:
+    run = toy_proof(60)
+    text = proof_markdown(run)
+    missed = run.table("missed")
+    silent = missed[missed["reason"] == SILENT]
+    row = next(line for line in text.splitlines() if line.startswith(f"| {SILENT} "))
+    by_plant = [int((silent["plant"] == p).sum()) for p in ("elements", "volumes")]
+    assert row == f"| {SILENT} | the search | {by_plant[0]} | {by_plant[1]} | {len(silent)} |"
+    assert "Claims that are not so, SIMULATED:\n" in text
+    quiet = proof_markdown(replace(run, tables={k: v for k, v in run.tables.items() if k not in ("missed", "claims")}))
+    assert "Claims that are not so" not in quiet and "owes" not in quiet
 
 
 def test_publishing_changes_the_block_alone_and_again_gives_the_same(page: Path, run: ProofRun) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pipelines.report.proof_run import ProofRun
+from twin.proof.scoring.shortfall import CLAIMS, missed
 
 EFFECTS = (
     "floor_sink", "cabinet_heat", "guide_friction", "sun", "radiation", "rotating_convection", "natural_convection",
@@ -45,6 +46,8 @@ def toy_proof(
         "reliability": _reliability(draws),
         "confusion_mechanism": _counted(terms, "mechanism"),
         "confusion_place": _counted(terms, "place"),
+        "missed": missed(terms),
+        "claims": _claims(terms),
         "leak": pd.DataFrame({"question": ["nothing or something", "kind"], "auc": [0.51, 0.49], "low90": [0.46, 0.45],
                               "high90": [0.56, 0.53], "chance": [0.5, 0.5], "p": [0.38, 0.61], "n": [300, 300]}),
         "convergence": _convergence(),
@@ -92,7 +95,8 @@ def _answers(cases: int, draws: np.random.Generator, plants: Sequence[str]) -> t
                 "limit_share": share, "decoy": kind == "decoy", "named_mechanism": named if found else "nothing",
                 "named_place": there if found else "nothing", "found": found, "amplitude_true": size,
                 "amplitude_found": told if found else np.nan, "low90": 0.8 * told if found else np.nan,
-                "high90": 1.22 * told if found else np.nan,
+                "high90": 1.22 * told if found else np.nan, "gain_nats": 130.0 * share, "bar_nats": 140.0,
+                "told_gain_nats": np.nan if not found else 130.0 * share,
             })  # fmt: skip
         floor = 1.0
         before = floor * (1 + float(np.exp(draws.normal(0.8, 0.9))) * (max(shares) / 3 if shares else 0.02))
@@ -108,6 +112,15 @@ def _answers(cases: int, draws: np.random.Generator, plants: Sequence[str]) -> t
             "limit_share": max(shares) if shares else np.nan, "right": found_all,
         })  # fmt: skip
     return pd.DataFrame(rows), pd.DataFrame(terms)
+
+
+def _claims(terms: pd.DataFrame) -> pd.DataFrame:
+    """One a term that was found; true where it has the term's own name."""
+    own = terms[terms["found"]]
+    named = {"mechanism": own["named_mechanism"], "place": own["named_place"], "probability": 0.8}
+    table = own[["case", "plant", "kind", "gain_nats"]].assign(**named)
+    table["true"] = own["named_mechanism"] == own["mechanism"]
+    return table[list(CLAIMS)].reset_index(drop=True)
 
 
 def _goals(draws: np.random.Generator, plants: Sequence[str]) -> pd.DataFrame:

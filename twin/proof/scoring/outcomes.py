@@ -6,6 +6,7 @@ Cells that do not apply are empty. A diagnosis that failed has found nothing, an
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 import pandas as pd
@@ -38,7 +39,8 @@ TERMS: Mapping[str, str] = {
     "case": "string", "kind": "string", "plant": "string", "effect": "string", "mechanism": "string",
     "place": "string", "visible": "boolean", "limit_share": "Float64", "decoy": "boolean",
     "named_mechanism": "string", "named_place": "string", "found": "boolean", "amplitude_true": "Float64",
-    "amplitude_found": "Float64", "low90": "Float64", "high90": "Float64",
+    "amplitude_found": "Float64", "low90": "Float64", "high90": "Float64", "gain_nats": "Float64",
+    "bar_nats": "Float64", "told_gain_nats": "Float64",
 }  # fmt: skip
 NOTHING = "nothing"
 
@@ -248,7 +250,14 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
         "amplitude_found": value,
         "low90": low,
         "high90": high,
+        "gain_nats": _finite(truth.gain_nats[k]) if truth is not None else None,
+        "bar_nats": _finite(truth.bar_nats[k]) if truth is not None else None,
+        "told_gain_nats": finding.evidence.get("gain_nats") if finding is not None else None,
     }
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def _named(finding: Finding, term: TrueTerm) -> str:

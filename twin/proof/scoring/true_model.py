@@ -25,6 +25,8 @@ from twin.diagnosis.rounds.null import Null, structural_null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import left_out_rows
+from twin.diagnosis.rounds.refits import Tried, improved
+from twin.diagnosis.rounds.trust import least_gain
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
@@ -38,7 +40,8 @@ Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
 @dataclass(frozen=True)
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
-    of `gain_nats` and `threshold_nats`, nan where nothing could be fitted.
+    of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis asks of such a gain before it claims it; nan where
+    nothing could be fitted.
 
     `visible` None: not known, as no candidate states the term and the case could not be redrawn.
     """
@@ -48,6 +51,7 @@ class TrueModel:
     error_floor: float
     gain_nats: tuple[float, ...]
     threshold_nats: tuple[float, ...]
+    bar_nats: tuple[float, ...]
     visible: tuple[bool | None, ...]
 
 
@@ -72,7 +76,7 @@ def true_model(
     fit = _fit(machine, batches)
     level = _level(fit)
     if not key.terms:
-        return TrueModel(level, level, 1.0, (), (), ())
+        return TrueModel(level, level, 1.0, (), (), (), ())
     every = proposed(fit)
     seen = screen(fit, every)
     found = [true_candidate(t, seen, every) for t in key.terms]
@@ -88,14 +92,15 @@ def true_model(
     ]
     others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
     best = full if stated and not others else others[0] if others else fit  # an unlisted effect stands alone
-    gains, thresholds, visible = zip(*((j.gain, j.threshold, j.visible) for j in judged), strict=True)
-    return TrueModel(level, _level(best), 1.0, gains, thresholds, visible)
+    numbers = zip(*((j.gain, j.threshold, j.bar, j.visible) for j in judged), strict=True)
+    return TrueModel(level, _level(best), 1.0, *numbers)
 
 
 @dataclass(frozen=True)
 class _Judged:
     gain: float = float("nan")
     threshold: float = float("nan")
+    bar: float = float("nan")
     visible: bool | None = None
     fitted: Fitted | None = None  # of the case redrawn
 
@@ -151,9 +156,11 @@ def _judged(
     assert s is not None
     beside = null_beside(without[best], full, s.candidate, seed)
     if beside is None:  # a value that is doubted, labels that are swapped
-        null = _null(without[best], seed)
-        return _beyond(without[best], full, memory, null.threshold(_score(full, memory), name=s.candidate.name))
-    return _beyond(without[best], full, memory, beside[0].threshold(beside[1], name=s.candidate.name))
+        beside = _null(without[best], seed), _score(full, memory)
+    out = _beyond(without[best], full, memory, beside[0].threshold(beside[1], name=s.candidate.name))
+    better = improved(alone(without[best], memory), alone(full, memory))
+    least = least_gain(Tried(s, out.gain, better, 0, 0.0, full), len(full.batches))
+    return replace(out, bar=max(least, out.threshold))
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
@@ -169,7 +176,7 @@ def _beyond(before: Fitted, after: Fitted, memory: Memory, threshold: float) -> 
     gain = _score(after, memory) - _score(before, memory)
     old, new = _rms(before), _rms(after)
     cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
-    return _Judged(gain, threshold, bool(gain > threshold and cut >= CUT))
+    return _Judged(gain, threshold, visible=bool(gain > threshold and cut >= CUT))
 
 
 def _score(fitted: Fitted, memory: Memory) -> float:

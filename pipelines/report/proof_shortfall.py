@@ -1,0 +1,103 @@
+"""The shortfall of a proof in sentences and tables: what was missed, what was claimed falsely, and who owes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from pipelines.report.layout import Column, Row, Table
+from pipelines.report.proof_run import ProofRun
+from pipelines.report.proof_words import key_label, origin, plant_letter, plant_origin
+from pipelines.report.words import NOTHING, count, number, percent
+from twin.proof.scoring.shortfall import OF_RECORDINGS, REASONS
+
+
+def sentences(run: ProofRun) -> list[str]:
+    """A sentence on visible effects, one on those that were missed, one on claims; those that the tables give."""
+    terms, missed, claims = run.table("terms"), run.table("missed"), run.table("claims")
+    said = []
+    if {"gain_nats", "bar_nats"} <= set(terms.columns):
+        seen = terms[terms["visible"].eq(True) & ~terms["decoy"].astype(bool) & terms["bar_nats"].notna()]
+        enough = int((seen["gain_nats"] > seen["bar_nats"]).sum())
+        said.append(
+            f"Of {count(len(seen), 'visible effect')} that the library lists, {enough} gain what a claim takes once "
+            f"all that is true is in the model."
+        )
+    if len(missed):
+        recordings = int(missed["reason"].isin(OF_RECORDINGS).sum())
+        said.append(
+            f"{len(missed)} of {int((terms['visible'].eq(True) & ~terms['decoy'].astype(bool)).sum())} visible effects "
+            f"have no claim; in {recordings} of them the recordings do not favour the truth, in "
+            f"{len(missed) - recordings} the search fell short."
+        )
+    if len(claims):
+        said.append(f"{int((~claims['true'].astype(bool)).sum())} of {count(len(claims), 'claim')} are not so.")
+    return said
+
+
+def reasons(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
+    """Why visible effects were not named, counted by plant, and whether the recordings or the search owe it."""
+    rows = []
+    for reason in REASONS:
+        own = missed[missed["reason"] == reason]
+        owes = "the recordings" if reason in OF_RECORDINGS else "the search"
+        rows.append(Row((reason, owes, *_by_plant(own, plants), f"{len(own)}")))
+    columns = (Column("why", kind="wide"), Column("who owes it"), *_plants("", plants), Column("all", kind="number"))
+    notes = (
+        "Gains are of the batches left out, in nats; the effect's own with all else that is true in the model. The "
+        "recordings: these, read by networks as coarse as the machine file's.",
+    )
+    return Table("Visible effects that no claim names", columns, tuple(rows), _simulated(plants), notes=notes)
+
+
+def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
+    """Each of them: what it gains, what a claim takes, what was told instead and what that gains."""
+    order = missed.assign(rank=missed["reason"].map(REASONS.index))
+    rows = []
+    for r in order.sort_values(["rank", "case"], ascending=[False, True]).to_dict("records"):
+        told = str(r["named_mechanism"])
+        named = NOTHING if told == "nothing" else f"{key_label(told)} at {key_label(str(r['named_place']))}"
+        what = f"{key_label(str(r['effect']))} at {key_label(str(r['place']))}"
+        gain, bar, other = (_nats(r[c]) for c in ("gain_nats", "bar_nats", "told_gain_nats"))
+        rows.append(Row((str(r["case"]), plant_letter(str(r["plant"])), what, gain, bar, named, other)))
+    columns = (
+        Column("case"), Column("plant"), Column("effect", kind="wide"), Column("gains", "nats", "number"),
+        Column("a claim takes", "nats", "number"), Column("told instead", kind="wide"),
+        Column("that gains", "nats", "number"),
+    )  # fmt: skip
+    return Table("Each of them", columns, tuple(rows), _simulated(plants))
+
+
+def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
+    """By mechanism, the worst first: how often it was claimed and was not so, and how sure the false claims were."""
+    false = claims[~claims["true"].astype(bool)]
+    rows = []
+    for mechanism, n in sorted(false["mechanism"].value_counts().items(), key=lambda one: (-one[1], str(one[0]))):
+        own = false[false["mechanism"] == mechanism]
+        nothing = int(own["kind"].isin(("nothing", "decoy")).sum())
+        sure = percent(float(own["probability"].median()))
+        every = int((claims["mechanism"] == mechanism).sum())
+        rows.append(Row((key_label(str(mechanism)), f"{every}", *_by_plant(own, plants), f"{n}", f"{nothing}", sure)))
+    columns = (
+        Column("mechanism", kind="wide"), Column("claims", kind="number"), *_plants("false, ", plants),
+        Column("false", kind="number"), Column("nothing was missing", kind="number"),
+        Column("median probability", kind="number"),
+    )  # fmt: skip
+    return Table("Claims that are not so", columns, tuple(rows), _simulated(plants))
+
+
+def _plants(said: str, plants: Sequence[str]) -> list[Column]:
+    return [Column(f"{said}{plant_letter(p)}", plant_origin(p), "number", p) for p in plants]
+
+
+def _by_plant(rows: pd.DataFrame, plants: Sequence[str]) -> list[str]:
+    return [f"{int((rows['plant'] == p).sum())}" for p in plants]
+
+
+def _nats(value: object) -> str:
+    return NOTHING if pd.isna(value) else number(float(value), 0)  # type: ignore[call-overload, arg-type]
+
+
+def _simulated(plants: Sequence[str]) -> bool:
+    return origin(plants) == "SIMULATED"
