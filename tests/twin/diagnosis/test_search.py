@@ -14,11 +14,14 @@ from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
+from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds import search as search_module
+from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.search import IMPROVED, Round, Search, one_round, search
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.rounds.workers import Workers
-from twin.diagnosis.scoring.screen import proposed
+from twin.diagnosis.scoring.screen import Scored, proposed
 
 COUNT = 8
 COLD = {**FLOOR, "parameters": {"conductance": "8 W/K"}}
@@ -128,6 +131,25 @@ def test_the_best_is_first_and_slack_is_no_news() -> None:
             order = [t.standing(r.null.temperature) for t in full]
             assert order == sorted(order, reverse=True)
             assert not {t.candidate.name for t in r.tried} & no_news(proposed(r.before), r.before)
+
+
+def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside a strong effect a finer network stays below what flipped residuals reach."""
+    now = found("drift").baseline
+    none = Scored(Candidate("coarse_network", Where("node", "head"), "finer_head", ""), 0.0, 0, 0.0, {}, 0.0, -1)
+    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], search_module._asked
+
+    def watched(*given: Any) -> Round:
+        asked.append(real(*given))
+        return asked[-1]
+
+    monkeypatch.setattr(search_module, "_apart", lambda *_: finer)
+    monkeypatch.setattr(search_module, "_asked", watched)
+    done = one_round(now, 0, Workers(), lambda *_: None)
+    assert [(r.best.candidate.name, r.accepted) for r in asked if r.best is not None] == [
+        ("finer_head", False), ("sensor_drift_t_head", True),
+    ]  # fmt: skip
+    assert done is asked[-1] and asked[0].threshold > finer.gain
 
 
 @cache

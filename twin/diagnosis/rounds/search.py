@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -178,7 +178,6 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     # Labels that are exchanged are plainly wrong before a fit (`suspects`); after it, two that are right may gain.
     news = [s for s in seen.scored if s.candidate.name not in loose and s.candidate.mechanism != "sensor_swap"]
     columns = seen.columns(loose)
-    alarm = list(columns.values())
     news = best_variants(news)
     null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
@@ -214,13 +213,23 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         name = tried[0].candidate.name if tried else ""
         least = max(null.threshold(before, name=name), EVEN)
         return Round(now, seen, tuple(tried), least, null, np.zeros((0, 0)), False)
-    n = len(now.batches)
-    best = to_claim(tried, n)
-    if best.gain > least_gain(best, n) and best.candidate.mechanism != "coarse_network":
-        best = _apart(now, best, tried, n) or best
+    best = to_claim(tried, len(now.batches))
+    ask = partial(_asked, now, seen, null, tried, columns, seed)
+    if best.gain > least_gain(best, len(now.batches)) and best.candidate.mechanism != "coarse_network":
+        finer = _apart(now, best, tried, len(now.batches))
+        if finer is not None and (done := ask(finer)).accepted:
+            return done
+    return ask(best)
+
+
+def _asked(
+    now: Fitted, seen: Screen, null: Null, tried: Sequence[Tried], columns: Mapping[str, int], seed: int, best: Tried
+) -> Round:
+    """The round with this one of those tried as its best, and whether it is accepted."""
     assert best.fitted is not None
+    n = len(now.batches)
     after = alone(best.fitted, now.memory)
-    flipped = flipped_gains(seen.evidence, after, alarm, seed)
+    flipped = flipped_gains(seen.evidence, after, list(columns.values()), seed)
     agreed = agreed_on(best, n)
     beside = null_beside(now, best.fitted, best.candidate, seed) if agreed and best.gain > EVEN else None
     own, density = (null, float(after.base_score()[0])) if beside is None else beside
@@ -231,8 +240,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     least = least_gain(best, n if agreed else best.improved)  # else the bar of one that all batches agree on
     threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed
-    tried = [best, *(t for t in tried if t is not best)]
-    return Round(now, seen, tuple(tried), threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+    tried = (best, *(t for t in tried if t is not best))
+    return Round(now, seen, tried, threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
 
 
 def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tried | None:
