@@ -77,11 +77,7 @@ def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
 
 def _shortfall(run: ProofRun) -> list[str]:
     """Why goals are missed: reasons by plant, and false claims by mechanism."""
-    missed, claims, own = run.table("missed"), run.table("claims"), []
-    if len(missed):
-        own.append(shortfall.reasons(missed, run.plants))
-    if len(claims) and not claims["true"].all():
-        own.append(shortfall.false_claims(claims, run.plants))
+    own = shortfall.tables(run, each=False)
     out = ["", " ".join(shortfall.sentences(run))] if own else []
     for table in own:
         heads = [f"{c.title} ({c.unit})" if c.unit else c.title for c in table.columns]

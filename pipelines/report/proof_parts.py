@@ -99,12 +99,7 @@ def _detection(run: ProofRun) -> Part:
 
 def _shortfall(run: ProofRun) -> Part:
     own = Part("shortfall", "Shortfall", "What was missed, what was claimed wrongly, and why")
-    missed, claims = run.table("missed"), run.table("claims")
-    shown: list[Table] = []
-    if len(missed):
-        shown += [shortfall.reasons(missed, run.plants), shortfall.missed_effects(missed, run.plants)]
-    if len(claims) and not claims["true"].all():
-        shown.append(shortfall.false_claims(claims, run.plants))
+    shown = shortfall.tables(run, each=True)
     if not shown:
         return _absent(own, "No visible effect was missed and no claim was false, or none was scored.")
     return replace(own, lead=" ".join(shortfall.sentences(run)), tables=tuple(shown))

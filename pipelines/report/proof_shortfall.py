@@ -8,8 +8,10 @@ import pandas as pd
 
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.proof_run import ProofRun
-from pipelines.report.proof_words import key_label, origin, plant_letter, plant_origin
+from pipelines.report.proof_words import key_label, plant_letter, plant_origin, simulated
 from pipelines.report.words import NOTHING, count, number, percent
+from twin.proof.scoring.outcomes import NOTHING as NOT_NAMED
+from twin.proof.scoring.outcomes import visible_physics
 from twin.proof.scoring.shortfall import OF_RECORDINGS, REASONS
 
 
@@ -17,23 +19,35 @@ def sentences(run: ProofRun) -> list[str]:
     """A sentence on visible effects, one on those that were missed, one on claims; those that the tables give."""
     terms, missed, claims = run.table("terms"), run.table("missed"), run.table("claims")
     said = []
+    seen = visible_physics(terms)
     if {"gain_nats", "bar_nats"} <= set(terms.columns):
-        seen = terms[terms["visible"].eq(True) & ~terms["decoy"].astype(bool) & terms["bar_nats"].notna()]
-        enough = int((seen["gain_nats"] > seen["bar_nats"]).sum())
+        listed = seen[seen["bar_nats"].notna()]
+        enough = int((listed["gain_nats"] > listed["bar_nats"]).sum())
         said.append(
-            f"Of {count(len(seen), 'visible effect')} that the library lists, {enough} gain what a claim takes once "
+            f"Of {count(len(listed), 'visible effect')} that the library lists, {enough} gain what a claim takes once "
             f"all that is true is in the model."
         )
     if len(missed):
         recordings = int(missed["reason"].isin(OF_RECORDINGS).sum())
         said.append(
-            f"{len(missed)} of {int((terms['visible'].eq(True) & ~terms['decoy'].astype(bool)).sum())} visible effects "
-            f"have no claim; in {recordings} of them the recordings do not favour the truth, in "
-            f"{len(missed) - recordings} the search fell short."
+            f"{len(missed)} of {count(len(seen), 'visible effect')} have no claim; in {recordings} of them the "
+            f"recordings do not favour the truth, in {len(missed) - recordings} the search fell short."
         )
     if len(claims):
         said.append(f"{int((~claims['true'].astype(bool)).sum())} of {count(len(claims), 'claim')} are not so.")
     return said
+
+
+def tables(run: ProofRun, each: bool) -> list[Table]:
+    """Those that say anything, without or with `each` missed effect."""
+    missed, claims, out = run.table("missed"), run.table("claims"), []
+    if len(missed):
+        out.append(reasons(missed, run.plants))
+        if each:
+            out.append(missed_effects(missed, run.plants))
+    if len(claims) and not claims["true"].all():
+        out.append(false_claims(claims, run.plants))
+    return out
 
 
 def reasons(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
@@ -48,7 +62,7 @@ def reasons(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
         "Gains are of the batches left out, in nats; the effect's own with all else that is true in the model. The "
         "recordings: these, read by networks as coarse as the machine file's.",
     )
-    return Table("Visible effects that no claim names", columns, tuple(rows), _simulated(plants), notes=notes)
+    return Table("Visible effects that no claim names", columns, tuple(rows), simulated(plants), notes=notes)
 
 
 def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
@@ -57,7 +71,7 @@ def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
     rows = []
     for r in order.sort_values(["rank", "case"], ascending=[False, True]).to_dict("records"):
         told = str(r["named_mechanism"])
-        named = NOTHING if told == "nothing" else f"{key_label(told)} at {key_label(str(r['named_place']))}"
+        named = NOTHING if told == NOT_NAMED else f"{key_label(told)} at {key_label(str(r['named_place']))}"
         what = f"{key_label(str(r['effect']))} at {key_label(str(r['place']))}"
         gain, bar, other = (_nats(r[c]) for c in ("gain_nats", "bar_nats", "told_gain_nats"))
         rows.append(Row((str(r["case"]), plant_letter(str(r["plant"])), what, gain, bar, named, other)))
@@ -66,7 +80,7 @@ def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
         Column("a claim takes", "nats", "number"), Column("told instead", kind="wide"),
         Column("that gains", "nats", "number"),
     )  # fmt: skip
-    return Table("Each of them", columns, tuple(rows), _simulated(plants))
+    return Table("Each of them", columns, tuple(rows), simulated(plants))
 
 
 def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
@@ -84,7 +98,7 @@ def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
         Column("false", kind="number"), Column("nothing was missing", kind="number"),
         Column("median probability", kind="number"),
     )  # fmt: skip
-    return Table("Claims that are not so", columns, tuple(rows), _simulated(plants))
+    return Table("Claims that are not so", columns, tuple(rows), simulated(plants))
 
 
 def _plants(said: str, plants: Sequence[str]) -> list[Column]:
@@ -97,7 +111,3 @@ def _by_plant(rows: pd.DataFrame, plants: Sequence[str]) -> list[str]:
 
 def _nats(value: object) -> str:
     return NOTHING if pd.isna(value) else number(float(value), 0)  # type: ignore[call-overload, arg-type]
-
-
-def _simulated(plants: Sequence[str]) -> bool:
-    return origin(plants) == "SIMULATED"

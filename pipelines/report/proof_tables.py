@@ -9,7 +9,7 @@ import pandas as pd
 
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.proof_run import ProofRun
-from pipelines.report.proof_words import KIND_WORDS, key_label, origin, plant_label, plant_letter, plant_origin
+from pipelines.report.proof_words import KIND_WORDS, key_label, plant_label, plant_letter, plant_origin, simulated
 from pipelines.report.words import NOTHING, number, p_words, percent
 
 _RARE = 0.05
@@ -80,7 +80,7 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
         f"Chance does as well in fewer than {percent(_RARE)} of the deals for {low} of {len(table)} questions; "
         f"chance alone would give about {_RARE * len(table):.1f}.",
     )
-    return Table("Leak test", columns, tuple(rows), _simulated(plants), notes=notes)
+    return Table("Leak test", columns, tuple(rows), simulated(plants), notes=notes)
 
 
 def convergence(table: pd.DataFrame) -> Table:
@@ -106,10 +106,6 @@ def _range(low: object, high: object, digits: int) -> str:
 
 def _time(stamp: str) -> str:
     return stamp.replace("T", " ").removesuffix("Z").split("+")[0].split(".")[0]
-
-
-def _simulated(plants: Sequence[str]) -> bool:
-    return origin(plants) == "SIMULATED"
 
 
 def _float(value: object) -> float:

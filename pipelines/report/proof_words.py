@@ -83,6 +83,11 @@ def origin(plants: Sequence[str]) -> str:
     return " · ".join(f"{', '.join(letters)} {said}".strip() for said, letters in groups.items())
 
 
+def simulated(plants: Sequence[str]) -> bool:
+    """Whether all of these plants are."""
+    return origin(plants) == "SIMULATED"
+
+
 def method_label(method: str) -> str:
     return _METHODS.get(method, method.replace("_", " "))
 

@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from twin.proof.scoring.intervals import Statistic
+from twin.proof.scoring.outcomes import visible_physics
 
 Select = Callable[[pd.DataFrame, pd.DataFrame], pd.Series]
 Better = Literal["higher", "lower"]
@@ -98,9 +99,10 @@ def _claims_of_two(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
 
 def _sized(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
     """Visible physics that was found and whose amplitude both sides state."""
-    at = terms["visible"].fillna(False).astype(bool) & terms["found"].fillna(False).astype(bool)
-    at &= ~terms["decoy"].astype(bool) & terms["amplitude_true"].notna() & terms["amplitude_found"].notna()
-    return terms[at & (terms["amplitude_true"] != 0)].set_index("case")
+    rows = visible_physics(terms)
+    at = rows["found"].fillna(False).astype(bool)
+    at &= rows["amplitude_true"].notna() & rows["amplitude_found"].notna()
+    return rows[at & (rows["amplitude_true"] != 0)].set_index("case")
 
 
 def _amplitude_error(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:

@@ -6,7 +6,6 @@ Cells that do not apply are empty. A diagnosis that failed has found nothing, an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import isfinite
 from typing import Any
 
 import pandas as pd
@@ -63,6 +62,11 @@ def outcomes(
         cases.append(outcome(key, own, truth, found, rows))
         terms += rows
     return _table(cases, OUTCOMES), _table(terms, TERMS)
+
+
+def visible_physics(terms: pd.DataFrame) -> pd.DataFrame:
+    """Of true terms (columns `TERMS`) those that can be seen and are physics, no decoys."""
+    return terms[terms["visible"].fillna(False).astype(bool) & ~terms["decoy"].astype(bool)]
 
 
 def outcome(
@@ -250,14 +254,10 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
         "amplitude_found": value,
         "low90": low,
         "high90": high,
-        "gain_nats": _finite(truth.gain_nats[k]) if truth is not None else None,
-        "bar_nats": _finite(truth.bar_nats[k]) if truth is not None else None,
+        "gain_nats": truth.gain_nats[k] if truth is not None else None,
+        "bar_nats": truth.bar_nats[k] if truth is not None else None,
         "told_gain_nats": finding.evidence.get("gain_nats") if finding is not None else None,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _named(finding: Finding, term: TrueTerm) -> str:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from twin.proof.scoring.answer_key import AnswerKey
 from twin.proof.scoring.matching import matches
-from twin.proof.scoring.outcomes import NOTHING
+from twin.proof.scoring.outcomes import NOTHING, visible_physics
 from twin.proof.scoring.stored import Stored
 
 LITTLE = "the effect itself gains less than a claim takes"
@@ -37,8 +37,8 @@ CLAIMS: Mapping[str, str] = {
 
 def missed(terms: pd.DataFrame) -> pd.DataFrame:
     """Visible physics that no finding claims, with the columns `MISSED`; `reason` is one of `REASONS`."""
-    at = terms["visible"].fillna(False).astype(bool) & ~terms["decoy"].astype(bool) & ~terms["found"].astype(bool)
-    out = terms[at].copy()
+    seen = visible_physics(terms)
+    out = seen[~seen["found"].astype(bool)].copy()
     out["reason"] = [_reason(row) for _, row in out.iterrows()]
     return out[list(MISSED)].astype(dict(MISSED)).reset_index(drop=True)
 

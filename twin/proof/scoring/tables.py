@@ -7,6 +7,7 @@ from typing import Literal
 import pandas as pd
 
 from twin.proof.scoring.intervals import clopper_pearson
+from twin.proof.scoring.outcomes import visible_physics
 
 BY = ("n", "visible", "right", "right_low90", "right_high90", "detected", "first_right", "place_exact", "place_near",
       "false_claims", "overlap", "amplitude_error", "closed", "seconds")  # fmt: skip
@@ -40,7 +41,7 @@ def by(outcomes: pd.DataFrame, column: str) -> pd.DataFrame:
 
 def confusion(terms: pd.DataFrame, what: Literal["mechanism", "place"]) -> pd.DataFrame:
     """Of visible physics: what was `true`, what was `named` in its stead ("nothing" too) and how often, `count`."""
-    rows = terms[terms["visible"].fillna(False).astype(bool) & ~terms["decoy"].astype(bool)]
+    rows = visible_physics(terms)
     table = pd.DataFrame({"true": rows[what].astype(str), "named": rows[f"named_{what}"].astype(str)})
     return table.value_counts(sort=False).rename("count").reset_index()
 
