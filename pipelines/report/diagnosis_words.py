@@ -76,7 +76,7 @@ def headline(verdict: str, probabilities: Sequence[float]) -> str:
     the = "The" if most >= SURE else "Most likely the" if most >= LIKELY else "Perhaps the"
     effects = "one effect" if n == 1 else f"{'up to ' if least < SURE else ''}{_spelled(n)} effects"
     return {
-        "consistent": "Consistent: the remaining error is the noise.",
+        "consistent": "Consistent: nothing is missing that these runs could show.",
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",
         "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",
         "unlisted": "Something is missing that no listed mechanism explains.",
@@ -88,7 +88,7 @@ def below_headline(verdict: str, runs: int, limits: int) -> str:
     """One sentence where a verdict has no finding to speak for it."""
     if verdict != "consistent":
         return ""
-    words = f"In {count(runs, 'left-out run')} the simulation misses no more than the sensors scatter"
+    words = f"In {count(runs, 'left-out run')} the simulation misses no more than noise and a coarse network leave"
     return words + ("; an effect above the limits below would have been seen." if limits else ".")
 
 

@@ -148,7 +148,7 @@ def test_a_second_run_replaces_only_when_asked(diagnose: Diagnosed, toy: Toy, tm
     done = diagnose("--overwrite", "--no-report")
     assert done.code == 0
     assert set(held(out)) == {"findings.json", "mine.txt"}  # nothing was found: the old machine file would mislead
-    assert "Consistent: the remaining error is the noise." in done.out and "machine.yml" not in done.out
+    assert "Consistent: nothing is missing that these runs could show." in done.out and "machine.yml" not in done.out
     assert "an effect above the limits below would have been seen" in done.out
 
 

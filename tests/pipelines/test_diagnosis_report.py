@@ -24,7 +24,7 @@ from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
 from twin.diagnosis.telling.findings import Findings
 
 VERDICTS = {
-    "consistent": ("consistent", "Consistent: the remaining error is the noise."),
+    "consistent": ("consistent", "Consistent: nothing is missing that these runs could show."),
     "explained": ("explained", "The simulation left out one effect; with it only the noise remains."),
     "partly_explained": (
         "partly explained",
@@ -107,7 +107,7 @@ def test_the_key_figures_are_before_after_and_noise_with_their_units() -> None:
     quiet = diagnosis_page(toy_diagnosis("consistent"), False)
     assert [k.before for k in quiet.figures] == [""] * 4 and quiet.figures[-1].after == "12"
     assert quiet.lead.startswith(
-        "In 12 left-out runs the simulation misses no more than the sensors scatter; an effect"
+        "In 12 left-out runs the simulation misses no more than noise and a coarse network leave; an effect"
     )
 
 

@@ -166,12 +166,12 @@ def _diagnosis(
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    rest = max(remainder(done), slow_remainder(rms))
+    rest, slow = remainder(done), slow_remainder(rms)
     listed = [f for f in found if f.mechanism not in UNLISTED]
-    verdict = verdict_of(listed, left is not None, rest, final.runs)
-    if rest > most_left(final.runs):
+    verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
+    if (most := max(rest, slow)) > most_left(final.runs):
         words += (
-            f"left-out errors are {rest:.1f} times what a coarse network alone would leave (median over channels)",
+            f"left-out errors are {most:.1f} times what a coarse network alone would leave (median over channels)",
         )
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)

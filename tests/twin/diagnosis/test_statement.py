@@ -183,6 +183,11 @@ def test_verdicts() -> None:
         "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 1 more in the table of limits."
     )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
+    coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
+    assert verdict_statement("consistent", rms=coarse) == (
+        "Nothing is missing that these runs could show: the remaining error, 11 times the noise in the median channel, "
+        "is what a network this coarse leaves (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y 30 µm (noise 1.2))."
+    )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "
         "the fit falls from 9.1 to 1.4 µm (noise 1.2). Nothing else is missing above the noise."

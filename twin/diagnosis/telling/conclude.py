@@ -18,7 +18,7 @@ from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.scoring.unseen import unseen
 from twin.diagnosis.telling.activity import activity
 from twin.diagnosis.telling.findings import Verdict
-from twin.diagnosis.telling.found import Found, Other, Rms, beside_words, place_words
+from twin.diagnosis.telling.found import Found, Other, Rms, beside_words, place_words, times_noise
 from twin.diagnosis.telling.honest_digits import Estimate
 from twin.diagnosis.writing.changes import deviations
 from twin.mechanisms import MECHANISMS
@@ -27,7 +27,7 @@ from twin.schema import TwinPart
 
 STRUCTURE = 5.0  # times the given noise that a network of castings leaves, in the median channel of plants
 # Times what structure leaves, beyond which something is left, whatever it is: 106 development plants that lacked
-# nothing, of 11 to 13 runs, left up to 3.5 times in filtered rows and up to 5.0 in plain ones. Few runs prove less.
+# nothing, of 11 to 13 runs, left up to 5.0 times in rows as they are. Few runs prove less.
 REST, REST_OF_FEW, FEW = 6.0, 4.0, 6
 # Of an amplitude, how far off a lumped network is beside all that its fit and the structural null know of: with it
 # nine in ten of 52 intervals told on development plants held the true amplitude, without it 63 in a hundred.
@@ -195,17 +195,18 @@ def remainder(search: Search) -> float:
 
 def slow_remainder(rms: Sequence[Rms]) -> float:
     """The same of the rows as they are, over what a network of castings usually leaves."""
-    return float(np.nanmedian([r.after / r.noise for r in rms if r.noise > 0] or [0.0])) / STRUCTURE
+    return times_noise(rms) / STRUCTURE
 
 
-def verdict_of(found: Sequence[Found], more: bool, rest: float, runs: int) -> Verdict:
-    """`more`: what is left over follows something that no listed mechanism is; `rest`: `remainder`."""
-    much = rest > most_left(runs)
+def verdict_of(found: Sequence[Found], more: bool, rest: float, slow: float, runs: int) -> Verdict:
+    """`more`: what is left over follows something that no listed mechanism is; `rest`: `remainder`, `slow`:
+    `slow_remainder`. Where nothing was found only the rows as they are speak: filtered ones tell the shape of what is
+    left, and castings that are cut too coarsely for one reason or another have every shape."""
     if not found:
-        return "unlisted" if more else "undecidable" if much else "consistent"
+        return "unlisted" if more else "undecidable" if slow > most_left(runs) else "consistent"
     if found[0].probability < SURE and found[0].tied:
         return "undecidable"
-    return "partly_explained" if more or much else "explained"
+    return "partly_explained" if more or max(rest, slow) > most_left(runs) else "explained"
 
 
 def most_left(runs: int) -> float:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from twin.compiling.scope import several
 from twin.diagnosis.proposals.candidate import Where
@@ -88,6 +90,11 @@ class Found:
         if self.probability > 0.9:
             return ()
         return tuple(o for o in self.others if o.alike and o.probability >= self.probability / 2)
+
+
+def times_noise(rms: Sequence[Rms]) -> float:
+    """Left-out errors after all that was found over the given noise, the median over channels; 0 where none is."""
+    return float(np.nanmedian([r.after / r.noise for r in rms if r.noise > 0] or [0.0]))
 
 
 def place_words(where: Where, part: TwinPart) -> str:

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.telling.equation import equation_with_numbers
 from twin.diagnosis.telling.findings import Alternative, DetectionLimit, Finding, FoundParameter, Place, Verdict, When
-from twin.diagnosis.telling.found import UNLISTED, Found, Rms
+from twin.diagnosis.telling.found import UNLISTED, Found, Rms, times_noise
 from twin.diagnosis.telling.honest_digits import Estimate, amount, as_given, few, listed, percent, spelt, with_unit
 from twin.mechanisms import MECHANISMS
 
 SURE, LIKELY = 0.9, 0.6  # above: plain; between: most likely; below: perhaps
 FALLS = 0.98  # an error that keeps a larger share than this has not fallen
 _THINGS = {"sensor": "sensor|channel", "error": "channel", "link": "joint|link", "node": "body"}  # what words call it
+NOISE = 2.0  # times the given noise: up to it what is left over is called noise
 _NAMED = 3  # limits, and alternatives, that a sentence names
 
 
@@ -133,7 +134,11 @@ def verdict_statement(
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
     left = [f"{r.channel} {with_unit(few(r.after), 'K' if r.unit == 'degC' else r.unit)}"
             + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
-    words = "Nothing is missing: the remaining error is the noise"
+    times = times_noise(rms)
+    words = "Nothing is missing: the remaining error is the noise" if times <= NOISE else (
+        f"Nothing is missing that these runs could show: the remaining error, {few(times)} times the noise in the "
+        "median channel, is what a network this coarse leaves"
+    )  # fmt: skip
     words += f" ({', '.join(left)})" if left else ""
     seen = []
     for limit, place in zip(limits[:_NAMED], places or [n.where.name for n in limits], strict=False):

@@ -10,14 +10,16 @@ from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.acceptance import flipped_threshold
 from twin.diagnosis.rounds.null import structural_misfits
+from twin.diagnosis.rounds.prediction import left_out_rows
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
 from twin.diagnosis.rounds.search import Round, Search, agreed_on, coarse_first, to_claim
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone
-from twin.diagnosis.telling.conclude import SURE, most_left, remainder
+from twin.diagnosis.telling.conclude import SURE, most_left, remainder, rms_of, slow_remainder
 from twin.diagnosis.telling.findings import Findings
+from twin.diagnosis.telling.tables import rms_table
 from twin.proof.rivals.answer import WITHIN, Claim, Reply
 
 COARSE = "coarse_network"
@@ -84,6 +86,12 @@ class Stage:
         """What the fit leaves, in units of what structure alone would."""
         return remainder(replace(self.done, final=self.round.before))
 
+    @cached_property
+    def slow(self) -> float:
+        """The same of rows as they are."""
+        left = left_out_rows(self.round.before)
+        return slow_remainder(rms_of(rms_table(left, left, self.round.before), self.round.before))
+
     def bar(self, null: float, name: str) -> float:
         """The threshold with another structural null."""
         names, flipped = self.round.null.names, self.round.flipped  # none where nothing was refitted
@@ -102,7 +110,7 @@ class Stage:
         best = to_claim(ranked, len(self.round.before.batches)) if ranked else None
         ranked = [best, *(t for t in ranked if t is not best)] if best is not None else []
         if best is None or not self.accepts(best, threshold):
-            return Reply("undecidable" if self.rest > most_left(self.round.before.runs) else "consistent")
+            return Reply("undecidable" if self.slow > most_left(self.round.before.runs) else "consistent")
         if best.candidate.mechanism == COARSE:
             return Reply("consistent")  # a refinement is no finding
         claim, told = self.claim(ranked, threshold)
