@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,6 +18,7 @@ from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds import search as search_module
+from twin.diagnosis.rounds.probability import explanations
 from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.search import IMPROVED, Round, Search, one_round, search
 from twin.diagnosis.rounds.trust import EVEN
@@ -150,6 +152,34 @@ def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(mo
         ("finer_head", False), ("sensor_drift_t_head", True),
     ]  # fmt: skip
     assert done is asked[-1] and asked[0].threshold > finer.gain
+
+
+@pytest.mark.parametrize("imitates", [True, False])
+def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
+    imitates: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A warm fixture gains 258 nats where the floor is cold, and ten beside a cold floor."""
+    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], search_module._asked
+
+    def watched(*given: Any) -> Round:
+        done = real(*given)
+        asked.append(done if asked else replace(done, accepted=False))
+        return asked[-1]
+
+    monkeypatch.setattr(search_module, "_asked", watched)
+    if not imitates:
+        monkeypatch.setattr(
+            search_module, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft"
+        )
+    done = one_round(now, 0, Workers(), lambda *_: None)
+    names = [r.best.candidate.name for r in asked if r.best is not None]
+    assert names == ["floor_sink_head_room", *([] if imitates else ["mandrel_fixture_z_shaft"])]
+    assert done is asked[-1] and done.accepted is not imitates
+    if not imitates:  # what structure may make explains nothing
+        barred = {t.candidate.name for t in done.tried if t.barred}
+        assert {"floor_sink_head_room", "jacket_chiller_head"} <= barred and "mandrel_fixture_z_shaft" not in barred
+        every, _, _ = explanations(done)
+        assert all(e.probability == 0.0 for e in every if e.tried.barred)
 
 
 @cache

@@ -28,6 +28,13 @@ def test_an_effect_goes_that_the_others_make_needless() -> None:
     assert best_change([dear, cheap, cheaper], effects, LEAST, TEMPERATURE) is cheaper
 
 
+def test_a_small_effect_that_nothing_made_needless_stays() -> None:
+    effects = [tried("coarse_network", 105.0), tried("viscosity_feedback", 149.0)]
+    assert best_change([Second(1, None, 93.0, FITTED)], effects, LEAST, TEMPERATURE) is None
+    needless = Second(1, None, 60.0, FITTED)
+    assert best_change([needless], effects, LEAST, TEMPERATURE) is needless
+
+
 @pytest.mark.parametrize(("gains", "changes"), [(2.0, False), (10.0, False), (15.0, False), (30.0, True)])
 def test_a_less_plausible_rival_must_gain_what_it_is_less_plausible(gains: float, changes: bool) -> None:
     effects, rival = [tried("nut_friction", 900.0, -1.0)], tried("guide_friction", 900.0, -3.0)

@@ -35,6 +35,7 @@ class Tried:
 
     `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size. `alike` is the
     gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the threshold.
+    `barred`: structure alone may make as much of it.
     """
 
     scored: Scored
@@ -44,6 +45,7 @@ class Tried:
     log_prior: float
     fitted: Fitted | None = None
     alike: float | None = None
+    barred: bool = False
 
     @property
     def candidate(self) -> Candidate:

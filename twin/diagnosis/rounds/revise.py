@@ -22,6 +22,7 @@ from twin.diagnosis.scoring.screen import alone
 from twin.schema import TwinPart
 
 RIVALS = 2  # of each effect that are tried in its place
+NEEDLESS = 0.5  # of its gain: what still loses more was not made needless by a later effect, however small it is
 BETTER = 3.0  # nats by which a rival must fit better beside all others
 
 
@@ -52,9 +53,9 @@ def second_thoughts(
     temperature: float,
     workers: Workers,
 ) -> Second | None:
-    """The best change of the set of effects, or None: an effect dropped whose loss is below `least` nats, or a rival
-    in its place that gains more than it is less plausible, `temperature` nats for each of log prior. Effects and rivals
-    as the rounds tried them."""
+    """The best change of the set of effects, or None: an effect dropped whose loss is below `least` nats and well
+    below what it gained when it was accepted, or a rival in its place that gains more than it is less plausible,
+    `temperature` nats for each of log prior. Effects and rivals as the rounds tried them."""
     work = []
     for k, t in enumerate(effects):
         rest = without(final.part, t.candidate, original)
@@ -75,7 +76,7 @@ def best_change(done: Sequence[Second], effects: Sequence[Tried], least: float, 
 
     def due(s: Second) -> bool:
         if s.rival is None:
-            return s.loss < least
+            return s.loss < min(least, NEEDLESS * effects[s.effect].gain)
         return s.loss + temperature * (effects[s.effect].log_prior - s.rival.log_prior) < -BETTER
 
     return min((s for s in done if due(s)), key=lambda s: s.loss, default=None)

@@ -37,7 +37,8 @@ FINALISTS, HOPEFUL = 4, 0.25  # refits taken on to their optimum, if they gain t
 MEMBERS = 2  # that are refitted too: of those that look like a refit the likeliest
 CLOSE, ALIKE = 2.0, 0.15  # if they stand no further below the best, or one step in the screen made the difference
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
-APART = 0.4  # of a finer network's gain: what gains as much beside an effect is none of it, and comes first
+APART = 0.4  # of a gain: what gains as much beside another is none of it
+NEXT = 2  # that are asked after one whose own null speaks against it
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
 Progress = Callable[[str, int, int], None]
@@ -146,7 +147,7 @@ def revised(done: Search, workers: Workers, tell: Progress) -> Search:
 
 def _rival(t: Tried, e: Tried) -> bool:
     """Whether it is near enough to the accepted effect to be tried in its place."""
-    return t.candidate.part is not None and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
+    return t.candidate.part is not None and not t.barred and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
 
 
 def _fair_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: Path | None) -> Round:
@@ -219,7 +220,26 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         finer = _apart(now, best, tried, len(now.batches))
         if finer is not None and (done := ask(finer)).accepted:
             return done
-    return ask(best)
+    first = ask(best)
+    if first.accepted or best.gain <= EVEN or best.candidate.mechanism == "coarse_network":
+        return first
+    # What structure may make of one effect, and of what looks like it, is not said of another that stands beside it.
+    rest = [replace(t, barred=True) if t.cluster == best.cluster else t for t in tried]
+    for other in elsewhere(best, rest, len(now.batches)):
+        if (done := _asked(now, seen, null, rest, columns, seed, other)).accepted:
+            return done
+    return first
+
+
+def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]:
+    """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much."""
+    out: list[Tried] = []
+    for t in tried:
+        if t.fitted is None or t.barred or t.cluster == first.cluster or t.candidate.mechanism == "coarse_network":
+            continue
+        if len(out) < NEXT and agreed_on(t, batches) and t.gain > least_gain(t, batches) and _beside(first, t):
+            out.append(t)
+    return out
 
 
 def _asked(
@@ -253,11 +273,16 @@ def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tr
     finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.fitted is not None]
     agreed = [t for t in finer if t.gain > LEAST_FINER and agreed_on(t, batches)]
     for first in sorted(agreed, key=lambda t: -t.gain)[:2]:
-        assert best.fitted is not None
-        beside = refit(best.fitted, first.scored)
-        if beside is not None and beside.gain > max(APART * first.gain, LEAST_FINER):
+        if _beside(best, first, LEAST_FINER):
             return taken_on(now, first)
     return None
+
+
+def _beside(first: Tried, t: Tried, least: float = EVEN) -> bool:
+    """Whether it gains much of what it does alone, and no less than `least` nats, in a fit that has the first."""
+    assert first.fitted is not None
+    beside = refit(first.fitted, t.scored)
+    return beside is not None and beside.gain > max(APART * t.gain, least)
 
 
 def _unscreened(c: Candidate) -> Scored:
