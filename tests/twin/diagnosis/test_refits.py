@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from data.errors import InputError
 from tests.twin.diagnosis.small_cases import SHIFT, fitted, four_bodies, runs
 from twin.diagnosis.rounds import refits
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
@@ -42,6 +43,26 @@ def test_at_an_error_the_better_of_two_beginnings_counts(
     assert once is not None and got.gain >= once.gain
     refit(now, heat)
     assert begun == ["afresh"]  # what acts on temperatures begins where the fit is
+
+
+def test_a_refit_begins_smaller_where_all_of_the_effect_cannot_be_simulated(
+    shifted: tuple[Any, Scored, Scored], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of preload that tightens with its own heat: what runs away at the screen's amplitude is still there."""
+    now, _, heat = shifted
+    name, real = f"mechanisms.{heat.candidate.name}.heat", refits.refitted
+    begun: list[float] = []
+
+    def runs_away(now: Any, part: Any, at: Any) -> Any:
+        begun.append(at[name])
+        if at[name] > 4.0:
+            raise InputError("stiff beyond the step control")
+        return real(now, part, at)
+
+    monkeypatch.setattr(refits, "refitted", runs_away)
+    got = refit(now, replace(heat, amplitudes={"heat": 20.0}))
+    assert got is not None and got.fitted is not None
+    assert begun == pytest.approx([20.0, 20.0, 6.0, 2.0])  # W
 
 
 def test_a_fit_is_not_taken_on_to_where_it_predicts_worse(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from data.batch import Batch
+from data.errors import InputError
 from tests.twin.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
 from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration.identifiability import Interval, intervals90
@@ -152,6 +153,28 @@ def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(mo
         ("finer_head", False), ("sensor_drift_t_head", True),
     ]  # fmt: skip
     assert done is asked[-1] and asked[0].threshold > finer.gain
+
+
+def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parameters gone with heat that feeds itself may make a machine that cannot be simulated without it."""
+
+    def stiff(*_: Any) -> None:
+        raise InputError("stiff beyond the step control")
+
+    now = fitted(two_bodies(), recordings("drift"))
+    monkeypatch.setattr(search_module, "refitted", stiff)
+    done = search_module._fair_round(now, 0, Workers(), lambda *_: None, None)
+    assert done.accepted and done.before is now and done.best is not None
+    assert done.best.candidate.name == "sensor_drift_t_head"
+
+
+def test_physics_never_takes_the_place_of_a_finer_network() -> None:
+    """A finer network is accepted for less than a claim is."""
+    r = found("drift").rounds[0]
+    assert r.best is not None
+    near = replace(r.best, cluster=r.best.cluster)
+    finer = replace(r.best.scored, candidate=replace(r.best.candidate, mechanism="coarse_network"))
+    assert search_module._rival(near, r.best) and not search_module._rival(near, replace(r.best, scored=finer))
 
 
 @pytest.mark.parametrize("imitates", [True, False])

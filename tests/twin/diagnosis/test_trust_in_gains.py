@@ -44,7 +44,7 @@ def test_batches_that_do_not_improve_ask_for_more() -> None:
 def test_so_does_what_says_how_a_network_or_a_lever_is_drawn() -> None:
     assert least_gain(tried("heat_bridge", 1.0), BATCHES) > 1.5 * EVEN
     assert least_gain(tried("joint_conductance", 1.0), BATCHES) > 1.5 * EVEN
-    assert least_gain(tried("column_bending", 1.0, kind="error"), BATCHES) > 1.2 * EVEN
+    assert least_gain(tried("column_bending", 1.0, kind="error"), BATCHES) > 1.7 * EVEN
     assert least_gain(tried("speed_shift", 1.0, kind="error"), BATCHES) == EVEN  # a driver makes it
     assert least_gain(tried("time_skew", 1.0, kind="error"), BATCHES) == EVEN  # and a clock's fault is no lever
 

@@ -178,6 +178,15 @@ def test_a_bearing_that_would_seize_is_drawn_weaker_and_the_answer_says_so(plant
     assert 40.0 < hottest <= HOTTEST_DEGC
 
 
+def test_convection_that_the_plants_step_does_not_take_is_drawn_weaker() -> None:
+    """A shaft that drags 80 times the air's exchange along ended the simulation: all recordings were empty."""
+    built = build(short(plant="elements", effects={"rotating_convection": 20.0}, hours=2.0))
+    (term,) = built.answer["terms"]
+    assert term["size"] == built.answer["redraw"]["effects"]["rotating_convection"] < 20.0
+    last = [[b.values(c)[-1] for c in b.names("temperature")] for b in batches_of(built)]
+    assert not any(np.isnan(degC).all() for degC in last)
+
+
 def test_a_machine_that_is_too_hot_by_itself_is_drawn_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     own = sys.modules["twin.proof.suite.build"]  # the package has a function of this name
     monkeypatch.setattr(own, "_seized", lambda _: True)

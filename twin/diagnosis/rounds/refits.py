@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -18,6 +18,7 @@ from twin.diagnosis.rounds.fitted import TOLERANCE, Fitted, refitted, settle
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
+from twin.quantity import Value
 from twin.schema import TwinPart
 
 BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
@@ -26,6 +27,7 @@ LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candi
 WORTH = 0.5  # nats in the screen that are worth a refit
 LOOKED_AT = 80
 AFRESH = 3  # steps of a refit at an error with all rows counted alike
+SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
 SHAPED = 5.0  # nats in the screen that each parameter beside the size must be worth
 
 
@@ -131,14 +133,13 @@ def _promise(s: Scored) -> tuple[float, str]:
 
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
-    values, at = start_values(s, now)
     if s.candidate.mechanism == "sensor_swap":  # the fit was bent towards the wrong labels
         try:
-            part = s.candidate.applied(now.part, values)
+            part = s.candidate.applied(now.part, start_values(s, now)[0])
             return judged(now, Tried(s, 0.0, 0, 0, 0.0, baseline(now.machine, part, now.batches, None, now.runs)))
         except (InputError, WorkError):
             return None
-    for begin in ({**_beside(s, now), **at}, at):
+    for values, begin in _begins(s, now):
         try:
             part = s.candidate.applied(now.part, values)
             done = judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, part, begin)), roughly=True)
@@ -147,8 +148,18 @@ def refit(now: Fitted, s: Scored) -> Tried | None:
             again = judged(now, replace(done, fitted=_afresh(now, part, begin)), roughly=True)
             return max(done, again, key=lambda one: one.gain)
         except (InputError, WorkError):
-            continue  # a linear step may lead where no machine is
+            continue
     return None
+
+
+def _begins(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
+    """Free values and where the refit begins, one after the other until it can: a linear step may lead where no machine
+    is, as heat that feeds itself runs away."""
+    values, at = start_values(s, now)
+    yield values, {**_beside(s, now), **at}
+    yield values, at
+    for share in SMALLER if s.amplitudes else ():
+        yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
 
 
 def _afresh(now: Fitted, part: TwinPart, begin: Mapping[str, float]) -> Fitted:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data.errors import InputError, WorkError
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.coarse import coarse_candidates
@@ -146,7 +147,10 @@ def revised(done: Search, workers: Workers, tell: Progress) -> Search:
 
 
 def _rival(t: Tried, e: Tried) -> bool:
-    """Whether it is near enough to the accepted effect to be tried in its place."""
+    """Whether it is near enough to the accepted effect to be tried in its place; a finer network was asked for less
+    than an effect is."""
+    if e.candidate.mechanism == "coarse_network":
+        return False
     return t.candidate.part is not None and not t.barred and (t.cluster == e.cluster or t.gain > SWAP * e.gain)
 
 
@@ -157,7 +161,10 @@ def _fair_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache:
         if not done.accepted or done.best is None or done.best.fitted is None:
             return done
         tell("fair baseline", 0, 0)
-        back = settle(refitted(done.best.fitted, now.part))
+        try:
+            back = settle(refitted(done.best.fitted, now.part))
+        except (InputError, WorkError):
+            return done  # where it has gone with the effect, no machine without it is
         more = float(alone(back, now.memory).base_score()[0] - alone(now, now.memory).base_score()[0])
         if more < BETTER:
             return done
