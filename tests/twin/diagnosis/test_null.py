@@ -55,6 +55,7 @@ def test_the_threshold_is_beyond_all_that_was_seen() -> None:
     exact = 5.0 - 2.0 * np.log(-np.log(0.99))
     quantile = replace(many, gain=np.minimum(many.gain, exact))  # only the largest would lift it
     assert quantile.threshold(-1.0) == pytest.approx(MARGIN * exact, rel=0.05)
+    assert quantile.threshold(-1.0, margin=1.0) == pytest.approx(exact, rel=0.05)
     assert null.threshold(-1.0, 0.999) > null.threshold(-1.0, 0.99) > 0
 
 

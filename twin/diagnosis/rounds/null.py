@@ -38,21 +38,21 @@ class Null:
     names: tuple[str, ...] = ()
     gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
-    def threshold(self, density: float, share: float = 0.99, name: str = "") -> float:
+    def threshold(self, density: float, share: float = 0.99, name: str = "", margin: float = MARGIN) -> float:
         """The gain that structure alone exceeds in 1 - share of the cases, where it leaves no more than `density` says.
 
         Of each machine counts the largest misfit that predicts left-out batches no worse. As there are few, a Gumbel
         distribution goes through their mean and spread.
 
         With the `name` of a candidate what structure makes of it counts, and not of others (`balanced`).
-        There is a `MARGIN` on either.
+        Either is `margin` times that quantile.
         """
         gain = self.typical(density)
         if len(gain) < 3:
             return float("inf")
         if name not in self.names or not self.gains.size:
-            return MARGIN * balanced(gain[:, None], None, share)
-        return MARGIN * balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
+            return margin * balanced(gain[:, None], None, share)
+        return margin * balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
 
     def typical(self, density: float) -> Array:
         """The largest gain (T,) of each machine at that misfit."""

@@ -21,7 +21,7 @@ from twin.compile import compile_network
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
-from twin.diagnosis.rounds.null import Null, structural_null
+from twin.diagnosis.rounds.null import MARGIN, Null, structural_null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import left_out_rows
@@ -157,10 +157,11 @@ def _judged(
     beside = null_beside(without[best], full, s.candidate, seed)
     if beside is None:  # a value that is doubted, labels that are swapped
         beside = _null(without[best], seed), _score(full, memory)
-    out = _beyond(without[best], full, memory, beside[0].threshold(beside[1], name=s.candidate.name))
+    structure = beside[0].threshold(beside[1], name=s.candidate.name, margin=1.0)
+    out = _beyond(without[best], full, memory, structure)
     better = improved(alone(without[best], memory), alone(full, memory))
     least = least_gain(Tried(s, out.gain, better, 0, 0.0, full), len(full.batches))
-    return replace(out, bar=max(least, out.threshold))
+    return replace(out, bar=max(least, MARGIN * structure))
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
@@ -169,7 +170,7 @@ def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> 
         return _Judged()
     other = _fit(*redraw(term.effect))
     memory = whiter(fit.memory, other.memory)
-    return replace(_beyond(fit, other, memory, null.threshold(_score(other, memory))), fitted=other)
+    return replace(_beyond(fit, other, memory, null.threshold(_score(other, memory), margin=1.0)), fitted=other)
 
 
 def _beyond(before: Fitted, after: Fitted, memory: Memory, threshold: float) -> _Judged:
