@@ -154,7 +154,7 @@ def test_sections_come_in_order_and_without_data_not_at_all(full: str) -> None:
     bare = replace(d, tables={k: pd.DataFrame(columns=list(c)) for k, c in COLUMNS.items()})
     page = diagnosis_page(bare)
     assert page.parts == () and [k.label for k in page.figures] == ["left-out runs"]
-    assert page.lead == "In 12 left-out runs the simulation misses no more than the sensors scatter."
+    assert page.lead == "In 12 left-out runs the simulation misses no more than noise and a coarse network leave."
     for name, anchor in {"map": "where", "rms": "better", "limits": "limits", "flux": "flux"}.items():
         tables = {**toy_diagnosis("unlisted").tables, name: bare.tables[name]}
         parts = diagnosis_page(replace(toy_diagnosis("unlisted"), tables=tables), False).parts
