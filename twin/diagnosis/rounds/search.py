@@ -230,9 +230,10 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     first = ask(best)
     if first.accepted or best.gain <= EVEN or best.candidate.mechanism == "coarse_network":
         return first
-    # What structure may make of one effect, and of what looks like it, is not said of another that stands beside it.
-    rest = [replace(t, barred=True) if t.cluster == best.cluster else t for t in tried]
-    for other in elsewhere(best, rest, len(now.batches)):
+    # What structure may make of one effect, and of what imitates it, is not said of another that stands beside it.
+    for other in elsewhere(best, tried, len(now.batches)):
+        better = next(n for n, t in enumerate(tried) if t is other)
+        rest = [replace(t, barred=True) if n < better or t.cluster == best.cluster else t for n, t in enumerate(tried)]
         if (done := _asked(now, seen, null, rest, columns, seed, other)).accepted:
             return done
     return first
@@ -242,7 +243,7 @@ def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]
     """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much."""
     out: list[Tried] = []
     for t in tried:
-        if t.fitted is None or t.barred or t.cluster == first.cluster or t.candidate.mechanism == "coarse_network":
+        if t.fitted is None or t.cluster == first.cluster or t.candidate.mechanism == "coarse_network":
             continue
         if len(out) < NEXT and agreed_on(t, batches) and t.gain > least_gain(t, batches) and _beside(first, t):
             out.append(t)
