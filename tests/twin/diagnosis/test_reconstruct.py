@@ -18,8 +18,9 @@ from twin.diagnosis.places.where_when import locate
 from twin.schema import MechanismPart, twin_part
 
 
-def found(given: Case) -> Reconstruction:
-    return reconstruct(locate(given.problem, given.fit.x, given.fit.nuisance, given.batches), given.batches)
+def found(given: Case, stateable: bool = False) -> Reconstruction:
+    located = locate(given.problem, given.fit.x, given.fit.nuisance, given.batches)
+    return reconstruct(located, given.batches, stateable=stateable)
 
 
 def size(part: MechanismPart | None, parameter: str) -> float:
@@ -82,6 +83,15 @@ def test_a_tilt_is_told_as_the_difference_that_it_is() -> None:
     assert {c.term.name: round(c.value) for c in out.terms} == {"θ_column": 6, "θ_bed": -6}
     assert out.part is None and 0 < out.part_gain < 0.9 * out.gain
     assert "6.0 µm of z per K of column's rise" in out.words and "−6.0 µm of z per K of bed's rise" in out.words
+
+
+def test_what_one_mechanism_can_state_of_it_is_told_on_demand() -> None:
+    """Where a finding must be refitted, the best that a machine file can state goes before what no file can."""
+    hot, cold = (shift("z", body, None, per_K=f"{g} um/K")["shift"] for body, g in (("column", 6.0), ("bed", -6.0)))
+    given = case({"hot": hot, "cold": cold})
+    free, stated = found(given), found(given, stateable=True)
+    assert free.part is None and stated.part is not None and stated.part.law == "free_shift"
+    assert stated.gain == pytest.approx(free.part_gain) and 0 < stated.explained < free.explained
 
 
 def test_nothing_to_reconstruct() -> None:

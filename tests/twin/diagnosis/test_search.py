@@ -168,6 +168,18 @@ def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: py
     assert done.best.candidate.name == "sensor_drift_t_head"
 
 
+def test_what_gains_by_its_own_memory_alone_is_not_claimed() -> None:
+    """A lever of 240 nats with rows as it counts them, of 96 as its rivals do, against a bar of 197."""
+    best = found("drift").rounds[0].best
+    assert best is not None
+    lever = replace(best, gain=240.0, alike=96.0)
+    assert search_module._unlikely(lever, 197.0, 10.0)  # 101 nats below, in units of 10: odds of e^10
+    assert not search_module._unlikely(replace(lever, alike=180.0), 197.0, 10.0)
+    assert not search_module._unlikely(replace(lever, alike=None), 197.0, 10.0)
+    finer = replace(best.scored, candidate=replace(best.candidate, mechanism="coarse_network"))
+    assert not search_module._unlikely(replace(lever, scored=finer), 197.0, 10.0)
+
+
 def test_physics_never_takes_the_place_of_a_finer_network() -> None:
     """A finer network is accepted for less than a claim is."""
     r = found("drift").rounds[0]

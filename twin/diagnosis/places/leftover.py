@@ -99,7 +99,7 @@ def leftover(done: Search, batches: Sequence[Batch], located: Located) -> Leftov
         if place.kind == "sensor":
             continue
         try:
-            terms = reconstruct(located, batches, place)
+            terms = reconstruct(located, batches, place, stateable=True)
         except (InputError, WorkError):
             continue
         if not terms.terms or terms.explained < UNLISTED_SHARE or terms.improved < IMPROVED * len(batches):

@@ -67,9 +67,10 @@ class Reconstruction:
 
 
 def reconstruct(
-    located: Located, batches: Sequence[Batch], found: Found | None = None, most: int = MOST
+    located: Located, batches: Sequence[Batch], found: Found | None = None, most: int = MOST, stateable: bool = False
 ) -> Reconstruction:
-    """At most so many terms for a place found, by default the first.
+    """At most so many terms for a place found, by default the first; `stateable`: those that one mechanism can state,
+    whatever others would gain.
 
     Raises:
         InputError: nothing was found, it is a sensor's, or there are fewer than two batches.
@@ -89,7 +90,7 @@ def reconstruct(
         best = scores.chosen([k for k, t in enumerate(terms) if not t.exchange], most, exchange)
     gain = scores.gain([*exchange, *best]) - scores.gain(exchange)
     stated, stated_gain = _stated(scores, terms, most, exchange)
-    if best and set(best) != set(stated) and stated_gain >= AS_GOOD * gain:
+    if best and set(best) != set(stated) and (stateable or stated_gain >= AS_GOOD * gain):
         best, gain = stated, stated_gain
     share, improved = scores.explained(best, exchange)
     told_by = _coefficients(scores, terms, best, exchange, found)

@@ -39,6 +39,7 @@ MEMBERS = 2  # that are refitted too: of those that look like a refit the likeli
 CLOSE, ALIKE = 2.0, 0.15  # if they stand no further below the best, or one step in the screen made the difference
 SWAP = 0.5  # of an effect's gain: what gained as much may take its place when all others are in
 APART = 0.4  # of a gain: what gains as much beside another is none of it
+UNLIKELY = 20.0  # odds of nothing against it, with rows counted as for its rivals, at which nothing is claimed
 NEXT = 2  # that are asked after one whose own null speaks against it
 FINER = 0.9  # of the best gain: a finer network that gains as much comes first
 
@@ -267,9 +268,19 @@ def _asked(
     which = list(columns).index(best.candidate.name) if best.candidate.name in columns else None
     least = least_gain(best, n if agreed else best.improved)  # else the bar of one that all batches agree on
     threshold = max(structure, flipped_threshold(flipped, n, which), least)
-    accepted = best.gain > threshold and agreed
+    accepted = best.gain > threshold and agreed and not _unlikely(best, threshold, null.temperature)
     tried = (best, *(t for t in tried if t is not best))
     return Round(now, seen, tried, threshold, null, flipped, accepted, sign_p(best.improved, n), own, density)
+
+
+def _unlikely(best: Tried, threshold: float, temperature: float) -> bool:
+    """Whether nothing would be far likelier, where its rows count as its rivals' do.
+
+    Its own memory may make many rows of a few: a lever that gained 240 nats so gained 96 beside its rivals.
+    """
+    if best.candidate.mechanism == "coarse_network":
+        return False
+    return threshold - best.level > temperature * float(np.log(UNLIKELY))
 
 
 def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tried | None:
