@@ -136,7 +136,8 @@ def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
 
     before, true, floor = (number(plain[k]) for k in ("error_before", "error_true", "error_floor"))
     gains, thresholds, bars = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats", "bar_nats"))
-    return TrueModel(before, true, floor, gains, thresholds, bars, tuple(plain["visible"]))
+    sizes = tuple((value, low, high) for value, low, high in plain["sizes"])
+    return TrueModel(before, true, floor, gains, thresholds, bars, tuple(plain["visible"]), sizes)
 
 
 def scoring_source() -> str:

@@ -36,13 +36,17 @@ class Cell:
     bar: Bar | None = None
 
 
+_NONE = Cell(NOTHING, "", "", "")
+
+
 @dataclass(frozen=True)
 class GoalRow:
-    """One goal: over all plants, and a cell for each plant."""
+    """One goal: over all plants, what an answer would reach that is told the truth, and a cell for each plant."""
 
     measure: str
     goal: str
     whole: Cell
+    informed: Cell
     plants: tuple[Cell, ...]
 
 
@@ -53,7 +57,15 @@ def goal_rows(goals: pd.DataFrame, plants: Sequence[str]) -> tuple[GoalRow, ...]
         by_plant = {str(r["plant"]): r for r in part.to_dict("records")}
         first = next(iter(by_plant.values()))
         every = [_cell(by_plant.get(p), False) for p in plants]
-        out.append(GoalRow(str(measure), str(first["goal"]), _cell(by_plant.get("all"), True), tuple(every)))
+        out.append(
+            GoalRow(
+                str(measure),
+                str(first["goal"]),
+                _cell(by_plant.get("all"), True),
+                _informed(by_plant.get("all")),
+                tuple(every),
+            )
+        )
     return tuple(out)
 
 
@@ -72,12 +84,17 @@ def shortfalls(goals: pd.DataFrame, plant: str = "all") -> list[str]:
 
 def _cell(r: Mapping[Any, Any] | None, picture: bool) -> Cell:
     if r is None or not math.isfinite(_number(r["value"])):
-        return Cell(NOTHING, "", "", "")
+        return _NONE
     low, high = _number(r["low90"]), _number(r["high90"])
     known = math.isfinite(low) and math.isfinite(high)
     said = _interval(r, low, high) if known else ""
     met = "" if pd.isna(r["met"]) else "yes" if bool(r["met"]) else "no"
     return Cell(_value(r), said, f"{int(r['n'])}", met, _bar(r, low, high) if picture else None)
+
+
+def _informed(r: Mapping[Any, Any] | None) -> Cell:
+    value = math.nan if r is None else _number(r["informed"])
+    return Cell(_value(r, value), "", f"{int(r['informed_n'])}", "") if r and math.isfinite(value) else _NONE
 
 
 def _value(r: Mapping[Any, Any], value: float | None = None) -> str:

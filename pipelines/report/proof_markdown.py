@@ -66,13 +66,13 @@ def proof_markdown(run: ProofRun | None) -> str:
 
 def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
     heads = [f"{words.plant_label(p)} ({words.plant_origin(p)})" for p in plants]
-    cells = ["measure", "goal", f"all plants ({words.origin(plants)})", "90 %", "n", "met", *heads]
-    out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * len(heads)])]
+    cells = ["measure", "goal", f"all plants ({words.origin(plants)})", "90 %", "n", "met", words.INFORMED, *heads]
+    out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
     for g in goal_rows(goals, plants):
         met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)
         interval, n = g.whole.interval or NOTHING, g.whole.n or NOTHING
-        out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, g.plants)]))
-    return out
+        out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, [g.informed, *g.plants])]))
+    return [*out, "", f"{words.INFORMED.capitalize()}: {words.meaning(words.INFORMED)}"]
 
 
 def _shortfall(run: ProofRun) -> list[str]:

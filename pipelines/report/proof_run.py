@@ -17,7 +17,8 @@ TABLES: Mapping[str, tuple[str, ...]] = {
                  "error_before", "error_after", "error_true", "error_floor", "limit_share"),
     "terms": ("case", "kind", "plant", "effect", "mechanism", "place", "visible", "limit_share", "decoy", "found",
               "amplitude_true", "amplitude_found", "low90", "high90"),
-    "goals": ("measure", "goal", "wanted", "better", "value", "low90", "high90", "n", "met", "plant"),
+    "goals": ("measure", "goal", "wanted", "better", "value", "low90", "high90", "n", "met", "informed",
+              "informed_n", "plant"),
     "compared": ("method", "group", "measure", "value", "low90", "high90", "n"),  # group: diagnosis, baseline, ablation
     "reliability": ("low", "high", "claimed", "right", "low90", "high90", "n"),
     "confusion_mechanism": ("true", "named", "count"),

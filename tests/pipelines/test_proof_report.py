@@ -188,7 +188,7 @@ def test_what_was_missed_and_claimed_falsely_is_told_with_who_owes_it(run: Proof
 
 def _goal(**changed: object) -> dict[str, object]:
     row = {"measure": "detection", "goal": "≥ 97 %", "wanted": 0.97, "better": "higher", "value": 0.955, "low90": 0.93,
-           "high90": 0.972, "n": 200, "met": False, "plant": "all"}  # fmt: skip
+           "high90": 0.972, "n": 200, "met": False, "informed": 0.99, "informed_n": 190, "plant": "all"}  # fmt: skip
     return row | changed
 
 
@@ -198,6 +198,7 @@ def test_a_goal_is_told_with_interval_count_and_plants() -> None:
     assert (row.measure, row.goal, row.whole.value) == ("detection", "≥ 97 %", "95.5 %")
     assert row.whole.interval == "93.0 to 97.2 %"
     assert (row.whole.met, row.whole.n) == ("no", "200")
+    assert (row.informed.value, row.informed.n, row.informed.met) == ("99.0 %", "190", "")
     assert [(c.value, c.met, c.n) for c in row.plants] == [("–", "", ""), ("98.0 %", "yes", "90")]
     bar = row.whole.bar
     assert bar is not None and (bar.wanted, bar.value) == (75.0, 62.5)  # the axis runs from 0.97 − 3 · 0.03 to 1
@@ -205,8 +206,9 @@ def test_a_goal_is_told_with_interval_count_and_plants() -> None:
 
 
 def test_a_goal_that_no_case_speaks_for_is_neither_met_nor_missed(run: ProofRun) -> None:
-    empty = _goal(value=None, low90=None, high90=None, n=0, met=None)
+    empty = _goal(value=None, low90=None, high90=None, n=0, met=None, informed=None, informed_n=0)
     goals = pd.DataFrame([empty, _goal(measure="time", met=True)], dtype=object)
+    assert goal_rows(goals, ())[0].informed.value == "–"
     assert goal_rows(goals, ())[0].whole.value == "–" and goal_rows(goals, ())[0].whole.bar is None
     told = replace(run, tables={"goals": goals, "outcomes": run.table("outcomes")})
     assert headline(told) == "Every goal met on 60 sealed cases."

@@ -145,7 +145,8 @@ def _goals(draws: np.random.Generator, plants: Sequence[str]) -> pd.DataFrame:
             met = pd.NA if np.isnan(v) else bool(v >= want) if better == "higher" else bool(v <= want)
             n = 0 if np.isnan(v) else 120 if plant == "all" else 60
             rows.append({"measure": measure, "goal": goal, "wanted": want, "better": better, "value": v, "met": met,
-                         "low90": v - spread, "high90": v + spread, "n": n, "plant": plant})  # fmt: skip
+                         "low90": v - spread, "high90": v + spread, "n": n, "plant": plant,
+                         "informed": np.nan if "time" in measure else v + 2 * spread, "informed_n": n})  # fmt: skip
     return pd.DataFrame(rows)
 
 

@@ -24,8 +24,8 @@ class FreeFlux(Mechanism):
     key = "free_flux"
     words = "heat of no listed mechanism"
     equation = (
-        "P = constant + linear u + square u^2 + cross u v + (per_K + product u) (T - 20 degC); "
-        "u level, v other, 0 where not named"
+        "P = constant + linear u + square u^2 + (cross u + square_cross u^2) v + (per_K + product u) (T - 20 degC); "
+        "u level, v other or 0"
     )
     source = SECOND_ORDER
     signature = "whatever the body's temperature lacks, as far as a driver and the temperature itself tell it"
@@ -39,6 +39,7 @@ class FreeFlux(Mechanism):
         Spec("linear", "W", "heat per unit of the level", 0.0, 50.0, -1e6, 1e6, "linear"),
         Spec("square", "W", "heat per unit of the level squared", 0.0, 50.0, -1e6, 1e6, "linear"),
         Spec("cross", "W", "heat per unit of both drivers", 0.0, 50.0, -1e6, 1e6, "linear"),
+        Spec("square_cross", "W", "heat per unit of the other and the level squared", 0.0, 50.0, -1e6, 1e6, "linear"),
         Spec("per_K", "W/K", "heat per kelvin of the body above 20 degC", 0.0, 2.0, -1e5, 1e5, "linear"),
         Spec("product", "W/K", "heat per kelvin and unit of the level", 0.0, 2.0, -1e5, 1e5, "linear"),
     )
@@ -55,7 +56,8 @@ class FreeShift(Mechanism):
     key = "free_shift"
     words = "displacement of no listed mechanism"
     equation = (
-        "error = linear u + square u^2 + cross u v + (per_K + product u) θ_body; u level, v other, 0 where not named"
+        "error = linear u + square u^2 + (cross u + square_cross u^2) v + (per_K + product u) θ_body; "
+        "u level, v other or 0"
     )
     source = SECOND_ORDER
     signature = "whatever the error lacks beside the temperatures, as far as a driver and one body's rise tell it"
@@ -68,6 +70,16 @@ class FreeShift(Mechanism):
         Spec("linear", "um", "displacement per unit of the level", 0.0, 5.0, -1e5, 1e5, "linear"),
         Spec("square", "um", "displacement per unit of the level squared", 0.0, 5.0, -1e5, 1e5, "linear"),
         Spec("cross", "um", "displacement per unit of both drivers", 0.0, 5.0, -1e5, 1e5, "linear"),
+        Spec(
+            "square_cross",
+            "um",
+            "displacement per unit of the other and the level squared",
+            0.0,
+            5.0,
+            -1e5,
+            1e5,
+            "linear",
+        ),
         Spec("per_K", "um/K", "displacement per kelvin of the body's rise", 0.0, 2.0, -1e4, 1e4, "linear"),
         Spec("product", "um/K", "displacement per kelvin and unit of the level", 0.0, 2.0, -1e4, 1e4, "linear"),
     )
@@ -81,4 +93,5 @@ class FreeShift(Mechanism):
 
 def _second_order(view: View, p: Mapping[str, Array], over_K: Array) -> Array:
     u, v = view.driver.get("level", 0.0), view.driver.get("other", 0.0)
-    return p["linear"] * u + p["square"] * u**2 + p["cross"] * u * v + (p["per_K"] + p["product"] * u) * over_K
+    driven = p["linear"] * u + p["square"] * u**2 + (p["cross"] * u + p["square_cross"] * u**2) * v
+    return driven + (p["per_K"] + p["product"] * u) * over_K

@@ -38,6 +38,8 @@ def size(part: MechanismPart | None, parameter: str) -> float:
          "W out of saddle with the square of rpm (at 5000 rpm)"),
         (flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", "cross", 0.012,
          "W into bed in proportion to rpm (at 5000 rpm) while coolant is on"),
+        (flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", "square_cross", 3e-6,
+         "W into bed with the square of rpm (at 5000 rpm) while coolant is on"),
         (shift("z", linear="8 um"), "z", "linear", 8.0, "µm of z while coolant is on"),
         (shift("y", "column", "rpm", product="0.0005 um/K"), "y", "product", 0.0005,
          "µm of y per K of column's rise, in proportion to rpm (at 5000 rpm)"),

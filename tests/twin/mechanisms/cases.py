@@ -143,6 +143,7 @@ def _charge_strain(q: SimpleNamespace) -> Any:
 
 def _free(q: SimpleNamespace, over: Any) -> Any:
     by_driver = q.linear * q.level + q.square * q.level**2 + q.cross * q.level * q.other
+    by_driver = by_driver + q.square_cross * q.level**2 * q.other
     return by_driver + (q.per_K + q.product * q.level) * over
 
 

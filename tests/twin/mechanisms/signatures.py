@@ -67,6 +67,7 @@ def free_shift(m: Mechanism) -> None:
     assert m.displacement(view, told).tolist() == [1.0, 11.0, 8.0]
     beside = replace(view, driver={**view.driver, "other": np.array([0.0, 1.0, 1.0])})
     assert m.displacement(beside, usual(m, cross=3.0)).tolist() == [0.0, 6.0, 0.0]
+    assert m.displacement(beside, usual(m, square_cross=3.0)).tolist() == [0.0, 12.0, 0.0]
 
 
 def charge_strain(m: Mechanism) -> None:

@@ -204,11 +204,9 @@ def free_flux(m: Mechanism) -> None:
     warm, told = {"body": 25.0}, {"constant": 3.0, "linear": 2.0, "square": 0.5, "per_K": -1.0, "product": 0.1}
     assert heat(m, warm, told, level=[0.0, 2.0, -2.0]).tolist() == [-2.0, 5.0, -5.0]
     assert heat(m, warm, told) == heat(m, warm, told, level=0.0)
-    assert heat(m, {"body": 20.0}, {"cross": 1.5}, level=[0.0, 2.0, 2.0], other=[3.0, 3.0, 0.0]).tolist() == [
-        0.0,
-        9.0,
-        0.0,
-    ]
+    for both, watts in (("cross", 9.0), ("square_cross", 18.0)):
+        beside = heat(m, {"body": 20.0}, {both: 1.5}, level=[0.0, 2.0, 2.0], other=[3.0, 3.0, 0.0])
+        assert beside.tolist() == [0.0, watts, 0.0]
 
 
 def ohmic_heat(m: Mechanism) -> None:

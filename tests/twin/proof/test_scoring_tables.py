@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,35 @@ def test_every_goal_is_measured_over_all_and_by_plant() -> None:
     assert row(goals, "time of one case, median")["value"] == 20.0
     absent = row(goals, "three visible effects")
     assert absent["n"] == 0 and pd.isna(absent["value"]) and pd.isna(absent["met"])
+
+
+def test_an_answer_that_is_told_the_truth_is_held_to_the_same_bars() -> None:
+    """Of ten visible effects (80 W by the true model, 60 to 110) eight pass the bar; of a pair both must."""
+    keys, given, true = {}, {}, {}
+    for k in range(12):
+        name = f"case_{k:04d}"
+        terms = [term(parameters={"heat": {"value": 100.0 - 5 * k, "unit": "W"}})] * (2 if k > 9 else 1)
+        keys[name] = answer("two" if k > 9 else "one", *terms, case=name)
+        given[name] = stored("consistent")
+        true[name] = replace(truth(*[True] * len(terms)), gain_nats=(50.0 if k > 1 else 39.0, 39.0)[: len(terms)])
+    true["case_0011"] = replace(true["case_0011"], gain_nats=(50.0, 60.0))
+    keys["case_0012"], given["case_0012"] = answer("unlisted", term(mechanism=None), case="case_0012"), given[name]
+    true["case_0012"] = replace(truth(True), bar_nats=(float("nan"),))  # no bar is known: not asked
+    goals = goal_table(*outcomes(keys, given, true))
+
+    def informed(measure: str) -> tuple[float, int]:
+        r = row(goals, measure)
+        return r["informed"], r["informed_n"]
+
+    assert row(goals, "detection")["value"] == 0.0
+    assert informed("detection") == (pytest.approx(10 / 12), 12)
+    assert informed("place exact,") == informed("mechanism first") == (0.8, 10)
+    assert informed("left-out error closed, worst tenth") == (0.0, 10)
+    assert informed("two visible effects") == (0.5, 2)
+    assert informed("amplitude error, median") == (pytest.approx(15 / 65), 11)  # of 90 to 45 W
+    assert informed("90 % intervals that cover, at least") == (pytest.approx(7 / 11), 11)
+    for nothing in ("false alarms", "time of one case, median", "unlisted: flagged", "probabilities"):
+        assert pd.isna(informed(nothing)[0])
 
 
 def test_exact_intervals_leave_five_per_cent_on_either_side() -> None:

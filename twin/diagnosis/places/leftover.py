@@ -150,8 +150,10 @@ def _stated(now: Fitted, terms: Reconstruction) -> tuple[Fitted, float, float, i
     part = now.part.model_copy(update={"mechanisms": {**now.part.mechanisms, name: terms.part}})
     try:
         fitted = settle(refitted(now, part))
-        before, after = alone(now, now.memory), alone(fitted, now.memory)
+        memory = whiter(now.memory, fitted.memory)  # as listed candidates count (`judged`)
+        before, after = alone(now, memory), alone(fitted, memory)
+        density = float(alone(fitted, now.memory).base_score()[0])
     except (InputError, WorkError):
         return None
-    density = float(after.base_score()[0])
-    return fitted, density - float(before.base_score()[0]), density, improved(before, after)
+    gain = float(after.base_score()[0] - before.base_score()[0])
+    return fitted, gain, density, improved(before, after)

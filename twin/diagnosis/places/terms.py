@@ -143,6 +143,11 @@ def _driven(drivers: Sequence[Level]) -> list[Term]:
             Term(f"{one.name} {other.name}", tail, both, role="cross", driver=one.name, top=one.top * other.top,
                  other=other.name)
         )  # fmt: skip
+        if other.switched and not one.switched:
+            tail = f"with the square of {one.words} {_following(other)}"
+            square = Term(f"{one.name}^2 {other.name}", tail, both * one.series / one.top, role="square_cross",
+                          driver=one.name, top=one.top**2 * other.top, other=other.name)  # fmt: skip
+            out.append(square)
     return out
 
 

@@ -15,6 +15,8 @@ from twin.proof.scoring.answer_key import TrueTerm
 
 RATED_RPM = 6000.0  # at which what follows the speed is compared
 Values = Mapping[str, float]
+Sized = tuple[float | None, float | None, float | None]  # a value, and low and high of its 90 % interval
+Told = Mapping[str, tuple[float | None, tuple[float | None, float | None] | None]]  # by parameter the same
 
 
 def _sun_W(p: Values) -> float:
@@ -68,22 +70,28 @@ def true_amplitude(term: TrueTerm) -> float | None:
     return amplitude(term.mechanism, values) if term.mechanism else None
 
 
-def found_amplitude(finding: Finding, scale_of: TrueTerm) -> tuple[float | None, float | None, float | None]:
-    """Value, low and high of a finding's 90 % interval, in what the key states; the interval None where none is told.
+def found_amplitude(finding: Finding, scale_of: TrueTerm) -> Sized:
+    """`sized` of a finding."""
+    told = {name: (p.value, p.interval90) for name, p in finding.parameters.items()}
+    return sized(finding.mechanism, told, scale_of)
+
+
+def sized(mechanism: str, parameters: Told, scale_of: TrueTerm) -> Sized:
+    """Value, low and high of the 90 % interval, in what the key states; the interval None where none is told.
 
     Of the key only what sets the scale is taken (a rated speed), never a size. A product's interval is that of its
     first amplitude, the other values held; several amplitudes have none.
     """
     given = {name: v for name, (v, _) in (scale_of.parameters or {}).items()}
-    told = {name: p.value for name, p in finding.parameters.items() if p.value is not None}
-    fixed = {name: v for name, v in given.items() if name in _beside(finding.mechanism) and name not in told}
+    told = {name: value for name, (value, _) in parameters.items() if value is not None}
+    fixed = {name: v for name, v in given.items() if name in _beside(mechanism) and name not in told}
     values = {**fixed, **told}
-    value = amplitude(finding.mechanism, values)
-    free = [name for name in _amplitudes(finding.mechanism) if name in told]
-    interval = finding.parameters[free[0]].interval90 if len(free) == 1 else None
+    value = amplitude(mechanism, values)
+    free = [name for name in _amplitudes(mechanism) if name in told]
+    interval = parameters[free[0]][1] if len(free) == 1 else None
     if value is None or interval is None or interval[0] is None or interval[1] is None:
         return value, None, None
-    ends = [amplitude(finding.mechanism, {**values, free[0]: end}) for end in interval if end is not None]
+    ends = [amplitude(mechanism, {**values, free[0]: end}) for end in interval if end is not None]
     known = sorted(e for e in ends if e is not None)
     return (value, known[0], known[-1]) if len(known) == 2 else (value, None, None)
 

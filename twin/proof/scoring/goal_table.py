@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from twin.proof.scoring.goals import GOALS, Goal, Wanted
+from twin.proof.scoring.goals import GOALS, Goal, Wanted, mean
 from twin.proof.scoring.intervals import bootstrap, clopper_pearson, of_groups
 from twin.proof.scoring.reliability import calibration_error, told_and_right
 
 GOAL_COLUMNS: Mapping[str, str] = {
     "measure": "string", "goal": "string", "wanted": "Float64", "better": "string", "value": "Float64",
-    "low90": "Float64", "high90": "Float64", "n": "Int64", "met": "boolean", "plant": "string",
+    "low90": "Float64", "high90": "Float64", "n": "Int64", "met": "boolean", "informed": "Float64",
+    "informed_n": "Int64", "plant": "string",
 }  # fmt: skip
 CALIBRATED = 0.05
 AHEAD = 0.15  # of the best baseline, in share of right answers
@@ -22,6 +23,7 @@ AHEAD = 0.15  # of the best baseline, in share of right answers
 
 def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFrame | None = None) -> pd.DataFrame:
     """Columns `GOAL_COLUMNS`, plant "all" first. Shares with exact intervals, the rest by a bootstrap over cases.
+    `informed` is what an answer would reach that is told the truth (`goals.Goal`).
 
     `compared` (`twin.proof.rivals.compared`) adds the lead over the best baseline, for all cases together.
     """
@@ -37,7 +39,10 @@ def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFra
 
 def _measured(outcomes: pd.DataFrame, terms: pd.DataFrame) -> Iterator[dict[str, Any]]:
     for goal in GOALS:
-        yield _row(goal, goal.of(outcomes, terms))
+        informed = goal.informed(outcomes, terms) if goal.informed is not None else pd.Series(dtype=float)
+        statistic = goal.statistic or mean
+        reached = statistic(informed.to_numpy(float)) if len(informed) else None
+        yield _row(goal, goal.of(outcomes, terms)) | {"informed": reached, "informed_n": len(informed)}
     pairs = np.column_stack(told_and_right(outcomes))
     low, high = (
         of_groups(list(pairs[:, None]), lambda g: calibration_error(np.vstack(g))) if len(pairs) else (None,) * 2

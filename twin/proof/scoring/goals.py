@@ -38,10 +38,15 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Goal(Wanted):
-    """`of` gives the values from outcomes and terms, indexed by case; `statistic` None: they are yes or no, a share."""
+    """`of` gives the values from outcomes and terms, indexed by case; `statistic` None: they are yes or no, a share.
+
+    `informed` gives those of an answer that has all that is true in its model, refitted, and claims of it what is held
+    to pass the same bars: what it misses, these recordings do not give with such bars. None where that says nothing.
+    """
 
     of: Select
     statistic: Statistic | None = None
+    informed: Select | None = field(default=None, kw_only=True)
 
 
 def quantile(share: float) -> Statistic:
@@ -115,6 +120,54 @@ def _covered(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
     return (rows["low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["high90"])
 
 
+def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
+    """Visible physics that the library lists, and whether the true model's gain passes the bars: `passes`."""
+    rows = visible_physics(terms)
+    rows = rows[rows["gain_nats"].notna() & rows["bar_nats"].notna()]
+    return rows.assign(passes=(rows["gain_nats"] > rows["bar_nats"]).astype(bool))
+
+
+def _informed_any(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    """By case with a visible listed effect whether one passes."""
+    return _claimable(terms).groupby("case")["passes"].any()
+
+
+def _informed_one(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _claimable(terms)
+    return rows[rows["kind"].isin(ONE)].groupby("case")["passes"].any()
+
+
+def _informed_closed(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _claimable(terms)
+    return rows[rows["kind"] == "one"].groupby("case")["passes"].any().astype(float)
+
+
+def _informed_all(kind: str) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        named = _claimable(terms).groupby("case")["passes"].all()
+        at = (outcomes["kind"] == kind) & (outcomes["visible_terms"] == outcomes["terms"]).fillna(False)
+        return named[named.index.isin(outcomes.loc[at, "case"])]
+
+    return select
+
+
+def _informed_sizes(terms: pd.DataFrame) -> pd.DataFrame:
+    """Those that pass, with the amplitudes that the true model fits."""
+    rows = _claimable(terms)
+    rows = rows[rows["passes"] & rows["amplitude_true"].notna() & rows["informed_amplitude"].notna()]
+    return rows[rows["amplitude_true"] != 0].set_index("case")
+
+
+def _informed_error(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _informed_sizes(terms)
+    return (rows["informed_amplitude"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
+
+
+def _informed_covered(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    rows = _informed_sizes(terms).dropna(subset=["informed_low90", "informed_high90"])
+    return (rows["informed_low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["informed_high90"])
+
+
 def _flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
     return _cases("flagged_unlisted", "unlisted", visible=True)(outcomes, terms)
 
@@ -126,24 +179,62 @@ def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
 ONE = ("one", "invisible")  # of one listed effect each; which can be seen the true model says
 GOALS: tuple[Goal, ...] = (
     Goal("false alarms, nothing missing", 0.01, "lower", _false_alarms),
-    Goal("detection, visible", 0.97, "higher", _detected),
-    Goal("place exact, one visible effect", 0.92, "higher", _cases("place_exact", *ONE, visible=True)),
-    Goal("place exact or neighbour, one visible effect", 0.99, "higher", _cases("place_near", *ONE, visible=True)),
-    Goal("mechanism first, one visible effect", 0.95, "higher", _cases("first_right", *ONE, visible=True)),
-    Goal("mechanism within the reported set", 0.98, "higher", _cases("in_set", *ONE, visible=True)),
+    Goal("detection, visible", 0.97, "higher", _detected, informed=_informed_any),
+    Goal(
+        "place exact, one visible effect",
+        0.92,
+        "higher",
+        _cases("place_exact", *ONE, visible=True),
+        informed=_informed_one,
+    ),
+    Goal(
+        "place exact or neighbour, one visible effect",
+        0.99,
+        "higher",
+        _cases("place_near", *ONE, visible=True),
+        informed=_informed_one,
+    ),
+    Goal(
+        "mechanism first, one visible effect",
+        0.95,
+        "higher",
+        _cases("first_right", *ONE, visible=True),
+        informed=_informed_one,
+    ),
+    Goal(
+        "mechanism within the reported set",
+        0.98,
+        "higher",
+        _cases("in_set", *ONE, visible=True),
+        informed=_informed_one,
+    ),
     Goal(
         "mean size of the reported set", 2.0, "lower", _cases("set_size", *ONE, visible=True), mean, unit="explanations"
     ),
     Goal("when: overlap in time, mean", 0.8, "higher", _cases("overlap", *ONE, visible=True), mean, unit=""),
-    Goal("amplitude error, median", 0.12, "lower", _amplitude_error, quantile(0.5)),
-    Goal("amplitude error, 90 % quantile", 0.40, "lower", _amplitude_error, quantile(0.9)),
-    Goal("90 % intervals that cover, at least", 0.85, "higher", _covered),
-    Goal("90 % intervals that cover, at most", 0.95, "lower", _covered),
-    Goal("left-out error closed, median", 0.95, "higher", _cases("closed", "one", visible=True), quantile(0.5)),
-    Goal("left-out error closed, worst tenth", 0.80, "higher", _cases("closed", "one", visible=True), quantile(0.1)),
-    Goal("two visible effects: both named", 0.85, "higher", _all_visible("two")),
+    Goal("amplitude error, median", 0.12, "lower", _amplitude_error, quantile(0.5), informed=_informed_error),
+    Goal("amplitude error, 90 % quantile", 0.40, "lower", _amplitude_error, quantile(0.9), informed=_informed_error),
+    Goal("90 % intervals that cover, at least", 0.85, "higher", _covered, informed=_informed_covered),
+    Goal("90 % intervals that cover, at most", 0.95, "lower", _covered, informed=_informed_covered),
+    Goal(
+        "left-out error closed, median",
+        0.95,
+        "higher",
+        _cases("closed", "one", visible=True),
+        quantile(0.5),
+        informed=_informed_closed,
+    ),
+    Goal(
+        "left-out error closed, worst tenth",
+        0.80,
+        "higher",
+        _cases("closed", "one", visible=True),
+        quantile(0.1),
+        informed=_informed_closed,
+    ),
+    Goal("two visible effects: both named", 0.85, "higher", _all_visible("two"), informed=_informed_all("two")),
     Goal("two effects: claims that are true", 0.97, "higher", _claims_of_two),
-    Goal("three visible effects: all named", 0.65, "higher", _all_visible("three")),
+    Goal("three visible effects: all named", 0.65, "higher", _all_visible("three"), informed=_informed_all("three")),
     Goal("confounded: the set holds the truth", 0.97, "higher", _cases("set_holds_truth", "confounded", visible=True)),
     Goal("confounded: the proposed run settles it", 0.90, "higher", _cases("settled", "confounded", visible=True)),
     Goal("unlisted: flagged", 0.95, "higher", _flagged),

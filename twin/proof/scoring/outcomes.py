@@ -39,7 +39,8 @@ TERMS: Mapping[str, str] = {
     "place": "string", "visible": "boolean", "limit_share": "Float64", "decoy": "boolean",
     "named_mechanism": "string", "named_place": "string", "found": "boolean", "amplitude_true": "Float64",
     "amplitude_found": "Float64", "low90": "Float64", "high90": "Float64", "gain_nats": "Float64",
-    "bar_nats": "Float64", "told_gain_nats": "Float64",
+    "bar_nats": "Float64", "told_gain_nats": "Float64", "informed_amplitude": "Float64", "informed_low90": "Float64",
+    "informed_high90": "Float64",
 }  # fmt: skip
 NOTHING = "nothing"
 
@@ -236,6 +237,7 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
     told = n if n is not None else found.beside[k]
     finding = found.findings[told] if told is not None else None
     value, low, high = found_amplitude(found.findings[n], term) if n is not None else (None, None, None)
+    informed = truth.sizes[k] if truth is not None else (None, None, None)
     return {
         "number": k,
         "case": key.case,
@@ -257,6 +259,9 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
         "gain_nats": truth.gain_nats[k] if truth is not None else None,
         "bar_nats": truth.bar_nats[k] if truth is not None else None,
         "told_gain_nats": finding.evidence.get("gain_nats") if finding is not None else None,
+        "informed_amplitude": informed[0],
+        "informed_low90": informed[1],
+        "informed_high90": informed[2],
     }
 
 

@@ -17,9 +17,11 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.diagnosis.proposals.slack import no_news
-from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.baseline import TOLERANCE, baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import MARGIN, Null, structural_null
 from twin.diagnosis.rounds.null_beside import null_beside
@@ -29,6 +31,8 @@ from twin.diagnosis.rounds.refits import Tried, improved
 from twin.diagnosis.rounds.trust import least_gain
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
+from twin.diagnosis.telling.conclude import parameters_told
+from twin.proof.scoring.amplitude import Sized, sized
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
 from twin.proof.scoring.true_candidate import true_candidate, with_terms
 from twin.schema import TwinPart, twin_part
@@ -41,7 +45,8 @@ Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
     of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis asks of such a gain before it claims it; nan where
-    nothing could be fitted.
+    nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval
+    as a diagnosis would tell them (`amplitude.sized`).
 
     `visible` None: not known, as no candidate states the term and the case could not be redrawn.
     """
@@ -53,6 +58,7 @@ class TrueModel:
     threshold_nats: tuple[float, ...]
     bar_nats: tuple[float, ...]
     visible: tuple[bool | None, ...]
+    sizes: tuple[Sized, ...]
 
 
 @threadpool_limits.wrap(limits=1)
@@ -76,7 +82,7 @@ def true_model(
     fit = _fit(machine, batches)
     level = _level(fit)
     if not key.terms:
-        return TrueModel(level, level, 1.0, (), (), (), ())
+        return TrueModel(level, level, 1.0, (), (), (), (), ())
     every = proposed(fit)
     seen = screen(fit, every)
     found = [true_candidate(t, seen, every) for t in key.terms]
@@ -92,7 +98,7 @@ def true_model(
     ]
     others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
     best = full if stated and not others else others[0] if others else fit  # an unlisted effect stands alone
-    numbers = zip(*((j.gain, j.threshold, j.bar, j.visible) for j in judged), strict=True)
+    numbers = zip(*((j.gain, j.threshold, j.bar, j.visible, j.size) for j in judged), strict=True)
     return TrueModel(level, _level(best), 1.0, *numbers)
 
 
@@ -102,6 +108,7 @@ class _Judged:
     threshold: float = float("nan")
     bar: float = float("nan")
     visible: bool | None = None
+    size: Sized = (None, None, None)
     fitted: Fitted | None = None  # of the case redrawn
 
 
@@ -161,7 +168,18 @@ def _judged(
     out = _beyond(without[best], full, memory, structure)
     better = improved(alone(without[best], memory), alone(full, memory))
     least = least_gain(Tried(s, out.gain, better, 0, 0.0, full), len(full.batches))
-    return replace(out, bar=max(least, MARGIN * structure))
+    size = _size(full, s, terms[which], beside[0].scatter(s.candidate.name, beside[1]))
+    return replace(out, bar=max(least, MARGIN * structure), size=size)
+
+
+def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
+    """The term's amplitude in the true model, told as a diagnosis tells it."""
+    known = intervals90(
+        result(full.problem, replace(full.state, noise=full.noise), TOLERANCE, ""), full.problem.unknowns
+    )
+    told, _ = parameters_told(full, s.candidate, {i.name: i for i in known}, scatter)
+    parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in told.items()}
+    return sized(s.candidate.mechanism, parameters, term)
 
 
 def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
