@@ -26,7 +26,7 @@ def run() -> ProofRun:
 @pytest.fixture
 def page(tmp_path: Path) -> Path:
     path = tmp_path / "proof.md"
-    path.write_text(f"# Proof\n\n{BEGIN}\n\nold\n{END}\n\nThe end.\n", encoding="utf-8")
+    path.write_text(f"# Proof\n\n{BEGIN}\n\nwhat stood here\n{END}\n\nThe end.\n", encoding="utf-8")
     return path
 
 
@@ -37,7 +37,7 @@ def test_the_block_names_root_dates_version_results_and_shortfalls(run: ProofRun
     assert "- Sealed 2026-01-05 06:00 UTC, opened 2026-01-05 19:30 UTC, thermodrift 0.1.0\n" in text
     assert "- Cases: 31 sealed, 30 count, 1 void, 1 failed (counted as wrong)\n" in text
     row = next(line for line in text.splitlines() if line.startswith("| detection, visible"))
-    assert row.startswith("| detection, visible | ≥ 97 % | 95.5 % | 93.6 to 97.4 % | 120 | **no** |")
+    assert row.startswith("| detection, visible | ≥ 97 % | 95.5 % | 93.6 to 97.4 % | 120 | **no** | 99.4 % (n 120) |")
     assert "- detection, visible: 95.5 %, wanted ≥ 97 %\n" in text
     assert "A, finite elements (SIMULATED) | B, finite volumes (SIMULATED) |" in text
 
@@ -68,7 +68,7 @@ def test_publishing_changes_the_block_alone_and_again_gives_the_same(page: Path,
     publish_proof(page, run)
     text = page.read_text(encoding="utf-8")
     assert text.startswith(f"# Proof\n\n{BEGIN}\n\n**10 of 12") and text.endswith(f"{END}\n\nThe end.\n")
-    assert "old" not in text
+    assert "what stood here" not in text
     publish_proof(page, run)
     assert page.read_text(encoding="utf-8") == text
 
