@@ -42,10 +42,11 @@ METHOD = (
     "A case counts as visible when the true effect, fitted, cuts a left-out error by a tenth or more, beyond what "
     "structure alone gives. Detection, place, mechanism and amplitude are judged on visible cases.",
 )
+INFORMED = "told the truth"
 GLOSSARY = (
     ("interval", "90 %: Clopper and Pearson for shares, bootstrap over cases for medians and quantiles."),
     ("met", "The measured value itself reaches the goal; the interval says how sure that is."),
-    ("told the truth", "The same measure for an answer that has all concealed effects in its model, refits it, and "
+    (INFORMED, "The same measure for an answer that has all concealed effects in its model, refits it, and "
      "claims what passes the bars of a claim. What it misses, these recordings do not give with such bars."),
     ("detection limit", "The size at which an effect of this kind is just found on development plants."),
     ("right answer", "Every visible effect is named with its place, and nothing false is claimed. Of a confounded pair "
@@ -57,9 +58,6 @@ GLOSSARY = (
     ("expected calibration error", "Mean distance of claimed probability and share right, weighted by cases. Right is "
      "the mechanism of a concealed effect at its place or beside it."),
 )  # fmt: skip
-
-
-INFORMED = "told the truth"
 
 
 def meaning(word: str) -> str:

@@ -14,6 +14,7 @@ from twin.proof.scoring.intervals import Statistic
 from twin.proof.scoring.outcomes import visible_physics
 
 Select = Callable[[pd.DataFrame, pd.DataFrame], pd.Series]
+Sizes = Callable[[pd.DataFrame, pd.DataFrame], pd.DataFrame]
 Better = Literal["higher", "lower"]
 
 
@@ -105,19 +106,28 @@ def _claims_of_two(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
 def _sized(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
     """Visible physics that was found and whose amplitude both sides state."""
     rows = visible_physics(terms)
-    at = rows["found"].fillna(False).astype(bool)
-    at &= rows["amplitude_true"].notna() & rows["amplitude_found"].notna()
+    return _both_stated(rows[rows["found"].fillna(False).astype(bool)])
+
+
+def _both_stated(rows: pd.DataFrame) -> pd.DataFrame:
+    at = rows["amplitude_true"].notna() & rows["amplitude_found"].notna()
     return rows[at & (rows["amplitude_true"] != 0)].set_index("case")
 
 
-def _amplitude_error(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _sized(outcomes, terms)
-    return (rows["amplitude_found"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
+def _amplitude_error(sizes: Sizes) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = sizes(outcomes, terms)
+        return (rows["amplitude_found"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
+
+    return select
 
 
-def _covered(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _sized(outcomes, terms).dropna(subset=["low90", "high90"])
-    return (rows["low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["high90"])
+def _covered(sizes: Sizes) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = sizes(outcomes, terms).dropna(subset=["low90", "high90"])
+        return (rows["low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["high90"])
+
+    return select
 
 
 def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
@@ -127,19 +137,14 @@ def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(passes=(rows["gain_nats"] > rows["bar_nats"]).astype(bool))
 
 
-def _informed_any(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    """By case with a visible listed effect whether one passes."""
-    return _claimable(terms).groupby("case")["passes"].any()
+def _informed(*kinds: str) -> Select:
+    """By case of these kinds (none named: all) with a visible listed effect, whether one passes."""
 
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = _claimable(terms)
+        return (rows[rows["kind"].isin(kinds)] if kinds else rows).groupby("case")["passes"].any()
 
-def _informed_one(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _claimable(terms)
-    return rows[rows["kind"].isin(ONE)].groupby("case")["passes"].any()
-
-
-def _informed_closed(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _claimable(terms)
-    return rows[rows["kind"] == "one"].groupby("case")["passes"].any().astype(float)
+    return select
 
 
 def _informed_all(kind: str) -> Select:
@@ -151,21 +156,11 @@ def _informed_all(kind: str) -> Select:
     return select
 
 
-def _informed_sizes(terms: pd.DataFrame) -> pd.DataFrame:
-    """Those that pass, with the amplitudes that the true model fits."""
-    rows = _claimable(terms)
-    rows = rows[rows["passes"] & rows["amplitude_true"].notna() & rows["informed_amplitude"].notna()]
-    return rows[rows["amplitude_true"] != 0].set_index("case")
-
-
-def _informed_error(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _informed_sizes(terms)
-    return (rows["informed_amplitude"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
-
-
-def _informed_covered(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    rows = _informed_sizes(terms).dropna(subset=["informed_low90", "informed_high90"])
-    return (rows["informed_low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["informed_high90"])
+def _informed_sizes(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
+    """Those that pass, with the amplitudes that the true model fits in place of those found."""
+    rows = _claimable(terms).drop(columns=["amplitude_found", "low90", "high90"])
+    rows = rows.rename(columns=lambda c: {"informed_amplitude": "amplitude_found"}.get(c, c.removeprefix("informed_")))
+    return _both_stated(rows[rows["passes"]])
 
 
 def _flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
@@ -177,52 +172,54 @@ def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
 
 
 ONE = ("one", "invisible")  # of one listed effect each; which can be seen the true model says
+_ERROR, _INFORMED_ERROR = _amplitude_error(_sized), _amplitude_error(_informed_sizes)
+_COVERED, _INFORMED_COVERED = _covered(_sized), _covered(_informed_sizes)
 GOALS: tuple[Goal, ...] = (
     Goal("false alarms, nothing missing", 0.01, "lower", _false_alarms),
-    Goal("detection, visible", 0.97, "higher", _detected, informed=_informed_any),
+    Goal("detection, visible", 0.97, "higher", _detected, informed=_informed()),
     Goal(
         "place exact, one visible effect",
         0.92,
         "higher",
         _cases("place_exact", *ONE, visible=True),
-        informed=_informed_one,
+        informed=_informed(*ONE),
     ),
     Goal(
         "place exact or neighbour, one visible effect",
         0.99,
         "higher",
         _cases("place_near", *ONE, visible=True),
-        informed=_informed_one,
+        informed=_informed(*ONE),
     ),
     Goal(
         "mechanism first, one visible effect",
         0.95,
         "higher",
         _cases("first_right", *ONE, visible=True),
-        informed=_informed_one,
+        informed=_informed(*ONE),
     ),
     Goal(
         "mechanism within the reported set",
         0.98,
         "higher",
         _cases("in_set", *ONE, visible=True),
-        informed=_informed_one,
+        informed=_informed(*ONE),
     ),
     Goal(
         "mean size of the reported set", 2.0, "lower", _cases("set_size", *ONE, visible=True), mean, unit="explanations"
     ),
     Goal("when: overlap in time, mean", 0.8, "higher", _cases("overlap", *ONE, visible=True), mean, unit=""),
-    Goal("amplitude error, median", 0.12, "lower", _amplitude_error, quantile(0.5), informed=_informed_error),
-    Goal("amplitude error, 90 % quantile", 0.40, "lower", _amplitude_error, quantile(0.9), informed=_informed_error),
-    Goal("90 % intervals that cover, at least", 0.85, "higher", _covered, informed=_informed_covered),
-    Goal("90 % intervals that cover, at most", 0.95, "lower", _covered, informed=_informed_covered),
+    Goal("amplitude error, median", 0.12, "lower", _ERROR, quantile(0.5), informed=_INFORMED_ERROR),
+    Goal("amplitude error, 90 % quantile", 0.40, "lower", _ERROR, quantile(0.9), informed=_INFORMED_ERROR),
+    Goal("90 % intervals that cover, at least", 0.85, "higher", _COVERED, informed=_INFORMED_COVERED),
+    Goal("90 % intervals that cover, at most", 0.95, "lower", _COVERED, informed=_INFORMED_COVERED),
     Goal(
         "left-out error closed, median",
         0.95,
         "higher",
         _cases("closed", "one", visible=True),
         quantile(0.5),
-        informed=_informed_closed,
+        informed=_informed("one"),
     ),
     Goal(
         "left-out error closed, worst tenth",
@@ -230,7 +227,7 @@ GOALS: tuple[Goal, ...] = (
         "higher",
         _cases("closed", "one", visible=True),
         quantile(0.1),
-        informed=_informed_closed,
+        informed=_informed("one"),
     ),
     Goal("two visible effects: both named", 0.85, "higher", _all_visible("two"), informed=_informed_all("two")),
     Goal("two effects: claims that are true", 0.97, "higher", _claims_of_two),
