@@ -23,11 +23,11 @@ from twin.diagnosis.diagnosis import Diagnosis
 from twin.diagnosis.drafting.draft import drafted_part
 from twin.diagnosis.next_run.next_experiment import Proposal
 from twin.diagnosis.next_run.settling import settling_run
-from twin.diagnosis.places.leftover import Leftover, instead, leftover
 from twin.diagnosis.places.where_when import Located, locate
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
 from twin.diagnosis.rounds.fitted import Fitted, settle
+from twin.diagnosis.rounds.leftover import Leftover, instead, leftover
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
 from twin.diagnosis.rounds.search import Round, Search, search
@@ -93,15 +93,18 @@ def diagnose(
         final = settle(done.final) if done.accepted else done.final
         done = replace(done, final=final)
         tell("left out", 0, 0)
-        beside = None if final is done.baseline else workers.beside(partial(_located, done.baseline, batches))
-        located = _located(final, batches, tell)
-        left = leftover(done, batches, located) if isinstance(located, Located) else None
-        first = located if beside is None else beside()
-        if _physics(done) and isinstance(first, Located):
-            done, left = instead(done, left, batches, first) or (done, left)
+        beside = workers.beside(partial(_located, done.baseline, batches))
+        left = leftover(done, seed)
+        if _physics(done):
+            done, left = instead(done, left, seed) or (done, left)
+        first = beside()
     if isinstance(first, str):
         words.append(f"no map of where and when: {first}")
     mapped = first.map if isinstance(first, Located) else None
+    over_time = None
+    if left is not None:
+        located = first if done.final is done.baseline else _located(done.final, batches)
+        over_time = left.flux(located) if isinstance(located, Located) else None
     return _diagnosis(
         machine,
         part,
@@ -110,6 +113,7 @@ def diagnose(
         stages(done),
         mapped,
         left,
+        over_time,
         tuple(words),
         drafted,
         time.perf_counter() - begun,
@@ -143,6 +147,7 @@ def _diagnosis(
     steps: Sequence[tuple[Fitted, LeftOutRows]],
     mapped: pd.DataFrame | None,
     left: Leftover | None,
+    over_time: pd.DataFrame | None,
     words: tuple[str, ...],
     drafted: bool,
     seconds: float,
@@ -193,8 +198,8 @@ def _diagnosis(
     }
     if mapped is not None:
         everything["map"] = mapped
-    if left is not None:
-        everything["flux"] = left.flux
+    if over_time is not None:
+        everything["flux"] = over_time
     return Diagnosis(
         machine=machine,
         findings=Findings(

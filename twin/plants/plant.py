@@ -157,6 +157,7 @@ def _term(effect: Effect, plant: Plant) -> dict[str, Any]:
         "neighbours": _neighbours(answer, plant),
         "parameters": {k: {"value": v, "unit": u} for k, (v, u) in answer.parameters.items()},
         "words": answer.words,
+        **({"form": list(answer.form)} if answer.form else {}),
     }
 
 

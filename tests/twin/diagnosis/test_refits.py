@@ -43,6 +43,9 @@ def test_at_an_error_the_better_of_two_beginnings_counts(
     assert once is not None and got.gain >= once.gain
     refit(now, heat)
     assert begun == ["afresh"]  # what acts on temperatures begins where the fit is
+    monkeypatch.setattr(refits, "GIVEN_UP", 1.01 * float(max(now.noise.factor)))
+    refit(now, shift)
+    assert begun == ["afresh"]  # and so does an error that the fit counts as it should
 
 
 def test_a_refit_begins_smaller_where_all_of_the_effect_cannot_be_simulated(

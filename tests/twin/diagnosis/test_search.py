@@ -140,14 +140,14 @@ def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(mo
     """Beside a strong effect a finer network stays below what flipped residuals reach."""
     now = found("drift").baseline
     none = Scored(Candidate("coarse_network", Where("node", "head"), "finer_head", ""), 0.0, 0, 0.0, {}, 0.0, -1)
-    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], search_module._asked
+    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], search_module.asked
 
     def watched(*given: Any) -> Round:
         asked.append(real(*given))
         return asked[-1]
 
     monkeypatch.setattr(search_module, "_apart", lambda *_: finer)
-    monkeypatch.setattr(search_module, "_asked", watched)
+    monkeypatch.setattr(search_module, "asked", watched)
     done = one_round(now, 0, Workers(), lambda *_: None)
     assert [(r.best.candidate.name, r.accepted) for r in asked if r.best is not None] == [
         ("finer_head", False), ("sensor_drift_t_head", True),
@@ -194,14 +194,14 @@ def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
     imitates: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A warm fixture gains 258 nats where the floor is cold, and ten beside a cold floor."""
-    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], search_module._asked
+    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], search_module.asked
 
     def watched(*given: Any) -> Round:
         done = real(*given)
         asked.append(done if asked else replace(done, accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(search_module, "_asked", watched)
+    monkeypatch.setattr(search_module, "asked", watched)
     if not imitates:
         monkeypatch.setattr(
             search_module, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft"

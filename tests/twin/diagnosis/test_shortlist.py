@@ -6,10 +6,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
-from twin.diagnosis.rounds.refits import SHARP, WELL, with_sharp
+from twin.diagnosis.rounds.refits import SHARP, WELL, shortlist, with_sharp
 from twin.diagnosis.scoring.screen import Scored
 
 
@@ -69,3 +70,10 @@ def test_there_are_few_of_them_and_each_candidate_stands_once() -> None:
     every = [s.candidate.name for s in done[0]]
     assert len(every) == len(set(every)) == len(done[1])
     assert names(done)[2] == "floor_sink_head"
+
+
+@pytest.mark.parametrize(("gains", "refitted"), [((90.0, 60.0, 5.5, 4.5), 3), ((90.0, 4.5, 4.0, 3.0), 2)])
+def test_beyond_the_first_two_a_refit_must_promise_something(gains: tuple[float, ...], refitted: int) -> None:
+    news = [scored(m, g) for m, g in zip(("sun", "draught", "radiation", "floor_sink"), gains, strict=True)]
+    worth, _, chosen = shortlist(news, EVIDENCE)
+    assert [worth[k].gain for k in chosen] == list(gains[:refitted]) and len(worth) == len(gains)

@@ -56,7 +56,7 @@ def test_its_course_is_reconstructed(heated: tuple[str, Case, Located]) -> None:
     knots = found.point.hats.knot_s
     true = WATTS * np.array([np.interp(knots, b.time_s, coolant(b, k)) for k, b in enumerate(given.batches)])
     assert np.corrcoef(true.ravel(), found.found[0].series.mean.ravel())[0, 1] > 0.9
-    flux_table = found.flux
+    flux_table = found.over_time("heat", body)
     assert tuple(flux_table.columns) == COLUMNS["flux"]
     assert set(flux_table["unit"]) == {"W"} and set(flux_table["place"]) == {body}
     own = flux_table[flux_table["batch"] == "b02"]
@@ -76,26 +76,11 @@ def test_averages_over_regimes_and_batches(heated: tuple[str, Case, Located]) ->
     assert elsewhere["value"].abs().max() < 0.3 * on["value"]
 
 
-def test_windows_are_when_it_runs(heated: tuple[str, Case, Located]) -> None:
-    _, given, found = heated
-    runs, told = 0.0, 0.0
-    for k, b in enumerate(given.batches):
-        on = coolant(b, k) > 0
-        within = np.zeros(len(on), bool)
-        for name, start_s, end_s in found.windows(found.found[0]):
-            if name == b.batch_id:
-                within |= (b.time_s >= start_s) & (b.time_s <= end_s)
-        runs += (on & within).sum()
-        told += (on | within).sum()
-    assert runs / told > 0.6
-
-
 def test_nothing_concealed(nothing: Case) -> None:
     found = located(nothing)
     assert found.kind == "nothing" and found.found == ()
     assert found.odds["nothing"] > 0.5
     assert found.map["z"].abs().max() < 3
-    assert found.flux.empty and tuple(found.flux.columns) == COLUMNS["flux"]
     assert tuple(found.map.columns) == COLUMNS["map"] and tuple(found.ranking.columns) == RANKING
     assert sum(found.odds.values()) == pytest.approx(1.0)
     assert set(zip(found.map["kind"], found.map["place"], strict=True)) == {
@@ -142,7 +127,7 @@ def test_missing_samples_and_unequal_lengths() -> None:
         cut.append(replace(b, table=table))
     found = located(calibrated(given.machine, cut))
     assert (found.found[0].kind, found.found[0].place) == ("heat", "bed")
-    ends = found.flux.groupby("batch")["time_s"].max()
+    ends = found.over_time("heat", "bed").groupby("batch")["time_s"].max()
     assert ends["b00"] == 14400 and ends["b01"] == 14400 - 1800
 
 

@@ -52,6 +52,16 @@ def test_what_a_driver_switches_works_while_the_recording_shows_it_on(key: str, 
     assert EFFECTS[key].driver == channels[0]
 
 
+def test_what_no_list_has_is_stated_as_a_regression_over_channels() -> None:
+    """The true model of a case fits it by that; what a list has needs none."""
+    for key, role in (("warm_speed", "product"), ("coolant_speed", "square_cross"), ("feed_speed", "cross")):
+        case = with_and_without(f"unlisted_{key}")[0]
+        stated, *drivers = case.truth["terms"][0]["form"]
+        assert stated == role and drivers[0] == "spindle_rpm"
+        assert all(case.machine.channels[name].role == "driver" for name in drivers)
+    assert "form" not in with_and_without("pump_heat")[0].truth["terms"][0]
+
+
 def test_the_sun_is_up_between_its_hours_by_a_tenth_of_noon() -> None:
     """A tenth of the sine's top is reached 3.2 % of the day after the rise."""
     case = with_and_without("sun")[0]

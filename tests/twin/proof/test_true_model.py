@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from data.batch import Batch
 from data.machine import Machine
+from tests.twin.diagnosis.concealed import case, flux
 from tests.twin.diagnosis.small_cases import FLOOR, runs, two_bodies
 from tests.twin.proof.answered import answer, term
 from twin.diagnosis.rounds.null import MARGIN
@@ -72,9 +74,26 @@ def test_a_mechanism_of_no_candidate_is_judged_by_the_case_without_it() -> None:
     assert true_model(known, runs(known, hidden), key).visible == (None,)
 
 
+@pytest.mark.parametrize("hidden", [{"square_cross": "6e-6 W"}, {"square": "6e-6 W"}])
+def test_what_no_list_has_is_fitted_by_its_own_law(hidden: dict[str, str]) -> None:
+    """Heat by the speed squared while coolant flows; where it always flows, by the speed squared alone."""
+    given = case(flux("bed", "rpm", "coolant" if "square_cross" in hidden else None, **hidden))
+    batches = given.batches
+    if "square" in hidden:
+        batches = [replace(b, table=b.table.assign(coolant=1.0)) for b in batches]
+    where = {"kind": "node", "name": "bed"}
+    own = term("unlisted", mechanism=None, where=where, form=["square_cross", "rpm", "coolant"])
+    got = true_model(given.machine, batches, answer("unlisted", own))
+    assert got.visible == (True,)
+    assert 0.7 < got.error_true < 1.3 < got.error_before
+    assert got.gain_nats[0] > got.bar_nats[0] >= EVEN
+    unrecorded = term("unlisted", mechanism=None, where=where, form=["linear", "vacuum"])
+    assert true_model(given.machine, batches, answer("unlisted", unrecorded)).visible == (None,)
+
+
 def test_a_plant_of_other_numerics_has_a_true_model_too() -> None:
-    case = draw(2, "sun", 2.0, **SHORT)
-    key = answer("one", *({**t, "size": 2.0, "decoy": False, "active": "always"} for t in case.truth["terms"]))
-    got = true_model(case.machine, case.batches, key)
+    drawn = draw(2, "sun", 2.0, **SHORT)
+    key = answer("one", *({**t, "size": 2.0, "decoy": False, "active": "always"} for t in drawn.truth["terms"]))
+    got = true_model(drawn.machine, drawn.batches, key)
     assert got.visible == (True,)
     assert got.error_true < 0.7 * got.error_before

@@ -86,15 +86,6 @@ class ForcedNetwork:
     def rows(self) -> Rows:
         return rows_of(self.solved, self.problem.inputs.every, 1)
 
-    @cached_property
-    def borders_degC(self) -> Array:
-        """Mean temperature of every body at all interval borders, (bodies, B, M + 1)."""
-        return np.moveaxis(self.solved.states.at(self.weights[None])[0], -1, 0)
-
-    def surrounding_degC(self, s: int) -> Array:
-        """Of a surrounding at all interval borders, (B, M + 1)."""
-        return np.asarray(self.solved.balance.air.borders(s, 1)[0])
-
     def answers(self, into: Array, series_W: Array) -> tuple[Array, Array]:
         """Channels (Q, B, K, C) in their units, and bodies' temperatures (Q, bodies, B, K), K, by Q heat series.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -28,7 +27,6 @@ from twin.diagnosis.places.regimes import Regime, regimes_of
 
 RANKING = ("rank", "kind", "place", "gain", "evidence", "probability", "sigma", "unit")
 MOVES = 3  # at most: beyond it places and series hardly change
-SHOWS = 2.0  # sd: a window is where a series is farther from 0
 
 
 @dataclass(frozen=True)
@@ -72,34 +70,20 @@ class Located:
         """Probabilities of nothing and of each kind, every place alone."""
         return _odds(self.point.search, ())
 
-    def beside(self, found: Found) -> list[Held]:
-        """What was found elsewhere."""
-        return [h for h, f in zip(self.held, self.found, strict=True) if f is not found]
-
-    @cached_property
-    def flux(self) -> pd.DataFrame:
-        """The series found, columns as `twin.diagnosis.diagnosis` has them."""
+    def over_time(self, kind: str, place: str) -> pd.DataFrame:
+        """The free series at a place beside what was found at others; columns of `twin.diagnosis.diagnosis`."""
+        i = next(n for n, basis in enumerate(self.point.search.bases) if basis.kind == kind)
+        basis = self.point.search.bases[i]
+        k = basis.places.index(place)
+        others = [h for h in self.held if h.at != (i, k)]
+        series = self.point.search.series(others)[i].posterior(k)
         rows = []
-        for f in self.found:
-            for b, end_s in enumerate(_ends_s(self.point.problem)):
-                for k in np.flatnonzero(self.point.hats.knot_s < end_s + self.point.hats.step_s / 2):
-                    time_s = float(min(self.point.hats.knot_s[k], end_s))
-                    value, sd = float(f.series.mean[b, k]), float(f.series.sd[b, k])
-                    rows.append((f.kind, f.place, self.point.problem.measured[b].batch_id, time_s, value, sd, f.unit))
-        return pd.DataFrame(rows, columns=list(COLUMNS["flux"]))
-
-    def windows(self, found: Found) -> list[tuple[str, float, float]]:
-        """Stretches (batch, start s, end s) in which a series found stands out from 0 by more than `SHOWS` sd."""
-        out = []
-        half = self.point.hats.step_s / 2
-        shows = np.abs(found.series.mean) > SHOWS * found.series.sd
         for b, end_s in enumerate(_ends_s(self.point.problem)):
-            own = shows[b] & (self.point.hats.knot_s < end_s + half)
-            edges = np.flatnonzero(np.diff(np.r_[False, own, False].astype(int)))
-            for first, behind in zip(edges[::2], edges[1::2], strict=True):
-                low, high = self.point.hats.knot_s[first] - half, self.point.hats.knot_s[behind - 1] + half
-                out.append((self.point.problem.measured[b].batch_id, float(max(0.0, low)), float(min(end_s, high))))
-        return out
+            for h in np.flatnonzero(self.point.hats.knot_s < end_s + self.point.hats.step_s / 2):
+                time_s = float(min(self.point.hats.knot_s[h], end_s))
+                value, sd = float(series.mean[b, h]), float(series.sd[b, h])
+                rows.append((kind, place, self.point.problem.measured[b].batch_id, time_s, value, sd, basis.units[k]))
+        return pd.DataFrame(rows, columns=list(COLUMNS["flux"]))
 
 
 def locate(

@@ -115,7 +115,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
     if target == "exposure" and "surrounding" in mechanism.acts_at and "expand" in mechanism.effects():
         return []  # it stands between a surrounding and all that it surrounds
     if target in ("node", "start"):
-        return [Site(kind, name) for name in _own(part)]
+        return [Site(kind, name) for name in own_bodies(part)]
     if target == "heat":
         return [
             Site(kind, name, outlets_of(given))
@@ -192,12 +192,12 @@ def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) 
     if role == "neighbour" and site.name in part.bodies:
         return linked(part, site.name)
     if role == "unlinked":
-        own = _own(part)
+        own = own_bodies(part)
         return [name for name in own[own.index(site.name) + 1 :] if name not in linked(part, site.name)]
-    return _own(part)
+    return own_bodies(part)
 
 
-def _own(part: TwinPart) -> list[str]:
+def own_bodies(part: TwinPart) -> list[str]:
     """The machine's bodies: physics at a piece that a finer network invented would be the network's, not hers."""
     pieces = pieces_of(part)
     return [name for name in part.bodies if name not in pieces]

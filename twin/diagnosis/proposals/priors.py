@@ -40,8 +40,10 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
     values: dict[str, Value] = {}
     at: dict[str, float] = {}
     size = size_of(now)
-    for amplitude, off in (mechanism.off or {}).items():
+    for amplitude, off in c.amplitudes.items():
         spec = at_size(mechanism.spec(amplitude), size)
+        if mechanism.any_unit:  # per unit of whatever drives it: no size is usual
+            spec = replace(spec, spread=0.0)
         begin = off + s.amplitudes.get(amplitude, 0.0)
         values[amplitude], begin = _free(spec, off, begin)
         at[f"mechanisms.{c.name}.{amplitude}"] = begin
@@ -62,7 +64,7 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
 
 def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:
     if spec.scale == "linear":
-        spread = max(3.0 * (spec.spread or 1.0), 2.0 * abs(begin - off))
+        spread = max(3.0 * (1.0 if spec.spread is None else spec.spread), 2.0 * abs(begin - off)) or 1.0
         low, high = spec.low, spec.high
         begin = float(np.clip(begin, low, high))
         return Value(value=_said(off, spec.unit), spread=_said(spread, _delta(spec)), bounds=_bounds(spec)), begin

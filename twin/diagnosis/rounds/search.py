@@ -223,7 +223,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
         least = max(null.threshold(before, name=name), EVEN)
         return Round(now, seen, tuple(tried), least, null, np.zeros((0, 0)), False)
     best = to_claim(tried, len(now.batches))
-    ask = partial(_asked, now, seen, null, tried, columns, seed)
+    ask = partial(asked, now, seen, null, tried, columns, seed)
     if best.gain > least_gain(best, len(now.batches)) and best.candidate.mechanism != "coarse_network":
         finer = _apart(now, best, tried, len(now.batches))
         if finer is not None and (done := ask(finer)).accepted:
@@ -235,7 +235,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     for other in elsewhere(best, tried, len(now.batches)):
         better = next(n for n, t in enumerate(tried) if t is other)
         rest = [replace(t, barred=True) if n < better or t.cluster == best.cluster else t for n, t in enumerate(tried)]
-        if (done := _asked(now, seen, null, rest, columns, seed, other)).accepted:
+        if (done := asked(now, seen, null, rest, columns, seed, other)).accepted:
             return done
     return first
 
@@ -251,7 +251,7 @@ def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]
     return out
 
 
-def _asked(
+def asked(
     now: Fitted, seen: Screen, null: Null, tried: Sequence[Tried], columns: Mapping[str, int], seed: int, best: Tried
 ) -> Round:
     """The round with this one of those tried as its best, and whether it is accepted."""

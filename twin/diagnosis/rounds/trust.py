@@ -43,5 +43,6 @@ def _doubts(t: Tried, batches: int) -> float:
     if c.mechanism in MECHANISMS:  # and no rival, which no registry has
         law = MECHANISMS[c.mechanism]
         doubts += NETWORK * law.of_network + LABELS * (c.mechanism == "sensor_swap")
-        doubts += LEVER * (c.where.kind == "error" and not law.drivers and not law.fault)
+        driven = c.part is not None and bool(c.part.drivers) if law.any_unit else bool(law.drivers)
+        doubts += LEVER * (c.where.kind == "error" and not driven and not law.fault)
     return doubts

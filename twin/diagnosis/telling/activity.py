@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from twin.calibration.fit_problem import Array
 from twin.compiling.scope import several
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
 from twin.schema import MechanismPart, TwinPart
-from twin.simulation import simulate
+from twin.simulation import Simulation, simulate
 
 AT_WORK = 0.1  # of the largest watts
-FOLLOWING = 0.02  # the same of what follows drivers whatever they are: a motor that idles drives it too
 ALWAYS = 0.95  # of the time
 
 Windows = tuple[tuple[str, float, float], ...]
@@ -37,24 +37,44 @@ def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
         on = {b.batch_id: np.all([b.values(n) != 0 for n in switched], axis=0) for b in fitted.batches}
         times = {b.batch_id: b.time_s for b in fitted.batches}
         return " and ".join(f"{n} > 0" for n in switched), _windows(on, times)
-    return by_watts(fitted, c.name, AT_WORK)
+    return _by_watts(fitted, c.name)
 
 
-def by_watts(fitted: Fitted, name: str, share: float) -> tuple[str, Windows]:
+def _by_watts(fitted: Fitted, name: str) -> tuple[str, Windows]:
     """The same by a heat's size, where it is above a share of its largest; always, where it is none."""
     if not any(h.law.name == name for h in fitted.problem.network.heats):
         return "always", ()
-    problem = fitted.problem
-    nuisance = fitted.state.nuisance
-    start, offset = problem.own(nuisance)
-    run = simulate(problem.network, fitted.values, problem.own_heat(nuisance), start, keep_cells=True, offsets_K=offset)
+    run = _simulated(fitted, fitted.values)
     watts = np.abs(run.heat_W[name][0])
-    on_rows = (watts > share * watts[run.valid].max(initial=0.0)) & run.valid
+    on_rows = (watts > AT_WORK * watts[run.valid].max(initial=0.0)) & run.valid
     if on_rows[run.valid].mean() > ALWAYS:
         return "always", ()
     on = {b: on_rows[k, run.valid[k]] for k, b in enumerate(run.batch_ids)}
     times = {b: run.time_s[k, run.valid[k]] for k, b in enumerate(run.batch_ids)}
     return "at times", _windows(on, times)
+
+
+def usual_size(fitted: Fitted, c: Candidate) -> float:
+    """Root mean square of a heat's watts, or of what a displacement adds to its error, where it is not next to none."""
+    run = _simulated(fitted, fitted.values)
+    if c.where.kind == "node":
+        series = run.heat_W[c.name][0]
+    else:
+        without = fitted.values.copy()
+        for amplitude, off in c.amplitudes.items():
+            without[fitted.problem.network.index(f"mechanisms.{c.name}.{amplitude}")] = off
+        column = [e.channel for e in fitted.problem.network.errors].index(c.where.name)
+        series = (run.errors - _simulated(fitted, without).errors)[0, ..., column]
+    series = np.abs(series[run.valid])
+    series = series[np.isfinite(series)]
+    at_work = series[series > AT_WORK * series.max(initial=0.0)]
+    return float(np.sqrt(np.mean(at_work**2))) if len(at_work) else 0.0
+
+
+def _simulated(fitted: Fitted, values: Array) -> Simulation:
+    problem, nuisance = fitted.problem, fitted.state.nuisance
+    start, offset = problem.own(nuisance)
+    return simulate(problem.network, values, problem.own_heat(nuisance), start, keep_cells=True, offsets_K=offset)
 
 
 def _stated(fitted: Fitted, c: Candidate) -> Windows | None:

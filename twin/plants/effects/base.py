@@ -21,7 +21,8 @@ from twin.plants.machine import Plant, Sensor
 class Answer:
     """What a diagnosis should say: mechanism (None: no listed one), place, values with units.
 
-    `also` are places that mean the same; `parameters` is the equation's, in the mechanism's own names.
+    `also` are places that mean the same; `parameters` is the equation's, in the mechanism's own names. `form` states
+    what no list has: the parameter of `free_flux` or `free_shift`, the channel of its level and of the other driver.
     """
 
     mechanism: str | None
@@ -30,6 +31,7 @@ class Answer:
     parameters: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     also: tuple[str, ...] = ()
     words: str = ""
+    form: tuple[str, ...] = ()
 
 
 class Effect:

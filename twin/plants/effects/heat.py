@@ -133,7 +133,8 @@ class UnlistedWarmSpeed(_Steady):
 
     def answer(self) -> Answer:
         values = {"power": (self.power_W, "W")}
-        return Answer(None, "node", self.body, values, words="power (n / rated) (T - 20 degC) / 10 K")
+        form = ("product", "spindle_rpm")
+        return Answer(None, "node", self.body, values, words="power (n / rated) (T - 20 degC) / 10 K", form=form)
 
     def share(self, cells_degC: Array, now: Now) -> Array:
         return now.speed_rpm / self.plant.rated_rpm * (self.at.mean(cells_degC) - 20.0) / 10.0
@@ -146,7 +147,8 @@ class UnlistedCoolantSpeed(PumpHeat):
     watts = 180.0
 
     def answer(self) -> Answer:
-        return Answer(None, "node", self.body, {"power": (self.power_W, "W")}, words="power coolant (n / rated)^2")
+        values, form = {"power": (self.power_W, "W")}, ("square_cross", "spindle_rpm", "coolant")
+        return Answer(None, "node", self.body, values, words="power coolant (n / rated)^2", form=form)
 
     def active(self, now: Now) -> NDArray[np.bool_]:
         return (now.coolant != 0) & (now.speed_rpm != 0)
@@ -166,7 +168,8 @@ class UnlistedFeedSpeed(_Steady):
 
     def answer(self) -> Answer:
         values = {"power": (self.power_W, "W")}
-        return Answer(None, "node", self.body, values, words="power (feed / 8000 mm/min) (n / rated)")
+        form = ("cross", "spindle_rpm", "feed")
+        return Answer(None, "node", self.body, values, words="power (feed / 8000 mm/min) (n / rated)", form=form)
 
     def active(self, now: Now) -> NDArray[np.bool_]:
         return (now.feed_mm_per_min != 0) & (now.speed_rpm != 0)

@@ -26,6 +26,7 @@ class TrueTerm:
 
     `also` are places that mean the same, `neighbours` bodies that touch it, `parameters` values in the mechanism's own
     names and units, `active` the windows (batch, start s, end s), `partners` what these recordings cannot tell from it.
+    `form` states what no list has: a parameter of `free_flux` or `free_shift` and the channels that drive it.
     """
 
     effect: str
@@ -41,6 +42,7 @@ class TrueTerm:
     active: Active = "always"
     driver: str | None = None
     partners: tuple[tuple[str, Spot], ...] = ()
+    form: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ def _term(raw: Mapping[str, Any]) -> TrueTerm:
         active="always" if active == "always" else tuple((str(b), float(s), float(e)) for b, s, e in active),
         driver=raw.get("driver"),
         partners=tuple((p["mechanism"], _spot(p["where"])) for p in raw.get("same_as", ())),
+        form=tuple(raw.get("form", ())),
     )
 
 

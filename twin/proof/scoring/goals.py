@@ -131,14 +131,14 @@ def _covered(sizes: Sizes) -> Select:
 
 
 def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
-    """Visible physics that the library lists, and whether the true model's gain passes the bars: `passes`."""
+    """Visible physics that a candidate states, and whether the true model's gain passes the bars: `passes`."""
     rows = visible_physics(terms)
     rows = rows[rows["gain_nats"].notna() & rows["bar_nats"].notna()]
     return rows.assign(passes=(rows["gain_nats"] > rows["bar_nats"]).astype(bool))
 
 
 def _informed(*kinds: str) -> Select:
-    """By case of these kinds (none named: all) with a visible listed effect, whether one passes."""
+    """By case of these kinds (none named: all) with a visible effect that a candidate states, whether one passes."""
 
     def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
         rows = _claimable(terms)
@@ -234,9 +234,15 @@ GOALS: tuple[Goal, ...] = (
     Goal("three visible effects: all named", 0.65, "higher", _all_visible("three"), informed=_informed_all("three")),
     Goal("confounded: the set holds the truth", 0.97, "higher", _cases("set_holds_truth", "confounded", visible=True)),
     Goal("confounded: the proposed run settles it", 0.90, "higher", _cases("settled", "confounded", visible=True)),
-    Goal("unlisted: flagged", 0.95, "higher", _flagged),
+    Goal("unlisted: flagged", 0.95, "higher", _flagged, informed=_informed("unlisted")),
     Goal("listed or nothing: falsely flagged as unlisted", 0.03, "lower", _falsely_flagged),
-    Goal("unlisted: driver found", 0.85, "higher", _cases("driver_right", "unlisted", visible=True)),
+    Goal(
+        "unlisted: driver found",
+        0.85,
+        "higher",
+        _cases("driver_right", "unlisted", visible=True),
+        informed=_informed("unlisted"),
+    ),
     Goal("time of one case, median", 30.0, "lower", _cases("seconds"), quantile(0.5), unit="s"),
     Goal("time of one case, 90 % quantile", 30.0, "lower", _cases("seconds"), quantile(0.9), unit="s"),
 )

@@ -1,16 +1,18 @@
-"""A true term as a candidate that the diagnosis could have proposed, begun at the key's own values."""
+"""A true term as a candidate that the diagnosis could have proposed or described, begun at the key's own values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.proposals.candidate import Candidate, Where
+from twin.diagnosis.proposals.free_forms import OF_BODY, Form, Level, candidate_of
 from twin.diagnosis.proposals.priors import start_values
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored, Screen
 from twin.mechanisms import MECHANISMS
 from twin.proof.scoring.answer_key import Spot, TrueTerm
+from twin.proof.scoring.names import counted_as
 from twin.proof.scoring.places import exact
 from twin.quantity import Value
 from twin.schema import TwinPart
@@ -21,14 +23,25 @@ def true_candidate(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> 
 
     The key does not say by which channel the twin would drive it, or which bodies it would look at besides.
     """
-    if term.mechanism is None:
-        return None
     own = [s for s in seen.scored if _is(term, s.candidate)]
     own = [s for s in own if s.candidate.where.name == term.where.name] or own
     if own:
         return max(own, key=lambda s: s.gain)
     unseen = next((c for c in every if _is(term, c)), None)  # what cannot be switched off has no signature
     return None if unseen is None else Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)
+
+
+def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
+    """The law of a heat that no list has, as the key states it; None where it states none or a driver is not recorded.
+
+    It is the one of no list that `true_candidate` looks for among the candidates.
+    """
+    role, *drivers = term.form or ("",)
+    if not role or not all(name in b.table.columns for name in drivers for b in fit.batches):
+        return None
+    level, other, *_ = (*(Level(name, "", 1.0, False) for name in drivers), None, None)
+    body = term.where.name if role in OF_BODY else ""
+    return candidate_of([Form(Where("node", term.where.name), role, level, other, body)])
 
 
 def begun_at_truth(term: TrueTerm, s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
@@ -65,7 +78,7 @@ def with_terms(
 
 
 def _is(term: TrueTerm, c: Candidate) -> bool:
-    return c.mechanism == term.mechanism and exact(Spot(c.where.kind, c.where.name), term)
+    return counted_as(c.mechanism) == counted_as(term.mechanism) and exact(Spot(c.where.kind, c.where.name), term)
 
 
 def _said(number: float, unit: str) -> str | float:

@@ -34,7 +34,7 @@ from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 from twin.diagnosis.telling.conclude import parameters_told
 from twin.proof.scoring.amplitude import Sized, sized
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
-from twin.proof.scoring.true_candidate import true_candidate, with_terms
+from twin.proof.scoring.true_candidate import of_no_list, true_candidate, with_terms
 from twin.schema import TwinPart, twin_part
 
 CUT = 0.1  # of a channel's left-out error: less is not worth a name
@@ -83,7 +83,7 @@ def true_model(
     level = _level(fit)
     if not key.terms:
         return TrueModel(level, level, 1.0, (), (), (), (), ())
-    every = proposed(fit)
+    every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
     seen = screen(fit, every)
     found = [true_candidate(t, seen, every) for t in key.terms]
     stated = [k for k, s in enumerate(found) if s is not None]
