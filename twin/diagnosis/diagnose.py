@@ -27,7 +27,6 @@ from twin.diagnosis.places.where_when import Located, locate
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
 from twin.diagnosis.rounds.fitted import Fitted, settle
-from twin.diagnosis.rounds.leftover import Leftover, instead, leftover
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
 from twin.diagnosis.rounds.search import Round, Search, search
@@ -47,6 +46,7 @@ from twin.diagnosis.telling.findings import (
 )
 from twin.diagnosis.telling.found import UNLISTED, Rms, place_words
 from twin.diagnosis.telling.statement import finding_of, verdict_statement
+from twin.diagnosis.unlisted.leftover import Leftover, instead, leftover
 from twin.diagnosis.writing.changes import changed_parts, with_deviations
 from twin.schema import TwinPart, twin_part
 

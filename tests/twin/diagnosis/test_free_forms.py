@@ -10,7 +10,7 @@ import pytest
 from tests.twin.diagnosis.concealed import BODIES, chain, empty
 from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Where
-from twin.diagnosis.proposals.free_forms import Form, Level, candidate_of, free_forms, levels
+from twin.diagnosis.unlisted.forms import Form, Level, candidate_of, free_forms, levels
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Value
 from twin.schema import twin_part

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.twin.diagnosis.concealed import Case, calibrated, case, flux, shift
-from twin.diagnosis.proposals.free_forms import Form, free_forms, told
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.rounds.leftover import Leftover, completed, strongest
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.telling.activity import usual_size
+from twin.diagnosis.unlisted.forms import Form, free_forms, told
+from twin.diagnosis.unlisted.leftover import Leftover, completed, strongest
 from twin.schema import twin_part
 
 

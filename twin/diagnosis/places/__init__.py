@@ -1,1 +1,1 @@
-"""Where and when: a free smooth series at every place, and what an unlisted effect follows."""
+"""Where and when: a free smooth series at every place, beside what was found at others."""

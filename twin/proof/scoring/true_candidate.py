@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
-from twin.diagnosis.proposals.free_forms import OF_BODY, Form, Level, candidate_of
 from twin.diagnosis.proposals.priors import start_values
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.scoring.screen import Scored, Screen
+from twin.diagnosis.unlisted.forms import OF_BODY, Form, Level, candidate_of
 from twin.mechanisms import MECHANISMS
 from twin.proof.scoring.answer_key import Spot, TrueTerm
 from twin.proof.scoring.names import counted_as

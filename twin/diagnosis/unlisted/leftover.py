@@ -12,7 +12,6 @@ from twin.calibration.identifiability import Interval
 from twin.diagnosis.places.where_when import Located
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.candidates import candidates, own_bodies
-from twin.diagnosis.proposals.free_forms import Form, candidate_of, free_forms, told
 from twin.diagnosis.proposals.rivals import rivals
 from twin.diagnosis.proposals.slack import LOOSE, no_news
 from twin.diagnosis.rounds.fitted import Fitted
@@ -25,6 +24,7 @@ from twin.diagnosis.scoring.screen import Scored, alone, proposed, screens
 from twin.diagnosis.telling.activity import activity, usual_size
 from twin.diagnosis.telling.found import Found, Rms, place_words
 from twin.diagnosis.telling.honest_digits import Estimate, listed
+from twin.diagnosis.unlisted.forms import Form, candidate_of, free_forms, told
 from twin.schema import TwinPart
 
 LEADS = 1.25  # times the gain of all listed effects: what no list has is claimed in their place only beyond it
