@@ -155,6 +155,23 @@ def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(mo
     assert done is asked[-1] and asked[0].threshold > finer.gain
 
 
+@pytest.mark.parametrize("second_gain", [150.0, 90.0])
+def test_a_finer_network_that_a_second_effect_explains_does_not_go_first(
+    second_gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A heat of two that are missing makes the network look too coarse as much as the first of them does not."""
+    best = found("drift").rounds[0].best
+    assert best is not None
+    bare = replace(best.candidate, where=Where("node", "head"), mechanism="motor_loss", name="loss")
+    second = replace(best, scored=replace(best.scored, candidate=bare), gain=second_gain, cluster=best.cluster + 1)
+    coarse = replace(best.candidate, mechanism="coarse_network", name="finer_head")
+    finer = replace(best, scored=replace(best.scored, candidate=coarse), gain=60.0, cluster=-1000)
+    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: first is not second)
+    monkeypatch.setattr(search_module, "taken_on", lambda now, t: t)
+    got = search_module._apart(found("drift").baseline, best, [best, second, finer], COUNT)
+    assert got is (None if second_gain > EVEN else finer)
+
+
 def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parameters gone with heat that feeds itself may make a machine that cannot be simulated without it."""
 

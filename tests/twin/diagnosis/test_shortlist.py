@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
-from twin.diagnosis.rounds.refits import SHARP, WELL, shortlist, with_sharp
+from twin.diagnosis.rounds.refits import KINDS as KINDS_REFITTED
+from twin.diagnosis.rounds.refits import MORE, SHARP, WELL, Tried, mates, shortlist, with_sharp
 from twin.diagnosis.scoring.screen import Scored
 
 
@@ -77,3 +78,36 @@ def test_beyond_the_first_two_a_refit_must_promise_something(gains: tuple[float,
     news = [scored(m, g) for m, g in zip(("sun", "draught", "radiation", "floor_sink"), gains, strict=True)]
     worth, _, chosen = shortlist(news, EVIDENCE)
     assert [worth[k].gain for k in chosen] == list(gains[:refitted]) and len(worth) == len(gains)
+
+
+def test_a_strong_effect_has_more_imitators_refitted() -> None:
+    """Ten of them, where they gain a quarter of the best; seven of those that gain less."""
+    names = [*COLUMNS, *(f"law{k}" for k in range(8))]
+    for last, refitted in ((30.0, KINDS_REFITTED + MORE), (20.0, KINDS_REFITTED)):
+        news = [many(m, 100.0 if k < 1 else last, k) for k, m in enumerate(names)]
+        assert len(shortlist(news, EVIDENCE)[2]) == refitted
+
+
+def many(mechanism: str, gain: float, column: int) -> Scored:
+    candidate = Candidate(mechanism, Where("node", "head"), mechanism, "")
+    return Scored(candidate, gain, 10, 0.0, {"size": 2.0}, 1.0, column)
+
+
+def tried(s: Scored, gain: float, cluster: int) -> Tried:
+    return Tried(s, gain, 10, cluster, 0.0)
+
+
+def test_where_what_speaks_for_a_cluster_falls_its_mates_are_refitted() -> None:
+    clock, shift, weak = scored("time_skew", 210.0), scored("speed_shift", 208.0), scored("floor_sink", 15.0)
+    worth, clusters = [clock, shift, weak], [0, 0, 0]
+    assert mates([tried(clock, 20.0, 0)], worth, clusters, [0]) == [1]
+    assert mates([tried(clock, 150.0, 0)], worth, clusters, [0]) == []  # it speaks for them
+    assert mates([tried(clock, 20.0, 0)], worth, [0, 1, 0], [0]) == []  # another cluster, and one that gains too little
+    assert mates([tried(clock, 20.0, 0)], worth, clusters, [0, 1]) == []  # refitted already
+
+
+def test_what_multiplies_a_heat_is_refitted_beside_what_speaks_for_it() -> None:
+    """Preload that feeds itself gains far more than its linear trace says."""
+    loss, feedback = scored("motor_loss", 114.0, alike="sun"), scored("preload_feedback", 107.0, alike="sun")
+    assert mates([tried(loss, 156.0, 0)], [loss, feedback], [0, 0], [0]) == [1]
+    assert mates([tried(feedback, 900.0, 0)], [feedback, loss], [0, 0], [0]) == []

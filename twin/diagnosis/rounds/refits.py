@@ -20,10 +20,12 @@ from twin.diagnosis.rounds.fitted import TOLERANCE, Fitted, refitted, settle
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
+from twin.mechanisms import MECHANISMS
 from twin.quantity import Value
 from twin.schema import TwinPart
 
 BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
+MORE, STRONG = 3, 0.25  # more of these if they gain this share of the best: a strong effect has many imitators
 SHARP, WELL = 2, 0.1  # more at errors, where every row counts in full, if they gain this share of the best there
 LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
 WORTH = 0.5  # nats in the screen that are worth a look
@@ -31,6 +33,7 @@ WORTH = 0.5  # nats in the screen that are worth a look
 # than 26 in the screen.
 PROMISING, ANYWAY = 5.0, 2
 LOOKED_AT = 80
+FELL, MATES = 0.5, 2  # of its gain in the screen: a refit that gains less speaks for none of its cluster
 AFRESH = 3  # steps of a refit at an error with all rows counted alike
 GIVEN_UP, PROMISED = 2.0, 20.0  # times the noise that a channel is fitted to, and nats, where that is worth its time
 SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
@@ -77,10 +80,12 @@ def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored],
     worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
     worth = [moved(s, evidence) for s in worth]
     clusters = _clusters(worth, evidence)
+    best = max((s.gain for s in worth), default=0.0)
     chosen: list[int] = []
     seen: set[tuple[str, str]] = set()
     for k, s in enumerate(worth):
-        if len(chosen) >= KINDS or (len(chosen) >= ANYWAY and s.gain < PROMISING):
+        most = KINDS + (MORE if s.gain > STRONG * best else 0)
+        if len(chosen) >= most or (len(chosen) >= ANYWAY and s.gain < PROMISING):
             break
         kind = s.candidate.mechanism, s.candidate.where.kind
         new = kind not in seen
@@ -137,6 +142,26 @@ def _promise(s: Scored) -> tuple[float, str]:
     return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
 
 
+def mates(tried: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]) -> list[int]:
+    """Numbers of those to refit though another mechanism speaks for their cluster: it fell in its refit, or they
+    multiply a heat, which a linear step shows at a fraction of what it comes to.
+
+    Two laws that look alike in one linear step part when they are fitted: a clock that is late is not a shift.
+    """
+    out: list[int] = []
+    for t in sorted(tried, key=lambda t: -t.scored.gain):
+        fell = t.gain < FELL * t.scored.gain
+        same = [k for k, s in enumerate(worth) if clusters[k] == t.cluster and k not in chosen and s.gain > PROMISED]
+        other = [k for k in same if worth[k].candidate.mechanism != t.candidate.mechanism]
+        out += [k for k in other if fell or _grows(worth[k].candidate)][:1]
+    return out[:MATES]
+
+
+def _grows(c: Candidate) -> bool:
+    """Whether it multiplies a heat by what that heat brings about."""
+    return c.mechanism in MECHANISMS and "heat" in MECHANISMS[c.mechanism].acts_at
+
+
 def refit(now: Fitted, s: Scored) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
     if s.candidate.mechanism == "sensor_swap":  # the fit was bent towards the wrong labels
@@ -149,6 +174,8 @@ def refit(now: Fitted, s: Scored) -> Tried | None:
         try:
             part = s.candidate.applied(now.part, values)
             done = judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, part, begin)), roughly=True)
+            if _grows(s.candidate) and done.gain < s.gain:
+                return taken_on(now, done)
             if max(done.gain, s.gain) < PROMISED or not _given_up(now, s.candidate):
                 return done
             again = judged(now, replace(done, fitted=_afresh(now, part, begin)), roughly=True)
@@ -205,7 +232,7 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
     """The same, fitted on to its optimum, unless batches left out are predicted worse there."""
     assert t.fitted is not None
     try:
-        done = judged(now, replace(t, fitted=settle(t.fitted, steps=4, tolerance=0.05, rounds=2)))
+        done = judged(now, replace(t, fitted=settle(t.fitted)))
         return done if done.gain >= t.gain else max(done, judged(now, t), key=lambda one: one.gain)
     except (InputError, WorkError):
         return t

@@ -19,7 +19,7 @@ from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
-from twin.diagnosis.rounds.refits import Tried, compared, refit, shortlist, taken_on, with_clusters, with_sharp
+from twin.diagnosis.rounds.refits import Tried, compared, mates, refit, shortlist, taken_on, with_clusters, with_sharp
 from twin.diagnosis.rounds.revise import second_thoughts
 from twin.diagnosis.rounds.trust import EVEN, LEAST_FINER, least_gain
 from twin.diagnosis.rounds.workers import Workers
@@ -198,6 +198,9 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     tried = _refits(
         now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell
     )
+    more = mates(tried, worth, clusters, chosen)
+    tried += _refits(now, [worth[k] for k in more], [clusters[k] for k in more], workers, tell)
+    chosen = [*chosen, *more]
     if any(t.gain > IN_DOUBT for t in tried):
         plain = alone(now, none)  # a slow misfit in full: that is what is too coarse
         left = plain.mean_squares(plain.left_out())[0]
@@ -210,8 +213,8 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     tried = sorted([*final, *tried[n_final:]], key=order)
     members = with_clusters(tried, worth, clusters, chosen) if n_final else []
     close = sorted((m for m in members if _close(m, tried, order)), key=order)[:MEMBERS]
-    more = zip(close, workers.map(partial(refit, now), [m.scored for m in close]), strict=True)
-    again = [replace(t, cluster=m.cluster) for m, t in more if t is not None]
+    fitted = zip(close, workers.map(partial(refit, now), [m.scored for m in close]), strict=True)
+    again = [replace(t, cluster=m.cluster) for m, t in fitted if t is not None]
     if again:
         rest = [t for t in tried if not any(t is f for f in final)]
         final = compared(now, [*final, *workers.map(partial(taken_on, now), again)])
@@ -240,13 +243,15 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     return first
 
 
-def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]:
-    """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much."""
+def elsewhere(first: Tried, tried: Sequence[Tried], batches: int, beside: bool = True) -> list[Tried]:
+    """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much, where that
+    is asked (`beside`)."""
     out: list[Tried] = []
     for t in tried:
         if t.fitted is None or t.cluster == first.cluster or t.candidate.mechanism == "coarse_network":
             continue
-        if len(out) < NEXT and agreed_on(t, batches) and t.gain > least_gain(t, batches) and _beside(first, t):
+        enough = agreed_on(t, batches) and t.gain > least_gain(t, batches)
+        if len(out) < NEXT and enough and (not beside or _beside(first, t)):
             out.append(t)
     return out
 
@@ -284,15 +289,16 @@ def _unlikely(best: Tried, threshold: float, temperature: float) -> bool:
 
 
 def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tried | None:
-    """A finer network that the best effect does not explain, taken on; None where there is none.
+    """A finer network that neither the best effect nor the next explains, taken on; None where there is none.
 
     What heat or a lever really adds makes a network look too coarse, and with it in that is over; castings stay too
     coarse whatever is added, and an effect is better judged where they are not.
     """
     finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.fitted is not None]
     agreed = [t for t in finer if t.gain > LEAST_FINER and agreed_on(t, batches)]
+    effects = [best, *elsewhere(best, tried, batches, beside=False)]
     for first in sorted(agreed, key=lambda t: -t.gain)[:2]:
-        if _beside(best, first, LEAST_FINER):
+        if all(_beside(effect, first, LEAST_FINER) for effect in effects):
             return taken_on(now, first)
     return None
 
