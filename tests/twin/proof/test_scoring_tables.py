@@ -93,6 +93,21 @@ def test_an_answer_that_is_told_the_truth_is_held_to_the_same_bars() -> None:
         assert pd.isna(informed(nothing)[0])
 
 
+def test_what_is_unlisted_or_confounded_is_told_the_truth_too() -> None:
+    """Of four each the last gains less than a claim takes; what is unlisted has no amplitude that could be compared."""
+    keys, given, true = {}, {}, {}
+    for kind, mechanism in (("unlisted", None), ("confounded", "cabinet_heat")):
+        for k in range(4):
+            name = f"case_{len(keys):04d}"
+            keys[name] = answer(kind, term(mechanism=mechanism), case=name)
+            given[name], true[name] = stored("consistent"), replace(truth(True), gain_nats=(50.0 - 4 * k,))
+    goals = goal_table(*outcomes(keys, given, true))
+    for measure in ("unlisted: flagged", "unlisted: driver found", "confounded: the set holds"):
+        r = row(goals, measure)
+        assert (r["value"], r["informed"], r["informed_n"]) == (0.0, 0.75, 4), measure
+    assert row(goals, "amplitude error, median")["informed_n"] == 3
+
+
 def test_exact_intervals_leave_five_per_cent_on_either_side() -> None:
     low, high = clopper_pearson(7, 20)
     assert low == pytest.approx(brentq(lambda p: binom.sf(6, 20, p) - 0.05, 0.01, 0.9))

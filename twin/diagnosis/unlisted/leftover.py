@@ -121,8 +121,8 @@ def instead(done: Search, left: Leftover | None, seed: int = 0) -> tuple[Search,
         none, them, it = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
         return it > (none + LEADS * (them - none) if left is None else them - EVEN)
 
-    told_first = max((r.best for r in done.accepted if r.best is not None), key=lambda t: t.gain)
-    own = _left(bare, better, seed, told_first.candidate)
+    listed_best = max((r.best for r in done.accepted if r.best is not None), key=lambda t: t.gain)
+    own = _left(bare, better, seed, listed_best.candidate)
     return None if own is None else (bare, own)
 
 
