@@ -172,6 +172,25 @@ def test_a_finer_network_that_a_second_effect_explains_does_not_go_first(
     assert got is (None if second_gain > EVEN else finer)
 
 
+def test_after_one_that_may_not_be_claimed_its_like_is_asked_only_if_it_gains_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rows count as each fit remembers them: the likeliest may gain less than what looks like it."""
+    best = found("drift").rounds[0].best
+    assert best is not None
+
+    def named(name: str, gain: float, cluster: int) -> Tried:
+        scored = replace(best.scored, candidate=replace(best.candidate, mechanism="motor_loss", name=name))
+        return replace(best, scored=scored, gain=gain, cluster=cluster)
+
+    first, more, less = named("first", 176.0, 1), named("more", 298.0, 1), named("less", 150.0, 1)
+    apart, weak = named("apart", 160.0, 2), named("weak", 100.0, 3)
+    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: True)
+    assert search_module.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more, apart]
+    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: False)
+    assert search_module.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more]
+
+
 def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parameters gone with heat that feeds itself may make a machine that cannot be simulated without it."""
 

@@ -237,23 +237,37 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     # What structure may make of one effect, and of what imitates it, is not said of another that stands beside it.
     for other in elsewhere(best, tried, len(now.batches)):
         better = next(n for n, t in enumerate(tried) if t is other)
-        rest = [replace(t, barred=True) if n < better or t.cluster == best.cluster else t for n, t in enumerate(tried)]
+        like = other.cluster == best.cluster
+        rest = [
+            replace(t, barred=True) if n < better or (t.cluster == best.cluster and not like) else t
+            for n, t in enumerate(tried)
+        ]
         if (done := asked(now, seen, null, rest, columns, seed, other)).accepted:
             return done
     return first
 
 
-def elsewhere(first: Tried, tried: Sequence[Tried], batches: int, beside: bool = True) -> list[Tried]:
-    """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much, where that
-    is asked (`beside`)."""
+def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]:
+    """Further finalists that may be claimed where the first may not: with it in, they gain nearly as much, or they look
+    like it and gain more where each counts rows as its own fit remembers them."""
     out: list[Tried] = []
-    for t in tried:
-        if t.fitted is None or t.cluster == first.cluster or t.candidate.mechanism == "coarse_network":
-            continue
-        enough = agreed_on(t, batches) and t.gain > least_gain(t, batches)
-        if len(out) < NEXT and enough and (not beside or _beside(first, t)):
+    for t in effects_of(tried, batches):
+        like = t.cluster == first.cluster
+        if len(out) < NEXT and t is not first and (t.gain > first.gain if like else _beside(first, t)):
             out.append(t)
     return out
+
+
+def effects_of(tried: Sequence[Tried], batches: int) -> list[Tried]:
+    """The finalists that gain what a claim takes; no finer network."""
+    return [
+        t
+        for t in tried
+        if t.fitted is not None
+        and t.candidate.mechanism != "coarse_network"
+        and agreed_on(t, batches)
+        and t.gain > least_gain(t, batches)
+    ]
 
 
 def asked(
@@ -296,7 +310,7 @@ def _apart(now: Fitted, best: Tried, tried: Sequence[Tried], batches: int) -> Tr
     """
     finer = [t for t in tried if t.candidate.mechanism == "coarse_network" and t.fitted is not None]
     agreed = [t for t in finer if t.gain > LEAST_FINER and agreed_on(t, batches)]
-    effects = [best, *elsewhere(best, tried, batches, beside=False)]
+    effects = [best, *(t for t in effects_of(tried, batches) if t.cluster != best.cluster)][: 1 + NEXT]
     for first in sorted(agreed, key=lambda t: -t.gain)[:2]:
         if all(_beside(effect, first, LEAST_FINER) for effect in effects):
             return taken_on(now, first)
