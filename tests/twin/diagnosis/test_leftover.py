@@ -13,7 +13,7 @@ from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.telling.activity import usual_size
 from twin.diagnosis.unlisted.forms import Form, free_forms, told
-from twin.diagnosis.unlisted.leftover import Leftover, completed, strongest
+from twin.diagnosis.unlisted.leftover import Terms, completed, strongest
 from twin.schema import twin_part
 
 
@@ -23,14 +23,14 @@ def fitted(given: Case) -> tuple[Fitted, list[Form]]:
     return now, free_forms(given.machine, part, given.batches)
 
 
-def found(given: Case) -> Leftover:
+def found(given: Case) -> Terms:
     now, forms = fitted(given)
     best = strongest(now, forms)
     assert best is not None
     return completed(now, best, forms)
 
 
-def values(out: Leftover) -> dict[str, float]:
+def values(out: Terms) -> dict[str, float]:
     network = out.fitted.problem.network
     return {f.role: float(out.fitted.values[network.index(f"mechanisms.{out.name}.{f.role}")]) for f in out.forms}
 

@@ -68,10 +68,7 @@ class ForcedNetwork:
         start, offset = problem.own(nuisance)
         values = problem.values_at(x)[None]
         solved = solved_balance(problem.network, values, problem.own_heat(nuisance), start, TOLERANCE_K, 1, offset)
-        out = cls(problem, solved)
-        for weights in out.weights:
-            solved.places.number(weights)
-        return out
+        return cls(problem, solved)
 
     @cached_property
     def weights(self) -> Array:
@@ -86,8 +83,8 @@ class ForcedNetwork:
     def rows(self) -> Rows:
         return rows_of(self.solved, self.problem.inputs.every, 1)
 
-    def answers(self, into: Array, series_W: Array) -> tuple[Array, Array]:
-        """Channels (Q, B, K, C) in their units, and bodies' temperatures (Q, bodies, B, K), K, by Q heat series.
+    def answers(self, into: Array, series_W: Array) -> Array:
+        """Channels (Q, B, K, C) in their units by Q heat series.
 
         `into` (Q, N) says where a watt goes, `series_W` (Q, B, M, 2) are the ends of every interval.
         """
@@ -99,8 +96,7 @@ class ForcedNetwork:
         cells_degC = self.solved.states.at(np.eye(self.problem.network.n_cells)[None])[0]
         tangents = _Tangents(self.solved, unknowns, cells_degC, self.problem.inputs.every).at_rows(self.rows)
         _, _, readings, errors = shown(self.rows, self.problem.network, tangents)
-        numbers = [self.solved.places.number(w) for w in self.weights]
-        return np.concatenate([readings, errors], axis=-1), np.moveaxis(tangents.degC[numbers], 1, 0)
+        return np.concatenate([readings, errors], axis=-1)
 
     def responses(self, hats: Hats) -> list[Array]:
         """By batch the whitened rows (bodies, K, n_b) of a watt's hat into every body, K hats."""
@@ -112,7 +108,7 @@ class ForcedNetwork:
         parts: list[list[Array]] = [[] for _ in self.problem.measured]
         for first in range(0, len(self.weights), together):
             into = np.repeat(self.weights[first : first + together], n, axis=0)
-            channels, _ = self.answers(into, np.tile(series, (len(into) // n, 1, 1, 1)))
+            channels = self.answers(into, np.tile(series, (len(into) // n, 1, 1, 1)))
             for part, rows in zip(parts, whitened(self.problem, channels), strict=True):
                 part.append(rows.reshape(-1, n, rows.shape[-1]))
         return [np.concatenate(part) for part in parts]

@@ -109,12 +109,18 @@ def alone(fitted: Fitted, memory: Memory, like: Fitted | None = None) -> Evidenc
     return _evidence(fitted, tuple(replace(b, columns=b.columns[:, :0]) for b in batches), memory, *np.zeros((2, 0)))
 
 
+def slackened(fitted: Fitted) -> list[Candidate]:
+    """The candidates that are slack: what every fit may do by itself."""
+    every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
+    loose = slack(every, fitted)
+    return [c for c in every if c.name in loose]
+
+
 @lru_cache(maxsize=8)
 def _slackened(fitted: Fitted) -> _Line:
     """With nothing asleep but what is slack. The last fits' are kept: each is judged with several memories."""
-    every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
-    loose = slack(every, fitted)
-    return _Line.at(fitted, [c for c in every if c.name in loose], loose)
+    every = slackened(fitted)
+    return _Line.at(fitted, every, slack(every, fitted))
 
 
 @dataclass(frozen=True)

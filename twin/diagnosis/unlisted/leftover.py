@@ -11,16 +11,15 @@ import pandas as pd
 from twin.calibration.identifiability import Interval
 from twin.diagnosis.places.where_when import Located
 from twin.diagnosis.proposals.candidate import Candidate
-from twin.diagnosis.proposals.candidates import candidates, own_bodies
-from twin.diagnosis.proposals.rivals import rivals
-from twin.diagnosis.proposals.slack import LOOSE, no_news
+from twin.diagnosis.proposals.candidates import own_bodies
+from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.probability import most_sure
 from twin.diagnosis.rounds.refits import Tried, moved, refit, taken_on
 from twin.diagnosis.rounds.search import HOPEFUL, Search, asked
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.memory import Memory, whiter
-from twin.diagnosis.scoring.screen import Scored, alone, proposed, screens
+from twin.diagnosis.scoring.screen import Scored, alone, proposed, screens, slackened
 from twin.diagnosis.telling.activity import activity, usual_size
 from twin.diagnosis.telling.found import Found, Rms, place_words
 from twin.diagnosis.telling.honest_digits import Estimate, listed
@@ -36,12 +35,11 @@ LEAST, SHARE = 3.0, 0.02  # nats that a further term must gain, and of the gain 
 
 
 @dataclass(frozen=True)
-class Leftover:
-    """An effect of no listed mechanism as a refit has it: its terms, and the nats that it had to gain."""
+class Terms:
+    """An effect of no listed mechanism as a refit has it, whatever it gains."""
 
     forms: tuple[Form, ...]
     tried: Tried
-    threshold: float
 
     @property
     def fitted(self) -> Fitted:
@@ -52,6 +50,13 @@ class Leftover:
     @property
     def name(self) -> str:
         return self.tried.candidate.name
+
+
+@dataclass(frozen=True)
+class Leftover(Terms):
+    """The same once it passed the bars of a claim: `threshold` nats it had to gain."""
+
+    threshold: float
 
     @property
     def _switched(self) -> Candidate:
@@ -116,7 +121,7 @@ def instead(done: Search, left: Leftover | None, seed: int = 0) -> tuple[Search,
     bare = replace(done, final=done.baseline, rounds=(replace(done.rounds[0], accepted=False),), dropped=())
     both = done.final if left is None else left.fitted
 
-    def better(own: Leftover) -> bool:
+    def better(own: Terms) -> bool:
         memory = reduce(whiter, (f.memory for f in (done.baseline, both, own.fitted)))
         none, them, it = (float(alone(f, memory).base_score()[0]) for f in (done.baseline, both, own.fitted))
         return it > (none + LEADS * (them - none) if left is None else them - EVEN)
@@ -126,7 +131,7 @@ def instead(done: Search, left: Leftover | None, seed: int = 0) -> tuple[Search,
     return None if own is None else (bare, own)
 
 
-def _left(done: Search, enough: Callable[[Leftover], bool], seed: int, rival: Candidate | None) -> Leftover | None:
+def _left(done: Search, enough: Callable[[Terms], bool], seed: int, rival: Candidate | None) -> Leftover | None:
     """The effect, if it gains enough and no less than a listed mechanism would have to."""
     now, last = done.final, done.rounds[-1]
     every = free_forms(now.machine, now.part, now.batches)
@@ -137,10 +142,11 @@ def _left(done: Search, enough: Callable[[Leftover], bool], seed: int, rival: Ca
     verdict = asked(now, last.screen, last.null, [best.tried], columns, seed, best.tried)
     if not verdict.accepted:
         return None
-    return replace(completed(now, best, every), threshold=verdict.threshold)
+    whole = completed(now, best, every)
+    return Leftover(whole.forms, whole.tried, verdict.threshold)
 
 
-def strongest(now: Fitted, every: Sequence[Form], rival: Candidate | None = None) -> Leftover | None:
+def strongest(now: Fitted, every: Sequence[Form], rival: Candidate | None = None) -> Terms | None:
     """The term that gains most of those that the screen thinks best, fitted to its optimum; of equals the simplest.
 
     With a `rival` those only that the screen thinks better than that.
@@ -154,7 +160,7 @@ def strongest(now: Fitted, every: Sequence[Form], rival: Candidate | None = None
     return min(alike, key=lambda one: every.index(one.forms[0]))
 
 
-def completed(now: Fitted, left: Leftover, every: Sequence[Form]) -> Leftover:
+def completed(now: Fitted, left: Terms, every: Sequence[Form]) -> Terms:
     """With further terms while batches left out miss them."""
     while len(left.forms) < MOST:
         beside = [f for f in every if f.goes_with(left.forms)]
@@ -173,7 +179,7 @@ def completed(now: Fitted, left: Leftover, every: Sequence[Form]) -> Leftover:
     return left
 
 
-def _best(now: Fitted, tried: Sequence[Leftover]) -> list[Leftover] | None:
+def _best(now: Fitted, tried: Sequence[Terms]) -> list[Terms] | None:
     """Those that may gain most, best first, fitted to their optimum."""
     most = max((one.tried.gain for one in tried), default=0.0)
     close = [one for one in tried if one.tried.gain > max(CLOSE * most, HOPEFUL * EVEN)]
@@ -185,9 +191,8 @@ def _promising(
     now: Fitted, forms: Sequence[Form], least: float = NEWS, rival: Candidate | None = None
 ) -> list[tuple[Form, Scored]]:
     """The best of a screen by the rows' memory and of one where every row counts in full."""
-    slack = candidates(now.machine, now.part, LOOSE) + rivals(now.problem.network)
     own = {c.name: (f, c) for f in forms for c in [candidate_of([f], own_bodies(now.part)[0])]}
-    every = [*slack, *(c for _, c in own.values())]
+    every = [*slackened(now), *(c for _, c in own.values())]
     if rival is not None and all(c.name != rival.name for c in every):
         every.append(rival)
     out: dict[str, tuple[Form, Scored]] = {}
@@ -198,11 +203,11 @@ def _promising(
     return list(out.values())
 
 
-def _refitted(now: Fitted, forms: tuple[Form, ...], s: Scored) -> Leftover | None:
+def _refitted(now: Fitted, forms: tuple[Form, ...], s: Scored) -> Terms | None:
     """The network with these terms as one mechanism, begun where the screen says; None where it cannot be simulated."""
     name = f"unlisted_{forms[0].where.name}"
     while name in now.part.mechanisms:
         name += "_"
     c = replace(candidate_of(forms, own_bodies(now.part)[0]), name=name)
     tried = refit(now, replace(s, candidate=c))
-    return None if tried is None else Leftover(forms, tried, 0.0)
+    return None if tried is None else Terms(forms, tried)

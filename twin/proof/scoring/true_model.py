@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from twin.calibration.identifiability import intervals90
+from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.diagnosis.proposals.slack import no_news
@@ -172,12 +173,16 @@ def _judged(
     return replace(out, bar=max(least, MARGIN * structure), size=size)
 
 
+@lru_cache(maxsize=1)
+def _known(full: Fitted) -> dict[str, Interval]:
+    """The intervals of a fit's parameters, by name; the last fit's are kept: each of its terms asks."""
+    state = replace(full.state, noise=full.noise)
+    return {i.name: i for i in intervals90(result(full.problem, state, TOLERANCE, ""), full.problem.unknowns)}
+
+
 def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
     """The term's amplitude in the true model, told as a diagnosis tells it."""
-    known = intervals90(
-        result(full.problem, replace(full.state, noise=full.noise), TOLERANCE, ""), full.problem.unknowns
-    )
-    told, _ = parameters_told(full, s.candidate, {i.name: i for i in known}, scatter)
+    told, _ = parameters_told(full, s.candidate, _known(full), scatter)
     parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in told.items()}
     return sized(s.candidate.mechanism, parameters, term)
 
