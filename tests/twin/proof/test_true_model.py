@@ -14,10 +14,15 @@ from data.machine import Machine
 from tests.twin.diagnosis.concealed import case, flux
 from tests.twin.diagnosis.small_cases import FLOOR, runs, two_bodies
 from tests.twin.proof.answered import answer, term
+from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.null import MARGIN
 from twin.diagnosis.rounds.trust import EVEN
+from twin.diagnosis.scoring.screen import Scored, proposed, screen
 from twin.plants.plant import draw
-from twin.proof.scoring.true_model import TrueModel, true_model
+from twin.proof.scoring.answer_key import AnswerKey
+from twin.proof.scoring.true_candidate import true_candidates
+from twin.proof.scoring.true_model import TrueModel, _chosen, true_model
+from twin.schema import twin_part
 
 SHORT: dict[str, Any] = {"batches": 4, "hours": 5.0, "before_h": 5.0, "solver_s": 50.0}
 
@@ -97,3 +102,23 @@ def test_a_plant_of_other_numerics_has_a_true_model_too() -> None:
     got = true_model(drawn.machine, drawn.batches, key)
     assert got.visible == (True,)
     assert got.error_true < 0.7 * got.error_before
+
+
+def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
+    """A bar sits at the spindle and all that the key says is which error it moves; the screen sees usual bars only."""
+    bar = {"law": "mandrel_fixture", "acts_on": "z", "at": {"seat": "spindle"},
+           "parameters": {"gain": "15 um/K", "capacity": "6000 J/K", "conductance": "1.5 W/K"}}  # fmt: skip
+    given = case({"bar": bar})
+    values = {"gain": {"value": 15.0, "unit": "um/K"}}
+    z = term("mandrel", mechanism="mandrel_fixture", where={"kind": "error", "name": "z"}, parameters=values)
+    key = AnswerKey.from_json(answer("one", z))
+    fit = baseline(given.machine, twin_part(given.machine), given.batches, None, len(given.batches))
+    own = true_candidates(key.terms[0], screen(fit, proposed(fit)), [])
+    last = sorted(own, key=lambda s: _seat(s) == "spindle")  # as if the screen had seen it least
+    (chosen,) = _chosen(fit, key.terms, [last])
+    assert len(own) > 3 and chosen is not None and _seat(chosen) == "spindle"
+
+
+def _seat(s: Scored) -> str:
+    assert s.candidate.part is not None and isinstance(s.candidate.part.at, dict)
+    return str(s.candidate.part.at["seat"])

@@ -18,23 +18,28 @@ from twin.quantity import Value
 from twin.schema import TwinPart
 
 
-def true_candidate(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> Scored | None:
-    """Of the candidates at the term's place with its mechanism the one that gains most in the screen, if there is any.
+def true_candidates(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> list[Scored]:
+    """The candidates at the term's place with its mechanism, best first in the screen.
 
     The key does not say by which channel the twin would drive it, or which bodies it would look at besides.
     """
     own = [s for s in seen.scored if _is(term, s.candidate)]
     own = [s for s in own if s.candidate.where.name == term.where.name] or own
     if own:
-        return max(own, key=lambda s: s.gain)
+        return sorted(own, key=lambda s: -s.gain)
     unseen = next((c for c in every if _is(term, c)), None)  # what cannot be switched off has no signature
-    return None if unseen is None else Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)
+    return [] if unseen is None else [Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)]
+
+
+def open_shape(term: TrueTerm, s: Scored) -> bool:
+    """Whether it has a shape that the key does not state: the screen saw it at one value of that alone."""
+    return not set(s.candidate.shape) <= set(term.parameters or {})
 
 
 def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
     """The law of a heat that no list has, as the key states it; None where it states none or a driver is not recorded.
 
-    It is the one of no list that `true_candidate` looks for among the candidates.
+    It is the one of no list that `true_candidates` looks for among the candidates.
     """
     role, *drivers = term.form or ("",)
     if not role or not all(name in b.table.columns for name in drivers for b in fit.batches):

@@ -35,7 +35,7 @@ from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 from twin.diagnosis.telling.conclude import parameters_told
 from twin.proof.scoring.amplitude import Sized, sized
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
-from twin.proof.scoring.true_candidate import of_no_list, true_candidate, with_terms
+from twin.proof.scoring.true_candidate import of_no_list, open_shape, true_candidates, with_terms
 from twin.schema import TwinPart, twin_part
 
 CUT = 0.1  # of a channel's left-out error: less is not worth a name
@@ -86,7 +86,7 @@ def true_model(
         return TrueModel(level, level, 1.0, (), (), (), (), ())
     every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
     seen = screen(fit, every)
-    found = [true_candidate(t, seen, every) for t in key.terms]
+    found = _chosen(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
     stated = [k for k, s in enumerate(found) if s is not None]
     full = _with(fit, key.terms, found, stated)
     if full is None:
@@ -124,6 +124,28 @@ def _null(fit: Fitted, seed: int) -> Null:
     every = proposed(fit)
     seen = screen(fit, every)
     return structural_null(fit, seen.evidence, seen.columns(no_news(every, fit)), seed)
+
+
+def _chosen(fit: Fitted, terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]) -> list[Scored | None]:
+    """By term the candidate that states it best: by the screen, or by refits where that saw one shape of many.
+
+    A test bar's growth gained 152 nats from the shaft, which the screen had preferred, and 539 from the front bearing.
+    """
+    found = [next(iter(own), None) for own in choices]
+    for k, own in enumerate(choices):
+        if len(own) > 1 and open_shape(terms[k], own[0]):
+            every = [[*found[:k], s, *found[k + 1 :]] for s in own]
+            found = max(every, key=lambda one: _gain(fit, terms, one))
+    return found
+
+
+def _gain(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> float:
+    """Of all these together."""
+    full = _with(fit, terms, found, [k for k, s in enumerate(found) if s is not None])
+    if full is None:
+        return -np.inf
+    memory = whiter(fit.memory, full.memory)
+    return _score(full, memory) - _score(fit, memory)
 
 
 def _with(
