@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,8 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
+from twin.diagnosis.rounds import refits
 from twin.diagnosis.rounds.refits import KINDS as KINDS_REFITTED
-from twin.diagnosis.rounds.refits import MORE, SHARP, WELL, Tried, mates, shortlist, with_sharp
+from twin.diagnosis.rounds.refits import MORE, SHARP, WELL, Tried, mates, short_ones_on, shortlist, with_sharp
+from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored
 
 
@@ -111,3 +114,19 @@ def test_what_multiplies_a_heat_is_refitted_beside_what_speaks_for_it() -> None:
     loss, feedback = scored("motor_loss", 114.0, alike="sun"), scored("preload_feedback", 107.0, alike="sun")
     assert mates([tried(loss, 156.0, 0)], [loss, feedback], [0, 0], [0]) == [1]
     assert mates([tried(feedback, 900.0, 0)], [feedback, loss], [0, 0], [0]) == []
+
+
+def test_a_refit_far_short_of_its_promise_is_fitted_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    on: list[str] = []
+
+    def further(now: Any, t: Tried) -> Tried:
+        on.append(t.candidate.mechanism)
+        return replace(t, gain=277.0)
+
+    monkeypatch.setattr(refits, "taken_on", further)
+    fit: Any = object()
+    promises = {"sun": (169.0, 30.0), "draught": (90.0, 60.0), "radiation": (80.0, 10.0), "floor_sink": (70.0, 5.0)}
+    every = [replace(tried(scored(m, p), g, 0), fitted=fit) for m, (p, g) in promises.items()]
+    done = short_ones_on(fit, [*every, tried(scored("time_skew", 500.0), 1.0, 0)], Workers())
+    assert on == ["sun", "radiation"]  # the two of the highest promise; the draught keeps its own, a clock has no fit
+    assert [t.gain for t in done] == [277.0, 60.0, 277.0, 5.0, 1.0]

@@ -115,8 +115,9 @@ def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
     fit = baseline(given.machine, twin_part(given.machine), given.batches, None, len(given.batches))
     own = true_candidates(key.terms[0], screen(fit, proposed(fit)), [])
     last = sorted(own, key=lambda s: _seat(s) == "spindle")  # as if the screen had seen it least
-    (chosen,) = _chosen(fit, key.terms, [last])
+    (chosen,), full = _chosen(fit, key.terms, [last])
     assert len(own) > 3 and chosen is not None and _seat(chosen) == "spindle"
+    assert full is not None and chosen.candidate.name in full.part.mechanisms
 
 
 def _seat(s: Scored) -> str:

@@ -19,8 +19,20 @@ from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null import Null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.null_cache import cached_null
-from twin.diagnosis.rounds.refits import Tried, compared, mates, refit, shortlist, taken_on, with_clusters, with_sharp
+from twin.diagnosis.rounds.refits import (
+    Tried,
+    compared,
+    mates,
+    moved,
+    refit,
+    short_ones_on,
+    shortlist,
+    taken_on,
+    with_clusters,
+    with_sharp,
+)
 from twin.diagnosis.rounds.revise import second_thoughts
+from twin.diagnosis.rounds.seats import at_best_seats
 from twin.diagnosis.rounds.trust import EVEN, LEAST_FINER, least_gain
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.exchanged import suspects
@@ -185,9 +197,9 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     seen, sharp = screens(now, every, [now.memory, none])
     loose = no_news(every, now)
     # Labels that are exchanged are plainly wrong before a fit (`suspects`); after it, two that are right may gain.
-    news = [s for s in seen.scored if s.candidate.name not in loose and s.candidate.mechanism != "sensor_swap"]
+    every_news = [s for s in seen.scored if s.candidate.name not in loose and s.candidate.mechanism != "sensor_swap"]
     columns = seen.columns(loose)
-    news = best_variants(news)
+    news = best_variants(every_news)
     null = cached_null(cache, now, seen.evidence, columns, seed, lambda n, of: tell("structural null", n, of))
     order = _order(null.temperature)
     base = alone(now, now.memory)
@@ -198,6 +210,7 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     tried = _refits(
         now, work, [*(clusters[k] for k in chosen), *(-2000 - k for k in range(len(swapped)))], workers, tell
     )
+    tried = short_ones_on(now, tried, workers)
     more = mates(tried, worth, clusters, chosen)
     tried += _refits(now, [worth[k] for k in more], [clusters[k] for k in more], workers, tell)
     chosen = [*chosen, *more]
@@ -209,8 +222,10 @@ def one_round(now: Fitted, seed: int, workers: Workers, tell: Progress, cache: P
     tried.sort(key=order)
     before = float(base.base_score()[0])
     n_final = sum(t.gain > HOPEFUL * null.threshold(before, name=t.candidate.name) for t in tried[:FINALISTS])
-    final = compared(now, list(workers.map(partial(taken_on, now), tried[:n_final])))
-    tried = sorted([*final, *tried[n_final:]], key=order)
+    cluster = {s.candidate.name: k for s, k in zip(worth, clusters, strict=True)}
+    seated, others = at_best_seats(tried, n_final, every_news, partial(_seated, now, seen, cluster, workers, tell))
+    final = compared(now, list(workers.map(partial(taken_on, now), seated)))
+    tried = sorted([*final, *others], key=order)
     members = with_clusters(tried, worth, clusters, chosen) if n_final else []
     close = sorted((m for m in members if _close(m, tried, order)), key=order)[:MEMBERS]
     fitted = zip(close, workers.map(partial(refit, now), [m.scored for m in close]), strict=True)
@@ -338,6 +353,14 @@ def _refits(
         if t is not None:
             out.append(replace(t, cluster=clusters[n]))
     return out
+
+
+def _seated(
+    now: Fitted, seen: Screen, cluster: Mapping[str, int], workers: Workers, tell: Progress, some: Sequence[Scored]
+) -> list[Tried]:
+    """Those that were no more than screened; outside the shortlist each is a cluster of its own."""
+    numbers = [cluster.get(s.candidate.name, -3000 - s.column) for s in some]
+    return _refits(now, [moved(s, seen.evidence) for s in some], numbers, workers, tell)
 
 
 def _close(member: Tried, tried: Sequence[Tried], order: Order) -> bool:
