@@ -171,7 +171,7 @@ def _diagnosis(
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    rest, slow = remainder(done), slow_remainder(rms)
+    rest, slow = remainder(done), slow_remainder(rms, final)
     listed = [f for f in found if f.mechanism not in UNLISTED]
     verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
     if (most := max(rest, slow)) > most_left(final.runs):

@@ -3,23 +3,45 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
+from twin.calibration.measured import Measured
 from twin.diagnosis.proposals.candidate import Where
-from twin.diagnosis.telling.conclude import REST, REST_OF_FEW, STRUCTURE, slow_remainder, verdict_of
+from twin.diagnosis.telling.conclude import REST, REST_OF_FEW, STRUCTURE, moved_rms, slow_remainder, verdict_of
 from twin.diagnosis.telling.found import Found, Rms
 
 
-def test_a_slow_misfit_counts_by_its_size() -> None:
+def moving(**moves: float) -> Any:
+    """A fit of one run whose channels are 0 and then go on at that much beside 0; errors are x, y and z."""
+    channels = tuple(moves)
+    value = np.array([v for size in moves.values() for v in (0.0, size * math.sqrt(2.0))])
+    number = np.repeat(np.arange(len(channels)), 2)
+    is_error = np.array([c in "xyz" for c in channels])
+    m = Measured("run", np.tile([0, 1], len(channels)), number, value, np.zeros(len(channels), int), is_error)
+    return SimpleNamespace(problem=SimpleNamespace(channels=channels, measured=[m]))
+
+
+def test_a_slow_misfit_counts_by_what_its_channel_moves() -> None:
     rms = [
-        Rms("t_head", "K", 9.0, 2.0, 0.1, sensor=True),
-        Rms("z", "um", 9.0, 30.0, 1.0),
+        Rms("t_head", "K", 9.0, 0.5, 0.3, sensor=True),  # 0.4 K beyond the noise
+        Rms("z", "um", 9.0, 30.0),
         Rms("x", "um", 9.0, 1.0, 1.0),
     ]
-    assert slow_remainder(rms) == pytest.approx(20.0 / STRUCTURE)  # the median channel
-    assert slow_remainder([Rms("z", "um", 9.0, 5.0, math.nan)]) == 0.0
-    assert slow_remainder([]) == 0.0
+    fit = moving(t_head=8.0, z=60.0, x=20.0)
+    assert moved_rms(fit) == pytest.approx({"t_head": 8.0, "z": 60.0, "x": 20.0})
+    assert slow_remainder(rms, fit) == pytest.approx(0.4 / 8.0 / STRUCTURE)  # the median channel
+    assert slow_remainder(rms, moving(t_head=0.2, z=60.0, x=0.5)) == pytest.approx(0.5 / STRUCTURE)  # noise moves both
+    assert slow_remainder([], fit) == 0.0
+
+
+def test_finer_sensors_are_no_reason_to_doubt_the_same_misfit() -> None:
+    fit = moving(t_head=8.0)
+    coarse, fine = (Rms("t_head", "K", 0.4, math.hypot(0.3, noise), noise, sensor=True) for noise in (0.1, 0.006))
+    assert slow_remainder([coarse], fit) == pytest.approx(slow_remainder([fine], fit))
 
 
 @pytest.mark.parametrize(

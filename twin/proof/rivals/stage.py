@@ -89,8 +89,9 @@ class Stage:
     @cached_property
     def slow(self) -> float:
         """The same of rows as they are."""
-        left = left_out_rows(self.round.before)
-        return slow_remainder(rms_of(rms_table(left, left, self.round.before), self.round.before))
+        before = self.round.before
+        left = left_out_rows(before)
+        return slow_remainder(rms_of(rms_table(left, left, before), before), before)
 
     def bar(self, null: float, name: str) -> float:
         """The threshold with another structural null."""
