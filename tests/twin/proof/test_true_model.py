@@ -12,7 +12,7 @@ import pytest
 from data.batch import Batch
 from data.machine import Machine
 from tests.twin.diagnosis.concealed import case, flux
-from tests.twin.diagnosis.small_cases import FLOOR, runs, two_bodies
+from tests.twin.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
 from tests.twin.proof.answered import answer, term
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.null import MARGIN
@@ -55,6 +55,15 @@ def test_a_floor_that_hardly_conducts_cannot_be_seen() -> None:
     assert got.visible == (False,)
     assert got.error_before == pytest.approx(got.error_true, rel=0.05)
     assert got.gain_nats[0] < EVEN <= got.bar_nats[0]  # a diagnosis would not claim it
+
+
+def test_where_the_file_has_no_twin_it_stands_in_the_draft() -> None:
+    known = two_bodies()
+    values = {"shift": {"value": 6.0, "unit": "um"}, "rated": {"value": 6000.0, "unit": "rpm"}}
+    z = term("speed_shift", where={"kind": "error", "name": "z"}, parameters=values)
+    bare = known.model_copy(update={"twin": None})
+    got = true_model(bare, runs(known, {"shift": SHIFT}), answer("one", z))
+    assert got.visible == (True,) and got.error_true < 0.7 * got.error_before
 
 
 def test_where_nothing_is_missing_the_baseline_is_the_true_model() -> None:

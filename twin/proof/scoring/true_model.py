@@ -21,6 +21,7 @@ from data.machine import Machine
 from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
+from twin.diagnosis.drafting.draft import drafted_part
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
@@ -113,7 +114,7 @@ class _Judged:
 
 
 def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
-    part = twin_part(machine)
+    part = twin_part(machine) if machine.twin is not None else drafted_part(machine, batches).part
     usable, _ = usable_batches(compile_network(machine, part=part), sorted(batches, key=lambda b: b.batch_id))
     parts, _ = enough_batches(usable)
     return baseline(machine, part, parts, None, len(usable))
