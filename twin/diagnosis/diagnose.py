@@ -33,7 +33,7 @@ from twin.diagnosis.rounds.search import Round, Search, search
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.limits import limits
 from twin.diagnosis.telling import tables as made
-from twin.diagnosis.telling.conclude import caps, found_of, most_left, remainder, rms_of, slow_remainder, verdict_of
+from twin.diagnosis.telling.conclude import caps, found_of, left_words, remainder, rms_of, slow_remainder, verdict_of
 from twin.diagnosis.telling.findings import (
     DetectionLimit,
     Finding,
@@ -174,10 +174,7 @@ def _diagnosis(
     rest, slow = remainder(done), slow_remainder(rms, final)
     listed = [f for f in found if f.mechanism not in UNLISTED]
     verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
-    if (most := max(rest, slow)) > most_left(final.runs):
-        words += (
-            f"left-out errors are {most:.1f} times what a coarse network alone would leave (median over channels)",
-        )
+    words += left_words(rest, slow, final.runs)
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
     told = _limits_told(table)

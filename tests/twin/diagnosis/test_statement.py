@@ -190,7 +190,7 @@ def test_verdicts() -> None:
     )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "
-        "the fit falls from 9.1 to 1.4 µm (noise 1.2). Nothing else is missing above the noise."
+        "the fit falls from 9.1 to 1.4 µm (noise 1.2). Nothing else is missing that these runs could show."
     )
     partly = verdict_statement("partly_explained", [replace(SINK, probability=0.7)], [Z])
     assert partly.startswith("Most likely (70 %) part of the difference is heat to the floor")

@@ -11,7 +11,15 @@ import pytest
 
 from twin.calibration.measured import Measured
 from twin.diagnosis.proposals.candidate import Where
-from twin.diagnosis.telling.conclude import REST, REST_OF_FEW, STRUCTURE, moved_rms, slow_remainder, verdict_of
+from twin.diagnosis.telling.conclude import (
+    REST,
+    REST_OF_FEW,
+    STRUCTURE,
+    left_words,
+    moved_rms,
+    slow_remainder,
+    verdict_of,
+)
 from twin.diagnosis.telling.found import Found, Rms
 
 
@@ -65,3 +73,12 @@ def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(slow: float,
 def test_beside_what_was_found_either_is_more(rest: float, slow: float, verdict: str) -> None:
     sink = Found("floor_sink", Where("node", "bed"), "the bed", {}, 0.95)
     assert verdict_of([sink], False, rest * REST, slow * REST, 12) == verdict
+
+
+def test_what_is_left_is_told_with_what_it_is_compared_with() -> None:
+    share = "left-out errors are 20 % of what their channels move (median over channels); up to 15 % may be the coarse"
+    assert left_words(0.0, 0.20 / STRUCTURE, 12) == (f"{share} network's",)
+    both = left_words(9.0, 0.20 / STRUCTURE, 4)
+    assert both[0].startswith("left-out errors filtered by their memory are 9.0 times what a coarse network makes")
+    assert both[1].endswith("up to 10 % may be the coarse network's")
+    assert left_words(REST, REST, 12) == ()

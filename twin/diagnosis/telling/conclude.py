@@ -233,3 +233,15 @@ def verdict_of(found: Sequence[Found], more: bool, rest: float, slow: float, run
 def most_left(runs: int) -> float:
     """How many times what structure leaves so many runs may leave before something is missing for sure."""
     return REST_OF_FEW if runs < FEW else REST
+
+
+def left_words(rest: float, slow: float, runs: int) -> tuple[str, ...]:
+    """What of `remainder` and `slow_remainder` is beyond what so many runs may leave, in words; the larger first."""
+    bound = most_left(runs)
+    said = {
+        f"left-out errors are {100 * STRUCTURE * slow:.0f} % of what their channels move (median over channels); up to "
+        f"{100 * STRUCTURE * bound:.0f} % may be the coarse network's": slow,
+        f"left-out errors filtered by their memory are {rest:.1f} times what a coarse network makes of them (median "
+        f"over channels); up to {bound:.0f} times may be its": rest,
+    }
+    return tuple(words for words, times in sorted(said.items(), key=lambda one: -one[1]) if times > bound)

@@ -128,7 +128,7 @@ def verdict_statement(
         words = _capital(f"{hedge} part of the difference is {said}".strip())
         return f"{words}{f'; with it {fall}' if fall else ''}. Something else is still missing."
     words = _capital(f"{hedge} the difference is {said}".strip())
-    return f"{words}{f'; with it {fall}' if fall else ''}. Nothing else is missing above the noise."
+    return f"{words}{f'; with it {fall}' if fall else ''}. Nothing else is missing that these runs could show."
 
 
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
