@@ -31,7 +31,8 @@ from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.baseline import baseline
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import TWINS, structural_null
-from twin.diagnosis.rounds.refits import refit, shortlist
+from twin.diagnosis.rounds.refits import refit
+from twin.diagnosis.rounds.shortlist import shortlist
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
 from twin.plants.plant import Case, draw
@@ -91,7 +92,7 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
     yield "linearise", timed(linearised, repeats)[0]
     if "assemble" in which:
         yield "assemble", timed(lambda: State.at(problem, state.z, state.nuisance, state.noise), repeats)[0]
-    yield "score a fit", timed(lambda: alone(fitted, state.noise.inflation).base_score(), repeats)[0]
+    yield "score a fit", timed(lambda: alone(fitted, fitted.memory).base_score(), repeats)[0]
     if "candidates" in which:
         yield "candidates", timed(lambda: proposed(fitted), repeats)[0]
     took, seen = timed(lambda: screen(fitted, p.every), repeats)
@@ -105,8 +106,8 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
 
 
 def chosen(seen: Screen) -> list[Scored]:
-    worth, _, numbers = shortlist(seen.scored, seen.evidence)
-    return [worth[k] for k in numbers][:REFITS]
+    listed = shortlist(seen.scored, seen.evidence)
+    return [listed.worth[k] for k in listed.chosen][:REFITS]
 
 
 def stages_table(case: Case, processes: int) -> None:

@@ -26,10 +26,11 @@ from twin.diagnosis.next_run.settling import settling_run
 from twin.diagnosis.places.where_when import Located, locate
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.rounds.baseline import TOLERANCE, baseline, check
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.rounds.fitted import Fitted, settle
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
-from twin.diagnosis.rounds.search import Round, Search, search
+from twin.diagnosis.rounds.search import Search, search
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.limits import limits
 from twin.diagnosis.telling import tables as made

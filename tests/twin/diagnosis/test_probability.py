@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.rounds.null import HOT, Null
 from twin.diagnosis.rounds.probability import LEAST, MOST, explanations, most_sure, told
 from twin.diagnosis.rounds.refits import Tried
-from twin.diagnosis.rounds.search import Round
 
 THRESHOLD = 10.0
 

@@ -18,10 +18,12 @@ from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds import decision
 from twin.diagnosis.rounds import search as search_module
+from twin.diagnosis.rounds.decision import IMPROVED, Round
 from twin.diagnosis.rounds.probability import explanations
 from twin.diagnosis.rounds.refits import Tried
-from twin.diagnosis.rounds.search import IMPROVED, Round, Search, one_round, search
+from twin.diagnosis.rounds.search import Search, one_round, search
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored, proposed
@@ -140,14 +142,14 @@ def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(mo
     """Beside a strong effect a finer network stays below what flipped residuals reach."""
     now = found("drift").baseline
     none = Scored(Candidate("coarse_network", Where("node", "head"), "finer_head", ""), 0.0, 0, 0.0, {}, 0.0, -1)
-    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], search_module.asked
+    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], decision.asked
 
     def watched(*given: Any) -> Round:
         asked.append(real(*given))
         return asked[-1]
 
-    monkeypatch.setattr(search_module, "_apart", lambda *_: finer)
-    monkeypatch.setattr(search_module, "asked", watched)
+    monkeypatch.setattr(decision, "_apart", lambda *_: finer)
+    monkeypatch.setattr(decision, "asked", watched)
     done = one_round(now, 0, Workers(), lambda *_: None)
     assert [(r.best.candidate.name, r.accepted) for r in asked if r.best is not None] == [
         ("finer_head", False), ("sensor_drift_t_head", True),
@@ -166,9 +168,9 @@ def test_a_finer_network_that_a_second_effect_explains_does_not_go_first(
     second = replace(best, scored=replace(best.scored, candidate=bare), gain=second_gain, cluster=best.cluster + 1)
     coarse = replace(best.candidate, mechanism="coarse_network", name="finer_head")
     finer = replace(best, scored=replace(best.scored, candidate=coarse), gain=60.0, cluster=-1000)
-    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: first is not second)
-    monkeypatch.setattr(search_module, "taken_on", lambda now, t: t)
-    got = search_module._apart(found("drift").baseline, best, [best, second, finer], COUNT)
+    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: first is not second)
+    monkeypatch.setattr(decision, "taken_on", lambda now, t: t)
+    got = decision._apart(found("drift").baseline, best, [best, second, finer], COUNT)
     assert got is (None if second_gain > EVEN else finer)
 
 
@@ -185,10 +187,10 @@ def test_after_one_that_may_not_be_claimed_its_like_is_asked_only_if_it_gains_mo
 
     first, more, less = named("first", 176.0, 1), named("more", 298.0, 1), named("less", 150.0, 1)
     apart, weak = named("apart", 160.0, 2), named("weak", 100.0, 3)
-    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: True)
-    assert search_module.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more, apart]
-    monkeypatch.setattr(search_module, "_beside", lambda first, t, least=0.0: False)
-    assert search_module.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more]
+    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: True)
+    assert decision.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more, apart]
+    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: False)
+    assert decision.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more]
 
 
 def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,11 +211,11 @@ def test_what_gains_by_its_own_memory_alone_is_not_claimed() -> None:
     best = found("drift").rounds[0].best
     assert best is not None
     lever = replace(best, gain=240.0, alike=96.0)
-    assert search_module._unlikely(lever, 197.0, 10.0)  # 101 nats below, in units of 10: odds of e^10
-    assert not search_module._unlikely(replace(lever, alike=180.0), 197.0, 10.0)
-    assert not search_module._unlikely(replace(lever, alike=None), 197.0, 10.0)
+    assert decision._unlikely(lever, 197.0, 10.0)  # 101 nats below, in units of 10: odds of e^10
+    assert not decision._unlikely(replace(lever, alike=180.0), 197.0, 10.0)
+    assert not decision._unlikely(replace(lever, alike=None), 197.0, 10.0)
     finer = replace(best.scored, candidate=replace(best.candidate, mechanism="coarse_network"))
-    assert not search_module._unlikely(replace(lever, scored=finer), 197.0, 10.0)
+    assert not decision._unlikely(replace(lever, scored=finer), 197.0, 10.0)
 
 
 def test_physics_never_takes_the_place_of_a_finer_network() -> None:
@@ -230,18 +232,16 @@ def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
     imitates: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A warm fixture gains 258 nats where the floor is cold, and ten beside a cold floor."""
-    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], search_module.asked
+    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], decision.asked
 
     def watched(*given: Any) -> Round:
         done = real(*given)
         asked.append(done if asked else replace(done, accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(search_module, "asked", watched)
+    monkeypatch.setattr(decision, "asked", watched)
     if not imitates:
-        monkeypatch.setattr(
-            search_module, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft"
-        )
+        monkeypatch.setattr(decision, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft")
     done = one_round(now, 0, Workers(), lambda *_: None)
     names = [r.best.candidate.name for r in asked if r.best is not None]
     assert names == ["floor_sink_head_room", *([] if imitates else ["mandrel_fixture_z_shaft"])]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
-from twin.diagnosis.rounds.refits import WORTH, Tried
+from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.seats import SEATS, at_best_seats
+from twin.diagnosis.rounds.shortlist import WORTH
 from twin.diagnosis.scoring.screen import Scored
 from twin.schema import MechanismPart
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from twin.diagnosis.proposals.candidate import Candidate, Where
-from twin.diagnosis.rounds import search
+from twin.diagnosis.rounds import decision
 from twin.diagnosis.rounds.refits import Tried
 from twin.diagnosis.rounds.revise import Second, best_change
 from twin.diagnosis.scoring.screen import Scored
@@ -54,15 +54,15 @@ def test_a_finer_network_that_an_effect_does_not_explain_comes_first(
 ) -> None:
     """It gains nearly as much with the effect in as without."""
     best, finer = tried("belt_loss", 160.0), tried("coarse_network", 100.0)
-    monkeypatch.setattr(search, "refit", lambda *_: None if beside is None else tried("coarse_network", beside))
-    monkeypatch.setattr(search, "taken_on", lambda _, t: t)
+    monkeypatch.setattr(decision, "refit", lambda *_: None if beside is None else tried("coarse_network", beside))
+    monkeypatch.setattr(decision, "taken_on", lambda _, t: t)
     now: Any = None
-    assert search._apart(now, best, [best, finer], BATCHES) is (finer if first else None)
+    assert decision._apart(now, best, [best, finer], BATCHES) is (finer if first else None)
 
 
 def test_one_that_gains_little_or_not_in_most_batches_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "refit", lambda *_: tried("coarse_network", 100.0))
-    monkeypatch.setattr(search, "taken_on", lambda _, t: t)
+    monkeypatch.setattr(decision, "refit", lambda *_: tried("coarse_network", 100.0))
+    monkeypatch.setattr(decision, "taken_on", lambda _, t: t)
     now: Any = None
     for finer in (tried("coarse_network", 39.0), tried("coarse_network", 100.0, improved=6)):
-        assert search._apart(now, tried("belt_loss", 160.0), [finer], BATCHES) is None
+        assert decision._apart(now, tried("belt_loss", 160.0), [finer], BATCHES) is None

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
 from twin.diagnosis.rounds import refits
-from twin.diagnosis.rounds.refits import KINDS as KINDS_REFITTED
-from twin.diagnosis.rounds.refits import MORE, SHARP, WELL, Tried, mates, short_ones_on, shortlist, with_sharp
+from twin.diagnosis.rounds.refits import Tried, short_ones_on
+from twin.diagnosis.rounds.shortlist import KINDS as KINDS_REFITTED
+from twin.diagnosis.rounds.shortlist import MORE, SHARP, WELL, Shortlist, mates, shortlist, unasked, with_sharp
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored
 
@@ -36,18 +37,18 @@ def scored(mechanism: str, gain: float, place: str = "head", alike: str = "") ->
     return Scored(candidate, gain, 10, 0.0, {"size": 2.0}, 1.0, column)
 
 
-FIRST = ([scored("sun", 90.0), scored("draught", 60.0), scored("sun", 50.0, "bed")], [0, 1, 0], [0, 1])
+FIRST = Shortlist((scored("sun", 90.0), scored("draught", 60.0), scored("sun", 50.0, "bed")), (0, 1, 0), (0, 1))
 
 
-def names(done: tuple[list[Scored], list[int], list[int]]) -> list[str]:
-    return [done[0][k].candidate.name for k in done[2]]
+def names(done: Shortlist) -> list[str]:
+    return [done.worth[k].candidate.name for k in done.chosen]
 
 
 def test_what_rows_in_full_show_of_another_mechanism_is_refitted_too() -> None:
     done = with_sharp(FIRST, [scored("sun", 900.0), scored("radiation", 200.0)], EVIDENCE)
     assert names(done) == ["sun_head", "draught_head", "radiation_head"]
-    assert len(set(done[1][k] for k in done[2])) == 3  # a cluster of its own
-    np.testing.assert_allclose(done[0][-1].moves, -2.0 * EVIDENCE.shadow[:, 3])  # begins at the joint optimum there
+    assert len(set(done.clusters[k] for k in done.chosen)) == 3  # a cluster of its own
+    np.testing.assert_allclose(done.worth[-1].moves, -2.0 * EVIDENCE.shadow[:, 3])  # begins at the joint optimum there
 
 
 def test_only_errors_send_theirs() -> None:
@@ -67,20 +68,20 @@ def test_what_looks_like_one_that_is_refitted_is_not() -> None:
 
 
 def test_there_are_few_of_them_and_each_candidate_stands_once() -> None:
-    worth = [*FIRST[0], scored("floor_sink", 3.0)]
+    worth = (*FIRST.worth, scored("floor_sink", 3.0))
     sharp = [scored(m, 500.0 - k) for k, m in enumerate(["floor_sink", "radiation", "time_skew", "speed_shift"])]
-    done = with_sharp((worth, [0, 1, 0, 2], [0, 1]), sharp, EVIDENCE)
-    assert len(done[2]) == 2 + SHARP
-    every = [s.candidate.name for s in done[0]]
-    assert len(every) == len(set(every)) == len(done[1])
+    done = with_sharp(Shortlist(worth, (0, 1, 0, 2), (0, 1)), sharp, EVIDENCE)
+    assert len(done.chosen) == 2 + SHARP
+    every = [s.candidate.name for s in done.worth]
+    assert len(every) == len(set(every)) == len(done.clusters)
     assert names(done)[2] == "floor_sink_head"
 
 
 @pytest.mark.parametrize(("gains", "refitted"), [((90.0, 60.0, 5.5, 4.5), 3), ((90.0, 4.5, 4.0, 3.0), 2)])
 def test_beyond_the_first_two_a_refit_must_promise_something(gains: tuple[float, ...], refitted: int) -> None:
     news = [scored(m, g) for m, g in zip(("sun", "draught", "radiation", "floor_sink"), gains, strict=True)]
-    worth, _, chosen = shortlist(news, EVIDENCE)
-    assert [worth[k].gain for k in chosen] == list(gains[:refitted]) and len(worth) == len(gains)
+    listed = shortlist(news, EVIDENCE)
+    assert [listed.worth[k].gain for k in listed.chosen] == list(gains[:refitted]) and len(listed.worth) == len(gains)
 
 
 def test_a_strong_effect_has_more_imitators_refitted() -> None:
@@ -88,7 +89,7 @@ def test_a_strong_effect_has_more_imitators_refitted() -> None:
     names = [*COLUMNS, *(f"law{k}" for k in range(8))]
     for last, refitted in ((30.0, KINDS_REFITTED + MORE), (20.0, KINDS_REFITTED)):
         news = [many(m, 100.0 if k < 1 else last, k) for k, m in enumerate(names)]
-        assert len(shortlist(news, EVIDENCE)[2]) == refitted
+        assert len(shortlist(news, EVIDENCE).chosen) == refitted
 
 
 def many(mechanism: str, gain: float, column: int) -> Scored:
@@ -102,18 +103,28 @@ def tried(s: Scored, gain: float, cluster: int) -> Tried:
 
 def test_where_what_speaks_for_a_cluster_falls_its_mates_are_refitted() -> None:
     clock, shift, weak = scored("time_skew", 210.0), scored("speed_shift", 208.0), scored("floor_sink", 15.0)
-    worth, clusters = [clock, shift, weak], [0, 0, 0]
-    assert mates([tried(clock, 20.0, 0)], worth, clusters, [0]) == [1]
-    assert mates([tried(clock, 150.0, 0)], worth, clusters, [0]) == []  # it speaks for them
-    assert mates([tried(clock, 20.0, 0)], worth, [0, 1, 0], [0]) == []  # another cluster, and one that gains too little
-    assert mates([tried(clock, 20.0, 0)], worth, clusters, [0, 1]) == []  # refitted already
+    listed = Shortlist((clock, shift, weak), (0, 0, 0), (0,))
+    assert mates(listed, [tried(clock, 20.0, 0)]) == [(shift, 0)]
+    assert mates(listed, [tried(clock, 150.0, 0)]) == []  # it speaks for them
+    apart = replace(listed, clusters=(0, 1, 0))
+    assert mates(apart, [tried(clock, 20.0, 0)]) == []  # another cluster, and one that gains too little
+    assert mates(replace(listed, chosen=(0, 1)), [tried(clock, 20.0, 0)]) == []  # refitted already
 
 
 def test_what_multiplies_a_heat_is_refitted_beside_what_speaks_for_it() -> None:
     """Preload that feeds itself gains far more than its linear trace says."""
     loss, feedback = scored("motor_loss", 114.0, alike="sun"), scored("preload_feedback", 107.0, alike="sun")
-    assert mates([tried(loss, 156.0, 0)], [loss, feedback], [0, 0], [0]) == [1]
-    assert mates([tried(feedback, 900.0, 0)], [feedback, loss], [0, 0], [0]) == []
+    assert mates(Shortlist((loss, feedback), (0, 0), (0,)), [tried(loss, 156.0, 0)]) == [(feedback, 0)]
+    assert mates(Shortlist((feedback, loss), (0, 0), (0,)), [tried(feedback, 900.0, 0)]) == []
+
+
+def test_what_was_never_refitted_is_as_much_worse_than_its_cluster_as_the_screen_says() -> None:
+    clock, shift, bar = scored("time_skew", 210.0), scored("speed_shift", 198.0), scored("floor_sink", 150.0)
+    listed = Shortlist((clock, shift, bar), (0, 0, 1), (0,))
+    best = replace(tried(clock, 320.0, 0), alike=300.0)
+    (like,) = unasked(listed, {clock.candidate.name}, [best])  # none of the bar's cluster was refitted
+    assert (like.scored, like.gain, like.alike, like.fitted) == (shift, 308.0, 288.0, None)
+    assert unasked(listed, {s.candidate.name for s in listed.worth}, [best]) == []  # or could not be simulated
 
 
 def test_a_refit_far_short_of_its_promise_is_fitted_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 from data.errors import InputError, WorkError
 from twin.diagnosis.next_run.next_experiment import Proposal, next_experiment
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.probability import explanations
 from twin.diagnosis.rounds.refits import Tried, refit
-from twin.diagnosis.rounds.search import Round, Search
+from twin.diagnosis.rounds.search import Search
 
 CLEAR = 0.9  # above it nothing needs to be told apart
 RIVAL = 0.05  # probability worth a run

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.diagnosis.rounds.search import IMPROVED, Round, Tried
+from twin.diagnosis.rounds.decision import IMPROVED, Round
+from twin.diagnosis.rounds.refits import Tried
 
 LEAST = 0.005  # probabilities below it are not told
 MOST = {1: 0.6, 2: 0.7, 3: 0.8, 4: 0.9, 5: 0.93}  # by number of batches: few agree by chance

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
@@ -25,20 +25,13 @@ from twin.mechanisms import MECHANISMS
 from twin.quantity import Value
 from twin.schema import TwinPart
 
-BEST, KINDS = 5, 7  # refits of a round: the best of all, and with the best of every other mechanism
-MORE, STRONG = 3, 0.25  # more of these if they gain this share of the best: a strong effect has many imitators
-SHARP, WELL = 2, 0.1  # more at errors, where every row counts in full, if they gain this share of the best there
-LIKE = 0.95  # |cos| of signatures beyond which recordings cannot tell two candidates apart
-WORTH = 0.5  # nats in the screen that are worth a look
-# And a refit, beyond the first few: in 112 development cases no true effect that gained 60 nats in its refit had less
-# than 26 in the screen.
-PROMISING, ANYWAY = 5.0, 2
-LOOKED_AT = 80
 FELL, MATES = 0.5, 2  # of its gain in the screen: a refit that gains less speaks for none of its cluster
 AFRESH = 3  # steps of a refit at an error with all rows counted alike
 GIVEN_UP, PROMISED = 2.0, 20.0  # times the noise that a channel is fitted to, and nats, where that is worth its time
 SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
-SHAPED = 5.0  # nats in the screen that each parameter beside the size must be worth
+
+Progress = Callable[[str, int, int], None]
+Work = tuple[Scored, int]  # a candidate and the number of its cluster
 
 
 @dataclass(frozen=True)
@@ -73,92 +66,25 @@ class Tried:
         return self.level / temperature + self.log_prior
 
 
-def shortlist(news: Sequence[Scored], evidence: Evidence) -> tuple[list[Scored], list[int], list[int]]:
-    """What is worth a look, its clusters, and the numbers of those to refit, one of each cluster.
+class Refits:
+    """Full refits beside one fit; `asked` are the names of all that it was asked for, simulated or not."""
 
-    A baseline bent far by what it lacks shows little in the screen, so every mechanism may send its best.
-    """
-    worth = sorted((s for s in news if s.gain > WORTH), key=_promise)[:LOOKED_AT]
-    worth = [moved(s, evidence) for s in worth]
-    clusters = _clusters(worth, evidence)
-    best = max((s.gain for s in worth), default=0.0)
-    chosen: list[int] = []
-    seen: set[tuple[str, str]] = set()
-    for k, s in enumerate(worth):
-        most = KINDS + (MORE if s.gain > STRONG * best else 0)
-        if len(chosen) >= most or (len(chosen) >= ANYWAY and s.gain < PROMISING):
-            break
-        kind = s.candidate.mechanism, s.candidate.where.kind
-        new = kind not in seen
-        if (len(chosen) < BEST or new) and not any(clusters[k] == clusters[j] for j in chosen):
-            chosen.append(k)
-            seen.add(kind)
-    return worth, clusters, chosen
+    def __init__(self, now: Fitted, workers: Workers, tell: Progress) -> None:
+        self.asked: set[str] = set()
+        self._now, self._workers, self._tell = now, workers, tell
+
+    def __call__(self, work: Sequence[Work]) -> list[Tried]:
+        """Those that can be simulated."""
+        out = []
+        self.asked |= {s.candidate.name for s, _ in work}
+        for n, t in enumerate(self._workers.map(partial(refit, self._now), [s for s, _ in work])):
+            self._tell("refit", n + 1, len(work))
+            if t is not None:
+                out.append(replace(t, cluster=work[n][1]))
+        return out
 
 
-def with_sharp(
-    first: tuple[list[Scored], list[int], list[int]], sharp: Sequence[Scored], evidence: Evidence
-) -> tuple[list[Scored], list[int], list[int]]:
-    """A shortlist with the best at errors of other mechanisms where every row counts in full.
-
-    What is missing makes rows remember each other; filtered by that memory, the sharp trace of a shift or of a clock
-    that is late may be gone. (A slow one, unfiltered, passes for thousands of rows.)
-    """
-    worth, clusters, chosen = first
-    first_names = {worth[k].candidate.name for k in chosen}
-    seen = {(worth[k].candidate.mechanism, worth[k].candidate.where.kind) for k in chosen}
-    ranked = [s for s in sorted(sharp, key=_promise) if s.column >= 0 and s.gain > WORTH][:LOOKED_AT]
-    own = _clusters(ranked, evidence)
-    known = {own[k] for k, s in enumerate(ranked) if s.candidate.name in first_names}
-    more: list[Scored] = []
-    for k, s in enumerate(ranked):
-        kind = s.candidate.mechanism, s.candidate.where.kind
-        if len(more) >= SHARP or s.gain < WELL * ranked[0].gain:
-            break
-        if kind[1] == "error" and kind not in seen and own[k] not in known:
-            seen.add(kind)
-            known.add(own[k])
-            more.append(moved(s, evidence))
-    names = {s.candidate.name for s in more}
-    kept = [k for k, s in enumerate(worth) if s.candidate.name not in names]
-    numbers = [kept.index(k) for k in chosen]  # none of those is of another mechanism
-    last = max(clusters, default=-1)
-    return (
-        [worth[k] for k in kept] + more,
-        [clusters[k] for k in kept] + [last + 1 + k for k in range(len(more))],
-        numbers + [len(kept) + k for k in range(len(more))],
-    )
-
-
-def moved(s: Scored, evidence: Evidence) -> Scored:
-    """With the way that the parameters go when it takes over what they had been bent for."""
-    if s.column < 0:
-        return s
-    amplitude = max(s.amplitudes.values(), key=abs, default=0.0)
-    return replace(s, moves=tuple((-amplitude * evidence.shadow[:, s.column]).tolist()))
-
-
-def _promise(s: Scored) -> tuple[float, str]:
-    """Best first; of those that gain alike the one with the least freedom speaks for its cluster."""
-    return SHAPED * len(s.candidate.shape) - s.gain, s.candidate.name
-
-
-def mates(tried: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]) -> list[int]:
-    """Numbers of those to refit though another mechanism speaks for their cluster: it fell in its refit, or they
-    multiply a heat, which a linear step shows at a fraction of what it comes to.
-
-    Two laws that look alike in one linear step part when they are fitted: a clock that is late is not a shift.
-    """
-    out: list[int] = []
-    for t in sorted(tried, key=lambda t: -t.scored.gain):
-        fell = t.gain < FELL * t.scored.gain
-        same = [k for k, s in enumerate(worth) if clusters[k] == t.cluster and k not in chosen and s.gain > PROMISED]
-        other = [k for k in same if worth[k].candidate.mechanism != t.candidate.mechanism]
-        out += [k for k in other if fell or _grows(worth[k].candidate)][:1]
-    return out[:MATES]
-
-
-def _grows(c: Candidate) -> bool:
+def grows(c: Candidate) -> bool:
     """Whether it multiplies a heat by what that heat brings about."""
     return c.mechanism in MECHANISMS and "heat" in MECHANISMS[c.mechanism].acts_at
 
@@ -186,7 +112,7 @@ def refit(now: Fitted, s: Scored) -> Tried | None:
         try:
             part = s.candidate.applied(now.part, values)
             done = judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, part, begin)), roughly=True)
-            if _grows(s.candidate) and done.gain < s.gain:
+            if grows(s.candidate) and done.gain < s.gain:
                 return taken_on(now, done)
             if max(done.gain, s.gain) < PROMISED or not _given_up(now, s.candidate):
                 return done
@@ -269,26 +195,6 @@ def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
     return [replace(t, alike=judged(now, t, whitest).gain) for t in finalists]
 
 
-def with_clusters(
-    done: Sequence[Tried], worth: Sequence[Scored], clusters: Sequence[int], chosen: Sequence[int]
-) -> list[Tried]:
-    """The others of each refitted cluster, as much worse as the screen says."""
-    best_in: dict[int, Tried] = {}
-    names = {t.candidate.name for t in done}
-    for t in done:
-        best_in.setdefault(t.cluster, t)
-    out = []
-    for k, s in enumerate(worth):
-        if k not in chosen and s.candidate.name not in names and clusters[k] in best_in:
-            like = best_in[clusters[k]]
-            loss = max(0.0, like.scored.gain - s.gain)
-            alike = None if like.alike is None else like.alike - loss
-            out.append(
-                Tried(s, like.gain - loss, s.improved, clusters[k], log_prior(s, like.fitted, like.scored), alike=alike)
-            )
-    return out
-
-
 def improved(before: Evidence, after: Evidence) -> int:
     """Left-out batches whose squares fall."""
     old, new = _squares(before, after)
@@ -308,23 +214,3 @@ def _squares(before: Evidence, after: Evidence) -> tuple[Array, Array]:
     old = [(e[:, 0] ** 2 / (before.weight * unit)[b.channel]).sum() for b, e in zip(before.batches, left, strict=True)]
     new = [(f[:, 0] ** 2 / (after.weight * unit)[a.channel]).sum() for a, f in zip(after.batches, right, strict=True)]
     return np.array(old), np.array(new)
-
-
-def _clusters(worth: Sequence[Scored], evidence: Evidence) -> list[int]:
-    """A number for every candidate, the same for those whose signatures agree with the first of their cluster."""
-    columns = [s.column for s in worth if s.column >= 0]
-    like = evidence.likeness(columns) if columns else np.zeros((0, 0))
-    place = {c: k for k, c in enumerate(columns)}
-    heads: list[int] = []
-    out: list[int] = []
-    for s in worth:
-        if s.column < 0:
-            out.append(-1 - len(out))
-            continue
-        k = place[s.column]
-        head = next((h for h in heads if like[k, place[h]] > LIKE), None)
-        if head is None:
-            heads.append(s.column)
-            head = s.column
-        out.append(heads.index(head))
-    return out

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from twin.diagnosis.rounds.refits import WORTH, Tried
+from twin.diagnosis.rounds.refits import Tried
+from twin.diagnosis.rounds.shortlist import WORTH
 from twin.diagnosis.scoring.screen import Scored
 
 SEATS = 6  # more that are refitted: in three cases the best stood third, fourth and seventh in the screen

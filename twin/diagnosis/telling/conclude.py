@@ -9,10 +9,11 @@ import pandas as pd
 
 from twin.calibration.identifiability import Interval
 from twin.diagnosis.proposals.candidate import Candidate
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import AS_IT_IS
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure, told
-from twin.diagnosis.rounds.search import Round, Search
+from twin.diagnosis.rounds.search import Search
 from twin.diagnosis.rounds.trust import trust
 from twin.diagnosis.scoring.screen import alone
 from twin.diagnosis.scoring.unseen import unseen

@@ -10,11 +10,11 @@ import pandas as pd
 from twin.calibration.fit_problem import Array
 from twin.calibration.whiteness import lagged_sums
 from twin.diagnosis.diagnosis import COLUMNS
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import Null
 from twin.diagnosis.rounds.prediction import LeftOutRows
 from twin.diagnosis.rounds.probability import explanations
-from twin.diagnosis.rounds.search import Round
 from twin.mechanisms import MECHANISMS
 
 LAGS = 40

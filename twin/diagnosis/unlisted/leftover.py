@@ -13,10 +13,12 @@ from twin.diagnosis.places.where_when import Located
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.candidates import own_bodies
 from twin.diagnosis.proposals.slack import no_news
+from twin.diagnosis.rounds.decision import Bars, asked
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.probability import most_sure
-from twin.diagnosis.rounds.refits import Tried, moved, refit, taken_on
-from twin.diagnosis.rounds.search import HOPEFUL, Search, asked
+from twin.diagnosis.rounds.refits import Tried, refit, taken_on
+from twin.diagnosis.rounds.search import HOPEFUL, Search
+from twin.diagnosis.rounds.shortlist import moved
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone, proposed, screens, slackened
@@ -139,7 +141,7 @@ def _left(done: Search, enough: Callable[[Terms], bool], seed: int, rival: Candi
     if best is None or best.tried.gain < EVEN or not enough(best):
         return None
     columns = last.screen.columns(no_news(proposed(now), now))
-    verdict = asked(now, last.screen, last.null, [best.tried], columns, seed, best.tried)
+    verdict = asked(Bars(now, last.screen, last.null, columns, seed), [best.tried], best.tried)
     if not verdict.accepted:
         return None
     whole = completed(now, best, every)

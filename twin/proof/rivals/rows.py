@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.slack import no_news, slack
-from twin.diagnosis.rounds.search import Round
+from twin.diagnosis.rounds.decision import Round
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import Scored
 from twin.diagnosis.scoring.whitened import Whitened

@@ -9,11 +9,12 @@ from functools import cached_property
 from twin.calibration.fit_problem import Array
 from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.rounds.acceptance import flipped_threshold
+from twin.diagnosis.rounds.decision import Round, agreed_on, coarse_first, to_claim
 from twin.diagnosis.rounds.null import structural_misfits
 from twin.diagnosis.rounds.prediction import left_out_rows
 from twin.diagnosis.rounds.probability import Explanation, explanations, most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import Round, Search, agreed_on, coarse_first, to_claim
+from twin.diagnosis.rounds.search import Search
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone

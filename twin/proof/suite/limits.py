@@ -26,9 +26,9 @@ from data.atomic_file import write_atomic
 from data.batch import Batch
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.decision import IMPROVED
 from twin.diagnosis.rounds.fitted import Fitted
 from twin.diagnosis.rounds.null import structural_null
-from twin.diagnosis.rounds.search import IMPROVED
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.screen import alone, proposed, screen
 from twin.plants.effects import EFFECTS
