@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from twin.diagnosis.rounds.fitted import Fitted, settle
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import LeftOutRows, left_out_rows
 from twin.diagnosis.rounds.search import Search, search
-from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.rounds.workers import Progress, Workers
 from twin.diagnosis.scoring.limits import limits
 from twin.diagnosis.telling import tables as made
 from twin.diagnosis.telling.conclude import caps, found_of, left_words, remainder, rms_of, slow_remainder, verdict_of
@@ -50,8 +50,6 @@ from twin.diagnosis.telling.statement import finding_of, verdict_statement
 from twin.diagnosis.unlisted.leftover import Leftover, instead, leftover
 from twin.diagnosis.writing.changes import changed_parts, with_deviations
 from twin.schema import TwinPart, twin_part
-
-Progress = Callable[[str, int, int], None]
 
 
 @threadpool_limits.wrap(limits=1)  # small matrices: more threads cost time, and results must not depend on them

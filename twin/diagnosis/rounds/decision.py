@@ -17,7 +17,7 @@ from twin.diagnosis.rounds.refits import Tried, refit, taken_on
 from twin.diagnosis.rounds.trust import EVEN, LEAST_FINER, least_gain
 from twin.diagnosis.scoring.screen import Screen, alone
 
-FINALISTS = 4  # refits that may be claimed
+FINALISTS = 4  # refits that are taken on to their optimum, and that may be claimed
 IMPROVED = 0.75  # share of the left-out batches that must improve
 WORTH_A_CLAIM = 0.5  # of the highest gain: what improves most batches is asked before what improves a few by more
 APART = 0.4  # of a gain: what gains as much beside another is none of it
@@ -84,7 +84,7 @@ def decided(bars: Bars, tried: Sequence[Tried]) -> Round:
         least = max(bars.structure(tried[0].candidate.name if tried else ""), EVEN)
         return Round(now, bars.seen, tuple(tried), least, bars.null, np.zeros((0, 0)), False)
     best = to_claim(tried, n)
-    if best.gain > least_gain(best, n) and best.candidate.mechanism != "coarse_network":
+    if best.gain > least_gain(best, n) and best.candidate.mechanism != "coarse_network":  # agreed on or not
         finer = _apart(now, best, tried, n)
         if finer is not None and (done := asked(bars, tried, finer)).accepted:
             return done
@@ -128,7 +128,7 @@ def asked(bars: Bars, tried: Sequence[Tried], best: Tried) -> Round:
 def to_claim(tried: Sequence[Tried], batches: int) -> Tried:
     """Of refits, best first, the first that improves most batches, stands out and gains enough; else the best."""
     for t in tried[:FINALISTS]:
-        if t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t, batches):
+        if gains_enough(t, batches):
             return t if t.gain > WORTH_A_CLAIM * tried[0].gain else tried[0]
     return tried[0]
 
@@ -153,14 +153,17 @@ def elsewhere(first: Tried, tried: Sequence[Tried], batches: int) -> list[Tried]
 
 def effects_of(tried: Sequence[Tried], batches: int) -> list[Tried]:
     """The finalists that gain what a claim takes; no finer network."""
-    return [
-        t
-        for t in tried
-        if t.fitted is not None
-        and t.candidate.mechanism != "coarse_network"
-        and agreed_on(t, batches)
-        and t.gain > least_gain(t, batches)
-    ]
+    return [t for t in tried if is_effect(t, batches)]
+
+
+def is_effect(t: Tried, batches: int) -> bool:
+    """Whether it gains what a claim takes, and is no finer network."""
+    return t.candidate.mechanism != "coarse_network" and gains_enough(t, batches)
+
+
+def gains_enough(t: Tried, batches: int) -> bool:
+    """Whether, refitted, most batches agree on it and it gains what one of its kind takes."""
+    return t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t, batches)
 
 
 def agreed_on(t: Tried, batches: int) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
@@ -17,7 +17,7 @@ from twin.diagnosis.proposals.candidate import Candidate
 from twin.diagnosis.proposals.priors import log_prior, start_values
 from twin.diagnosis.rounds.baseline import MISFIT, SMOOTH, baseline
 from twin.diagnosis.rounds.fitted import TOLERANCE, Fitted, refitted, settle
-from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.rounds.workers import Progress, Workers
 from twin.diagnosis.scoring.evidence import Evidence
 from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
@@ -30,7 +30,6 @@ AFRESH = 3  # steps of a refit at an error with all rows counted alike
 GIVEN_UP, PROMISED = 2.0, 20.0  # times the noise that a channel is fitted to, and nats, where that is worth its time
 SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
 
-Progress = Callable[[str, int, int], None]
 Work = tuple[Scored, int]  # a candidate and the number of its cluster
 
 

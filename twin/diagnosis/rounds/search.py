@@ -14,12 +14,12 @@ from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.decision import FINALISTS, Bars, Round, coarse_first, decided
 from twin.diagnosis.rounds.fitted import Fitted, refitted, settle
 from twin.diagnosis.rounds.null_cache import cached_null
-from twin.diagnosis.rounds.refits import Progress, Refits, Tried, Work, compared, short_ones_on, taken_on
+from twin.diagnosis.rounds.refits import Refits, Tried, Work, compared, short_ones_on, taken_on
 from twin.diagnosis.rounds.revise import second_thoughts
 from twin.diagnosis.rounds.seats import at_best_seats
 from twin.diagnosis.rounds.shortlist import mates, moved, shortlist, unasked, with_sharp
 from twin.diagnosis.rounds.trust import EVEN
-from twin.diagnosis.rounds.workers import Workers
+from twin.diagnosis.rounds.workers import Progress, Workers
 from twin.diagnosis.scoring.exchanged import suspects
 from twin.diagnosis.scoring.memory import Memory
 from twin.diagnosis.scoring.screen import Scored, alone, best_variants, proposed, screens

@@ -44,8 +44,8 @@ class Shortlist:
 
     def cluster(self, s: Scored) -> int:
         """The number of its cluster; outside the shortlist each is one of its own."""
-        names = [one.candidate.name for one in self.worth]
-        return self.clusters[names.index(s.candidate.name)] if s.candidate.name in names else -3000 - s.column
+        of_name = {one.candidate.name: k for one, k in zip(self.worth, self.clusters, strict=True)}
+        return of_name.get(s.candidate.name, -3000 - s.column)
 
 
 def shortlist(news: Sequence[Scored], evidence: Evidence) -> Shortlist:

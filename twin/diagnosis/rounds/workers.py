@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 R = TypeVar("R")
+Progress = Callable[[str, int, int], None]  # told of a step, how many of it are done, and of how many
 
 
 class Workers:

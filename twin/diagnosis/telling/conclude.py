@@ -239,10 +239,13 @@ def most_left(runs: int) -> float:
 def left_words(rest: float, slow: float, runs: int) -> tuple[str, ...]:
     """What of `remainder` and `slow_remainder` is beyond what so many runs may leave, in words; the larger first."""
     bound = most_left(runs)
-    said = {
+    of_moves = (
         f"left-out errors are {100 * STRUCTURE * slow:.0f} % of what their channels move (median over channels); up to "
-        f"{100 * STRUCTURE * bound:.0f} % may be the coarse network's": slow,
+        f"{100 * STRUCTURE * bound:.0f} % may be the coarse network's"
+    )
+    of_memory = (
         f"left-out errors filtered by their memory are {rest:.1f} times what a coarse network makes of them (median "
-        f"over channels); up to {bound:.0f} times may be its": rest,
-    }
-    return tuple(words for words, times in sorted(said.items(), key=lambda one: -one[1]) if times > bound)
+        f"over channels); up to {bound:.0f} times may be its"
+    )
+    said = sorted(((slow, of_moves), (rest, of_memory)), reverse=True)
+    return tuple(words for times, words in said if times > bound)
