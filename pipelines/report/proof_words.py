@@ -47,7 +47,8 @@ GLOSSARY = (
     ("interval", "90 %: Clopper and Pearson for shares, bootstrap over cases for medians and quantiles."),
     ("met", "The measured value itself reaches the goal; the interval says how sure that is."),
     (INFORMED, "The same measure for an answer that has all concealed effects in its model, refits it, and "
-     "claims what passes the bars of a claim. What it misses, these recordings do not give with such bars."),
+     "claims what passes the bars of a claim. What it misses, these recordings do not give with such bars. Of the "
+     "calibration error: what probabilities show that are exactly right, in the mean over chance."),
     ("detection limit", "The size at which an effect of this kind is just found on development plants."),
     ("right answer", "Every visible effect is named with its place, and nothing false is claimed. Of a confounded pair "
      "the reported set must hold the truth; an effect that is not in the library must be called so."),

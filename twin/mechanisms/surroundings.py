@@ -92,6 +92,7 @@ class FloorSink(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     shape = ("temperature", "follow")
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"temperature": (12.0,)}  # beside the usual one
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "itself", "room": "surrounding"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:

@@ -61,12 +61,19 @@ def scattered() -> list[Batch]:
 
 
 def names(done: Search) -> list[str]:
-    return [r.best.candidate.name for r in done.accepted if r.best is not None]
+    return [r.best.candidate.plain for r in done.accepted if r.best is not None]
 
 
 def told(done: Search) -> dict[str, Interval]:
+    """By name, numbers of where a shape began left out."""
     fit = result(done.final.problem, done.final.state, 0.01, "")
-    return {i.name: i for i in intervals90(fit, done.final.problem.unknowns)}
+    number = {r.best.candidate.name: r.best.candidate.plain for r in done.accepted if r.best is not None}
+    out = {}
+    for i in intervals90(fit, done.final.problem.unknowns):
+        group, entry, value = i.name.split(".")
+        head, dash, own = entry.rpartition("-")
+        out[f"{group}.{head}{dash}{number.get(own, own)}.{value}"] = i
+    return out
 
 
 def test_a_cold_floor_is_found_with_its_size() -> None:
@@ -243,14 +250,60 @@ def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
     if not imitates:
         monkeypatch.setattr(decision, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft")
     done = one_round(now, 0, Workers(), lambda *_: None)
-    names = [r.best.candidate.name for r in asked if r.best is not None]
-    assert names == ["floor_sink_head_room", *([] if imitates else ["mandrel_fixture_z_shaft"])]
+    every_asked = [r.best.candidate.plain for r in asked if r.best is not None]
+    assert every_asked == ["floor_sink_head_room", *([] if imitates else ["mandrel_fixture_z_shaft"])]
     assert done is asked[-1] and done.accepted is not imitates
     if not imitates:  # what structure may make explains nothing
-        barred = {t.candidate.name for t in done.tried if t.barred}
+        barred = {t.candidate.plain for t in done.tried if t.barred}
         assert {"floor_sink_head_room", "jacket_chiller_head"} <= barred and "mandrel_fixture_z_shaft" not in barred
         every, _, _ = explanations(done)
         assert all(e.probability == 0.0 for e in every if e.tried.barred)
+
+
+def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_claimed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Heat to a floor gained 30 nats in one step, and 731 at its optimum."""
+    on: list[str] = []
+
+    def further(_: Any, t: Tried) -> Tried:
+        on.append(t.candidate.name)
+        return replace(t, gain=700.0)
+
+    monkeypatch.setattr(search_module, "taken_on", further)
+    monkeypatch.setattr(search_module, "compared", lambda _, finalists: [replace(t, alike=t.gain) for t in finalists])
+    refused, far, finer, weak, third, fourth = (
+        of(name, mechanism, gain)
+        for name, mechanism, gain in (
+            ("floor_sink_bed", "floor_sink", 90.0), ("sun_head", "sun", 62.0), ("finer", "coarse_network", 61.0),
+            ("draught_room", "draught", search_module.LEFT - 1.0), ("radiation_head", "radiation", 45.0),
+            ("sun_bed", "sun", 44.0),
+        )
+    )  # fmt: skip
+    begun = replace(refused.scored.candidate, name="floor_sink_bed_2", variant_of="floor_sink_bed")
+    again = replace(refused, scored=replace(refused.scored, candidate=begun), gain=80.0)
+    every = [refused, again, far, finer, third, fourth, weak]
+    done, new = search_module._looked_again(found("floor").baseline, every, [refused], Workers())
+    assert on == ["sun_head", "radiation_head"] and new == set(on)  # not what was refused once, wherever it begins
+    assert len(done) == len(every) and {t.candidate.name: t.gain for t in done}["sun_head"] == 700.0
+
+
+def test_what_is_no_better_the_second_time_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both looks of a round come to the same best, which was refused."""
+    asked: list[Round] = []
+    real = search_module.decided
+
+    def refusing(bars: Any, tried: Any) -> Round:
+        asked.append(replace(real(bars, tried), accepted=False))
+        return asked[-1]
+
+    monkeypatch.setattr(search_module, "decided", refusing)
+    assert one_round(found("drift").baseline, 0, Workers(), lambda *_: None) is asked[0] and len(asked) == 1
+
+
+def of(name: str, mechanism: str, gain: float) -> Tried:
+    scored = Scored(Candidate(mechanism, Where("node", name), name, ""), gain, 10, 0.0, {}, 1.0, 1)
+    return Tried(scored, gain, 10, 0, 0.0, found("floor").baseline)
 
 
 @cache

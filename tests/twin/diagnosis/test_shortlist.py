@@ -14,7 +14,19 @@ from twin.diagnosis.proposals.candidate import Candidate, Kind, Where
 from twin.diagnosis.rounds import refits
 from twin.diagnosis.rounds.refits import Tried, short_ones_on
 from twin.diagnosis.rounds.shortlist import KINDS as KINDS_REFITTED
-from twin.diagnosis.rounds.shortlist import MORE, SHARP, WELL, Shortlist, mates, shortlist, unasked, with_sharp
+from twin.diagnosis.rounds.shortlist import (
+    MORE,
+    PLACES,
+    SHARP,
+    THERE,
+    WELL,
+    Shortlist,
+    mates,
+    neighbours,
+    shortlist,
+    unasked,
+    with_sharp,
+)
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored
 
@@ -116,6 +128,25 @@ def test_what_multiplies_a_heat_is_refitted_beside_what_speaks_for_it() -> None:
     loss, feedback = scored("motor_loss", 114.0, alike="sun"), scored("preload_feedback", 107.0, alike="sun")
     assert mates(Shortlist((loss, feedback), (0, 0), (0,)), [tried(loss, 156.0, 0)]) == [(feedback, 0)]
     assert mates(Shortlist((feedback, loss), (0, 0), (0,)), [tried(feedback, 900.0, 0)]) == []
+
+
+def test_before_nothing_is_claimed_the_places_of_the_best_are_looked_at_again() -> None:
+    """Natural convection at a motor showed 2 nats of its 349 in the screen, where radiation there showed 56."""
+    first, convection = scored("sun", 56.0, "motor"), scored("draught", 2.0, "motor")
+    like, other, far = scored("sun", 1.5, "head"), scored("draught", 9.0, "bed"), scored("sun", 20.0, "table")
+    listed = Shortlist((first, far, other, convection, like), (0, 1, 2, 3, 0), (0, 1))
+    best, second = tried(first, 55.0, 0), tried(far, 12.0, 1)
+    finer = replace(first, candidate=replace(first.candidate, mechanism="coarse_network", where=other.candidate.where))
+    asked = {first.candidate.name, far.candidate.name}
+    assert neighbours(listed, [tried(finer, 90.0, 9), best, second], asked) == [(convection, 3)]
+    assert neighbours(listed, [best, second], asked | {convection.candidate.name}) == []
+
+
+def test_each_place_sends_few_and_each_cluster_one() -> None:
+    laws = [many(f"law{k}", 9.0 - k, k) for k in range(THERE + 3)]
+    listed = Shortlist(tuple(laws), (0, 1, 1, *range(2, THERE + 2)), (0,))
+    done = neighbours(listed, [tried(laws[0], 30.0, 0)], {laws[0].candidate.name})
+    assert [cluster for _, cluster in done] == list(range(1, THERE + 1)) and PLACES > 1
 
 
 def test_what_was_never_refitted_is_as_much_worse_than_its_cluster_as_the_screen_says() -> None:

@@ -15,7 +15,7 @@ from tests.twin.proof.answered import answer, finding, stored, term, truth
 from twin.proof.scoring.goal_table import GOAL_COLUMNS, goal_table
 from twin.proof.scoring.intervals import bootstrap, clopper_pearson
 from twin.proof.scoring.outcomes import OUTCOMES, outcomes
-from twin.proof.scoring.reliability import reliability
+from twin.proof.scoring.reliability import error_by_chance, reliability
 from twin.proof.scoring.tables import by, confusion, worst
 
 HEATS_W = (100.0, 105.0, 110.0, 120.0, 150.0, 90.0, 100.0, 100.0)  # of 100; intervals 90 to 130
@@ -135,6 +135,15 @@ def test_probabilities_that_come_true_as_often_as_they_say_have_no_error() -> No
     _, error = reliability(cases.assign(probability=0.2))  # half come true
     assert error == pytest.approx(0.3)
     assert np.isnan(reliability(cases[:0])[1])
+
+
+def test_probabilities_that_are_exactly_right_show_an_error_too_where_cases_are_few() -> None:
+    """The mean distance from 0.9 of the share right of 12 cases, by the binomial distribution."""
+    k = np.arange(13)
+    expected = float(np.sum(binom.pmf(k, 12, 0.9) * np.abs(k / 12 - 0.9)))
+    assert error_by_chance(np.full(120, 0.9)) == pytest.approx(expected, abs=0.003)
+    assert error_by_chance(np.full(12000, 0.9)) < 0.15 * expected
+    assert error_by_chance(np.ones(50)) == 0.0 and np.isnan(error_by_chance(np.zeros(0)))
 
 
 def test_other_views_count_what_they_say() -> None:

@@ -54,6 +54,11 @@ class Candidate:
     variant_of: str = ""  # the name of what this is at another value of its shape
     parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
 
+    @property
+    def plain(self) -> str:
+        """The name, the same at every value at which its shape is looked for."""
+        return self.variant_of or self.name
+
     def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
         """The twin part with this candidate in it; `values` replace its parameters' own.
 

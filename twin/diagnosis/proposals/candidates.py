@@ -85,17 +85,18 @@ def _at(
 
 
 def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
-    """The candidate at every value at which its shape is looked for: what happens at another time has no trace yet."""
+    """The candidate begun at every value at which its shape is looked for: what happens at another time has no trace
+    yet, and a floor at the temperature of a body takes no heat from it."""
     yield c
     if c.part is None or c.where.kind == "link":
         return
     for name, values in mechanism.scan.items():
         unit = mechanism.spec(name).unit
-        for value in values:
+        for k, value in enumerate(values):  # a number in its name: what its fit comes to is another value
             given = {**c.part.parameters, name: Value(value=f"{value:g} {unit}")}
             part = c.part.model_copy(update={"parameters": given})
-            own, words = f"{c.name}_{name}_{value:g}".replace(".", "_"), f"{c.words}, {name} at {value:g} {unit}"
-            yield replace(c, name=own, words=words, part=part, variant_of=c.name)
+            words = f"{c.words}, {name} begun at {value:g} {unit}"
+            yield replace(c, name=f"{c.name}_{k + 2}", words=words, part=part, variant_of=c.name)
 
 
 def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:

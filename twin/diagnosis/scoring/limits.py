@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
 from twin.diagnosis.diagnosis import COLUMNS
 from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.scoring.screen import Screen, best_variants
+from twin.diagnosis.scoring.screen import Scored, Screen
 from twin.mechanisms import MECHANISMS
 
 SURE = 1.64  # sd beyond the threshold: seen in 95 of 100 such sets of runs
+NO_TRACE = 1e100  # sd of an amplitude that changes nothing that was recorded
 
 
 def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
@@ -24,7 +27,7 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
     own = np.sqrt(sum(np.einsum("np,np->p", b.jacobian, b.jacobian) for b in evidence.batches))
     names = [u.name for u in fitted.problem.unknowns]
     rows = []
-    for s in best_variants(seen.scored):
+    for s in _usual(seen.scored):
         c = s.candidate
         if s.column < 0 or c.mechanism not in MECHANISMS or not c.amplitudes:
             continue
@@ -39,3 +42,12 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["limits"]))
     return table.sort_values(["mechanism", "limit", "name"], ignore_index=True)
+
+
+def _usual(scored: Sequence[Scored]) -> list[Scored]:
+    """Of what is looked for at several values of its shape the one at the usual value, or, where that has no trace, the
+    most sensitive."""
+    out: dict[str, Scored] = {}
+    for s in sorted(scored, key=lambda s: (s.sd > NO_TRACE, bool(s.candidate.variant_of), s.sd, s.candidate.name)):
+        out.setdefault(s.candidate.plain, s)
+    return list(out.values())

@@ -91,7 +91,7 @@ def best_variants(scored: Sequence[Scored]) -> list[Scored]:
     """Of what was looked for at several values of its shape, the best one; in the same order."""
     best: dict[str, Scored] = {}
     for s in scored:
-        own = s.candidate.variant_of or s.candidate.name
+        own = s.candidate.plain
         if own not in best or s.gain > best[own].gain:
             best[own] = s
     kept = {s.candidate.name for s in best.values()}

@@ -10,7 +10,7 @@ import pandas as pd
 
 from twin.proof.scoring.goals import GOALS, Goal, Wanted, mean
 from twin.proof.scoring.intervals import bootstrap, clopper_pearson, of_groups
-from twin.proof.scoring.reliability import calibration_error, told_and_right
+from twin.proof.scoring.reliability import calibration_error, error_by_chance, told_and_right
 
 GOAL_COLUMNS: Mapping[str, str] = {
     "measure": "string", "goal": "string", "wanted": "Float64", "better": "string", "value": "Float64",
@@ -48,7 +48,8 @@ def _measured(outcomes: pd.DataFrame, terms: pd.DataFrame) -> Iterator[dict[str,
         of_groups(list(pairs[:, None]), lambda g: calibration_error(np.vstack(g))) if len(pairs) else (None,) * 2
     )
     wanted = Wanted("probabilities: expected calibration error", CALIBRATED, "lower", unit="")
-    yield _said(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
+    said = _said(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
+    yield said | {"informed": error_by_chance(pairs[:, 0]) if len(pairs) else None, "informed_n": len(pairs)}
 
 
 def _row(goal: Goal, values: pd.Series) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from twin.proof.scoring.intervals import clopper_pearson
 
-BINS = 10
+BINS, DRAWS = 10, 1000
 COLUMNS = ("low", "high", "n", "claimed", "right", "low90", "high90")
 
 
@@ -40,6 +40,17 @@ def calibration_error(pairs: NDArray[np.float64]) -> float:
         return float("nan")
     gaps = [len(own) * abs(float(np.mean(pairs[own, 0] - pairs[own, 1]))) for own in _bins(pairs[:, 0])]
     return float(np.sum(gaps) / len(pairs))
+
+
+def error_by_chance(told: NDArray[np.float64], seed: int = 0) -> float:
+    """The calibration error that these probabilities (n,) show in the mean where every one of them is exactly right.
+
+    Ten bins of a dozen cases scatter about the truth: the error is never 0 (Bröcker and Smith 2007).
+    """
+    if not len(told):
+        return float("nan")
+    drawn = np.random.default_rng(seed).random((DRAWS, len(told))) < told
+    return float(np.mean([calibration_error(np.column_stack([told, right])) for right in drawn]))
 
 
 def _bins(told: NDArray[np.float64]) -> list[NDArray[np.int64]]:
