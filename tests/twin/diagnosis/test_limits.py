@@ -78,7 +78,8 @@ def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:
 def test_every_mechanism_that_can_be_switched_off_has_one() -> None:
     assert tuple(table().columns) == COLUMNS["limits"]
     smooth = {s.candidate.plain for s in best_variants(seen().scored) if s.candidate.amplitudes}
-    assert len(table()) == len(set(table()["words"])) == len(smooth)
+    name_of = {c.words: c.plain for c in proposed(consistent())}
+    assert {name_of[words] for words in table()["words"]} == smooth and len(table()) == len(smooth)
     every = {c.plain: c.words for c in proposed(consistent()) if c.amplitudes}
     assert len(every) == len(smooth)
     for row in rows():
