@@ -18,12 +18,14 @@ from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.diagnosis.proposals.candidate import Candidate, Where
 from twin.diagnosis.proposals.slack import no_news
-from twin.diagnosis.rounds import decision
+from twin.diagnosis.rounds import decision, looks
 from twin.diagnosis.rounds import search as search_module
 from twin.diagnosis.rounds.decision import IMPROVED, Round
+from twin.diagnosis.rounds.looks import one_round
 from twin.diagnosis.rounds.probability import explanations
 from twin.diagnosis.rounds.refits import Tried
-from twin.diagnosis.rounds.search import Search, one_round, search
+from twin.diagnosis.rounds.search import Search, search
+from twin.diagnosis.rounds.shortlist import Shortlist
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.rounds.workers import Workers
 from twin.diagnosis.scoring.screen import Scored, proposed
@@ -260,44 +262,55 @@ def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
         assert all(e.probability == 0.0 for e in every if e.tried.barred)
 
 
-def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_claimed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_claimed() -> None:
     """Heat to a floor gained 30 nats in one step, and 731 at its optimum."""
-    on: list[str] = []
-
-    def further(_: Any, t: Tried) -> Tried:
-        on.append(t.candidate.name)
-        return replace(t, gain=700.0)
-
-    monkeypatch.setattr(search_module, "taken_on", further)
-    monkeypatch.setattr(search_module, "compared", lambda _, finalists: [replace(t, alike=t.gain) for t in finalists])
     refused, far, finer, weak, third, fourth = (
         of(name, mechanism, gain)
         for name, mechanism, gain in (
             ("floor_sink_bed", "floor_sink", 90.0), ("sun_head", "sun", 62.0), ("finer", "coarse_network", 61.0),
-            ("draught_room", "draught", search_module.LEFT - 1.0), ("radiation_head", "radiation", 45.0),
+            ("draught_room", "draught", looks.LEFT - 1.0), ("radiation_head", "radiation", 45.0),
             ("sun_bed", "sun", 44.0),
         )
     )  # fmt: skip
     begun = replace(refused.scored.candidate, name="floor_sink_bed_2", variant_of="floor_sink_bed")
     again = replace(refused, scored=replace(refused.scored, candidate=begun), gain=80.0)
-    every = [refused, again, far, finer, third, fourth, weak]
-    done, new = search_module._looked_again(found("floor").baseline, every, [refused], Workers())
-    assert on == ["sun_head", "radiation_head"] and new == set(on)  # not what was refused once, wherever it begins
-    assert len(done) == len(every) and {t.candidate.name: t.gain for t in done}["sun_head"] == 700.0
+    more = looks._left_behind([refused, again, far, finer, third, fourth, weak], [refused])
+    assert more == [far, third]  # not what was refused once, wherever it begins
+
+
+def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shortlist passes the floor over, and what imitates it is refused."""
+    asked: list[Round] = []
+    listing, real = looks.shortlist, looks.decided
+
+    def passing_over(*given: Any) -> Shortlist:
+        listed = listing(*given)
+        floor = {c for s, c in listed.work(range(len(listed.worth))) if s.candidate.mechanism == "floor_sink"}
+        return replace(listed, chosen=tuple(k for k in listed.chosen if listed.clusters[k] not in floor))
+
+    def refusing_once(bars: Any, tried: Any) -> Round:
+        done = real(bars, tried)
+        asked.append(done if asked else replace(done, accepted=False))
+        return asked[-1]
+
+    monkeypatch.setattr(looks, "shortlist", passing_over)
+    monkeypatch.setattr(looks, "decided", refusing_once)
+    done = one_round(found("floor").baseline, 0, Workers(), lambda *_: None)
+    assert done is asked[1] and done.accepted and done.best is not None
+    assert done.best.candidate.plain == "floor_sink_head_room"
+    assert asked[0].best is not None and asked[0].best.candidate.mechanism != "floor_sink"
 
 
 def test_what_is_no_better_the_second_time_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both looks of a round come to the same best, which was refused."""
     asked: list[Round] = []
-    real = search_module.decided
+    real = looks.decided
 
     def refusing(bars: Any, tried: Any) -> Round:
         asked.append(replace(real(bars, tried), accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(search_module, "decided", refusing)
+    monkeypatch.setattr(looks, "decided", refusing)
     assert one_round(found("drift").baseline, 0, Workers(), lambda *_: None) is asked[0] and len(asked) == 1
 
 

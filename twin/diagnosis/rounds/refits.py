@@ -28,7 +28,7 @@ from twin.schema import TwinPart
 FELL, MATES = 0.5, 2  # of its gain in the screen: a refit that gains less speaks for none of its cluster
 AFRESH = 3  # steps of a refit at an error with all rows counted alike
 GIVEN_UP, PROMISED = 2.0, 20.0  # times the noise that a channel is fitted to, and nats, where that is worth its time
-RANKED = 4  # rounds after which a gain stands: ten more changed it by 4 of 11 to 900 nats at most
+RANKED = 4  # rounds after which a gain stands: with ten, 11 gains of 11 to 900 nats came to 4 more at most
 SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
 
 Work = tuple[Scored, int]  # a candidate and the number of its cluster

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 
 from twin.diagnosis.diagnosis import COLUMNS
 from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.scoring.screen import Scored, Screen
+from twin.diagnosis.scoring.screen import Scored, Screen, one_of_each
 from twin.mechanisms import MECHANISMS
 
 SURE = 1.64  # sd beyond the threshold: seen in 95 of 100 such sets of runs
@@ -27,7 +25,7 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
     own = np.sqrt(sum(np.einsum("np,np->p", b.jacobian, b.jacobian) for b in evidence.batches))
     names = [u.name for u in fitted.problem.unknowns]
     rows = []
-    for s in _usual(seen.scored):
+    for s in one_of_each(seen.scored, _usual):
         c = s.candidate
         if s.column < 0 or c.mechanism not in MECHANISMS or not c.amplitudes:
             continue
@@ -41,13 +39,9 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
              s.absorbed, names[by] if s.absorbed > 0.3 else "")
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["limits"]))
-    return table.sort_values(["mechanism", "limit", "name"], ignore_index=True)
+    return table.sort_values(["mechanism", "limit", "name", "words"], ignore_index=True)
 
 
-def _usual(scored: Sequence[Scored]) -> list[Scored]:
-    """Of what is looked for at several values of its shape the one at the usual value, or, where that has no trace, the
-    most sensitive."""
-    out: dict[str, Scored] = {}
-    for s in sorted(scored, key=lambda s: (s.sd > NO_TRACE, bool(s.candidate.variant_of), s.sd, s.candidate.name)):
-        out.setdefault(s.candidate.plain, s)
-    return list(out.values())
+def _usual(s: Scored) -> tuple[float, ...]:
+    """Sorts the one at the usual value of its shape first, or, where that has no trace, the most sensitive."""
+    return s.sd > NO_TRACE, bool(s.candidate.variant_of), s.sd

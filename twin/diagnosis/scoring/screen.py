@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -88,13 +88,18 @@ def screens(fitted: Fitted, every: Sequence[Candidate], memories: Sequence[Memor
 
 
 def best_variants(scored: Sequence[Scored]) -> list[Scored]:
-    """Of what was looked for at several values of its shape, the best one; in the same order."""
-    best: dict[str, Scored] = {}
+    """Of what was looked for at several values of its shape, the one that gains most."""
+    return one_of_each(scored, lambda s: (-s.gain,))
+
+
+def one_of_each(scored: Sequence[Scored], key: Callable[[Scored], tuple[float, ...]]) -> list[Scored]:
+    """Of what was looked for at several values of its shape, the one that sorts first; in the same order."""
+    first: dict[str, Scored] = {}
     for s in scored:
         own = s.candidate.plain
-        if own not in best or s.gain > best[own].gain:
-            best[own] = s
-    kept = {s.candidate.name for s in best.values()}
+        if own not in first or key(s) < key(first[own]):
+            first[own] = s
+    kept = {s.candidate.name for s in first.values()}
     return [s for s in scored if s.candidate.name in kept]
 
 

@@ -15,9 +15,10 @@ from twin.diagnosis.proposals.candidates import own_bodies
 from twin.diagnosis.proposals.slack import no_news
 from twin.diagnosis.rounds.decision import Bars, asked
 from twin.diagnosis.rounds.fitted import Fitted
+from twin.diagnosis.rounds.looks import HOPEFUL
 from twin.diagnosis.rounds.probability import most_sure
 from twin.diagnosis.rounds.refits import Tried, refit, taken_on
-from twin.diagnosis.rounds.search import HOPEFUL, Search
+from twin.diagnosis.rounds.search import Search
 from twin.diagnosis.rounds.shortlist import moved
 from twin.diagnosis.rounds.trust import EVEN, trust
 from twin.diagnosis.scoring.memory import Memory, whiter
