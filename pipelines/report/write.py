@@ -21,6 +21,7 @@ from pipelines.tracking import Training
 
 FORMATS = (".html", ".md")
 _TEMPLATES = Path(__file__).parent / "templates"
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=(?:%|s|K|µm|points)(?!\w))")
 _MARKDOWN = re.compile(r"[\\|*`\[\]<]|(?<!\w)_|_(?!\w)")  # an underscore inside a word is only itself
 
 
@@ -60,7 +61,13 @@ def template_environment(html: bool) -> Environment:
         env.globals["script"] = Markup((_TEMPLATES / "figures.js").read_text(encoding="utf-8"))
         env.globals["plotly_js"] = Markup(get_plotlyjs().replace("</script", "<\\/script"))
         env.filters["raw"] = Markup
+        env.filters["unbroken"] = _unbroken
     return env
+
+
+def _unbroken(text: str) -> str:
+    """No line ends between a number and its unit."""
+    return _BEFORE_UNIT.sub("\u00a0", text)
 
 
 def _markdown(value: object) -> object:

@@ -85,6 +85,8 @@ def test_the_page_holds_everything_and_asks_no_network(text: str) -> None:
     assert set(re.findall(r'href="#(\w+)"', text)) == set(ANCHORS)
     assert not re.findall(r"\bnan\b|<NA>|&lt;NA", re.sub(r'src="data:[^"]*"', "", text))
     assert "<h1>10 of 12 goals met on 60 sealed cases.</h1>" in text
+    lead = re.search('<p class="lead">(.*)</p>', text)
+    assert lead and "\u00a0%" in lead[1] and " %" not in lead[1]  # no line ends before a unit
 
 
 def test_every_picture_is_drawn_and_says_what_is_simulated(text: str) -> None:
