@@ -73,6 +73,11 @@ def test_a_tie_is_said_as_one() -> None:
         "runs left out of the fit falls from 9.1 to 1.4 µm (noise 1.2), better in 11 of 12 runs. A night switched off "
         "would tell them apart."
     )
+    likelier = replace(tied, probability=0.004, others=(replace(tied.others[0], probability=0.92),))
+    assert claim_words(likelier) == (
+        "These runs cannot tell two explanations apart: radiation to walls or from a hot neighbour at the bed "
+        "(surrounding: the room) (92 %) or heat to the floor at the bed, 10 W/K (90 %: 9–12) (under 1 %)"
+    )
     unlike = replace(tied, others=(replace(tied.others[0], alike=False),))
     assert claim_words(unlike).startswith("Perhaps (52 %) missing: heat to the floor")
 
@@ -185,8 +190,14 @@ def test_verdicts() -> None:
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
-        "Nothing is missing that these runs could show: the remaining error, 11 times the noise in the median channel, "
-        "is what a network this coarse leaves (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y 30 µm (noise 1.2))."
+        "Nothing is missing that these runs could show: the remaining error, 11 times the noise in the median channel "
+        "and 25 times in y, is what a network this coarse leaves (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y "
+        "30 µm (noise 1.2))."
+    )
+    one = (*after, Rms("x", "um", 1.0, 1.1, 1.0), Rms("front", "degC", 0.35, 0.35, 0.03, sensor=True))
+    assert verdict_statement("consistent", rms=one).startswith(
+        "Nothing is missing that these runs could show: the remaining error, 1.1 times the noise in the median channel "
+        "and 12 times in front, is what a network this coarse leaves (z 1.3"
     )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "
@@ -205,6 +216,11 @@ def test_verdicts() -> None:
         "Something is missing. These runs cannot tell two explanations apart: heat to "
         "the floor at the bed, 10 W/K (90 %: 9–12) (50 %) or radiation to walls or from a hot neighbour at the bed "
         "(40 %). A night switched off would tell."
+    )
+    assert verdict_statement("explained", [flux, tied, replace(SINK, probability=0.7, others=())]) == (
+        "The difference is 60 W into the column back (when: coolant on, no lag), heat to the floor at the bed, 10 W/K "
+        "(90 %: 9–12) (50 %; or radiation to walls or from a hot neighbour at the bed, 40 %) and heat to the floor at "
+        "the bed, 10 W/K (90 %: 9–12) (70 %). Nothing else is missing that these runs could show."
     )
     unsure = replace(SINK, probability=0.4, others=())
     assert verdict_statement("undecidable", [unsure]).startswith(

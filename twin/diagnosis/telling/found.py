@@ -34,6 +34,11 @@ class Rms:
     def key(self) -> str:
         return rms_key(self.channel, self.unit)
 
+    @property
+    def times_noise(self) -> float:
+        """What is left after all that was found over the given noise; 0 where none is given."""
+        return self.after / self.noise if self.noise > 0 else 0.0
+
 
 @dataclass(frozen=True)
 class Other:
@@ -94,7 +99,7 @@ class Found:
 
 def times_noise(rms: Sequence[Rms]) -> float:
     """Left-out errors after all that was found over the given noise, the median over channels; 0 where none is."""
-    return float(np.nanmedian([r.after / r.noise for r in rms if r.noise > 0] or [0.0]))
+    return float(np.nanmedian([r.times_noise for r in rms if r.noise > 0] or [0.0]))
 
 
 def place_words(where: Where, part: TwinPart) -> str:

@@ -8,17 +8,19 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+import numpy as np
+
 from twin.diagnosis.proposals.candidate import Where
 from twin.diagnosis.telling.equation import equation_with_numbers
 from twin.diagnosis.telling.findings import Alternative, DetectionLimit, Finding, FoundParameter, Place, Verdict, When
-from twin.diagnosis.telling.found import UNLISTED, Found, Rms, times_noise
+from twin.diagnosis.telling.found import UNLISTED, Found, Other, Rms, times_noise
 from twin.diagnosis.telling.honest_digits import Estimate, amount, as_given, few, listed, percent, spelt, with_unit
 from twin.mechanisms import MECHANISMS
 
 SURE, LIKELY = 0.9, 0.6  # above: plain; between: most likely; below: perhaps
 FALLS = 0.98  # an error that keeps a larger share than this has not fallen
 _THINGS = {"sensor": "sensor|channel", "error": "channel", "link": "joint|link", "node": "body"}  # what words call it
-NOISE = 2.0  # times the given noise: up to it what is left over is called noise
+NOISE, NOISE_OF_ONE = 2.0, 3.0  # times the given noise, of the median channel and of each: up to it that is noise
 _NAMED = 3  # limits, and alternatives, that a sentence names
 
 
@@ -60,8 +62,10 @@ def statement(found: Found) -> str:
 def claim_words(found: Found) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
     if found.tied:
-        said = [f"{effect_words(found)}{_size(found)} ({percent(found.probability)})"]
-        said += [f"{_noun(o.mechanism, o.where, o.place, o.beside)} ({percent(o.probability)})" for o in found.tied]
+        # what is claimed may be the less likely: a likelier one that looks alike may fail a bar
+        own = (found.probability, f"{effect_words(found)}{_size(found)} ({percent(found.probability)})")
+        tied = [(o.probability, f"{_other_words(o)} ({percent(o.probability)})") for o in found.tied]
+        said = [words for _, words in sorted([own, *tied], key=lambda s: -s[0])]
         return f"These runs cannot tell {_number(len(said))} explanations apart: {listed(said, 'or')}"
     hedge = _hedge(found.probability)
     sentence = _sentence(found)
@@ -104,8 +108,8 @@ def verdict_statement(
 ) -> str:
     """The verdict in words. `limits`, the most telling first, with `places` (`place_words`) of each; `separates` is the
     run that would tell tied explanations apart."""
-    # of several effects each says by itself how sure it is
-    doubts = ["" if len(found) < 2 or f.probability > SURE else f" ({percent(f.probability)})" for f in found]
+    # of several effects each says by itself how sure it is, and what may be in its place
+    doubts = [_doubt(f) if len(found) > 1 else "" for f in found]
     said = listed(
         [
             effect_words(f) + ("" if f.mechanism in UNLISTED else _size(f)) + doubt
@@ -134,10 +138,12 @@ def verdict_statement(
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
     left = [f"{r.channel} {with_unit(few(r.after), 'K' if r.unit == 'degC' else r.unit)}"
             + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
-    times = times_noise(rms)
-    words = "Nothing is missing: the remaining error is the noise" if times <= NOISE else (
+    times, worst = times_noise(rms), max(rms, key=lambda r: np.nan_to_num(r.times_noise), default=None)
+    most = worst.times_noise if worst is not None else 0.0
+    of_one = f" and {few(most)} times in {worst.channel}" if worst is not None and most > NOISE_OF_ONE else ""
+    words = "Nothing is missing: the remaining error is the noise" if times <= NOISE and not of_one else (
         f"Nothing is missing that these runs could show: the remaining error, {few(times)} times the noise in the "
-        "median channel, is what a network this coarse leaves"
+        f"median channel{of_one}, is what a network this coarse leaves"
     )  # fmt: skip
     words += f" ({', '.join(left)})" if left else ""
     seen = []
@@ -231,9 +237,21 @@ def _others(found: Found) -> list[str]:
     alike = [o for o in found.others if o.alike and o not in found.tied][:_NAMED]
     if not alike:
         return [f"{_capital(found.separates)} would tell them apart."] if found.tied and found.separates else []
-    said = listed([f"{_noun(o.mechanism, o.where, o.place, o.beside)} ({percent(o.probability)})" for o in alike])
+    said = listed([f"{_other_words(o)} ({percent(o.probability)})" for o in alike])
     run = f"; {found.separates} would tell them apart" if found.separates else ""
     return [f"{_capital(said)} would look the same in these runs{run}."]
+
+
+def _doubt(found: Found) -> str:
+    """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure."""
+    if found.probability > SURE:
+        return ""
+    tied = [f"{_other_words(o)}, {percent(o.probability)}" for o in found.tied]
+    return f" ({percent(found.probability)}{''.join(f'; or {words}' for words in tied)})"
+
+
+def _other_words(other: Other) -> str:
+    return _noun(other.mechanism, other.where, other.place, other.beside)
 
 
 def _advice(found: Found) -> list[str]:
