@@ -9,12 +9,15 @@ from typing import Any
 
 import pytest
 
+import twin.proof.scoring.true_model as module
 from data.batch import Batch
+from data.errors import InputError
 from data.machine import Machine
 from tests.twin.diagnosis.concealed import case, flux
 from tests.twin.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
 from tests.twin.proof.answered import answer, term
 from twin.diagnosis.rounds.baseline import baseline
+from twin.diagnosis.rounds.fitted import refitted
 from twin.diagnosis.rounds.null import MARGIN
 from twin.diagnosis.rounds.trust import EVEN
 from twin.diagnosis.scoring.screen import Scored, proposed, screen
@@ -127,6 +130,39 @@ def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
     (chosen,), full = _chosen(fit, key.terms, [last])
     assert len(own) > 3 and chosen is not None and _seat(chosen) == "spindle"
     assert full is not None and chosen.candidate.name in full.part.mechanisms
+
+
+def test_two_heats_of_one_mechanism_at_one_body_are_two_terms() -> None:
+    """A cabinet that is always on, and one that a driver switches: each is fitted by a candidate of its own."""
+    heat = {"law": "cabinet_heat", "into": "bed"}
+    given = case({
+        "always": {**heat, "parameters": {"heat": "60 W"}},
+        "pump": {**heat, "drivers": {"running": "coolant"}, "parameters": {"heat": "90 W"}},
+    })  # fmt: skip
+    place = {"kind": "node", "name": "bed"}
+    always = term(where=place, parameters={"heat": {"value": 60.0, "unit": "W"}})
+    pump = term("pump_heat", mechanism="cabinet_heat", where=place, driver="coolant",
+                parameters={"heat": {"value": 90.0, "unit": "W"}})  # fmt: skip
+    got = true_model(given.machine, given.batches, answer("two", always, pump))
+    assert got.visible == (True, True)
+    assert [size for size, *_ in got.sizes] == [pytest.approx(60.0, rel=0.2), pytest.approx(90.0, rel=0.2)]
+
+
+def test_it_begins_with_less_where_all_of_it_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = two_bodies()
+    hidden = {"floor": {**FLOOR, "parameters": {"conductance": "8 W/K"}}}
+    begun: list[float] = []
+
+    def at_first_not(old: Any, part: Any, at: Any = None) -> Any:
+        begun.extend([max(at.values())] if at else [])
+        if len(begun) == 1:
+            raise InputError("stiff beyond the step control")
+        return refitted(old, part, at)
+
+    monkeypatch.setattr(module, "refitted", at_first_not)
+    got = true_model(known, runs(known, hidden), answer("one", floor(8.0)))
+    assert begun[1] == pytest.approx(0.3 * begun[0])
+    assert got.visible == (True,) and got.error_true == pytest.approx(cold(8.0).error_true, rel=0.05)
 
 
 def _seat(s: Scored) -> str:

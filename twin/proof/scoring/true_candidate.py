@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -49,15 +50,32 @@ def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
     return candidate_of([Form(Where("node", term.where.name), role, level, other, body)])
 
 
-def begun_at_truth(term: TrueTerm, s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
-    """`start_values` of a refit, with the key's values to begin with; priors are what a diagnosis would have."""
+def each_its_own(terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]) -> list[Scored | None]:
+    """By term the first of its choices, none twice: of what two terms want, each has first what is driven as its key
+    says. A cabinet's heat and a pump's at one body are two candidates of one mechanism."""
+    wanted = Counter(own[0].candidate.name for own in choices if own)
+    out: list[Scored | None] = []
+    for term, own in zip(terms, choices, strict=True):
+        twice = bool(own) and wanted[own[0].candidate.name] > 1
+        first = sorted(own, key=lambda s: not _driven_as(term, s.candidate)) if twice else own
+        taken = {s.candidate.name for s in out if s is not None}
+        out.append(next((s for s in first if s.candidate.name not in taken), None))
+    return out
+
+
+def begun_at_truth(
+    term: TrueTerm, s: Scored, now: Fitted, share: float = 1.0
+) -> tuple[Mapping[str, Value], Mapping[str, float]]:
+    """`start_values` of a refit, with the key's values to begin with, amplitudes at this share of them; priors are
+    what a diagnosis would have."""
     c = s.candidate
     if c.mechanism not in MECHANISMS or c.change is not None:
         return start_values(s, now)
     mechanism = MECHANISMS[c.mechanism]
     known = {n: v for n, (v, _) in (term.parameters or {}).items() if n in {p.name for p in mechanism.parameters}}
     told = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
-    values, at = start_values(replace(s, amplitudes={**s.amplitudes, **told}), now)
+    amplitudes = {a: share * v for a, v in {**s.amplitudes, **told}.items()}
+    values, at = start_values(replace(s, amplitudes=amplitudes), now)
     shaped = {
         name: given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": given.value})
         for name, given in values.items()
@@ -67,19 +85,26 @@ def begun_at_truth(term: TrueTerm, s: Scored, now: Fitted) -> tuple[Mapping[str,
 
 
 def with_terms(
-    part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted
+    part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted, share: float = 1.0
 ) -> tuple[TwinPart, dict[str, float]]:
-    """The twin part with these candidates in it, and where a refit begins.
+    """The twin part with these candidates in it, and where a refit begins; `share` as in `begun_at_truth`.
 
     Raises:
         ValueError: two of them take the same name.
     """
     at: dict[str, float] = {}
     for term, s in zip(terms, found, strict=True):
-        values, begin = begun_at_truth(term, s, now)
+        values, begin = begun_at_truth(term, s, now, share)
         part = s.candidate.applied(part, values)
         at.update(begin)
     return part, at
+
+
+def _driven_as(term: TrueTerm, c: Candidate) -> bool:
+    """Whether it is driven by the channel that the key names; by none, where the key names none."""
+    drivers = c.part.drivers if c.part is not None else None
+    channels = set(drivers.values()) if isinstance(drivers, Mapping) else {drivers} - {None}
+    return term.driver in channels if term.driver else not channels
 
 
 def _is(term: TrueTerm, c: Candidate) -> bool:

@@ -29,14 +29,14 @@ from twin.diagnosis.rounds.null import MARGIN, Null, structural_null
 from twin.diagnosis.rounds.null_beside import null_beside
 from twin.diagnosis.rounds.parts_of_batches import enough_batches, usable_batches
 from twin.diagnosis.rounds.prediction import left_out_rows
-from twin.diagnosis.rounds.refits import Tried, improved
+from twin.diagnosis.rounds.refits import SMALLER, Tried, improved
 from twin.diagnosis.rounds.trust import least_gain
 from twin.diagnosis.scoring.memory import Memory, whiter
 from twin.diagnosis.scoring.screen import Scored, alone, proposed, screen
 from twin.diagnosis.telling.conclude import parameters_told
 from twin.proof.scoring.amplitude import Sized, sized
 from twin.proof.scoring.answer_key import AnswerKey, TrueTerm
-from twin.proof.scoring.true_candidate import of_no_list, open_shape, true_candidates, with_terms
+from twin.proof.scoring.true_candidate import each_its_own, of_no_list, open_shape, true_candidates, with_terms
 from twin.schema import TwinPart, twin_part
 
 CUT = 0.1  # of a channel's left-out error: less is not worth a name
@@ -134,7 +134,7 @@ def _chosen(
 
     A test bar's growth gained 152 nats from the shaft, which the screen had preferred, and 539 from the front bearing.
     """
-    found = [next(iter(own), None) for own in choices]
+    found = each_its_own(terms, choices)
     several = [k for k, own in enumerate(choices) if len(own) > 1 and open_shape(terms[k], own[0])]
     if not several:
         return found, _with(fit, terms, found)
@@ -148,13 +148,21 @@ def _chosen(
 
 
 def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> Fitted | None:
-    """The fit with the terms that are stated in it at its optimum; None where it cannot be simulated."""
+    """The fit with the terms that are stated in it at its optimum; None where it cannot be simulated.
+
+    As a diagnosis does, it begins with less where all of it cannot: heat that feeds itself runs away in a network whose
+    values are off.
+    """
     own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
-    try:
-        part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)
-        return settle(refitted(fit, part, at))
-    except (InputError, WorkError, ValueError):
-        return None
+    for share in (1.0, *SMALLER):
+        try:
+            part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
+            return settle(refitted(fit, part, at))
+        except (InputError, WorkError):
+            continue
+        except ValueError:  # one candidate twice
+            return None
+    return None
 
 
 def _judged(
