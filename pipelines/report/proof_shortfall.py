@@ -24,7 +24,7 @@ def sentences(run: ProofRun) -> list[str]:
         listed = seen[seen["bar_nats"].notna()]
         enough = int((listed["gain_nats"] > listed["bar_nats"]).sum())
         said.append(
-            f"Of {count(len(listed), 'visible effect')} that the library lists, {enough} gain what a claim takes once "
+            f"Of {count(len(listed), 'visible effect')} that the true model states, {enough} gain what a claim takes once "
             f"all that is true is in the model."
         )
     if len(missed):

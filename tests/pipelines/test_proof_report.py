@@ -177,7 +177,7 @@ def test_what_was_missed_and_claimed_falsely_is_told_with_who_owes_it(run: Proof
     terms = run.table("terms")
     seen = terms[terms["visible"].eq(True) & ~terms["decoy"].astype(bool)]
     enough = int((seen["gain_nats"] > seen["bar_nats"]).sum())
-    assert f"Of {len(seen)} visible effects that the library lists, {enough} gain what a claim takes" in plain
+    assert f"Of {len(seen)} visible effects that the true model states, {enough} gain what a claim takes" in plain
     little = int((missed["reason"] == LITTLE).sum())
     assert f"{len(missed)} of {len(seen)} visible effects have no claim; in {little} of them the recordings do" in plain
     table = shortfall.reasons(missed, ("elements", "volumes"))
