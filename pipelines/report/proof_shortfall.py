@@ -9,7 +9,8 @@ import pandas as pd
 from pipelines.report.layout import Column, Row, Table
 from pipelines.report.proof_run import ProofRun
 from pipelines.report.proof_words import key_label, plant_letter, plant_origin, simulated
-from pipelines.report.words import NOTHING, count, number, percent
+from pipelines.report.words import NOTHING, count, number
+from twin.diagnosis.telling.honest_digits import percent
 from twin.proof.scoring.outcomes import NOTHING as NOT_NAMED
 from twin.proof.scoring.outcomes import visible_physics
 from twin.proof.scoring.shortfall import OF_RECORDINGS, REASONS
@@ -21,11 +22,11 @@ def sentences(run: ProofRun) -> list[str]:
     said = []
     seen = visible_physics(terms)
     if {"gain_nats", "bar_nats"} <= set(terms.columns):
-        listed = seen[seen["bar_nats"].notna()]
-        enough = int((listed["gain_nats"] > listed["bar_nats"]).sum())
+        stated = seen[seen["bar_nats"].notna()]
+        enough = int((stated["gain_nats"] > stated["bar_nats"]).sum())
         said.append(
-            f"Of {count(len(listed), 'visible effect')} that the true model states, {enough} gain what a claim takes once "
-            f"all that is true is in the model."
+            f"Of {count(len(stated), 'visible effect')} that the true model states, {enough} gain what a claim takes "
+            f"once all that is true is in the model."
         )
     if len(missed):
         recordings = int(missed["reason"].isin(OF_RECORDINGS).sum())
