@@ -22,7 +22,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import sklearn
@@ -40,6 +40,7 @@ from models.crossing import Crossing, Plan, cross_family, prepare
 from models.grid import run_grid
 from models.metrics import residual_std_um
 
+P = ParamSpec("P")
 T = TypeVar("T")
 POINTS, EVERY = 4, 5
 
@@ -88,9 +89,9 @@ def grid_way(crossing: Crossing, family: str) -> tuple[float, int]:
     return float(own["S_um"].iloc[::EVERY].mean()), len(result.cells)
 
 
-def timed(work: Callable[[], T]) -> tuple[float, T]:
+def timed(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[float, T]:
     start = time.perf_counter()
-    value = work()
+    value = work(*args, **kwargs)
     return time.perf_counter() - start, value
 
 
@@ -113,9 +114,9 @@ def compare(batches: list[Batch], families: list[str], repeats: int) -> None:
         took: list[list[float]] = [[], [], []]
         for _ in range(repeats if family in CHEAP else 1):
             with threadpool_limits(limits=1):
-                a, S_plain = timed(lambda f=family: plain_loop(crossing, f))
-                b, S_joblib = timed(lambda f=family: joblib_way(crossing, f))
-                c, (S_grid, cells) = timed(lambda f=family: grid_way(crossing, f))
+                a, S_plain = timed(plain_loop, crossing, family)
+                b, S_joblib = timed(joblib_way, crossing, family)
+                c, (S_grid, cells) = timed(grid_way, crossing, family)
             for seconds, value in zip(took, (a * EVERY, b * EVERY, c / cells), strict=True):
                 seconds.append(value)
         a, b, c = (statistics.median(s) for s in took)

@@ -106,7 +106,7 @@ def largest(batches: int = 1_000, sensors: int = 300, rows: int = 10_000) -> Non
         masks = np.ones((len(left), batches), bool)
         masks[np.arange(len(left)), left] = False
         pool = blocks.pool(masks, scaled=False)
-        coef = np.linalg.solve(pool.xx, pool.xy[:, :, None])
+        coef = np.asarray(np.linalg.solve(pool.xx, pool.xy[:, :, None]), np.float64)
         S_um.append(blocks.left_out_S_um(left, pool, np.arange(len(left)), coef)[:, 0])
     took = time.perf_counter() - start
     words = f"\n{batches} batches × {sensors} sensors × {rows} rows: sums {reading:.0f} s"

@@ -88,12 +88,12 @@ def _gaussian_process() -> GaussianProcessRegressor:
 
 PLAIN: dict[str, Callable[[int], BaseEstimator]] = {
     "mlr": lambda p: LinearRegression(),
-    "ridge": lambda p: _searched(Ridge(), {"alpha": PENALTIES * 1e3}),
+    "ridge": lambda p: _searched(Ridge(), {"alpha": list(PENALTIES * 1e3)}),
     "pcr": lambda p: make_pipeline(PCA(n_components=0.95 if p > 1 else 1, svd_solver="full"), LinearRegression()),
     "pcr_lbo": lambda p: _searched(make_pipeline(PCA(), LinearRegression()), {"pca__n_components": [*range(1, p + 1)]}),
     "pls": lambda p: _searched(PLSRegression(scale=False), {"n_components": [*range(1, p + 1)]}),
     "elastic_net": lambda p: _searched(
-        ElasticNet(max_iter=2000), {"alpha": np.geomspace(10, 1e-3, 20), "l1_ratio": [0.1, 0.5, 0.9, 1.0]}
+        ElasticNet(max_iter=2000), {"alpha": list(np.geomspace(10, 1e-3, 20)), "l1_ratio": [0.1, 0.5, 0.9, 1.0]}
     ),
     "huber": lambda p: make_pipeline(StandardScaler(), HuberRegressor(max_iter=300)),
     "lssvm": lambda p: _searched(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from data import thermal_machine as laws
 from twin.simulation.inputs import Inputs
 
 Array = NDArray[np.float64]
+Method = Literal["LSODA", "BDF"]
+METHODS: tuple[Method, ...] = ("LSODA", "BDF")
 
 
 class Plain:
@@ -31,7 +33,7 @@ class Plain:
         edges = np.flatnonzero(np.diff(self.rpm)) + 1
         self.segments = list(zip([0, *edges.tolist()], [*edges.tolist(), len(self.rpm)], strict=True))
 
-    def solve(self, method: str, rtol: float, **options: Any) -> Array:
+    def solve(self, method: Method, rtol: float, max_step: float = np.inf) -> Array:
         """Temperatures (M + 1, 14) at every border, the solver restarted where the speed jumps."""
         out = np.empty((len(self.time_s), 14))
         out[0] = self.start
@@ -39,7 +41,7 @@ class Plain:
             slope, jacobian = self._functions(float(self.rpm[lo]))
             done = solve_ivp(
                 slope, (self.time_s[lo], self.time_s[hi]), out[lo], method, self.time_s[lo : hi + 1], rtol=rtol,
-                atol=rtol * 10.0, jac=jacobian, **options,
+                atol=rtol * 10.0, jac=jacobian, max_step=max_step,
             )  # fmt: skip
             out[lo + 1 : hi + 1] = done.y.T[1:]
         return out

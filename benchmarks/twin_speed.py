@@ -19,14 +19,15 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from benchmarks.stiff import Plain
+from benchmarks.stiff import METHODS, Method, Plain
 from data import sample_machine as sample
 from data.machine import load_machine
 from data.sample_year import plan_year
@@ -41,6 +42,8 @@ from twin.simulation.response import Response
 from twin.simulation.sensitivity import sensitivities
 
 Array = NDArray[np.float64]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 STEP_S, HOURS, BATCHES = 10.0, 8, 30
 TARGET_MS = {"linear": 20.0, "dependent": 500.0, "set": 5.0}
@@ -77,7 +80,7 @@ def ways() -> list[Way]:
 def year(network: Network) -> tuple[Inputs, Array]:
     """The sample year's plans, all 8 h long, and their start temperatures (1, B, N)."""
     plans = plan_year(0, BATCHES)
-    time_s = np.arange(int(HOURS * 3600 / STEP_S) + 1) * STEP_S
+    time_s = np.arange(int(HOURS * 3600 / STEP_S) + 1, dtype=np.float64) * STEP_S
     start = np.stack([p.start_nodes_degC() for p in plans])[:, [sample.NODE[c] for c in network.cells]]
     room = np.stack([p.room_at(time_s) for p in plans])
     inputs = Inputs(
@@ -92,10 +95,10 @@ def year(network: Network) -> tuple[Inputs, Array]:
     return inputs, start[None]
 
 
-def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of CPU time, so that other work on the machine counts little, and the value."""
+def timed(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[float, T]:
+    """Seconds of CPU time of a call, so that other work on the machine counts little, and what it gives."""
     start = time.process_time()
-    value = work()
+    value = work(*args, **kwargs)
     return time.process_time() - start, value
 
 
@@ -112,9 +115,9 @@ def machine_rates() -> tuple[float, float]:
     n = 1000
     a = np.random.default_rng(0).normal(size=(n, n))
     out = np.empty_like(a)
-    gemm = min(timed(lambda: np.matmul(a, a, out=out))[0] for _ in range(8))
+    gemm = min(timed(np.matmul, a, a, out=out)[0] for _ in range(8))
     big, to = np.ones(8_000_000), np.empty(8_000_000)
-    copy = min(timed(lambda: np.copyto(to, big))[0] for _ in range(8))
+    copy = min(timed(np.copyto, to, big)[0] for _ in range(8))
     return 2 * n**3 / gemm, 2 * big.nbytes / copy
 
 
@@ -143,11 +146,11 @@ def year_table(all_ways: list[Way], repeats: int, gemm: float, copy: float) -> d
         response.outputs(forcing, start, every_cell)
         for _ in range(repeats):
             new = replace(kept)
-            fresh.append(timed(lambda n=new, w=network, s=start: simulate(w, w.values, n, s))[0])
-            again.append(timed(lambda n=kept, w=network, s=start: simulate(w, w.values, n, s))[0])
-            coarse.append(timed(lambda n=kept, w=network, s=start: simulate(w, w.values, n, s, every=6))[0])
+            fresh.append(timed(simulate, network, network.values, new, start)[0])
+            again.append(timed(simulate, network, network.values, kept, start)[0])
+            coarse.append(timed(simulate, network, network.values, kept, start, every=6)[0])
             if not way.feedback:
-                bare.append(timed(lambda r=response, f=forcing, s=start, e=every_cell: r.outputs(f, s, e))[0])
+                bare.append(timed(response.outputs, forcing, start, every_cell)[0])
         out[way.name] = ms(again), ms(bare) if bare else ms(coarse)
         target = TARGET_MS["dependent" if way.feedback else "linear"]
         print(f"{way.name:30} {ms(fresh):9.1f} {ms(again):9.1f} {spread(again):>17} {target:7.0f}")
@@ -173,10 +176,7 @@ def sets_table(all_ways: list[Way], n_sets: int, repeats: int) -> None:
         inputs, start = year(network)
         values = np.repeat(network.values[None], n, axis=0)
         values[:, network.free] *= np.exp(rng.normal(0.0, 0.1, (n, len(network.free))))
-        took = [
-            timed(lambda w=network, v=values, i=inputs, s=start: simulate(w, v, i, s, every=30))[0]
-            for _ in range(repeats)
-        ]
+        took = [timed(simulate, network, values, inputs, start, every=30)[0] for _ in range(repeats)]
         target = f"{TARGET_MS['set']:7.0f}" if not way.feedback else ""
         print(f"{way.name:42} {n:5} {ms(took) / n:11.2f} {target}")
 
@@ -193,10 +193,10 @@ def jacobian_table(way: Way, repeats: int) -> None:
             drivers={n: v[:, ::every] for n, v in inputs.drivers.items()},
             recorded={n: v[:, ::every] for n, v in inputs.recorded.items()},
         ).batch(slice(0, 12))  # fmt: skip
-        work = lambda i=coarse, e=30 // every: sensitivities(network, network.values, i, start[:, :12], every=e)  # noqa: E731
+        work = partial(sensitivities, network, network.values, coarse, start[:, :12], every=30 // every)
         work()
         took = [timed(work)[0] for _ in range(repeats)]
-        alone = [timed(lambda i=coarse: simulate(network, network.values, i, start[:, :12]))[0] for _ in range(repeats)]
+        alone = [timed(simulate, network, network.values, coarse, start[:, :12])[0] for _ in range(repeats)]
         print(
             f"  steps of {step_s:3} s, rows every 300 s: {ms(took):8.0f} ms {spread(took)} = "
             f"{ms(took) / ms(alone):.0f} simulations; finite differences would take {len(network.free) + 1}"
@@ -219,16 +219,12 @@ def scipy_table(all_ways: list[Way], year_ms: dict[str, tuple[float, float]]) ->
         ours = simulate(way.network, way.network.values, inputs, start, keep_cells=True).cells_degC
         assert ours is not None
         error_K = float(np.abs(ours[0, batch] - exact).max())
-        for method in ("LSODA", "BDF"):
+        for method in METHODS:
             for asked_K in (ASKED_K, max(error_K, LEAST_K)):
                 rtol, theirs_K = loosest(plain, method, asked_K, exact, order)
-                one_s = statistics.median(timed(lambda m=method, r=rtol, p=plain: p.solve(m, r))[0] for _ in range(3))
+                one_s = statistics.median(timed(plain.solve, method, rtol)[0] for _ in range(3))
                 scaled = one_s * BATCHES > MOST_S
-                seconds = (
-                    one_s * BATCHES
-                    if scaled
-                    else sum(timed(lambda m=method, r=rtol, p=p: p.solve(m, r))[0] for p in every)
-                )
+                seconds = one_s * BATCHES if scaled else sum(timed(p.solve, method, rtol)[0] for p in every)
                 whole, alone = (1e3 * seconds / took for took in year_ms[way.name])
                 print(
                     f"{way.name:30} {method:6} {rtol:7.0e} {theirs_K:9.1e} {seconds:8.2f} {error_K:9.1e} "
@@ -242,7 +238,7 @@ def plain_of(way: Way, inputs: Inputs, start: Array, batch: int) -> Plain:
     return Plain(inputs, batch, start[0, batch][np.argsort(order)], way.spinning, way.feedback)
 
 
-def loosest(plain: Plain, method: str, asked_K: float, exact: Array, order: list[int]) -> tuple[float, float]:
+def loosest(plain: Plain, method: Method, asked_K: float, exact: Array, order: list[int]) -> tuple[float, float]:
     """The loosest relative tolerance that reaches an accuracy, and the error that it leaves; at most 1e-12."""
     for power in np.arange(3.0, 12.5, 0.5):
         rtol = 10.0**-power
