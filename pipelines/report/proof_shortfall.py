@@ -97,7 +97,7 @@ def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
     columns = (
         Column("mechanism", kind="wide"), Column("claims", kind="number"), *_plants("false, ", plants),
         Column("false", kind="number"), Column("nothing was missing", kind="number"),
-        Column("median probability", kind="number"),
+        Column("median probability of the false", kind="number"),
     )  # fmt: skip
     return Table("Claims that are not so", columns, tuple(rows), simulated(plants))
 

@@ -19,7 +19,7 @@ from twin.diagnosis.rounds.baseline import MISFIT, SMOOTH, baseline
 from twin.diagnosis.rounds.fitted import TOLERANCE, Fitted, refitted, settle
 from twin.diagnosis.rounds.workers import Progress, Workers
 from twin.diagnosis.scoring.evidence import Evidence
-from twin.diagnosis.scoring.memory import QUIET, Memory, whiter
+from twin.diagnosis.scoring.memory import QUIET, whiter
 from twin.diagnosis.scoring.screen import Scored, alone
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Value
@@ -176,14 +176,14 @@ def taken_on(now: Fitted, t: Tried) -> Tried:
         return t
 
 
-def judged(now: Fitted, t: Tried, memory: Memory | None = None, roughly: bool = False) -> Tried:
+def judged(now: Fitted, t: Tried, roughly: bool = False) -> Tried:
     """A refit with its gain over the fit before; `roughly` with the slack of that fit.
 
     Rows remember each other, for both as in the fit that leaves the whiter residuals: a missing effect makes those of
-    the other repeat themselves (as `twin.calibration.annealing.likelier`). `memory` says otherwise.
+    the other repeat themselves (as `twin.calibration.annealing.likelier`).
     """
     assert t.fitted is not None
-    memory = whiter(now.memory, t.fitted.memory) if memory is None else memory
+    memory = whiter(now.memory, t.fitted.memory)
     before, after = alone(now, memory), alone(t.fitted, memory, now if roughly else None)
     gain = float(after.base_score()[0] - before.base_score()[0])
     return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
@@ -192,7 +192,8 @@ def judged(now: Fitted, t: Tried, memory: Memory | None = None, roughly: bool = 
 def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
     """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
     whitest = reduce(whiter, (t.fitted.memory for t in finalists if t.fitted), now.memory)
-    return [replace(t, alike=judged(now, t, whitest).gain) for t in finalists]
+    before = float(alone(now, whitest).base_score()[0])
+    return [replace(t, alike=float(alone(t.fitted, whitest).base_score()[0]) - before) for t in finalists if t.fitted]
 
 
 def improved(before: Evidence, after: Evidence) -> int:

@@ -71,12 +71,20 @@ class Evidence:
         return [b.target[:, None] for b in self.batches]
 
     @cached_property
+    def _own(self) -> list[Array]:
+        """Every batch's information (p, p)."""
+        return [b.jacobian.T @ b.jacobian for b in self.batches]
+
+    @cached_property
+    def _cross(self) -> list[Array]:
+        """What every batch's parameters share with its columns, (p, C)."""
+        return [b.jacobian.T @ b.columns for b in self.batches]
+
+    @cached_property
     def folds(self) -> list[Fold]:
-        own = [b.jacobian.T @ b.jacobian for b in self.batches]
-        cross = [b.jacobian.T @ b.columns for b in self.batches]
-        all_own, all_cross = np.sum(own, axis=0) + np.eye(len(own[0])), np.sum(cross, axis=0)
+        all_own, all_cross = np.sum(self._own, axis=0) + np.eye(len(self._own[0])), np.sum(self._cross, axis=0)
         out = []
-        for b, h, g in zip(self.batches, own, cross, strict=True):
+        for b, h, g in zip(self.batches, self._own, self._cross, strict=True):
             factor = cho_factor(all_own - h)
             left = b.columns - b.jacobian @ cho_solve(factor, all_cross - g)
             out.append(Fold(factor, left, self._by_channel(b, left**2)))
@@ -85,14 +93,12 @@ class Evidence:
     @cached_property
     def factor(self) -> tuple[Array, bool]:
         """Cholesky of all batches' information and the prior."""
-        own = sum(b.jacobian.T @ b.jacobian for b in self.batches)
-        return cho_factor(own + np.eye(self.batches[0].jacobian.shape[1]))
+        return cho_factor(np.sum(self._own, axis=0) + np.eye(len(self._own[0])))
 
     @cached_property
     def shadow(self) -> Array:
         """By how much the parameters (p, C) would move for a unit of each column."""
-        cross = np.sum([b.jacobian.T @ b.columns for b in self.batches], axis=0)
-        return np.asarray(cho_solve(self.factor, cross))
+        return np.asarray(cho_solve(self.factor, np.sum(self._cross, axis=0)))
 
     @cached_property
     def _shadow_square(self) -> Array:
@@ -144,9 +150,10 @@ class Evidence:
     def group_score(self, group: Sequence[int]) -> float:
         """Log density of some batches left out together, per batch, predicted by all others."""
         chosen = set(group)
-        rest = [b for k, b in enumerate(self.batches) if k not in chosen]
-        own = sum(b.jacobian.T @ b.jacobian for b in rest) + np.eye(self.batches[0].jacobian.shape[1])
-        z = cho_solve(cho_factor(own), np.sum([b.jacobian.T @ b.target for b in rest], axis=0))
+        rest = [k for k in range(len(self.batches)) if k not in chosen]
+        own = np.sum([self._own[k] for k in rest], axis=0) + np.eye(len(self._own[0]))
+        to = np.sum([self.batches[k].jacobian.T @ self.batches[k].target for k in rest], axis=0)
+        z = cho_solve(cho_factor(own), to)
         square, least = np.zeros(len(self.rows)), np.zeros(len(self.rows))
         for k in group:
             b = self.batches[k]
