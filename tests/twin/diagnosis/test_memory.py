@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twin.diagnosis.scoring.memory import ROWS, SHARES, Memory, memory_of, whiter
+from twin.diagnosis.scoring.memory import ROWS, SHARES, SHORT, Memory, memory_of, whiter
 
 Array = NDArray[np.float64]
 N = 80
@@ -25,7 +25,7 @@ def memory(share: float, rows: float) -> Memory:
 @pytest.mark.parametrize(("share", "rows"), CASES)
 def test_filtered_rows_are_white(share: float, rows: float) -> None:
     own = memory(share, rows)
-    filtering = own.filtered(1, np.eye(N))
+    filtering = own.filtered([(1, slice(0, N))], np.eye(N))
     seen = filtering @ covariance(share, float(own.keep[1])) @ filtering.T
     assert np.diag(seen) == pytest.approx(1.0, abs=0.5)  # of the second row: the filter begins in its steady state
     assert np.diag(seen)[8:] == pytest.approx(1.0, abs=0.03)
@@ -35,7 +35,7 @@ def test_filtered_rows_are_white(share: float, rows: float) -> None:
 @pytest.mark.parametrize(("share", "rows"), CASES)
 def test_white_noise_that_is_filtered_has_the_variance_told(share: float, rows: float) -> None:
     own = memory(share, rows)
-    filtering = own.filtered(1, np.eye(2000))
+    filtering = own.filtered([(1, slice(0, 2000))], np.eye(2000))
     assert np.sum(filtering[-1] ** 2) == pytest.approx(own.white[1], rel=1e-9)
     assert own.white[0] == 1.0
 
@@ -43,14 +43,26 @@ def test_white_noise_that_is_filtered_has_the_variance_told(share: float, rows: 
 def test_what_is_filtered_can_be_restored() -> None:
     rows = np.random.default_rng(1).standard_normal((N, 3))
     own = memory(0.87, 8.0)
-    np.testing.assert_allclose(own.restored(1, own.filtered(1, rows)), rows, atol=1e-12)
-    assert own.filtered(0, rows) is rows and own.restored(0, rows) is rows
+    both = [(0, slice(0, 20)), (1, slice(20, N))]
+    seen = own.filtered(both, rows)
+    np.testing.assert_allclose(own.restored(both, seen), rows, atol=1e-12)
+    np.testing.assert_array_equal(seen[:20], rows[:20])  # the first channel's rows are independent
+    assert np.abs(seen[20:] - rows[20:]).max() > 1.0
+
+
+def test_few_rows_are_filtered_as_many_are() -> None:
+    """A matrix filters the few, a recursion the many."""
+    rows = np.random.default_rng(2).standard_normal((SHORT + 1, 2))
+    own = memory(0.87, 8.0)
+    many, few = (own.filtered([(1, slice(0, n))], rows[:n]) for n in (SHORT + 1, SHORT))
+    np.testing.assert_allclose(few, many[:SHORT], atol=1e-12)
+    np.testing.assert_allclose(own.filtered([(1, slice(0, 7))], rows[:7, 0]), many[:7, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("share", "rows"), CASES)
 def test_a_trace_that_does_not_change_counts_as_the_inflation_says(share: float, rows: float) -> None:
     own, n = memory(share, rows), 4000
-    level = own.filtered(1, np.ones((n, 1)))
+    level = own.filtered([(1, slice(0, n))], np.ones((n, 1)))
     assert n / float((level**2).sum()) == pytest.approx(own.inflation[1], rel=0.1)
 
 
@@ -81,7 +93,7 @@ def test_what_is_found_is_as_likely_as_any_by_the_series_own_covariance(share: f
     """Series of different lengths, the variance at its best."""
     given = Memory(np.array([share]), np.array([np.exp(-1.0 / rows)]))
     rng = np.random.default_rng(int(10 * rows))
-    series = [3.0 * given.restored(0, rng.standard_normal(n)) for n in (120, 120, 90, 60, 119, 120)]
+    series = [3.0 * given.restored([(0, slice(0, n))], rng.standard_normal(n)) for n in (120, 120, 90, 60, 119, 120)]
     found = memory_of(series, [np.zeros(len(s), int) for s in series], 1)
 
     def likelihood(w: float, keep: float) -> float:

@@ -62,7 +62,7 @@ class Filtered:
         return Noise(np.maximum(factor, 1.0), np.ones(len(factor)))
 
     def _innovations(self, rows: Array, channel: NDArray[np.int64]) -> Array:
-        return np.concatenate([self.memory.filtered(c, rows[at]) for c, at in slices_of(channel)])
+        return self.memory.filtered(slices_of(channel), rows)
 
 
 def square_sums(problem: CalibrationProblem, rows: Sequence[Array]) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.calibration.fit_problem import Array, Block, Unknown
-from twin.diagnosis.scoring.memory import Memory, slices_of
+from twin.diagnosis.scoring.memory import Memory, Slices, slices_of
 
 SEEN = 1e-9  # sum of squares below which a direction of the nuisances, of variance 1, shows in no row
 
@@ -48,7 +48,7 @@ class Whitened:
         return self.channel[self.starts]
 
     @cached_property
-    def slices(self) -> list[tuple[int, slice]]:
+    def slices(self) -> Slices:
         """Every channel's number and rows."""
         return slices_of(self.channel)
 
@@ -84,7 +84,7 @@ class Whitened:
         """Rows (n, …) less what each channel's memory of the rows before foretells."""
         if self.memory is None:
             return rows
-        return np.concatenate([self.memory.filtered(c, rows[at]) for c, at in self.slices])
+        return self.memory.filtered(self.slices, rows)
 
     def restored(self, rows: Array) -> Array:
         """Rows (n, …) as they were before `of`, in units of the weighted noise."""
@@ -92,7 +92,7 @@ class Whitened:
         rows = np.asarray(rows + self.mixing @ (back * (self.mixing.T @ rows).T).T)
         if self.memory is None:
             return rows
-        return np.concatenate([self.memory.restored(c, rows[at]) for c, at in self.slices])
+        return self.memory.restored(self.slices, rows)
 
 
 def whitened(
