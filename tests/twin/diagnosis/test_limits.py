@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -87,6 +88,15 @@ def test_every_mechanism_that_can_be_switched_off_has_one() -> None:
         assert 0 <= row.absorbed <= 1
         assert np.isnan(row.limit) or row.limit > 0
     assert list(table()["mechanism"]) == sorted(table()["mechanism"])
+
+
+def test_limits_that_differ_by_rounding_alone_stand_in_a_fixed_order() -> None:
+    def order(seed: int) -> list[str]:
+        rng = np.random.default_rng(seed)
+        scored = tuple(replace(s, sd=1.0 + 1e-13 * rng.standard_normal()) for s in seen().scored)
+        return list(limits(consistent(), replace(seen(), scored=scored), THRESHOLD)["words"])
+
+    assert order(0) == order(1)
 
 
 def test_what_every_fit_has_slack_for_is_seen_only_far_beyond_it() -> None:

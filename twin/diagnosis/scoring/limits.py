@@ -39,7 +39,8 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
              s.absorbed, names[by] if s.absorbed > 0.3 else "")
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["limits"]))
-    return table.sort_values(["mechanism", "limit", "name", "words"], ignore_index=True)
+    digits = table.assign(size=np.log(table["limit"]).round(9))  # what differs by rounding alone is of equal size
+    return digits.sort_values(["mechanism", "size", "name", "words"], ignore_index=True).drop(columns="size")
 
 
 def _usual(s: Scored) -> tuple[float, ...]:
