@@ -21,7 +21,7 @@ from pipelines.tracking import Training
 
 FORMATS = (".html", ".md")
 _TEMPLATES = Path(__file__).parent / "templates"
-_BEFORE_UNIT = re.compile(r"(?<=\d) (?=(?:%|s|K|µm|points)(?!\w))")
+_HELD_TOGETHER = re.compile(r"(?<=\d) (?=(?:%|s|K|µm|points)(?!\w))|(?<=[≤≥]) (?=\d)")
 _MARKDOWN = re.compile(r"[\\|*`\[\]<]|(?<!\w)_|_(?!\w)")  # an underscore inside a word is only itself
 
 
@@ -66,8 +66,8 @@ def template_environment(html: bool) -> Environment:
 
 
 def _unbroken(text: str) -> str:
-    """No line ends between a number and its unit."""
-    return _BEFORE_UNIT.sub("\u00a0", text)
+    """No line ends between a number and its unit, or between a bound's sign and its number."""
+    return _HELD_TOGETHER.sub("\u00a0", text)
 
 
 def _markdown(value: object) -> object:
