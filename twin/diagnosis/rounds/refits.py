@@ -191,6 +191,8 @@ def judged(now: Fitted, t: Tried, roughly: bool = False) -> Tried:
 
 def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
     """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
+    if not finalists:
+        return []
     whitest = reduce(whiter, (t.fitted.memory for t in finalists if t.fitted), now.memory)
     before = float(alone(now, whitest).base_score()[0])
     return [replace(t, alike=float(alone(t.fitted, whitest).base_score()[0]) - before) for t in finalists if t.fitted]

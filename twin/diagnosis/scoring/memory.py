@@ -24,9 +24,7 @@ SHARES = (0.1, 0.25, 0.4, 0.6, 0.75, 0.87, 0.94, 0.97, 0.985)
 FEWEST = 20  # rows of a channel that say anything about it
 QUIET = 0.25  # of the given noise's variance: no channel has less; files state noise on the safe side
 WORTH = 4.0  # nats of likelihood below which rows are taken as independent
-SHORT = (
-    110  # rows up to which a filter's matrix is quicker than its recursion: at 73 rows of 150 columns twice as quick
-)
+SHORT = 110  # rows up to which a filter's matrix is quicker than its recursion; at 73 rows of 150 columns twice
 
 Slices = Sequence[tuple[int, slice]]  # every channel's number and rows
 
@@ -138,7 +136,7 @@ def _likelihoods(rows: Array, there: NDArray[np.bool_], w: Array, keep: Array) -
     return np.asarray(-0.5 * n * (np.log(scale) + np.log(variance)[:, None] + mean / scale))
 
 
-@lru_cache(maxsize=2 * len(SHARES) * len(ROWS))  # that is found is on the grid
+@lru_cache(maxsize=len(SHARES) * len(ROWS))  # of every memory that `memory_of` may find
 def _matrix(phi: float, theta: float, sd: float) -> Array:
     """The filter of SHORT rows; what it does to the first n of them is its corner of n rows."""
     return _innovations(phi, theta, sd, np.eye(SHORT))
