@@ -23,9 +23,9 @@ from data.batch import Batch
 from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
-from data.sample_year import write_sample_year
 from models.crossing import Plan
 from models.grid import run_grid
+from plants.sample.sample_year import write_sample_year
 
 ROOT = Path(__file__).parent.parent
 RECORDED = (

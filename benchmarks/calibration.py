@@ -26,11 +26,11 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from data.sample_year import PROBE_NOISE_UM, PROBE_STEP_UM, TEMPERATURE_STEP_K, write_sample_year
+from plants.sample.sample_year import PROBE_NOISE_UM, PROBE_STEP_UM, TEMPERATURE_STEP_K, write_sample_year
 from twin.calibration import TOLERANCE, calibrate
+from twin.calibration.estimate import leave_batch_out
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import fit
-from twin.calibration.left_out import leave_batch_out
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.network import Network

@@ -24,18 +24,16 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from twin.calibration.descent import State
-from twin.diagnosis.diagnose import diagnose
-from twin.diagnosis.places.where_when import locate
-from twin.diagnosis.proposals.candidate import Candidate
-from twin.diagnosis.rounds.baseline import baseline
-from twin.diagnosis.rounds.fitted import Fitted
-from twin.diagnosis.rounds.null import TWINS, structural_null
-from twin.diagnosis.rounds.refits import refit
-from twin.diagnosis.rounds.shortlist import shortlist
-from twin.diagnosis.rounds.workers import Workers
-from twin.diagnosis.scoring.screen import Scored, Screen, alone, proposed, screen
-from twin.plants.plant import Case, draw
+from diagnosis.contracts import Candidate, Fitted, Scored
+from diagnosis.diagnose import diagnose
+from diagnosis.fitting.fitted import baseline
+from diagnosis.localisation.where_when import locate
+from diagnosis.screening.screen import Screen, alone, proposed, screen
+from diagnosis.search.null import TWINS, structural_null
+from diagnosis.search.refits import Workers, refit
+from diagnosis.search.shortlist import shortlist
+from plants.plant import Case, draw
+from twin.calibration.least_squares import State
 from twin.schema import twin_part
 
 GOAL_S, SCREEN_GOAL_S = 30.0, 1.0

@@ -35,10 +35,10 @@ from benchmarks.plain_models import CHEAP, PLAIN, ROWS, TopCorrelated
 from data.batch import Batch
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from data.sample_year import write_sample_year
 from models.crossing import Crossing, Plan, cross_family, prepare
 from models.grid import run_grid
 from models.metrics import residual_std_um
+from plants.sample.sample_year import write_sample_year
 
 P = ParamSpec("P")
 T = TypeVar("T")

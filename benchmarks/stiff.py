@@ -7,14 +7,13 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from data import sample_machine as sample
-from data import thermal_machine as laws
+from data.arrays import Array
+from plants.sample import sample_machine as sample
+from plants.sample import thermal_machine as laws
 from twin.simulation.inputs import Inputs
 
-Array = NDArray[np.float64]
 Method = Literal["LSODA", "BDF"]
 METHODS: tuple[Method, ...] = ("LSODA", "BDF")
 

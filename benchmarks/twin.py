@@ -3,9 +3,10 @@
 import sys
 from pathlib import Path
 
+from benchmarks.twin_speed import main
+
 sys.path[0] = str(Path(__file__).resolve().parent.parent)  # else `import twin` would find this file
 
-from benchmarks.twin_speed import main  # noqa: E402
 
 if __name__ == "__main__":
     main()

@@ -28,13 +28,13 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.machine import Machine, load_machine, parse_machine
 from data.recording import read_batches
-from data.sample_year import write_sample_year
 from features.design import Design
 from models import FAMILIES
 from models.base import Family
 from models.metrics import batch_scores
 from models.protocols import Fold, leave_batch_out, leave_season_out
-from twin.calibration.rewrite import Update, with_values
+from plants.sample.sample_year import write_sample_year
+from twin.calibration.calibrated_file import Update, with_values
 from twin.compile import compile_network
 
 MACHINE_FILE = Path(__file__).parent.parent / "machines" / "sample_vmc.yml"

@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.stiff import METHODS, Method, Plain
-from data import sample_machine as sample
+from data.arrays import Array
 from data.machine import load_machine
-from data.sample_year import plan_year
+from plants.sample import sample_machine as sample
+from plants.sample.sample_year import plan_year
 from twin.compile import compile_network
 from twin.network import Network
 from twin.schema import twin_part
@@ -41,7 +41,6 @@ from twin.simulation.inputs import Inputs
 from twin.simulation.response import Response
 from twin.simulation.sensitivity import sensitivities
 
-Array = NDArray[np.float64]
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -18,8 +18,8 @@ from data.guess import Guess
 from data.guess_axes import Group
 from data.machine import Machine, parse_machine
 from data.peek import Table, look, look_at, sheets_of
+from data.readers.csv import normalise
 from data.readers.header import Layout
-from data.readers.text import normalise
 from data.rows import Rows, join, stream
 from data.timegrid import repair_time
 from data.units import conversion, known_unit, quantity

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import TypeVar
 
 
 class InputError(Exception):
@@ -20,3 +21,19 @@ def closest(got: str, allowed: Iterable[str]) -> str:
     near = difflib.get_close_matches(got, names, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}Allowed: {', '.join(names)}"
+
+
+T = TypeVar("T", bound=str)
+
+
+def one_of(given: str, allowed: Iterable[T], option: str) -> T:
+    """The allowed value that was given.
+
+    Raises:
+        InputError: another one, with the closest.
+    """
+    known = tuple(allowed)
+    for value in known:
+        if value == given:
+            return value
+    raise InputError(f"{option}: unknown value {given!r}: {closest(given, known)}")

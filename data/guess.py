@@ -6,12 +6,10 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data.readers.text import normalise
+from data.arrays import Array
+from data.readers.csv import normalise
 from data.units import known_unit, quantity
-
-Array = NDArray[np.float64]
 
 _TIME = re.compile(r"time|zeit|时间|時間|時刻|日時|timestamp|elapsed|datum|date|^t$|^t ?[\[(]")
 _SETPOINT = re.compile(r"set ?point|sollwert|\bset\b|command")

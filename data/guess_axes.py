@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.guess import NICE_STEPS_S, Guess
 from data.rows import Rows
 from data.sweeps import position_bins
-
-Array = NDArray[np.float64]
 
 _LEAST_COLUMNS = 3
 _SWEEP_S = 120.0  # rows of a sweep under one time stamp may spread so far: a machine then warms by a tenth of a kelvin

@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
+from data.machine import Machine, Recording, TimeColumn
 
 SCHEMA = "thermodrift.batch/1"
 META_KEY = b"thermodrift"
@@ -205,3 +206,51 @@ def _plain(value: Any, where: str) -> Any:
     raise InputError(
         f"{where}: label of type {type(value).__name__} cannot be stored; expected text, a number, a bool or a list"
     )
+
+
+@dataclass(frozen=True)
+class OwnFile:
+    """The note inside a file: which machine, whether simulated, when it began, labels."""
+
+    name: str
+    note: Mapping[str, Any]
+
+    def layout(self, machine: Machine) -> Machine:
+        """The machine file as it describes this file: columns by channel name, time in s, no schedule, no cutting.
+
+        Raises:
+            InputError: the file is of another machine.
+        """
+        if self.note["machine"] != machine.machine:
+            raise InputError(
+                f"{self.name}: written for machine {self.note['machine']!r}, the machine file is of "
+                f"{machine.machine!r}; take the machine file of this recording"
+            )
+        own = Recording(time=TimeColumn(), step_s=machine.recording.step_s, max_gap_s=machine.recording.max_gap_s)
+        channels = {
+            n: c.model_copy(update={"column": n, "columns": None, "unit_in_file": c.unit, "source": "file"})
+            for n, c in machine.channels.items()
+        }
+        simulated = machine.simulated or bool(self.note["simulated"])
+        ignore = ["batch", "simulated"]
+        return machine.model_copy(
+            update={"recording": own, "channels": channels, "simulated": simulated, "ignore": ignore}
+        )
+
+    def marked(self, batch: Batch) -> Batch:
+        """The batch with the start and the labels that the file notes."""
+        start = self.note["start"]
+        return replace(batch, start=None if start is None else pd.Timestamp(start), labels=self.note["labels"])
+
+
+def own_file(path: Path) -> OwnFile | None:
+    """The note of a file that thermodrift wrote; None for every other file, damaged ones included."""
+    if path.suffix.lower() not in (".parquet", ".pq"):
+        return None
+    try:
+        note = json.loads((pq.read_schema(path).metadata or {})[META_KEY])
+        if note["schema"] != SCHEMA:
+            return None
+        return OwnFile(path.name, {k: note[k] for k in ("machine", "simulated", "start", "labels")})
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError):
+        return None

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from data.machine import Machine
 from data.readers.base import Sheet
 from data.readers.cells import stamp_format, to_float, to_seconds
 from data.readers.header import Layout
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -12,14 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from data.arrays import Array, Index
 from data.errors import InputError
 from data.machine import Machine
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Columns = Mapping[str, Sequence[tuple[str, float]]]  # error channel -> (column's key, position) one by one
 _SAME = 1e-3  # of the travel: a control comes back to a position far closer, and nobody measures that densely
 _PAUSE = 3.0  # times the usual time between readings

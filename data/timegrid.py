@@ -23,10 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array, Index
 from data.errors import InputError
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 _FAR_INTERVALS = 5.0
 _END_SPANS = 10.0
 _MANY_JUMPS = 1000

@@ -10,10 +10,10 @@ import numpy as np
 
 from data.machine import load_machine
 from data.recording import read_batches
-from data.sample_year import write_sample_year
 from features.selectors.fuzzy_correlation import FuzzyCorrelation
 from models.metrics import residual_std_um
 from models.ridge import Ridge
+from plants.sample.sample_year import write_sample_year
 
 machine = load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")
 with tempfile.TemporaryDirectory() as folder:

@@ -10,8 +10,9 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from features.design import Design
-from models.base import Array, Family
+from models.base import Family
 
 
 class NearestBatch(Family):
@@ -48,9 +49,9 @@ if __name__ == "__main__":
     import models
     from data.machine import load_machine
     from data.recording import read_batches
-    from data.sample_year import write_sample_year
     from models.crossing import Plan
     from models.grid import run_grid
+    from plants.sample.sample_year import write_sample_year
 
     models.FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
 

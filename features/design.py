@@ -9,12 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, closest
 from data.machine import Machine
 from features.rises import feature, feature_unit, zeroed_error_um
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -238,3 +237,16 @@ class Design:
             count[i], sum_x[i], sum_y[i] = len(y), x.sum(axis=0), y.sum()
             xx[i], xy[i], yy[i] = x.T @ x, x.T @ y, y @ y
         return Moments(count, sum_x, sum_y, xx, xy, yy, shift_x, shift_y)
+
+
+def even_rows(design: Design, batch: int, most: int) -> NDArray[np.int64]:
+    """Numbers of a batch's usable rows: all, or `most` of them evenly spread."""
+    usable = np.flatnonzero(design.usable[design.rows(batch)]) + design.offsets[batch]
+    if len(usable) > most:
+        usable = usable[np.round(np.linspace(0, len(usable) - 1, most)).astype(int)]
+    return usable.astype(np.int64)
+
+
+def decimated_rows(design: Design, train: Sequence[int], most: int) -> list[NDArray[np.int64]]:
+    """The same of every training batch, in rising order of the batches."""
+    return [even_rows(design, k, most) for k in sorted(train)]

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from data.arrays import Array
 from features.nets import Nets
-
-Array = NDArray[np.float64]
 
 _DAMPING_START, _DAMPING_MOST = 1e-2, 1e8
 _LEAST_KEPT = 0.25  # of the fall that the quadratic model promises, for a step to be trusted farther

@@ -18,14 +18,13 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, closest
 from data.sweeps import position_bins, sweep_numbers
 
-Array = NDArray[np.float64]
 _RATE_WINDOW_S = 600.0
 _THERMAL = ("temperature", "ambient")
 _LAG = re.compile(r"^lag(\d+(?:\.\d+)?)(s|min|h)$")

@@ -5,8 +5,8 @@ from data.registry import Registry
 FAMILIES = Registry(
     "family",
     {
-        "zero": "models.zero:Zero",
-        "mean_curve": "models.mean_curve:MeanCurve",
+        "zero": "models.baselines:Zero",
+        "mean_curve": "models.baselines:MeanCurve",
         "thermal_exponential": "models.thermal_exponential:ThermalExponential",
         "twin": "models.twin:Twin",
         "twin_residual": "models.twin_residual:TwinResidual",
@@ -22,9 +22,9 @@ FAMILIES = Registry(
         "lag_dictionary": "models.lag_dictionary:LagDictionary",
         "axis_coupled": "models.axis_coupled:AxisCoupled",
         "bp": "models.bp:BP",
-        "bp_linear": "models.bp_linear:BPLinear",
-        "lstm": "models.lstm:LSTM",
-        "gru": "models.gru:GRU",
+        "bp_linear": "models.bp:BPLinear",
+        "lstm": "models.recurrent:LSTM",
+        "gru": "models.recurrent:GRU",
         "tcn": "models.tcn:TCN",
         "lssvm": "models.lssvm:LSSVM",
         "svr": "models.svr:SVR",

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, column_or_1d, validate_data
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
-from models.base import Array, Family
+from models.base import Family
 
 
 class ArrayRegressor(RegressorMixin, BaseEstimator):

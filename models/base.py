@@ -14,13 +14,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
 from data.registry import Effort
 from features.design import Design
 
-Array = NDArray[np.float64]
 Plain = dict[str, Any]  # str, int, float, list of those, or numpy array
 
 

@@ -9,13 +9,13 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from data.registry import Effort
-from features.decimation import decimated_rows
-from features.design import Design
+from features.design import Design, decimated_rows
 from features.nets import Nets
-from models.base import Array, Family
-from models.batchwise import too_few_rows
+from models.base import Family
+from models.solvers.batches import too_few_rows
 
 _STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
 TRANSFERS = ("tanh", "linear")
@@ -105,7 +105,7 @@ class BP(Family):
         return stacks
 
     def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
-        from features.levenberg_marquardt import train  # here alone: a trained model predicts without torch
+        from features.levenberg_marquardt import train
 
         n, p, starts = max(len(r) for r in rows), len(design.inputs), self.starts
         x_t, y, known = np.zeros((len(rows), p, n)), np.zeros((len(rows), n)), np.zeros((len(rows), n))
@@ -127,3 +127,17 @@ class BP(Family):
             self._learned(design, {"nets": parts[s], **scales[s], "steps": taken[s], "n_rows": len(rows[s])})
             for s in range(len(rows))
         ]
+
+
+class BPLinear(BP):
+    """`BP` with linear transfer: one start, since every start leads to the same linear map."""
+
+    key = "bp_linear"
+    words = "BP neural network with linear transfer: a linear map found iteratively"
+    source = "year-round PCR study; Hagan and Menhaj 1994"
+    effort: ClassVar[Effort] = "complete"
+    rank = 20
+
+    def __init__(self, hidden: int = 3, starts: int = 1, decay: float = 3e-4, iterations: int = 30,
+                 max_rows: int = 80, seed: int = 0, transfer: str = "linear") -> None:  # fmt: skip
+        super().__init__(hidden, starts, decay, iterations, max_rows, seed, transfer)

@@ -28,7 +28,6 @@ from models.judging import Judged, score_table
 from models.protocols import PROTOCOLS, Fold, folds_of
 from models.result import CELL_KEYS
 
-Array = NDArray[np.float64]
 Inputs = tuple[str, ...]
 
 

@@ -7,21 +7,23 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
-from models.base import Array, Family
-from models.batchwise import by_batch, steps_s, too_few_rows
+from models.base import Family
 from models.linear import Blocks, Task
-from models.parts.kernel_expansion import unit_scale
-from models.parts.lag_responses import Response, lag_responses
-from models.parts.lag_shapes import (
+from models.solvers.batches import by_batch, steps_s, too_few_rows
+from models.solvers.kernels import unit_scale
+from models.solvers.lags import (
     CRITERIA,
     LagRegression,
+    Response,
     Shape,
     effective_rows,
     free_shapes,
     intercepts_um,
     koyck_shapes,
+    lag_responses,
     polynomial_shapes,
 )
 

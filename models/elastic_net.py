@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
-from models.base import Array
 from models.linear import Pool, Task, Tuned
-from models.parts.active_set import sparse_coefficients
+from models.solvers.penalised import sparse_coefficients
 
 
 class ElasticNet(Tuned):

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from models.base import Array, Family, inner_groups
-from models.batchwise import too_few_rows
+from models.base import Family, inner_groups
 from models.metrics import SIDE_OF_90
-from models.parts.bordered import Kernel
-from models.parts.kernel_expansion import evenly, products, unit_scale
-from models.parts.left_out_groups import LeftOut
+from models.solvers.batch_process import LeftOut
+from models.solvers.batches import too_few_rows
+from models.solvers.kernels import Kernel, evenly, products, unit_scale
 
 Rows = NDArray[np.int64]
 LINES = (1e2, 1e3, 1e4, 1e5, 1e6)

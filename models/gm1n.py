@@ -8,11 +8,12 @@ from typing import Self
 import numpy as np
 from scipy.signal import lfilter
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
-from features.grey_model import equations, least_squares
-from models.base import Array, Family, Plain
-from models.batchwise import bridged, by_batch, padded, steps_s, too_few_rows, unpadded
+from features.grey import equations, least_squares
+from models.base import Family, Plain
+from models.solvers.batches import bridged, by_batch, padded, steps_s, too_few_rows, unpadded
 
 RESPONSES = ("difference", "whitening")
 _A_HIGHEST = 2.0  # beyond it the recursion's pole (1 − a/2)/(1 + a/2) is negative: the prediction would zigzag

@@ -7,13 +7,14 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
-from models.base import Array, Family, Plain
+from models.base import Family, Plain
 from models.distributed_lag import DistributedLag
 from models.gm1n import GM1N
-from models.parts.grey_layer import grey_layers, layer_design
-from models.parts.start_bands import band_weights, bands_of, start_temperatures_degC
+from models.solvers.grey_models import grey_layers, layer_design
+from models.solvers.start_bands import band_weights, bands_of, start_temperatures_degC
 
 BANDED = ("lag", "both")
 
@@ -31,7 +32,7 @@ class GMDL(Family):
     `banded`: "lag" bands the distributed lag behind one grey model of all batches; "both" bands both layers. The grey
     model learns from each batch's `recent_rows` most recent rows (None: all), the distributed lag from honest outputs:
     those for a training batch come from grey models of the other batches, with one or two batches those for a quarter
-    from models that were not shown its errors (`models.parts.grey_layer`). `lags` and `lag_min` belong to the
+    from models that were not shown its errors (`models.solvers.grey_models`). `lags` and `lag_min` belong to the
     distributed lag.
 
     Source: study of a grey model and distributed lags, weighted by start temperature; Deng 1989; Almon 1965.

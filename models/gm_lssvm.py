@@ -7,13 +7,14 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
-from models.base import Array, Family
-from models.batchwise import steps_s
+from models.base import Family
 from models.gm1n import GM1N
 from models.lssvm import LSSVM
-from models.parts.grey_layer import grey_layers, layer_design
+from models.solvers.batches import steps_s
+from models.solvers.grey_models import grey_layers, layer_design
 
 LENGTHS_IN = ("rows", "min")
 _SECOND = ("support", "alpha", "bias", "gamma", "sigma", "scale", "inner_rms_um")
@@ -26,11 +27,11 @@ class GMLSSVM(Family):
     published (2-min samples), or minutes with `lengths_in` "min"; none is shorter than the model has unknowns. The
     LS-SVM (RBF and linear, at most `max_rows` rows, evenly) learns from outputs that are honest: those for a training
     batch come from grey models of the other training batches, with one or two batches those for a quarter from models
-    that were not shown its errors (`models.parts.grey_layer`). γ and σ by exact leave-batch-out of this second layer on
-    a grid (`tuning` "closed_form") or by "particle_swarm" as published.
+    that were not shown its errors (`models.solvers.grey_models`). γ and σ by exact leave-batch-out of this second layer
+    on a grid (`tuning` "closed_form") or by "particle_swarm" as published.
 
     Source: study of a THM6380 machining centre (GM(1,6) of 25, 30, 35 and 40 rows, LS-SVM tuned by particle swarm);
-    Deng 1989; Suykens et al. 2002. The study ran within one batch: `models.parts.grey_sequence`.
+    Deng 1989; Suykens et al. 2002. The study ran within one batch: `models.solvers.grey_models`.
     """
 
     key = "gm_lssvm"

@@ -7,9 +7,10 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from features.design import Design
-from models.base import Array, Family
-from models.parts.trees import Trees, training_rows
+from models.base import Family
+from models.solvers.trees import Trees, training_rows
 
 _ROWS = 720  # that few batches may give together
 

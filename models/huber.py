@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
-from models.base import Array, inner_groups
+from models.base import inner_groups
 from models.linear import Linear, Mask, Task
-from models.parts.pooled_sums import FLAT
-from models.parts.reweighting import Settled, settle
+from models.solvers.penalised import Settled, settle
+from models.solvers.pooled_sums import FLAT
 
 
 class Huber(Linear):

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
 from models.base import Family
@@ -17,7 +18,6 @@ from models.metrics import batch_scores, coverage, residual_std_um
 from models.protocols import Fold
 from models.result import CERTAINTY, SCORES
 
-Array = NDArray[np.float64]
 Inputs = tuple[str, ...]
 _AT_ONCE_BYTES = 128 * 2**20
 _FITTED_ON, _FITTED_ON_ITERATIVE = 100, 4  # training batches, evenly chosen, that fitting accuracy is taken from

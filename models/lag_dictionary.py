@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import nnls
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from models.base import Array, Family
-from models.batchwise import by_batch, too_few_rows
+from models.base import Family
 from models.metrics import SIDE_OF_90
-from models.parts.batch_process import BatchProcess, Windows
-from models.parts.lag_dictionary_columns import DRIVEN, PROMPT, UNDRIVEN, Columns
+from models.solvers.batch_process import BatchProcess, Windows
+from models.solvers.batches import by_batch, too_few_rows
+from models.solvers.lags import DRIVEN, PROMPT, UNDRIVEN, Columns
 
 _LEVELS = (0.1, 10.0, 1000.0)  # prior variance of a gain per K, in units of what no column explains
 _STEADY = (1.0, 100.0)  # offset and noise of that, against its walk in an hour
@@ -50,10 +51,10 @@ _USUAL_SETTING = _Setting(10.0, DRIVEN, 1.0)
 class LagDictionary(Family):
     """error_um = x(t) · β over a dictionary of delayed inputs, drivers and start states, β by pooling batches.
 
-    Columns (`models.parts.lag_dictionary_columns`): each input as it is and behind lags of 10 min to 8 h, each driver
+    Columns (`models.solvers.lags`): each input as it is and behind lags of 10 min to 8 h, each driver
     (a speed also squared) likewise, how the machine stood at the start, and the clock. A batch's error is x · β and a
     drift of its own that no column explains, so that the fit is generalised least squares with a ridge prior
-    (`models.parts.batch_process`). The prediction is 0 at the first row.
+    (`models.solvers.batch_process`). The prediction is 0 at the first row.
 
     Eighteen settings (three levels of the prior; inputs of now, or also slow ones and the start, or also drivers; a
     drift that wanders or mostly stands) are averaged with weights S^−10, S the mean residual standard deviation of

@@ -10,13 +10,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from features.design import Design
-from models.base import Array, inner_groups
-from models.batchwise import too_few_rows
-from models.parts.bordered import Bordered, Kernel
-from models.parts.kernel_expansion import KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
-from models.parts.particle_swarm import least
+from models.base import inner_groups
+from models.solvers.batches import too_few_rows
+from models.solvers.kernels import Bordered, Kernel, KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
+from models.solvers.particle_swarm import least
 
 TUNINGS = ("closed_form", "particle_swarm")
 _LEAST_ROWS_PER_BATCH = 8

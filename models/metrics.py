@@ -11,12 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.grey import synthetic_degree
 from models.result import SCORES
 
-Array = NDArray[np.float64]
 SIDE_OF_90 = 1.6449  # standard deviations: a normal value lies within them nine times in ten
 
 

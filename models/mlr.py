@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.base import Array
+from data.arrays import Array
 from models.linear import DIGITS_LEFT, EPS, Linear, Pool, Task
 
 

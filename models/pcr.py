@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
-from models.base import Array
 from models.linear import DIGITS_LEFT, EPS, Linear, Pool, Task, Tuned
 
 _RESOLVED = 1e-10  # variance, relative to the first component's, that the covariance still resolves

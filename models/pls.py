@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
-from models.base import Array
 from models.linear import EPS, Pool, Tuned
 
 _EXHAUSTED = 1e-9  # remaining covariance with the error, relative to the first: below it there is only rounding

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, closest
 
 _SEASON_BOUNDS_DEGC = (10.0, 18.0, 25.0)
 
@@ -109,3 +111,23 @@ def _leave_group_out(labels: Sequence[str]) -> list[Fold]:
         test = tuple(i for i, got in enumerate(labels) if got == label)
         folds.append(Fold(label, tuple(i for i in range(len(labels)) if i not in test), test))
     return [f for f in folds if f.train]
+
+
+class PromotionRule(BaseModel):
+    """Which cell becomes the champion, and when a newcomer may replace one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    protocol: str = "leave-batch-out"
+    score: Literal["S_mean + S_std", "S_mean", "max_abs"] = "S_mean + S_std"
+    min_tsp_stability: Annotated[float, Field(ge=0, le=1)] = 0.7
+    tie_percent: Annotated[float, Field(ge=0, lt=100)] = 2.0
+    significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    min_batches: Annotated[int, Field(ge=2)] = 5
+
+    @field_validator("protocol")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in PROTOCOLS:
+            raise ValueError(f"unknown protocol; {closest(value, PROTOCOLS)}")
+        return value

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from data.arrays import Array
 from features.design import Design
-from models.base import Array, Family, inner_groups
-from models.parts.trees import Trees, training_rows
+from models.base import Family, inner_groups
+from models.solvers.trees import Trees, training_rows
 
 _ROWS = 480  # that few batches may give together
 _PARTS_OF_ONE = 12  # of one or two batches: a tree that lacks a quarter of its only run knows too little

@@ -74,3 +74,15 @@ class GridResult:
         values = {k: v for k, v in meta.items() if k != "schema"}
         values |= {name: pd.read_parquet(folder / f"{name}.parquet") for name in tables}
         return cls(**values)
+
+
+@dataclass(frozen=True)
+class Training:
+    """One tracked training of one error channel. `promotion` is what `registry.promote` recorded, empty if nothing."""
+
+    training_id: str
+    started: pd.Timestamp
+    simulated: bool
+    result: GridResult
+    params: dict[str, str] = field(default_factory=dict)
+    promotion: dict[str, Any] = field(default_factory=dict)

@@ -9,11 +9,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from models.base import Array, inner_groups
-from models.batchwise import too_few_rows
-from models.parts.kernel_expansion import KernelExpansion, Rows, evenly, kernel, unit_scale
+from models.base import inner_groups
+from models.solvers.batches import too_few_rows
+from models.solvers.kernels import KernelExpansion, Rows, evenly, kernel, unit_scale
 
 _LEAST_ROWS_PER_BATCH = 3
 _GROUPS = 3  # that the training batches are left out in, when the setting is chosen

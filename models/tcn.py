@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from models.parts.sequence_net import SequenceNet, Weights
+from models.solvers.sequence_net import SequenceNet
+from models.solvers.sequences import Weights
 
 LAYERS = 4  # receptive field 2⁴ = 16 steps: 5 h 20 min at steps of 20 min
 

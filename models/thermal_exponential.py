@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from data.arrays import Array
 from features.design import Design
 from features.rises import hold_last
-from models.base import Array, Family, Plain
-from models.batchwise import padded, steps_s, too_few_rows, unpadded
+from models.base import Family, Plain
+from models.solvers.batches import padded, steps_s, too_few_rows, unpadded
 
 EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it stays where one speed tells nothing
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)

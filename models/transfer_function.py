@@ -7,14 +7,27 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array, Mask
 from data.errors import InputError
 from features.design import Design
-from models.base import Array, Family
-from models.batchwise import too_few_rows
-from models.parts.left_out_spread import left_out_spread, mean_square
-from models.parts.pole_responses import TAUS_S, Dictionary, Source, combination, drivers_of, gaps_of, only, responses
-from models.parts.pole_search import Candidate, Search, gains, refined
-from models.parts.pooled_sums import Blocks, Mask
+from models.base import Family
+from models.linear import left_out_spread, mean_square
+from models.solvers.batches import too_few_rows
+from models.solvers.poles import (
+    TAUS_S,
+    Candidate,
+    Dictionary,
+    Search,
+    Source,
+    combination,
+    drivers_of,
+    gains,
+    gaps_of,
+    only,
+    refined,
+    responses,
+)
+from models.solvers.pooled_sums import Blocks
 
 _FEWEST_ROWS = 8
 _MOST_INPUTS = 60
@@ -100,7 +113,7 @@ class TransferFunction(Family):
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value, see `models.parts.left_out_spread`.
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.linear`.
 
         NaN throughout where fewer than three batches were learned from.
         """

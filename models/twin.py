@@ -8,16 +8,15 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.registry import Effort
 from features.design import Design
-from models.base import Array, Family, Plain
-from models.batchwise import by_batch, too_few_rows
-from models.parts.twin_folds import Calibrated, Calibrations
-from models.parts.twin_run import TwinRun
-from models.recent import Recent
+from models.base import Family, Plain
+from models.solvers.batches import Recent, by_batch, too_few_rows
+from models.solvers.twin_folds import Calibrated, Calibrations, TwinRun
 from twin.compile import compile_network
 from twin.network import Network
 

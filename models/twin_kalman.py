@@ -8,11 +8,11 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
-from models.base import Array
-from models.parts.twin_run import TwinRun
+from models.solvers.twin_folds import TwinRun
 from models.twin import Twin, run_of
 from twin.kalman import Doubt, Filtered, filtered
 

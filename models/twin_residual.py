@@ -8,13 +8,14 @@ from typing import Self
 
 import numpy as np
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from models.base import Array, Family, Plain
-from models.batchwise import by_batch
+from models.base import Family, Plain
 from models.gaussian_process import GaussianProcess
-from models.parts.twin_run import TwinRun
 from models.ridge import Ridge
+from models.solvers.batches import by_batch
+from models.solvers.twin_folds import TwinRun
 from models.twin import Twin, run_of
 from twin.network import Network
 

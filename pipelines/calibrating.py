@@ -82,8 +82,7 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: screen.Done) -> 
     write_file(request.out, new, request.machine_file, request.overwrite)
     if not request.report:
         return CalibrationOutcome(found, request.out, when)
-    from pipelines.report.twin_data import twin_data
-    from pipelines.report.twin_report import write_twin_report
+    from reports.twin.page import twin_data, write_twin_report
 
     say("pictures")
     page = request.out.with_suffix(".html")

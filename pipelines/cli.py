@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from data.errors import InputError, WorkError
+from data.errors import InputError, WorkError, one_of
 from pipelines import prove_command, report_command, reproduce_command, screen, twin_commands
 from pipelines import settings as settings_module
-from pipelines.options import Json, MachineFile, names, one_of, split
+from pipelines.options import Json, MachineFile, names, split
 
 app = typer.Typer(
     name="thermodrift",

@@ -13,17 +13,16 @@ from rich.table import Table as Shown
 from data.errors import InputError, closest
 from data.machine import Machine, load_machine
 from pipelines import screen
-from pipelines.report import twin_tables
-from pipelines.report.layout import Table
-from pipelines.report.network_picture import counted
-from pipelines.report.twin_report import PICTURES, TwinData, write_picture, write_twin_report
+from reports.layout import Table
+from reports.twin import tables as twin_tables
+from reports.twin.network_picture import counted
+from reports.twin.page import PICTURES, TwinData, write_picture, write_twin_report
 from twin.compile import compile_network, expanded
 from twin.network import Network
 from twin.quantity import convert
 from twin.schema import twin_part
-from twin.simulation.steady import Steady, steady_state
-from twin.views.mode_words import ModeView, machine_modes, mode_views
-from twin.views.overview import Overview, overview
+from twin.simulation.start import Steady, steady_state
+from twin.views.overview import ModeView, Overview, machine_modes, mode_views, overview
 
 AIR_DEGC = 20.0
 

@@ -13,17 +13,17 @@ from typing import Protocol
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
+from data.files import check_folder, staged
 from data.ingest import IngestReport
 from data.machine import Machine, load_machine
+from diagnosis.export.machine_file import diagnosed_text, drafted_text
+from diagnosis.findings.schema import Findings, as_json
+from diagnosis.result import Diagnosis
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done
-from pipelines.out_folder import check_folder, staged
 from pipelines.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
 from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
-from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.telling.findings import Findings, as_json
-from twin.diagnosis.writing.machine_file import diagnosed_text, drafted_text
 
 Say = Callable[[str], None]
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
@@ -31,7 +31,7 @@ FILES = (REPORT, PLAN, MACHINE, FINDINGS)  # the last one says that the others a
 
 
 class Diagnose(Protocol):
-    """What does the work: `twin.diagnosis.diagnose.diagnose`, or a toy in its place."""
+    """What does the work: `diagnosis.diagnose.diagnose`, or a toy in its place."""
 
     def __call__(
         self,
@@ -152,7 +152,7 @@ def write_diagnosis(d: Diagnosis, out: Path, text: str, report: bool = True) -> 
     Raises:
         WorkError: OUT cannot be written; what stood there is unchanged.
     """
-    from pipelines.report.diagnosis_report import write_diagnosis_report
+    from reports.diagnosis.page import write_diagnosis_report
 
     machine_file, trouble = None, ""
     try:
@@ -222,7 +222,7 @@ def _diagnosed(
 
 def library_diagnosis() -> Diagnose:
     """The product's own diagnosis; imported late, because it takes a while."""
-    from twin.diagnosis.diagnose import diagnose
+    from diagnosis.diagnose import diagnose
 
     return diagnose
 

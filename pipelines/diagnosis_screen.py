@@ -8,13 +8,13 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from diagnosis.findings.schema import Finding
+from diagnosis.result import Diagnosis
 from pipelines import screen
 from pipelines.diagnosing import FINDINGS, MACHINE, PLAN, REPORT, DiagnosisOutcome
-from pipelines.report import diagnosis_words as words
-from pipelines.report.diagnosis_extracts import by_channel
-from pipelines.report.words import count, number
-from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.telling.findings import Finding
+from reports.diagnosis import tables as words
+from reports.diagnosis.tables import by_channel
+from reports.labels import count, number
 
 _WHAT = {
     REPORT: "the report, one page",

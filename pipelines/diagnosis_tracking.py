@@ -15,10 +15,18 @@ import pandas as pd
 from mlflow.entities import Metric, Run
 
 from data.batch import Batch
+from diagnosis.result import Diagnosis
 from pipelines.settings import Settings, load
-from pipelines.tracked_runs import dataset_inputs, experiment_id, finished_runs, log_values, started, yes_or_no
-from pipelines.tracking import open_store, store_errors
-from twin.diagnosis.diagnosis import Diagnosis
+from pipelines.tracking import (
+    dataset_inputs,
+    experiment_id,
+    finished_runs,
+    log_values,
+    open_store,
+    started,
+    store_errors,
+    yes_or_no,
+)
 
 TARGET = "diagnosis"  # stands where an experiment's name has the error channel
 COLUMNS = ("run_id", "machine", "started", "n_batches", "verdict", "mechanism", "where", "probability", "simulated")

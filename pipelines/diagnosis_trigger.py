@@ -11,11 +11,12 @@ import numpy as np
 
 from data.errors import InputError, WorkError
 from models import FAMILIES
+from models.promotion import left_out, score_um
+from models.protocols import PromotionRule
 from models.result import GridResult
 from pipelines import tracking
 from pipelines.diagnosing import Diagnose, DiagnosisOutcome, DiagnosisRequest, dated_folder, diagnose_file
-from pipelines.promotion import left_out, score_um
-from pipelines.settings import PromotionRule, Settings
+from pipelines.settings import Settings
 
 
 @dataclass(frozen=True)

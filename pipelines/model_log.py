@@ -17,8 +17,7 @@ from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
 
 from models.base import Family
-from models.region import Region
-from models.trust import Rise
+from models.trust import Region, Rise
 from pipelines import model_store, pyfunc_model
 from pipelines.settings import Settings
 from pipelines.tracking import open_store, store_errors

@@ -17,16 +17,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
-from models.region import Region, watched
-from models.trust import Rise
+from models.trust import Region, Rise, watched
 
 SCHEMA = "thermodrift.model/2"
 FILES = ("model.json", "arrays.npz", "machine.yml")
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

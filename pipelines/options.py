@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
@@ -12,21 +12,6 @@ from data.errors import InputError, closest
 
 MachineFile = Annotated[Path, typer.Option("--machine", help="machine file (.yml)")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables")]
-
-T = TypeVar("T", bound=str)
-
-
-def one_of(given: str, allowed: Iterable[T], option: str) -> T:
-    """The allowed value that was given.
-
-    Raises:
-        InputError: another one, with the closest.
-    """
-    known = tuple(allowed)
-    for value in known:
-        if value == given:
-            return value
-    raise InputError(f"{option}: unknown value {given!r}: {closest(given, known)}")
 
 
 def split(given: str) -> tuple[str, ...]:

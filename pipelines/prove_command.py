@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data.errors import InputError
+from data.errors import InputError, one_of
 from pipelines import screen
-from pipelines.options import Json, one_of, split
+from pipelines.options import Json, split
 
 if TYPE_CHECKING:
-    from pipelines.proof_suite import ProofRequest
-    from twin.proof.sealing.examining import Examinee
+    from evidence.proof.proving import ProofRequest
+    from evidence.proof.sealing.running import Examinee
 
 app = typer.Typer(help="Examine the diagnosis in public, on recordings in which the effect is concealed.")
 
@@ -48,8 +48,8 @@ def prove(
     """Examine the diagnosis on concealed effects: seal, run and open in one go, or step by step."""
     if context.invoked_subcommand is not None:
         return
+    from evidence.proof.proving import prove as prove_all
     from pipelines.prove_screen import outcome_dict, print_outcome
-    from pipelines.proving import prove as prove_all
 
     request = _request(cases, to, plants, suite, seed, data)
     with screen.progress(as_json) as (say, done):
@@ -72,7 +72,7 @@ def seal(
     as_json: Json = False,
 ) -> None:
     """Draw and build the cases, lock the answers away, and tell the root that commits to all of it."""
-    from pipelines.proving import seal_proof
+    from evidence.proof.proving import seal_proof
 
     request = _request(cases, to, plants, suite, seed, data)
     with screen.progress(as_json) as (_, done):
@@ -96,7 +96,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Have every case answered by a process that sees nothing else; what is answered stays."""
-    from pipelines.proving import run_proof
+    from evidence.proof.proving import run_proof
 
     with screen.progress(as_json) as (_, done):
         outcome = run_proof(proof, _count(workers), restart, _examinee(limit), done)
@@ -126,13 +126,13 @@ def open_(
     as_json: Json = False,
 ) -> None:
     """Check seal, ledger and answers, reveal the key, score, and write tables and page."""
+    from evidence.proof.proving import open_proof
     from pipelines.prove_screen import outcome_dict, print_outcome
-    from pipelines.proving import open_proof
 
     with screen.progress(as_json) as (say, done):
         outcome = open_proof(proof, _count(workers), partial, _deals(deals), say, done)
     if publish is not None:
-        from pipelines.report.proof_markdown import publish_proof
+        from evidence.proof.report.markdown import publish_proof
 
         publish_proof(publish, outcome.run)
     if as_json:
@@ -142,8 +142,7 @@ def open_(
 
 
 def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | None, data: Path | None) -> ProofRequest:
-    from pipelines.proof_suite import SUITES, ProofRequest
-    from pipelines.proving import check_plants
+    from evidence.proof.proving import SUITES, ProofRequest, check_plants
 
     if cases < 1:
         raise InputError(f"--cases: got {cases}, expected 1 or more")
@@ -156,7 +155,7 @@ def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | N
 
 
 def _examinee(limit_s: float) -> Examinee:
-    from twin.proof.sealing.examining import Examinee
+    from evidence.proof.sealing.running import Examinee
 
     if not limit_s > 0:
         raise InputError(f"--limit: got {limit_s:g}, expected more than 0 seconds")

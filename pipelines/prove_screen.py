@@ -8,9 +8,9 @@ import pandas as pd
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from evidence.proof.proving import ProofOutcome
 from pipelines import screen
-from pipelines.proving import ProofOutcome
-from pipelines.report.words import count
+from reports.labels import count
 
 
 def outcome_dict(outcome: ProofOutcome) -> dict[str, Any]:

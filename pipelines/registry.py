@@ -22,12 +22,11 @@ from data.errors import InputError, closest
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.metrics import residual_std_um
-from models.region import Region
+from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
-from models.trust import Rise
+from models.trust import Region, Rise
 from pipelines import model_store
 from pipelines.model_log import local_folder, log_version
-from pipelines.promotion import Choice, Comparison, compare_paired, left_out
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 

@@ -41,8 +41,8 @@ def report(
     if sheet is not None:
         raise InputError("--sheet: a test sheet belongs to a thermal test; add --iso")
     from pipelines import tracking
-    from pipelines.report import write_report
     from pipelines.request import REPORT_ENDINGS, check_ending
+    from reports.comparison import write_report
 
     if to is not None:
         check_ending("--out", to, (f".{form}",) if form else REPORT_ENDINGS)
@@ -55,7 +55,7 @@ def report(
             raise InputError(f"no training of {machine!r} is tracked; call `thermodrift train` first")
         ids = past.drop_duplicates("target")["training_id"].tolist()
     path = to or settings_module.home() / "reports" / f"{machine}.{form or 'html'}"
-    write_report([tracking.load_training(i, settings) for i in ids], path, settings)
+    write_report([tracking.load_training(i, settings) for i in ids], path, settings.promotion)
     screen.line(path)
 
 

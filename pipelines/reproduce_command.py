@@ -22,17 +22,17 @@ def reproduce(
     as_json: Json = False,
 ) -> None:
     """Repeat published studies on simulated machines: their figures beside ours, and which orderings hold."""
-    from models.studies import STUDIES
-    from models.studies.running import run_studies
+    from evidence.studies import STUDIES
+    from evidence.studies.base import run_studies
+    from evidence.studies.report import FILES, write_results
     from pipelines.reproduce_screen import outcome_dict, print_results
-    from pipelines.reproducing import FILES, write_results
 
     if study != "all" and study not in STUDIES:
         raise InputError(f"unknown study {study!r}: {closest(study, [*STUDIES, 'all'])}")
     if workers is not None and workers < 1:
         raise InputError(f"--workers: got {workers}, expected 1 or more")
     if to is not None:
-        from pipelines.out_folder import check_folder
+        from data.files import check_folder
 
         check_folder(to, [to / name for name in FILES], overwrite)
     with screen.progress(as_json) as (_, done):

@@ -11,10 +11,10 @@ import pandas as pd
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from models.studies.result import StudyResult
+from evidence.studies.base import StudyResult
+from evidence.studies.report import our_gain, printed_gain, spread
 from pipelines import screen
-from pipelines.report.reproduction import our_gain, printed_gain, spread
-from pipelines.report.words import number, percent
+from reports.labels import number, percent
 
 LABEL = "SIMULATED"
 

@@ -6,13 +6,13 @@ import os
 import string
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.errors import InputError, closest
 from data.yaml_file import load_yaml
-from models.protocols import PROTOCOLS
+from models.protocols import PromotionRule
 from pipelines import TELEMETRY_OFF
 
 PROJECT_ROOT = Path(__file__).resolve().parent.parent
@@ -51,24 +51,6 @@ class NamesPart(_Part):
     def _no_separator(cls, value: str) -> str:
         if "/" in value or ":" in value:
             raise ValueError("a registered model's name must not contain / or :")
-        return value
-
-
-class PromotionRule(_Part):
-    """Which cell becomes the champion, and when a newcomer may replace one."""
-
-    protocol: str = "leave-batch-out"
-    score: Literal["S_mean + S_std", "S_mean", "max_abs"] = "S_mean + S_std"
-    min_tsp_stability: Annotated[float, Field(ge=0, le=1)] = 0.7
-    tie_percent: Annotated[float, Field(ge=0, lt=100)] = 2.0
-    significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
-    min_batches: Annotated[int, Field(ge=2)] = 5
-
-    @field_validator("protocol")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if value not in PROTOCOLS:
-            raise ValueError(f"unknown protocol; {closest(value, PROTOCOLS)}")
         return value
 
 

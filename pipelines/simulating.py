@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from data.atomic_file import write_atomic
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
+from data.files import check_folder, write_atomic
 from data.lakefile import content_digest, encode, safe_name
 from data.machine import Machine, load_machine
-from pipelines.out_folder import check_folder
-from pipelines.report.iso230_3 import write_iso_report
+from reports.twin.iso230_3 import write_iso_report
 from twin.compile import compile_network
 from twin.network import Network
 from twin.run_plan import RunPlan, load_run_plan
@@ -26,7 +26,6 @@ from twin.simulation import Simulation, choose_substeps
 from twin.simulation import simulate as simulate_network
 from twin.simulation.inputs import Inputs, inputs_of_plan, start_of_plan
 
-Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
 STEPS_K = 0.01  # to which the time steps are right
@@ -89,8 +88,8 @@ def simulate_plans(request: SimulationRequest, say: Say, done: Callable[[str, in
             cannot be written, heat that is stiff beyond the step control.
     """
     from pipelines.describe_twin import describe_twin
-    from pipelines.report.simulation_figure import overview_png
-    from pipelines.report.twin_report import TwinData, write_twin_report
+    from reports.twin.figures import overview_png
+    from reports.twin.page import TwinData, write_twin_report
     from twin.views.heat_flows import heat_flows
 
     network, machine, jobs = jobs_of(request)

@@ -10,10 +10,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from data.batch import Batch
+from features.iso230_3 import clock
 from pipelines import screen
-from pipelines.report.words import number
 from pipelines.simulating import Simulated, SimulationOutcome
-from twin.iso230_3.kind import clock
+from reports.labels import number
 
 HOURS = (1.0, 2.0, 6.0)
 _UNITS = {"um": "µm", "um/m": "µm/m"}

@@ -13,7 +13,7 @@ from data.lakefile import safe_name
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
 from data.yaml_file import load_yaml
-from pipelines.report.iso230_3 import TestSheet, write_iso_report
+from reports.twin.iso230_3 import TestSheet, write_iso_report
 
 Say = Callable[[str], None]
 

@@ -19,19 +19,19 @@ from data.errors import InputError
 from data.ingest import IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
-from models import FAMILIES
+from models import FAMILIES, promotion
 from models.crossing import Crossing, Plan, prepare, refit, with_target
 from models.grid import Workers, assemble, jobs_of, workers_for
-from models.region import Region
 from models.result import GridResult
-from pipelines import promotion, registry, tracking
+from models.trust import Region
+from pipelines import registry, tracking
 from pipelines.caller import RETRIES, Caller
 from pipelines.diagnosing import DiagnosisOutcome
 from pipelines.diagnosis_trigger import diagnose_if_grown
-from pipelines.report import figure_pngs, write_report
 from pipelines.request import TrainRequest, check_request
 from pipelines.settings import Settings, home
 from pipelines.unfinished import Unfinished
+from reports.comparison import figure_pngs, write_report
 
 Say = Callable[[str], None]
 
@@ -214,4 +214,4 @@ def _promote(
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:
     trainings = [tracking.load_training(i, settings) for i in outcome.training_ids.values()]
-    return write_report(trainings, path, settings)
+    return write_report(trainings, path, settings.promotion)

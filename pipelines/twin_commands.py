@@ -29,7 +29,7 @@ def simulate(
     if sample_year:
         if plans or machine is not None:
             raise InputError("simulate: --sample-year has its own machine and plans; leave out --machine and PLANS")
-        from data.sample_year import write_sample_year
+        from plants.sample.sample_year import write_sample_year
 
         folder = to or Path("sample_year")
         files = write_sample_year(folder, seed=seed)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 from data.errors import InputError
 from data.machine import Machine
+from twin.compiling.cells import Scope, exposure, inside, link, number
 from twin.compiling.channels import error, reading, surrounding
 from twin.compiling.checks import problems
-from twin.compiling.edges import exposure, inside, link
 from twin.compiling.laws import acting_on, heats, law_of, mechanism_of, starts
-from twin.compiling.scope import Scope, number
 from twin.network import Network
+from twin.quantity import Value
 from twin.schema import TwinPart, twin_part
 
 
@@ -68,3 +68,31 @@ def _network(scope: Scope) -> Network:
         drivers=tuple(n for n in scope.machine.channels if n in scope.drivers),
         start_spread_K=number("initial_spread", part.initial_spread, "K"),
     )
+
+
+_MARK = "own path: "
+
+
+def own_paths(machine: Machine, part: TwinPart) -> dict[str, str]:
+    """By parameter of the network: ``{"exposures.bed-sink.conductance": "mechanisms.sink.conductance"}``.
+
+    Parameters that stand under their own path are left out. Every value of a structural mechanism is marked, and the
+    marks are looked for in the compiled network, so that a new mechanism needs nothing here.
+
+    Raises:
+        InputError: the part makes no sense.
+    """
+    marked = {}
+    for name, given in part.mechanisms.items():
+        mechanism = mechanism_of(name, given)
+        if "expand" in mechanism.effects():
+            values = {}
+            for s in mechanism.parameters:
+                held = given.parameters.get(s.name) or Value(value=s.value or 0.0)
+                values[s.name] = held.model_copy(update={"source": f"{_MARK}mechanisms.{name}.{s.name}"})
+            marked[name] = given.model_copy(update={"parameters": values})
+    if not marked:
+        return {}
+    part = part.model_copy(update={"mechanisms": {**part.mechanisms, **marked}})
+    parameters = compile_network(machine, part=part).parameters
+    return {p.name: p.source.removeprefix(_MARK) for p in parameters if p.source.startswith(_MARK)}

@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from data.arrays import Array
 from data.errors import InputError
 from twin.network import Network
 from twin.simulation import TOLERANCE_K, Simulation, simulation_of
 from twin.simulation.channels import Rows, Tangents, shown
 from twin.simulation.inputs import Inputs
-from twin.simulation.solved import Solved, rows_of, solved_balance
+from twin.simulation.run import Solved, rows_of, solved_balance
 from twin.simulation.start import start_of
-
-Array = NDArray[np.float64]
 
 _HOUR_S = 3600.0
 

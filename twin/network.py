@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from twin.mechanisms.base import Mechanism
 from twin.quantity import Monomial, Parameter, values_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-Array = NDArray[np.float64]
+from data.arrays import Array
+
 Scale = Literal["log", "linear", "logit"]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -21,7 +22,7 @@ class _Part(BaseModel):
 
 
 class Material(_Part):
-    """What a body is made of; built-in ones (steel, cast_iron, aluminium, …) are in `twin.materials`."""
+    """What a body is made of; built-in ones (steel, cast_iron, aluminium, …) are in `twin.schema`."""
 
     specific_heat: Value  # J/kg/K
     conductivity: Value  # W/m/K
@@ -243,3 +244,16 @@ def twin_part(machine: Machine, where: str = "") -> TwinPart:
     if machine.twin is None:
         raise InputError(f"{at}: key 'twin' is missing; add bodies, surroundings, links and sensors (see machines/)")
     return parse_part(machine.twin, TwinPart, at, "twin")
+
+
+# The expansions of steel and iron are those of the sample machine; the rest are handbook values.
+MATERIALS: Mapping[str, Mapping[str, float]] = MappingProxyType({
+    "steel": {"specific_heat": 460.0, "conductivity": 48.0, "expansion": 11.5},
+    "cast_iron": {"specific_heat": 500.0, "conductivity": 50.0, "expansion": 10.8},
+    "aluminium": {"specific_heat": 900.0, "conductivity": 160.0, "expansion": 23.5},
+    "polymer_concrete": {"specific_heat": 900.0, "conductivity": 1.7, "expansion": 16.0},
+    "granite": {"specific_heat": 800.0, "conductivity": 2.8, "expansion": 6.5},
+    "invar": {"specific_heat": 515.0, "conductivity": 11.0, "expansion": 1.3},
+    "brass": {"specific_heat": 380.0, "conductivity": 115.0, "expansion": 19.0},
+    "copper": {"specific_heat": 385.0, "conductivity": 390.0, "expansion": 16.8},
+})  # fmt: skip

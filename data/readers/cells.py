@@ -13,9 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
-
-Array = NDArray[np.float64]
 
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%Y%m%d",
           "%d.%m.%y", "%d/%m/%y", "%m/%d/%y", "%Y年%m月%d日")  # fmt: skip

@@ -11,7 +11,7 @@ from data.errors import InputError
 from data.machine import Machine
 from data.readers.base import Sheet
 from data.readers.cells import parse_number
-from data.readers.text import normalise
+from data.readers.csv import normalise
 
 _UNIT_ROWS = 3  # rows between header and data that may hold units or descriptions
 

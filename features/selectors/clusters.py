@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.design import Design
 from features.selectors.base import Diagnostic
 from features.selectors.statistics import DIGITS, Statistics, chosen_of_varying, ranking
 
-Array = NDArray[np.float64]
 _CHAINED, _ONE_CLUSTER = 0.1, 0.6  # a weaker pair than its cluster's level by this; a share of all in one cluster
 
 

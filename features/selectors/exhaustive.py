@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.design import Design
 from features.selectors.base import Diagnostic, Selector
 from features.selectors.left_out import LeftOut, beam, errors_of_all
 from features.selectors.statistics import DIGITS, check_n_tsps, chosen_of_varying, training_statistics
 
-Array = NDArray[np.float64]
 _STATE_NUMBERS = 4_000_000  # of the beam's matrices at once
 _TIE = 0.02  # errors closer than this are one choice, as in the promotion rule
 

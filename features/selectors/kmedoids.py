@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.design import Design
 from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import DIGITS, Statistics, check_n_tsps, chosen_of_varying, training_statistics
 
-Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
 _STRUCTURE = 0.25  # a mean silhouette below this is no structure worth the name (Kaufman and Rousseeuw)
 

@@ -8,16 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from features.decimation import decimated_rows
-from features.design import Design
+from data.arrays import Array, Mask
+from features.design import Design, decimated_rows
 from features.nets import Nets
 from features.rises import zeroed_error_um
 from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import check_n_tsps, chosen_of_varying, in_order, ranking, training_statistics
 
-Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 _COLLINEAR = 0.95  # |corr| from which two inputs count as one group for the diagnostics
 _SPREAD, _CHANGES = 0.5, 0.2  # more than this over the starts and the order inside a group is chance
 _HELD_OUT_EVERY, _STARTS_PER_SIZE = 4, 2
@@ -145,7 +143,7 @@ class MainFactorBP(Selector):
 
     def _trained(self, hidden: int, starts: int, x_t: Array, y: Array, known: Mask) -> Nets:
         """Nets (C · starts) of all error channels, y and known (C, n), channel after channel."""
-        from features.levenberg_marquardt import train  # here alone: selectors are listed without torch
+        from features.levenberg_marquardt import train
 
         drawn = Nets.drawn(starts, len(x_t), hidden, self.seed)
         nets = Nets(np.tile(drawn.parameters, (len(y), 1)), len(x_t), hidden)

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from features.decimation import decimated_rows
-from features.design import Design
+from data.arrays import Array
+from features.design import Design, decimated_rows
 from features.selectors.base import Selector
 from features.selectors.statistics import DIGITS, check_n_tsps, chosen_of_varying, training_statistics
 
-Array = NDArray[np.float64]
 _MOST_SHARED = 1.0 - 1e-12  # squared correlation of inputs that tell the same
 
 

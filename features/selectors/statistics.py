@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
 
-Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
 DIGITS = 9  # scores equal to so many digits are a tie: summation order must not choose a sensor
 _CONSTANT = 1e-12  # variance over mean square below which an input counts as constant

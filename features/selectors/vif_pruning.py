@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.design import Design
 from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import DIGITS, Statistics, check_n_tsps, in_order, training_statistics
 
-Array = NDArray[np.float64]
 _FLOOR = 1e-10  # smallest eigenvalue that counts: a VIF ends at 1e10
 _USUAL_LIMIT = 10.0
 

@@ -10,7 +10,7 @@ import pytest
 
 from data.batch import Batch, Finding
 from data.checks import check_batch
-from data.checks.signals import rolling_median
+from data.checks.base import rolling_median
 from data.machine import parse_machine
 
 THERMAL = ("front", "rear", "head", "column", "bed")

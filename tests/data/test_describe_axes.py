@@ -12,7 +12,7 @@ from data import guess_axes
 from data.describe import draft_machine_file
 from data.machine import Machine, parse_machine
 from data.recording import read_batches
-from data.sample_axis import write_sample_axis
+from plants.sample.sample_axis import write_sample_axis
 
 AT_MM = np.linspace(0, 330, 12)
 SWEEPS_MIN = np.arange(0, 241, 30)

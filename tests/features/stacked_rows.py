@@ -1,11 +1,10 @@
 """Designs made by hand for the tests of the selectors."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from features.design import Design
 
-Array = NDArray[np.float64]
 LENGTHS = [30, 42, 25, 37, 33]
 P = 7
 

@@ -4,15 +4,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from sklearn.linear_model import lasso_path
 from stacked_rows import LENGTHS, P, orthonormal, stack, year
 
+from data.arrays import Array
 from features.design import Design
-from features.selectors.elastic_net_path import ElasticNetPath
-from features.selectors.homotopy import active_inputs
+from features.selectors.elastic_net_path import ElasticNetPath, active_inputs
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3, 4]
 LEVELS = np.geomspace(1.0, 1e-3, 25)
 

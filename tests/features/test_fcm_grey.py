@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from stacked_rows import LENGTHS, P, orthonormal, stack, year
 
-from features.grey_model import equations, least_squares
-from features.selectors.fcm_grey import FcmGrey, driving_strengths
-from features.selectors.fuzzy_c_means import fuzzy_c_means
+from data.arrays import Array
+from features.grey import equations, least_squares
+from features.selectors.fcm_grey import FcmGrey, driving_strengths, fuzzy_c_means
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3]
 
 

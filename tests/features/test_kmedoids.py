@@ -4,13 +4,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from sklearn.metrics import silhouette_samples
 from stacked_rows import LENGTHS, P, orthonormal, stack, year
 
+from data.arrays import Array
 from features.selectors.kmedoids import KMedoids, medoids_of_all, partition_around_medoids, silhouettes
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3]
 
 

@@ -12,7 +12,6 @@ from features.selectors.exhaustive import Exhaustive
 from features.selectors.left_out import LeftOut, beam, errors_of_all
 from features.selectors.sequential_forward import SequentialForward
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3, 4]
 
 

@@ -3,15 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 from stacked_rows import LENGTHS, orthonormal, stack, year
 
+from data.arrays import Array
 from data.batch import Batch, Channel
 from features.design import Design
 from features.nets import Nets
 from features.selectors.main_factor_bp import MainFactorBP, held_out, weight_products
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3, 4]
 
 

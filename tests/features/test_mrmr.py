@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import norm
 from stacked_rows import LENGTHS, P, orthonormal, stack, year
 
-from features.decimation import decimated_rows
+from features.design import decimated_rows
 from features.selectors.mrmr import MRMR, incremental_order, mutual_information
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3]
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 from stacked_rows import LENGTHS, P, stack, year
 
 from data.batch import Batch, Channel
@@ -12,7 +11,6 @@ from features.design import Design
 from features.selectors import SELECTORS
 from features.selectors.statistics import training_statistics
 
-Array = NDArray[np.float64]
 TRAIN = [0, 1, 3]
 ALL_N = list(range(1, P + 1))
 CHOOSING = [key for key in SELECTORS if SELECTORS[key].takes_n_tsp]

@@ -28,19 +28,19 @@ from data.batch import Batch
 from data.ingest import ingest
 from data.lake import Lake
 from data.machine import Machine, load_machine
-from data.sample_year import write_sample_year
+from diagnosis.diagnose import diagnose
+from diagnosis.findings.schema import as_json
+from evidence.proof.sealing.examinee import read_case
+from evidence.proof.spec import CaseSpec
+from evidence.proof.suite import build, small_suite, write_built
+from evidence.studies import STUDIES
+from evidence.studies.base import run_studies
 from models import FAMILIES
 from models.crossing import Plan
 from models.grid import run_grid
-from models.studies import STUDIES
-from models.studies.running import run_studies
+from plants.sample.sample_year import write_sample_year
 from twin.calibration import calibrate
 from twin.compile import compile_network
-from twin.diagnosis.diagnose import diagnose
-from twin.diagnosis.telling.findings import as_json
-from twin.proof.sealing.examinee import read_case
-from twin.proof.spec import CaseSpec
-from twin.proof.suite import build, small_suite, write_built
 from twin.run_plan import load_run_plan
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of_plan, start_of_plan

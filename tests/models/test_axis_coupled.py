@@ -14,9 +14,9 @@ from data.machine import parse_machine
 from features.design import Design
 from models import FAMILIES
 from models.axis_coupled import AxisCoupled
+from models.baselines import MeanCurve
 from models.crossing import Plan, prepare
 from models.grid import run_grid
-from models.mean_curve import MeanCurve
 
 INPUTS = ("room", "spindle", "nut", "bed")
 AT_MM = np.array([-500.0, -240.0, 20.0])

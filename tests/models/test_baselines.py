@@ -5,8 +5,7 @@ import pytest
 
 from data.errors import InputError
 from features.design import Design
-from models.mean_curve import MeanCurve
-from models.zero import Zero
+from models.baselines import MeanCurve, Zero
 
 
 def make_design(runs: list[list[float]], time_s: list[list[float]] | None = None) -> Design:

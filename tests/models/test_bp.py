@@ -13,8 +13,7 @@ from data.errors import InputError
 from features.design import Design
 from features.levenberg_marquardt import jacobian, outputs, train
 from features.nets import Nets
-from models.bp import BP, TRANSFERS
-from models.bp_linear import BPLinear
+from models.bp import BP, TRANSFERS, BPLinear
 from models.mlr import MLR
 
 

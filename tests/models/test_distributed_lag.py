@@ -8,8 +8,15 @@ from features.design import Design
 from features.rises import first_order_lag
 from models.distributed_lag import KOYCK_TAUS_S, DistributedLag
 from models.linear import Blocks, Task
-from models.parts.lag_responses import lag_responses
-from models.parts.lag_shapes import RIDGES, LagRegression, effective_rows, free_shapes, koyck_shapes, polynomial_shapes
+from models.solvers.lags import (
+    RIDGES,
+    LagRegression,
+    effective_rows,
+    free_shapes,
+    koyck_shapes,
+    lag_responses,
+    polynomial_shapes,
+)
 
 SIZES = (60, 45, 52, 40, 57)
 

@@ -11,7 +11,7 @@ from data.errors import InputError
 from features.design import Design
 from models.elastic_net import ElasticNet
 from models.linear import Blocks
-from models.parts.active_set import sparse_coefficients
+from models.solvers.penalised import sparse_coefficients
 
 K, N, P = 6, 40, 6
 FOLDS = [[j for j in range(K) if j != k] for k in range(K)] + [[2], [0, 3], [1, 2, 5]]

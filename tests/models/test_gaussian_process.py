@@ -11,8 +11,8 @@ from data.errors import InputError
 from features.design import Design
 from models import gaussian_process
 from models.gaussian_process import GaussianProcess, Setting
-from models.parts.kernel_expansion import products
-from models.parts.left_out_groups import LeftOut
+from models.solvers.batch_process import LeftOut
+from models.solvers.kernels import products
 
 NOISE_UM, OWN_SLOPE_UM_PER_K = 0.5, 0.25
 

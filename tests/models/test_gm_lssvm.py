@@ -9,8 +9,7 @@ from data.errors import InputError
 from features.design import Design
 from models.gm1n import GM1N, response
 from models.gm_lssvm import GMLSSVM
-from models.parts.grey_layer import grey_layers, layer_design
-from models.parts.grey_sequence import corrected, sequence_outputs
+from models.solvers.grey_models import corrected, grey_layers, layer_design, sequence_outputs
 
 SIZES = (70, 55, 62, 58, 66)
 

@@ -9,7 +9,7 @@ from data.errors import InputError
 from features.design import Design
 from models.huber import Huber
 from models.mlr import MLR
-from models.parts.reweighting import settle
+from models.solvers.penalised import settle
 
 K, N, P = 6, 50, 4
 COEF = np.array([2.0, -1.5, 0.8, 3.0])

@@ -12,9 +12,9 @@ from features.design import Design
 from features.rises import first_order_lag
 from models.lag_dictionary import LagDictionary
 from models.metrics import residual_std_um
-from models.parts.batch_process import BatchProcess, Windows
-from models.parts.lag_dictionary_columns import Columns
 from models.ridge import Ridge
+from models.solvers.batch_process import BatchProcess, Windows
+from models.solvers.lags import Columns
 
 STEP_S, N = 300.0, 72
 INPUTS = ("nose", "bed")

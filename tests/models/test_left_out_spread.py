@@ -7,8 +7,8 @@ from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
 from models.base import Family
+from models.linear import mean_square
 from models.mlr import MLR
-from models.parts.left_out_spread import mean_square
 from models.pcr import PCR
 from models.ridge import Ridge
 

@@ -330,7 +330,7 @@ def test_options_out_of_range_are_refused(make, words):
 def test_chunked_and_whole_choice_agree(monkeypatch):
     design = make_design(6)
     whole = [m.fitted for m in PLS().fit_folds(design, FOLDS)]
-    monkeypatch.setattr("models.parts.pooled_sums.AT_ONCE", 5 * P * P)
+    monkeypatch.setattr("models.solvers.pooled_sums.AT_ONCE", 5 * P * P)
     for one, other in zip(whole, [m.fitted for m in PLS().fit_folds(design, FOLDS)], strict=True):
         assert one["n_components"] == other["n_components"]
         near(one["coef_um_per_K"], other["coef_um_per_K"])

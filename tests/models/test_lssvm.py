@@ -7,9 +7,8 @@ from sklearn.kernel_ridge import KernelRidge
 from data.errors import InputError
 from features.design import Design
 from models.lssvm import LSSVM
-from models.parts import bordered
-from models.parts.bordered import Bordered, Kernel
-from models.parts.kernel_expansion import kernel
+from models.solvers import kernels as bordered
+from models.solvers.kernels import Bordered, Kernel, kernel
 
 SIZES = (14, 9, 12, 11, 13)
 SMALL = {"sigmas": (0.5, 2.0), "gammas": (1.0, 100.0)}

@@ -5,9 +5,7 @@ import pytest
 
 from features.design import Design
 from features.rises import first_order_lag
-from models.parts.linear_memory import LAG_STEPS, fit_memories, memory_columns
-from models.parts.net_stack import Stack
-from models.parts.sequences import Sequences, strides
+from models.solvers.sequences import LAG_STEPS, Sequences, Stack, fit_memories, memory_columns, strides
 
 
 def make_design(sizes=(7, 5), p=2, step_s=60.0, seed=0, **more) -> Design:

@@ -11,8 +11,8 @@ from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from models.metrics import residual_std_um
-from models.parts.pole_responses import TAUS_S, Dictionary, Source, combination, only, responses
 from models.ridge import Ridge
+from models.solvers.poles import TAUS_S, Dictionary, Source, combination, only, responses
 from models.transfer_function import TransferFunction
 
 STEP_S = 120.0

@@ -15,8 +15,7 @@ from models import FAMILIES
 from models.base import Family, family_from_plain
 from models.crossing import Plan, cross_family, prepare
 from models.grid import jobs_of
-from models.parts.twin_folds import Calibrations
-from models.parts.twin_run import TwinRun
+from models.solvers.twin_folds import Calibrations, TwinRun
 from models.twin import Twin
 from models.twin_kalman import TwinKalman
 from models.twin_residual import TwinResidual
@@ -107,7 +106,7 @@ def test_where_a_fit_begins_does_not_matter_even_where_the_beginning_saw_a_spoil
 
 
 def test_error_channels_share_one_calibration(monkeypatch):
-    import models.parts.twin_folds as folds
+    import models.solvers.twin_folds as folds
 
     calls = []
     real = folds._arrived

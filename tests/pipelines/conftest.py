@@ -14,7 +14,7 @@ from pipelines import settings as settings_module
 from twin.compile import compile_network, expanded
 from twin.network import Network
 from twin.schema import twin_part
-from twin.simulation.steady import steady_state
+from twin.simulation.start import steady_state
 from twin.views.overview import Overview, overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"

@@ -13,9 +13,9 @@ import pandas as pd
 from data.batch import Batch, Finding
 from models.crossing import Plan
 from models.grid import run_grid
-from models.result import GridResult
-from pipelines.settings import NamesPart, PromotionRule, Settings
-from pipelines.tracking import Training
+from models.protocols import PromotionRule
+from models.result import GridResult, Training
+from pipelines.settings import NamesPart, Settings
 
 Maker = Callable[..., list[Batch]]
 FAMILIES = ("zero", "mean_curve", "thermal_exponential", "mlr", "ridge")

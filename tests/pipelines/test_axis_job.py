@@ -17,20 +17,20 @@ from data.checks import check_batch, check_machine
 from data.errors import InputError
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from data.sample_axis import write_sample_axis
 from models.axis_coupled import AxisCoupled
 from models.crossing import Plan
 from models.grid import run_grid
-from models.region import Region
+from models.promotion import choose
+from models.protocols import PromotionRule
 from models.result import GridResult
+from models.trust import Region
 from pipelines import model_store
 from pipelines.predict import predict_file
-from pipelines.promotion import choose
-from pipelines.report import figure_pngs, write_report
-from pipelines.report.axis_figures import fan_panel
-from pipelines.report.extracts import left_out_batches
 from pipelines.request import TrainRequest, check_request
-from pipelines.settings import PromotionRule
+from plants.sample.sample_axis import write_sample_axis
+from reports.comparison import figure_pngs, write_report
+from reports.comparison.figures import fan_panel
+from reports.comparison.tables import left_out_batches
 
 MACHINE_FILE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
 
@@ -55,7 +55,7 @@ def result(recordings: list[Path], machine: Machine) -> GridResult:
 @pytest.fixture(scope="module")
 def page(result: GridResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
-    return write_report([training(result)], folder / "r.html", settings(folder))
+    return write_report([training(result)], folder / "r.html", settings(folder).promotion)
 
 
 def test_the_fan_shows_every_reading_and_the_lines_of_the_left_out_model(result: GridResult) -> None:
@@ -93,7 +93,7 @@ def test_the_page_and_the_small_pictures_are_made(result: GridResult, page: Path
     in_time = json.loads(specs["c1-left-out-1"])
     assert {t["mode"] for t in in_time["data"]} == {"markers"}  # a line through readings would be a zigzag
     assert figure_pngs(result)["left_out.png"].startswith(b"\x89PNG")
-    text = write_report([training(result)], tmp_path / "r.md", settings(tmp_path)).read_text(encoding="utf-8")
+    text = write_report([training(result)], tmp_path / "r.md", settings(tmp_path).promotion).read_text(encoding="utf-8")
     assert "axis coupled" in text
 
 

@@ -16,10 +16,10 @@ from toy_diagnosis import toy_diagnosis
 
 from data.errors import WorkError
 from data.machine import load_machine
+from diagnosis.findings.schema import read_findings
+from diagnosis.result import Diagnosis
 from pipelines import diagnosing
 from twin.compile import compile_network
-from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.telling.findings import read_findings
 from twin.schema import twin_part
 
 NAME = "sample-diagnosed"
@@ -216,7 +216,7 @@ def test_work_that_fails_leaves_the_folder_as_it_was(
         raise OSError(28, "No space left on device")
 
     toy.change = Toy().change
-    monkeypatch.setattr("pipelines.report.diagnosis_report.write_diagnosis_report", full)
+    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", full)
     done = diagnose("--overwrite")
     assert done.code == 1 and held(out) == before
     assert one_line(done) == (f"{out}: cannot be written ([Errno 28] No space left on device); give another --out")

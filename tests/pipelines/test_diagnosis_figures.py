@@ -13,10 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 from toy_diagnosis import BATCHES, toy_diagnosis
 
-from pipelines.report import diagnosis_evidence, diagnosis_extracts, diagnosis_figures
-from pipelines.report.diagnosis_map import Mark, mismatch_picture
-from pipelines.report.network_boxes import PITCH_IN
-from twin.diagnosis.diagnosis import COLUMNS
+from diagnosis.contracts import COLUMNS
+from reports.diagnosis import figures as diagnosis_evidence
+from reports.diagnosis import figures as diagnosis_figures
+from reports.diagnosis import tables as diagnosis_extracts
+from reports.diagnosis.map import Mark, mismatch_picture
+from reports.twin.network_picture import PITCH_IN
 from twin.views.overview import Overview
 
 

@@ -11,11 +11,11 @@ import pytest
 from toy_diagnoser import Toy, write_machine, write_recordings
 
 from data.errors import InputError, WorkError
+from diagnosis.findings.schema import read_findings
 from models.crossing import Plan
 from pipelines import diagnosing, training
 from pipelines.diagnosis_tracking import diagnoses
 from pipelines.request import TrainRequest
-from twin.diagnosis.telling.findings import read_findings
 
 SMALL = Plan(("none",), ("zero",), ("leave-batch-out",))
 
@@ -40,7 +40,7 @@ def test_a_flow_writes_and_tracks_what_the_command_does(
     assert read_findings(out / "findings.json").machine == "flow-diagnosed" and (out / "report.html").exists()
     assert diagnoses("flow-diagnosed", store)["verdict"].tolist() == ["explained"]
     assert f"flow-diagnosed: {words}" in capfd.readouterr().out
-    monkeypatch.setattr("pipelines.report.diagnosis_report.write_diagnosis_report", lambda path, d: None)
+    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d: None)
     toy.verdict = "consistent"
     assert flows.diagnose(str(machine), [], str(out)) == f"diagnosed: consistent, {out}"
     assert not (out / "machine.yml").exists()

@@ -17,11 +17,12 @@ from matplotlib.image import imread
 from toy_diagnosis import BATCHES, toy_diagnosis
 
 from data.errors import InputError
-from pipelines.report import diagnosis_tables
-from pipelines.report.diagnosis_report import diagnosis_page, write_diagnosis_report
-from pipelines.report.diagnosis_words import GLOSSARY, METHOD, headline, likelihood, probability_words
-from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
-from twin.diagnosis.telling.findings import Findings
+from diagnosis.contracts import COLUMNS
+from diagnosis.findings.schema import Findings
+from diagnosis.result import Diagnosis
+from reports.diagnosis import tables as diagnosis_tables
+from reports.diagnosis.page import diagnosis_page, write_diagnosis_report
+from reports.diagnosis.tables import GLOSSARY, METHOD, headline, likelihood, probability_words
 
 VERDICTS = {
     "consistent": ("consistent", "Consistent: nothing is missing that these runs could show."),

@@ -11,10 +11,10 @@ from mlflow.tracking import MlflowClient
 from toy_diagnosis import toy_diagnosis
 from toy_training import toy_batches
 
+from diagnosis.result import Diagnosis
 from pipelines import tracking
 from pipelines.diagnosis_tracking import diagnoses, log_diagnosis
 from pipelines.settings import Settings
-from twin.diagnosis.diagnosis import Diagnosis
 
 MACHINE = "sample_vmc"
 

@@ -17,12 +17,13 @@ from data.ingest import ingest
 from data.lake import Lake
 from data.machine import load_machine
 from models.crossing import Plan
+from models.protocols import PromotionRule
 from models.result import GridResult
 from pipelines import tracking, training
 from pipelines.caller import DirectCaller
 from pipelines.diagnosis_trigger import diagnose_if_grown, greatest_growth, growth
 from pipelines.request import TrainRequest
-from pipelines.settings import DiagnoseRule, PromotionRule, Settings
+from pipelines.settings import DiagnoseRule, Settings
 
 RULE = PromotionRule()
 
@@ -75,7 +76,7 @@ def test_the_first_training_has_nothing_to_grow_from(home: Path, store: Settings
 @pytest.fixture
 def grown(home: Path, store: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A machine whose twin's error on a new batch has grown by 40 %; its lake holds three recordings."""
-    monkeypatch.setattr("pipelines.report.diagnosis_report.write_diagnosis_report", lambda path, d: None)
+    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d: None)
     name = f"grown-{zlib.crc32(str(tmp_path).encode()):x}"
     file = write_machine(tmp_path / "m.yml", name)
     ingest([write_recordings(tmp_path / "in")], load_machine(file), Lake(home / "lake"))

@@ -13,9 +13,8 @@ import pytest
 from data.batch import Batch, Channel
 from data.errors import InputError
 from data.yaml_file import parse_yaml
-from pipelines.report.iso230_3 import FILES, TestSheet, Tilt, write_iso_report
-from pipelines.report.iso_figure import iso_figure
-from twin.iso230_3 import thermal_test
+from features.iso230_3 import thermal_test
+from reports.twin.iso230_3 import FILES, TestSheet, Tilt, iso_figure, write_iso_report
 
 CHANNELS = {
     "front": Channel("front", "temperature", "degC", 0.1),

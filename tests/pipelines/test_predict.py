@@ -16,10 +16,10 @@ from data.errors import InputError
 from data.machine import parse_machine
 from models import FAMILIES
 from models.base import Family
-from models.region import Region
+from models.promotion import choose
+from models.trust import Region
 from pipelines import model_store, registry, tracking
 from pipelines.predict import load_model, predict_file
-from pipelines.promotion import choose
 from tests.models.twin_year import recording, two_errors
 
 

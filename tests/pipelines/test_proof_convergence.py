@@ -7,9 +7,9 @@ from importlib import import_module
 import pandas as pd
 import pytest
 
-from pipelines import proof_convergence
-from pipelines.proof_convergence import STUDIES, convergence_of
-from pipelines.report.proof_run import TABLES
+from evidence.proof import tables as proof_convergence
+from evidence.proof.report.tables import TABLES
+from evidence.proof.tables import STUDIES, convergence_of
 
 
 @pytest.mark.parametrize("plant", STUDIES)

@@ -15,19 +15,16 @@ from matplotlib.image import imread
 from toy_proof import ROOT, toy_proof, without
 
 from data.errors import WorkError
-from pipelines.report import proof_extracts as extracts
-from pipelines.report import proof_shortfall as shortfall
-from pipelines.report import proof_tables as tables
-from pipelines.report.proof import headline, proof_page, write_proof_report
-from pipelines.report.proof_goals import goal_rows, shortfalls
-from pipelines.report.proof_run import TABLES, ProofRun
-from pipelines.report.proof_words import measured, origin
-from twin.proof.scoring.compared import COLUMNS as COMPARED
-from twin.proof.scoring.goal_table import GOAL_COLUMNS
-from twin.proof.scoring.outcomes import OUTCOMES, TERMS
-from twin.proof.scoring.reliability import COLUMNS
-from twin.proof.scoring.shortfall import CLAIMS, LITTLE, MISSED
-from twin.proof.sealing.leak import COLUMNS as LEAK
+from evidence.proof.report import shortfall, tables
+from evidence.proof.report import tables as extracts
+from evidence.proof.report.labels import measured, origin
+from evidence.proof.report.page import headline, proof_page, write_proof_report
+from evidence.proof.report.tables import TABLES, ProofRun, goal_rows, shortfalls
+from evidence.proof.scoring.goal_table import GOAL_COLUMNS, RELIABILITY_COLUMNS
+from evidence.proof.scoring.outcomes import OUTCOMES, TERMS
+from evidence.proof.scoring.tables import CLAIMS, LITTLE, MISSED
+from evidence.proof.scoring.tables import COMPARED_COLUMNS as COMPARED
+from evidence.proof.sealing.leak import COLUMNS as LEAK
 
 ANCHORS = (
     "goals",
@@ -160,7 +157,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 
 def test_the_scoring_gives_every_column_that_the_page_reads() -> None:
     assert set(TABLES["outcomes"]) <= set(OUTCOMES) and set(TABLES["terms"]) <= set(TERMS)
-    assert set(TABLES["goals"]) <= set(GOAL_COLUMNS) and set(TABLES["reliability"]) <= set(COLUMNS)
+    assert set(TABLES["goals"]) <= set(GOAL_COLUMNS) and set(TABLES["reliability"]) <= set(RELIABILITY_COLUMNS)
     assert (set(TABLES["missed"]), set(TABLES["claims"])) == (set(TABLES["missed"]) & set(MISSED), set(CLAIMS))
     assert set(TABLES["leak"]) <= set(LEAK) and set(TABLES["compared"]) <= set(COMPARED)
 

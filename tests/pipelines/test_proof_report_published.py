@@ -10,10 +10,10 @@ from command import in_process
 from toy_proof import ROOT, toy_proof
 
 from data.errors import InputError
-from pipelines import proving
-from pipelines.report.proof_markdown import BEGIN, END, proof_markdown, publish_proof
-from pipelines.report.proof_run import ProofRun
-from twin.proof.scoring.shortfall import SILENT
+from evidence.proof import proving
+from evidence.proof.report.markdown import BEGIN, END, proof_markdown, publish_proof
+from evidence.proof.report.tables import ProofRun
+from evidence.proof.scoring.tables import SILENT
 
 DOCS = Path(__file__).parents[2] / "docs" / "proof.md"
 

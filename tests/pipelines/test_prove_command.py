@@ -10,11 +10,11 @@ import pytest
 from command import Call, in_process
 
 from data.machine import load_machine
-from pipelines import proof_judging
-from twin.diagnosis.telling.findings import Findings, FitSummary, as_json
-from twin.proof.scoring.true_model import TrueModel
-from twin.proof.sealing import running
-from twin.proof.sealing.examining import Examinee
+from diagnosis.findings.schema import Findings, FitSummary, as_json
+from evidence.proof import judging as proof_judging
+from evidence.proof.scoring.true_model import TrueModel
+from evidence.proof.sealing import running
+from evidence.proof.sealing.running import Examinee
 
 ASKED = ("--cases", 2, "--suite", "development", "--seed", 4, "--plants", "volumes", "--workers", 1)
 

@@ -12,13 +12,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipelines.proof_suite import make_case
-from pipelines.proving import ProofOutcome, open_proof, run_proof
-from twin.proof.scoring.goals import GOALS
-from twin.proof.sealing.examining import Examinee
-from twin.proof.sealing.folder import ProofFolder
-from twin.proof.sealing.seal import Suite, seal
-from twin.proof.suite import small_suite
+from evidence.proof.proving import ProofOutcome, make_case, open_proof, run_proof
+from evidence.proof.scoring.goals import GOALS
+from evidence.proof.sealing.folder import ProofFolder
+from evidence.proof.sealing.running import Examinee
+from evidence.proof.sealing.seal import Suite, seal
+from evidence.proof.suite import small_suite
 
 WORKERS = 2
 
@@ -46,7 +45,7 @@ def test_every_case_is_answered_apart_and_counts(proof: tuple[Path, ProofOutcome
 
 def test_the_same_specs_seal_the_same_cases(proof: tuple[Path, ProofOutcome], tmp_path: Path) -> None:
     """Whoever has the key can draw any case again: here the first, its files compared by their digest."""
-    from twin.proof.sealing.digests import folder_digest, salted_digest
+    from evidence.proof.sealing.folder import folder_digest, salted_digest
 
     opened = json.loads((proof[0] / "opened.json").read_text())["cases"]["case_0001"]
     committed = json.loads((proof[0] / "commitment.json").read_text())["cases"]["case_0001"]

@@ -9,9 +9,9 @@ from mlflow.tracking import MlflowClient
 from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 from data.errors import InputError
-from models.region import Region
+from models.promotion import Choice, choose
+from models.trust import Region
 from pipelines import registry, tracking
-from pipelines.promotion import Choice, choose
 
 
 def train(store, machine: str, S_um: list[float], *, batches_given: bool = False, yaml: str = "", force: bool = False):
@@ -178,7 +178,7 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     batches = toy_batches("toy-zero", 6)
     result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})
     choice: Choice = choose(result.cells, store.promotion)
-    from models.zero import Zero
+    from models.baselines import Zero
 
     got = registry.promote(
         result, choice, Zero().fit(batches, (), "z"), machine_yaml("toy-zero"),

@@ -15,19 +15,18 @@ import pytest
 from plotly.offline import get_plotlyjs
 from report_training import HOSTILE, Maker, column, promotion, results, settings, table_after, training
 
-from data import atomic_file
+from data import files as atomic_file
 from data.errors import InputError
 from models.crossing import Plan
 from models.grid import run_grid
-from models.result import GridResult
-from pipelines.promotion import Choice, choose
-from pipelines.report import figure_pngs, write_report
-from pipelines.report.extracts import frequencies, left_out_batches, picked, scored
-from pipelines.report.layout import Scale
-from pipelines.report.records import changed_batches
-from pipelines.report.words import between, cell_label, count, decimals, listed, number
-from pipelines.settings import PromotionRule
-from pipelines.tracking import Training
+from models.promotion import Choice, choose
+from models.protocols import PromotionRule
+from models.result import GridResult, Training
+from reports.comparison import figure_pngs, write_report
+from reports.comparison.story import changed_batches
+from reports.comparison.tables import frequencies, left_out_batches, picked, scored
+from reports.labels import between, cell_label, count, decimals, listed, number
+from reports.layout import Scale
 
 RULE = PromotionRule()
 LBO = "leave-batch-out"
@@ -68,11 +67,11 @@ def cell_words(choice: Choice) -> str:
 
 
 def html_of(trainings: list[Training], folder: Path) -> str:
-    return write_report(trainings, folder / "r.html", settings(folder)).read_text(encoding="utf-8")
+    return write_report(trainings, folder / "r.html", settings(folder).promotion).read_text(encoding="utf-8")
 
 
 def markdown_of(trainings: list[Training], folder: Path) -> str:
-    return write_report(trainings, folder / "r.md", settings(folder)).read_text(encoding="utf-8")
+    return write_report(trainings, folder / "r.md", settings(folder).promotion).read_text(encoding="utf-8")
 
 
 def test_left_out_scores_are_those_of_the_predictions(toy_batches: Maker, tmp_path: Path) -> None:
@@ -274,25 +273,25 @@ def test_pictures_are_pngs_and_the_same_from_two_threads(toy_batches: Maker) -> 
 @pytest.mark.parametrize("name", ["r.pdf", "r", "r.HTM"])
 def test_another_suffix_is_refused(name: str, toy_batches: Maker, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"got suffix '.*', expected \.html or \.md"):
-        write_report([training(results(toy_batches)["z"])], tmp_path / name, settings(tmp_path))
+        write_report([training(results(toy_batches)["z"])], tmp_path / name, settings(tmp_path).promotion)
 
 
 def test_no_training_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="report: got no training; give at least one tracked training"):
-        write_report([], tmp_path / "r.md", settings(tmp_path))
+        write_report([], tmp_path / "r.md", settings(tmp_path).promotion)
 
 
 def test_a_place_that_cannot_be_written_is_told(toy_batches: Maker, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"report .*r\.md: cannot be written \(.+\); give another place"):
-        write_report([training(results(toy_batches)["z"])], tmp_path / "file" / "r.md", settings(tmp_path))
+        write_report([training(results(toy_batches)["z"])], tmp_path / "file" / "r.md", settings(tmp_path).promotion)
 
 
 def test_a_failure_leaves_the_old_report_whole(
     toy_batches: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = tmp_path / "new" / "r.md"
-    write_report([training(results(toy_batches)["z"])], target, settings(tmp_path))
+    write_report([training(results(toy_batches)["z"])], target, settings(tmp_path).promotion)
     before = target.read_text(encoding="utf-8")
 
     def broken(_: int) -> None:
@@ -300,7 +299,7 @@ def test_a_failure_leaves_the_old_report_whole(
 
     monkeypatch.setattr(atomic_file.os, "fsync", broken)
     with pytest.raises(InputError, match="No space left on device"):
-        write_report([training(results(toy_batches)["x"])], target, settings(tmp_path))
+        write_report([training(results(toy_batches)["x"])], target, settings(tmp_path).promotion)
     assert target.read_text(encoding="utf-8") == before
     assert [p.name for p in target.parent.iterdir()] == ["r.md"]
 

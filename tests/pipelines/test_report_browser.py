@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from report_training import COMPARISON, Maker, promotion, results, settings, training
 
-from pipelines.promotion import choose
-from pipelines.report import write_report
-from pipelines.settings import PromotionRule
+from models.promotion import choose
+from models.protocols import PromotionRule
+from reports.comparison import write_report
 
 CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium or google-chrome on the path to open the page in")
@@ -53,7 +53,7 @@ def test_every_figure_is_drawn_and_no_error_is_logged(toy_batches: Maker, scratc
         training(before, name="old", when="2025-06-01"),
         training(both["x"], name="x"),
     ]
-    page = write_report(trainings, scratch / "r.html", settings(scratch))
+    page = write_report(trainings, scratch / "r.html", settings(scratch).promotion)
     dom, log = open_page(page, scratch)
     assert re.search(r'<html[^>]* data-errors=""', dom), re.search(r"<html[^>]*>", dom)
     assert console(log) == []
@@ -78,7 +78,7 @@ def test_every_figure_is_drawn_and_no_error_is_logged(toy_batches: Maker, scratc
 
 
 def test_a_script_error_is_caught_by_the_page(toy_batches: Maker, scratch: Path) -> None:
-    page = write_report([training(results(toy_batches)["x"])], scratch / "broken.html", settings(scratch))
+    page = write_report([training(results(toy_batches)["x"])], scratch / "broken.html", settings(scratch).promotion)
     text = page.read_text(encoding="utf-8").replace("Plotly.newPlot(", "Plotly.noPlot(")
     page.write_text(text.replace("<footer>", '<footer><img src="https://example.org/a.png">'), encoding="utf-8")
     dom, log = open_page(page, scratch)
@@ -89,7 +89,7 @@ def test_a_script_error_is_caught_by_the_page(toy_batches: Maker, scratch: Path)
 
 
 def test_a_phone_needs_no_sideways_scrolling(toy_batches: Maker, scratch: Path) -> None:
-    write_report([training(results(toy_batches)["z"])], scratch / "phone.html", settings(scratch))
+    write_report([training(results(toy_batches)["z"])], scratch / "phone.html", settings(scratch).promotion)
     inner = (scratch / "phone.html").read_text(encoding="utf-8")
     measure = (
         "<script>addEventListener('load',function(){setTimeout(function(){parent.postMessage("

@@ -13,12 +13,12 @@ from features.design import Design
 from models.crossing import Plan
 from models.gaussian_process import GaussianProcess
 from models.grid import run_grid
+from models.promotion import choose
+from models.protocols import PromotionRule
 from models.result import GridResult
-from pipelines.promotion import choose
-from pipelines.report import write_report
-from pipelines.report.certainty import certainty_table, verdict
-from pipelines.report.extracts import scored
-from pipelines.settings import PromotionRule
+from reports.comparison import write_report
+from reports.comparison.certainty import certainty_table, verdict
+from reports.comparison.tables import scored
 
 RULE = PromotionRule()
 LBO = "leave-batch-out"
@@ -34,7 +34,7 @@ def result(toy_batches: Maker) -> GridResult:
 
 def text_of(result: GridResult, folder: Path, suffix: str = "md", cell: str = "") -> str:
     page = [training(result, promotion(cell) if cell else None)]
-    return write_report(page, folder / f"r.{suffix}", settings(folder)).read_text(encoding="utf-8")
+    return write_report(page, folder / f"r.{suffix}", settings(folder).promotion).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ import re
 import pytest
 from report_training import COMPARISON, Maker, promotion, results, training
 
-from pipelines.promotion import choose, score_of_choice
-from pipelines.report.story import promoted_cell, verdict
-from pipelines.report.words import cell_label
-from pipelines.settings import PromotionRule
+from models.promotion import choose, score_of_choice
+from models.protocols import PromotionRule
+from reports.comparison.story import promoted_cell, verdict
+from reports.labels import cell_label
 
 RULE = PromotionRule()
 SCORE = r"\d+\.\d+ ± \d+\.\d+ µm on left-out batches \(leave-batch-out, 6 batches\)"

@@ -3,7 +3,7 @@
 import pandas as pd
 
 from models.trust import COLUMNS
-from pipelines.report.trust import rise_panel, rise_table
+from reports.comparison.certainty import rise_panel, rise_table
 
 
 def distances() -> pd.DataFrame:

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from command import Call, in_process
 
-from models.studies import STUDIES
-from models.studies.base import Figure, Ordering, Study
-from pipelines.reproducing import FILES
+from evidence.studies import STUDIES
+from evidence.studies.base import Figure, Ordering, Study
+from evidence.studies.report import FILES
 
 
 class ToyStudy(Study):

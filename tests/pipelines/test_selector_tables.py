@@ -11,10 +11,10 @@ from features.design import Design
 from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
 from models.result import GridResult
-from pipelines.report import write_report
-from pipelines.report.layout import Table
-from pipelines.report.selector_tables import _WORDS, diagnostics_table
-from pipelines.report.words import selector_label
+from reports.comparison import write_report
+from reports.comparison.certainty import _WORDS, diagnostics_table
+from reports.labels import selector_label
+from reports.layout import Table
 
 CAPTION = "z: known weaknesses of the selectors"
 
@@ -24,7 +24,7 @@ def test_the_page_and_the_text_hold_every_measured_row(toy_batches: Maker, tmp_p
     measured = result.selector_diagnostics
     assert set(measured["selector"]) == {"correlation", "pca_elimination"}
     for suffix in ("md", "html"):
-        write_report([training(result)], tmp_path / f"r.{suffix}", settings(tmp_path))
+        write_report([training(result)], tmp_path / f"r.{suffix}", settings(tmp_path).promotion)
     rows = table_after((tmp_path / "r.md").read_text(), CAPTION)
     own = measured[measured["statistic"] != "stability over batches"]
     stable = measured[measured["statistic"] == "stability over batches"].set_index("selector")
@@ -70,7 +70,7 @@ def test_an_unstable_choice_is_marked_whatever_else_is_fine(toy_batches: Maker) 
 def test_a_result_of_an_older_version_has_no_such_table(toy_batches: Maker, tmp_path: Path) -> None:
     older = replace(results(toy_batches)["z"], selector_diagnostics=pd.DataFrame())
     assert diagnostics_table("z", older) is None
-    write_report([training(older)], tmp_path / "r.md", settings(tmp_path))
+    write_report([training(older)], tmp_path / "r.md", settings(tmp_path).promotion)
     assert "known weaknesses" not in (tmp_path / "r.md").read_text()
 
 

@@ -11,7 +11,6 @@ import pytest
 import yaml
 from command import Call, in_process
 
-from data import sample_machine
 from data.batch import Batch
 from data.describe import draft_machine_file
 from data.errors import InputError
@@ -21,6 +20,7 @@ from data.recording import read_batches
 from pipelines import cli
 from pipelines.simulating import Simulated, SimulationRequest, beginning, jobs_of, simulate_job, simulate_plans
 from pipelines.simulation_screen import error_table, heat_table, hottest
+from plants.sample import sample_machine
 from tests.twin.machines import TWO_BODIES
 
 ROOT = Path(cli.__file__).resolve().parents[1]
@@ -57,8 +57,8 @@ def plain_pages(monkeypatch: pytest.MonkeyPatch) -> None:
         return folder / "report.html"
 
     monkeypatch.setattr("pipelines.simulating.write_iso_report", iso)
-    monkeypatch.setattr("pipelines.report.simulation_figure.overview_png", lambda _: b"")
-    monkeypatch.setattr("pipelines.report.twin_report.write_twin_report", lambda path, *_: path.write_bytes(b""))
+    monkeypatch.setattr("reports.twin.figures.overview_png", lambda _: b"")
+    monkeypatch.setattr("reports.twin.page.write_twin_report", lambda path, *_: path.write_bytes(b""))
 
 
 def simulated(machine: Path, plan: Path, out: Path, **options: object) -> Batch:

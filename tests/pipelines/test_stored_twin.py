@@ -10,11 +10,11 @@ import yaml
 
 from data.errors import InputError
 from models import FAMILIES
-from models.region import Region
+from models.trust import Region
 from models.twin import Twin
 from models.twin_kalman import TwinKalman
 from pipelines import model_store
-from pipelines.report.words import family_label, family_style
+from reports.labels import family_label, family_style
 from tests.models.twin_year import year
 
 

@@ -10,8 +10,9 @@ from mlflow.tracking import MlflowClient
 from toy_training import toy_batches, toy_result
 
 from data.errors import InputError, WorkError
+from models.protocols import PromotionRule
 from pipelines import tracking
-from pipelines.settings import NamesPart, PromotionRule, Settings
+from pipelines.settings import NamesPart, Settings
 
 S_UM = {
     "none|zero|0": [9.0, 8.0, 10.0],

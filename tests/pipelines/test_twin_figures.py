@@ -15,17 +15,13 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from toy_twin import batch, flows
 
 from data.errors import InputError
-from pipelines.report.chain_strip import by_length
-from pipelines.report.flow_figures import heat_stack
-from pipelines.report.flow_picture import flow_picture
-from pipelines.report.network_boxes import PITCH_IN, shortened
-from pipelines.report.network_glyphs import Rect
-from pipelines.report.network_picture import network_picture, picture_bytes
-from pipelines.report.twin_figures import fit_figure, mode_shapes, residual_map, rms_map
-from pipelines.report.twin_report import write_picture
+from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
+from reports.twin.flows import flow_picture, heat_stack
+from reports.twin.glyphs import Rect
+from reports.twin.network_picture import PITCH_IN, by_length, network_picture, picture_bytes, shortened
+from reports.twin.page import write_picture
 from twin.views.compared import rms_table
-from twin.views.mode_words import ModeView
-from twin.views.overview import Overview
+from twin.views.overview import ModeView, Overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

@@ -12,15 +12,13 @@ from toy_twin import batch, flows
 
 from data.batch import Batch
 from data.errors import InputError
-from pipelines.report import twin_tables
-from pipelines.report.twin_data import twin_data
-from pipelines.report.twin_report import TwinData, twin_page, worst, write_twin_report
+from reports.twin import tables as twin_tables
+from reports.twin.page import TwinData, twin_data, twin_page, worst, write_twin_report
 from tests.twin.machines import machine as two_bodies
 from twin.calibration.identifiability import Interval
 from twin.network import Network
 from twin.quantity import Parameter
-from twin.views.mode_words import ModeView
-from twin.views.overview import Overview
+from twin.views.overview import ModeView, Overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

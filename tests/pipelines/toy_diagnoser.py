@@ -13,8 +13,8 @@ from toy_diagnosis import SAMPLE, toy_diagnosis
 
 from data.batch import Batch
 from data.machine import Machine
+from diagnosis.result import Diagnosis
 from twin.calibration.identifiability import Interval
-from twin.diagnosis.diagnosis import Diagnosis
 from twin.quantity import Value
 from twin.schema import MechanismPart
 
@@ -30,7 +30,7 @@ NOTE = "Found by a diagnosis: probability 0.97"
 
 @dataclass
 class Toy:
-    """Called as `twin.diagnosis.diagnose.diagnose` is; `calls` keeps what it was given."""
+    """Called as `diagnosis.diagnose.diagnose` is; `calls` keeps what it was given."""
 
     verdict: str = "explained"
     change: Callable[[Diagnosis], Diagnosis] = lambda d: d

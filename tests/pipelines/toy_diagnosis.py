@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from data.machine import Machine, load_machine
-from twin.diagnosis.diagnosis import COLUMNS, Diagnosis
-from twin.diagnosis.telling.findings import Findings, rms_key
+from diagnosis.contracts import COLUMNS
+from diagnosis.findings.schema import Findings, rms_key
+from diagnosis.result import Diagnosis
 from twin.schema import TwinPart, twin_part
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"

@@ -11,8 +11,8 @@ import pandas as pd
 from data.batch import Batch
 from data.machine import parse_machine
 from models.mlr import MLR
-from models.region import Region
 from models.result import SCORES, GridResult
+from models.trust import Region
 
 GAIN_UM_PER_K = (3.0, -1.5)
 

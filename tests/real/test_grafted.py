@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
+from diagnosis.candidates.library import candidates
+from evidence.proof.scoring.answer_key import AnswerKey
+from evidence.proof.spec import KINDS
+from plants.grafted import build, cases
+from plants.grafted.cases import CASES
+from plants.real import RealCase
 from tests.real.recorded import DATA
 from twin.compile import compile_network
-from twin.diagnosis.proposals.candidates import candidates
-from twin.plants.grafted import build, cases
-from twin.plants.grafted.cases import CASES
-from twin.plants.real.case import RealCase
-from twin.proof.scoring.answer_key import AnswerKey
-from twin.proof.spec import KINDS
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data")

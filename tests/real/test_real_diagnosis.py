@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from data.machine import Machine
+from diagnosis.contracts import Fitted
+from diagnosis.diagnose import diagnose
+from diagnosis.drafting.draft import drafted_part
+from diagnosis.fitting.fitted import baseline, settle
+from diagnosis.localisation.where_when import Found, Located, locate
+from diagnosis.result import Diagnosis
+from diagnosis.screening.screen import proposed, screen
+from diagnosis.search.refits import refit
 from tests.real.recorded import recorded
-from twin.diagnosis.diagnose import diagnose
-from twin.diagnosis.diagnosis import Diagnosis
-from twin.diagnosis.drafting.draft import drafted_part
-from twin.diagnosis.places.where_when import Found, Located, locate
-from twin.diagnosis.rounds.baseline import baseline
-from twin.diagnosis.rounds.fitted import Fitted, settle
-from twin.diagnosis.rounds.refits import refit
-from twin.diagnosis.scoring.screen import proposed, screen
 from twin.quantity import Value
 from twin.schema import twin_part
 

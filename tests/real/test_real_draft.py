@@ -12,11 +12,11 @@ from data.batch import Batch
 from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
-from twin.calibration.left_out import free_running_rms
+from diagnosis.drafting.draft import Drafted, drafted_part
+from diagnosis.drafting.groups import rows_of
+from twin.calibration.estimate import free_running_rms
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
-from twin.diagnosis.drafting.draft import Drafted, drafted_part
-from twin.diagnosis.drafting.rows import rows_of
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

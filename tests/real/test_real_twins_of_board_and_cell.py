@@ -14,7 +14,7 @@ from data.batch import Batch
 from data.machine import Machine, load_machine
 from tests.real.recorded import ROOT, recorded
 from twin.calibration import calibrate
-from twin.calibration.left_out import leave_batch_out
+from twin.calibration.estimate import leave_batch_out
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 

@@ -13,15 +13,15 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.recording import read_batches
+from diagnosis.candidates.library import candidates
+from evidence.proof.scoring.answer_key import AnswerKey
+from evidence.proof.spec import KINDS
+from plants.real import recorded
+from plants.withheld import board, build, cases, cell
+from plants.withheld.cases import CASES
 from tests.real.recorded import DATA
 from twin.calibration import calibrate
 from twin.compile import compile_network
-from twin.diagnosis.proposals.candidates import candidates
-from twin.plants.real.recordings import recorded
-from twin.plants.withheld import board, build, cases, cell
-from twin.plants.withheld.cases import CASES
-from twin.proof.scoring.answer_key import AnswerKey
-from twin.proof.spec import KINDS
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data")

@@ -6,14 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from tests.twin.machines import machine
 from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation.inputs import Inputs
-
-Array = NDArray[np.float64]
 
 
 def network(**changes: Any) -> Network:

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
 from twin.compile import compile_network
@@ -16,8 +16,6 @@ from twin.network import Network
 from twin.quantity import values_of
 from twin.simulation import simulate
 from twin.simulation.inputs import inputs_of
-
-Array = NDArray[np.float64]
 
 
 def drawn(network: Network, rng: np.random.Generator) -> Array:

@@ -13,9 +13,9 @@ from data.machine import Machine
 from tests.twin.machines import machine
 from tests.twin.recordings import drawn, empty_batches, recorded
 from twin.calibration import Calibration, calibrate
+from twin.calibration.estimate import leave_batch_out
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import fit
-from twin.calibration.left_out import leave_batch_out
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.simulation import simulate

@@ -11,8 +11,8 @@ from data.machine import load_machine
 from tests.twin.drives import network
 from twin.compile import compile_network
 from twin.network import Network
-from twin.simulation.steady import steady_state
-from twin.views.mode_words import ModeView, machine_modes, mode_views, time_words
+from twin.simulation.start import steady_state
+from twin.views.overview import ModeView, machine_modes, mode_views, time_words
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 

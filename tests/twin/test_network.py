@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-from data import sample_machine as truth
 from data.errors import InputError
 from data.machine import load_machine, parse_machine
-from data.thermal_machine import ROTATING_GAIN
+from plants.sample import sample_machine as truth
+from plants.sample.thermal_machine import ROTATING_GAIN
 from tests.twin.machines import TWO_BODIES, machine
 from twin.compile import compile_network
 from twin.network import Network

@@ -11,7 +11,7 @@ from data.machine import load_machine
 from tests.twin.machines import machine
 from twin.compile import compile_network, expanded
 from twin.schema import twin_part
-from twin.simulation.steady import steady_state
+from twin.simulation.start import steady_state
 from twin.views.overview import Overview, overview
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"

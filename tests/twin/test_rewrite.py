@@ -8,7 +8,7 @@ import pytest
 
 from data.errors import InputError
 from data.machine import parse_machine
-from twin.calibration.rewrite import Update, with_calibrated, with_values
+from twin.calibration.calibrated_file import Update, with_calibrated, with_values
 from twin.compile import compile_network
 
 TEXT = (Path(__file__).parents[2] / "machines" / "sample_vmc.yml").read_text()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from data import sample_machine as truth
 from data.errors import InputError
 from data.machine import load_machine
+from plants.sample import sample_machine as truth
 from tests.twin.drives import at, closed, drive, network, one_body
 from twin.compile import compile_network
 from twin.network import Network

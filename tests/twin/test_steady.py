@@ -8,7 +8,7 @@ import pytest
 from data.errors import InputError
 from tests.twin.drives import at, drive, network
 from twin.simulation import simulate
-from twin.simulation.steady import steady_state
+from twin.simulation.start import steady_state
 
 GREASE = {
     "friction": {"law": "bearing_viscous", "drivers": "rpm", "into": {"shaft": 0.7, "head": "rest"}},

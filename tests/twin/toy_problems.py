@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from twin.calibration.least_squares import Block, Unknown
 
-Array = NDArray[np.float64]
 Model = Callable[[Array, int], tuple[Array, Array]]  # (x, batch) -> modelled (n,), derivative (n, p)
 
 

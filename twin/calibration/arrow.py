@@ -13,8 +13,9 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.optimize import lsq_linear
 
+from data.arrays import Array
 from data.errors import WorkError
-from twin.calibration.fit_problem import Array, Block, Unknown
+from twin.calibration.fit_problem import Block, Unknown
 
 # Above this squared column norm the Gram matrix loses the prior's 1 to rounding: Householder QR instead.
 GRAM_LIMIT = 1e9

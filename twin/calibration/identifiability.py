@@ -13,7 +13,8 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linprog
 
-from twin.calibration.fit_problem import Array, Unknown
+from data.arrays import Array
+from twin.calibration.fit_problem import Unknown
 from twin.calibration.least_squares import Fit
 
 Z90 = 1.6448536269514722

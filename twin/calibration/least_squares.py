@@ -6,20 +6,214 @@ whose nuisances are eliminated one batch at a time (`arrow`), with the noise as 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from data.arrays import Array
 from data.errors import InputError, WorkError
-from twin.calibration.annealing import SETTLED, annealed, likelier, misfits, noise_left, with_noise
-from twin.calibration.descent import State, Step, descend, x_of, z_bounds
-from twin.calibration.fit_noise import Noise
-from twin.calibration.fit_problem import Array, Block, Problem, Scale, Unknown
+from twin.calibration.arrow import Arrow, assemble
+from twin.calibration.fit_problem import Block, Noise, Problem, Unknown, estimate
 
-__all__ = ["Block", "Fit", "Problem", "Scale", "Step", "Unknown", "fit", "result", "settled"]
+MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted step: the cost after it, the damping it took and how many tries were rejected before."""
+
+    cost: float
+    damping: float
+    rejected: int
+
+
+@dataclass(frozen=True)
+class State:
+    """A point z (p,) = (x − prior) / spread with its linearisation there; `channels` of every batch's rows."""
+
+    z: Array
+    nuisance: list[Array]
+    cost: float
+    arrow: Arrow
+    channels: list[NDArray[np.int64]]
+    noise: Noise
+    expected: float = np.inf  # by how much the linear model expects the undamped step to lower the cost
+    stuck: bool = False
+    history: list[Step] = field(default_factory=list)
+
+    @classmethod
+    def at(cls, problem: Problem, z: Array, nuisance: list[Array], noise: Noise) -> State:
+        """Linearised at z.
+
+        Raises:
+            WorkError: not finite there, or the simulation failed.
+            InputError: fewer rows than parameters.
+        """
+        channels: list[NDArray[np.int64]] = []
+        squares = [float(z @ z) + sum(float(v @ v) for v in nuisance)]
+
+        def watched(blocks: Iterable[Block]) -> Iterable[Block]:
+            for block in blocks:
+                channels.append(block.channel)
+                squares.append(float(np.sum(noise.weight[block.channel] * block.residual**2)))
+                yield block
+
+        with np.errstate(over="ignore", invalid="ignore"):
+            blocks = watched(problem.linearise(x_of(problem.unknowns, z), nuisance))
+            arrow = assemble(blocks, nuisance, z, problem.unknowns, noise.weight)
+        rows = sum(map(len, channels))
+        if rows < len(z):
+            raise InputError(
+                f"calibration: {rows} usable rows for {len(z)} free parameters; "
+                "give more batches or channels, or make parameters fixed in the machine file"
+            )
+        return cls(z, nuisance, sum(squares), arrow, channels, noise)
+
+    @property
+    def rows(self) -> int:
+        return sum(map(len, self.channels))
+
+    def small(self, tolerance: float) -> bool:
+        """Is what a further step could gain below the tolerance?"""
+        dof = max(1.0, self.rows - self.arrow.effective_parameters())
+        return self.expected <= tolerance * max(1.0, self.cost / dof)
+
+
+def x_of(unknowns: Sequence[Unknown], z: Array) -> Array:
+    """Fitting coordinates x (p,) at z (p,), never outside the bounds by rounding."""
+    prior, spread, low, high = np.array([(u.prior, u.spread, u.low, u.high) for u in unknowns]).reshape(-1, 4).T
+    return np.clip(prior + spread * z, low, high)
+
+
+def z_bounds(unknowns: Sequence[Unknown]) -> tuple[Array, Array]:
+    """Lower and upper bounds in z, (p,) each."""
+    low = np.array([(u.low - u.prior) / u.spread for u in unknowns])
+    return low, np.array([(u.high - u.prior) / u.spread for u in unknowns])
+
+
+def descend(problem: Problem, state: State, max_iterations: int, tolerance: float) -> State:
+    """From a state down to an optimum, or as far as the iterations go. Only accepted steps are linearised."""
+    low, high = z_bounds(problem.unknowns)
+    damping = 0.0
+    while True:
+        full = state.arrow.step(0.0, low - state.z, high - state.z)
+        state = replace(state, expected=state.arrow.gain(full))
+        if state.small(tolerance) or len(state.history) >= max_iterations:
+            return state
+        growth, rejected = 4.0, 0
+        while True:
+            dz = full if damping == 0 else state.arrow.step(damping, low - state.z, high - state.z)
+            # Nuisances take their whole step unless damping alone has not helped.
+            share = min(1.0, 1e4 / damping) if damping > 0 else 1.0
+            moved, ratio = _try(problem, state, dz, share)
+            if moved is not None:
+                break
+            rejected += 1
+            damping, growth = max(1.0, damping * growth), growth * 2
+            if damping > MOST_DAMPING:
+                return replace(state, stuck=True)
+        history = [*state.history, Step(moved.cost, damping, rejected)]
+        state = replace(moved, history=history)
+        damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        damping = 0.0 if damping < 1e-3 else damping
+
+
+def _try(problem: Problem, state: State, dz: Array, share: float) -> tuple[State | None, float]:
+    """The state after a step and its gain ratio (real fall over expected), or None where the step must be rejected."""
+    z = state.z + dz
+    nuisance = [v + c.step(dz, share) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
+    cost = float(z @ z) + sum(float(v @ v) for v in nuisance)
+    weight = state.noise.weight
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            for residual, channel in zip(
+                problem.residuals(x_of(problem.unknowns, z), nuisance), state.channels, strict=True
+            ):
+                cost += float(np.sum(weight[channel] * residual**2))
+        expected = state.arrow.gain(dz, share)
+        ratio = (state.cost - cost) / expected if expected > 0 else -1.0
+        if not np.isfinite(cost) or ratio < 1e-3:
+            return None, 0.0
+        return State.at(problem, z, nuisance, state.noise), ratio
+    except (WorkError, InputError):  # the simulation refuses values that no machine has: too far a step
+        return None, 0.0
+
+
+MISFIT, SMOOTH = 3.0, 5.0  # noise factor and rows that count as one: above both, a channel shows no noise but misfit
+SETTLED = 0.2  # change of a channel's weight in a round: 10 % of its sd, less than residuals of a few batches tell
+
+
+def noise_left(problem: Problem, state: State) -> Noise:
+    """The noise of each channel from what a state leaves over."""
+    residuals = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
+    return estimate(residuals, state.channels, len(problem.channels), state.arrow.effective_parameters())
+
+
+def with_noise(problem: Problem, state: State, noise: Noise) -> State:
+    """The same point under another noise, its history kept."""
+    return replace(State.at(problem, state.z, state.nuisance, noise), history=state.history)
+
+
+def annealed(
+    problem: Problem,
+    state: State,
+    max_iterations: int,
+    tolerance: float,
+    progress: Callable[[str], None] | None = None,
+    correlated: bool = True,
+) -> State:
+    """From a state down until the noise settles, one step a round under the noise that is left.
+
+    With `correlated` False every row counts in full, however smooth the residuals are.
+
+    Raises:
+        WorkError: not finite on the way.
+    """
+    still = np.zeros(len(state.z))
+    own = [v + c.step(still) for v, c in zip(state.nuisance, state.arrow.corners, strict=True)]
+    state = State.at(problem, state.z, own, state.noise)
+
+    def left() -> Noise:
+        noise = noise_left(problem, state)
+        return noise if correlated else replace(noise, inflation=np.ones_like(noise.inflation))
+
+    noise = left()
+    while True:
+        steps = len(state.history)
+        state = descend(problem, with_noise(problem, state, noise), steps + 1, tolerance)
+        noise = left()
+        change = noise.change(state.noise)
+        if progress:
+            progress(f"step {len(state.history)}: noise weights changed by up to {100 * change:.0f} %")
+        if change < SETTLED or state.stuck or not steps < len(state.history) < max_iterations:
+            return state
+
+
+def misfits(noise: Noise) -> bool:
+    """Whether what is called noise in some channel is far above the instrument's and smooth: a missed optimum?"""
+    return bool(np.any((noise.factor > MISFIT) & (noise.inflation > SMOOTH)))
+
+
+def likelier(problem: Problem, one: State, other: State) -> State:
+    """The state of the higher posterior when every channel's noise is unknown, sum n log(rms²) + priors.
+
+    Rows that count as one are those of the state whose residuals are less correlated, for both: each state's own would
+    reward the smoother misfit.
+    """
+    noises = [noise_left(problem, s) for s in (one, other)]
+    every_row = np.bincount(np.concatenate(one.channels), minlength=len(problem.channels))
+    rows = every_row / np.minimum(noises[0].inflation, noises[1].inflation)
+
+    def cost(state: State, noise: Noise) -> float:
+        priors = float(state.z @ state.z) + sum(float(v @ v) for v in state.nuisance)
+        return priors + float(np.sum(rows * np.log(noise.factor**2)))
+
+    return one if cost(one, noises[0]) <= cost(other, noises[1]) else other
+
 
 SAME_COST = 1e-3  # starts whose costs differ by less, and which lie together, have reached the same optimum
 # What a model's rounding and its derivatives may hide of the cost, where no step lowers it any more. An undamped step

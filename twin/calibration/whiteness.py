@@ -10,11 +10,10 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import chi2, combine_pvalues, norm
 
-Array = NDArray[np.float64]
+from data.arrays import Array
 
 COLUMNS = ("batch", "channel", "rows", "mean", "rms", "lag1", "lag1_band", "ljung_box_p", "runs", "runs_expected",
            "runs_p", "correlated_rows")  # fmt: skip

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import closest
-from twin.schema import Body
-
-Array = NDArray[np.float64]
+from data.machine import Machine
+from twin.compiling.parameters import AREA, COEFFICIENT, CONDUCTANCE, LENGTH, ParameterTable
+from twin.network import Edge, Law
+from twin.quantity import Monomial, Value, convert
+from twin.schema import Body, TwinPart
 
 
 class Cells:
@@ -98,3 +102,107 @@ def _between(at: float, n: int) -> Array:
     if n > 1:
         out[low + 1] = where - low
     return out
+
+
+@dataclass
+class Scope:
+    """Filled while one network is compiled."""
+
+    machine: Machine
+    part: TwinPart
+    table: ParameterTable
+    cells: Cells
+    drivers: set[str] = field(default_factory=set)  # channels that some law needs
+    laws: dict[str, Law] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, machine: Machine, part: TwinPart) -> Scope:
+        return cls(machine, part, ParameterTable(part), Cells(part.bodies))
+
+    @property
+    def surroundings(self) -> dict[str, int]:
+        """Numbers of the surroundings by name."""
+        return {name: k for k, name in enumerate(self.part.surroundings)}
+
+
+def several(on: tuple[str, ...] | str | None) -> tuple[str, ...]:
+    return (on,) if isinstance(on, str) else on or ()
+
+
+def number(key: str, given: str | float, unit: str) -> float:
+    try:
+        value = convert(given, unit)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+    if value < 0:
+        raise ValueError(f"{key}: got {given!r}, expected 0 {unit} or more")
+    return value
+
+
+def inside(scope: Scope, name: str) -> list[Edge]:
+    """Conduction between neighbouring cells of a bar or a plate."""
+    nx, ny = scope.cells.shape[name]
+    if nx * ny == 1:
+        return []
+    along, across = scope.table.inside(name, scope.part.bodies[name])
+    number = scope.cells.of[name].reshape(nx, ny)
+    edges = []
+    for a, b, g in (
+        (number[:-1], number[1:], along.times(nx / ny)),
+        (number[:, :-1], number[:, 1:], across.times(ny / nx)),
+    ):
+        edges += [
+            Edge(name, _from_to(scope, i, j), g) for i, j in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
+        ]
+    return edges
+
+
+def _from_to(scope: Scope, i: int, j: int) -> Array:
+    d = np.zeros(len(scope.cells))
+    d[i], d[j] = 1.0, -1.0
+    return d
+
+
+def link(scope: Scope, name: str) -> list[Edge]:
+    link, key = scope.part.links[name], f"links.{name}"
+    ends = [scope.cells.weights(p, f"{key}.between") for p in link.between]
+    if np.array_equal(ends[0], ends[1]):
+        raise ValueError(f"{key}.between: both ends are {link.between[0]!r}; link two different places")
+    given = {k for k in ("conductance", "coefficient", "length") if getattr(link, k) is not None}
+    if given == {"conductance"}:
+        g = scope.table.one(f"{key}.conductance", CONDUCTANCE, link.conductance)
+    elif given == {"coefficient"}:
+        g = _joint(scope, key, link.area, link.coefficient)
+    elif given == {"length"}:
+        k = scope.table.material(link.material, "conductivity", f"{key}.material")
+        area = scope.table.add(f"{key}.area", AREA, link.area)
+        g = Monomial(1.0, ((k, 1.0), (area, 1.0), (scope.table.add(f"{key}.length", LENGTH, link.length), -1.0)))
+    else:
+        raise ValueError(f"{key}: give one of conductance, area with coefficient, or length with area and material")
+    return [Edge(name, ends[0] - ends[1], g)]
+
+
+def _joint(scope: Scope, key: str, area: Value | None, coefficient: Value | None) -> Monomial:
+    return scope.table.product((f"{key}.area", AREA, area, 1.0), (f"{key}.coefficient", COEFFICIENT, coefficient, 1.0))
+
+
+def exposure(scope: Scope, name: str) -> list[Edge]:
+    given, key = scope.part.exposures[name], f"exposures.{name}"
+    if given.conductance is not None:
+        g = scope.table.one(f"{key}.conductance", CONDUCTANCE, given.conductance)
+    else:
+        g = _joint(scope, key, given.area, given.coefficient)
+    body = scope.cells.body_of(given.of, f"{key}.of")
+    if "@" in given.of:
+        places, g = [scope.cells.weights(given.of, f"{key}.of")], g
+    else:
+        places = [np.eye(len(scope.cells))[i] for i in scope.cells.of[body]]
+        g = g.times(1.0 / len(places))
+    if given.to in scope.surroundings:
+        return [Edge(name, w, g, surrounding=scope.surroundings[given.to]) for w in places]
+    if given.to not in scope.part.bodies:
+        raise ValueError(
+            f"{key}.to: no surrounding {given.to!r}; {closest(given.to, [*scope.surroundings, *scope.part.bodies])}"
+        )
+    other = scope.cells.weights(given.to, f"{key}.to")
+    return [Edge(name, w - other, g) for w in places]

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from data.errors import closest
+from twin.compiling.cells import Scope, number
 from twin.compiling.laws import acting, port_of
 from twin.compiling.parameters import LENGTH, MATERIAL, OFFSET, SHARE, TEMPERATURE
-from twin.compiling.scope import Scope, number
 from twin.mechanisms import MECHANISMS
 from twin.network import CompiledSurrounding, ErrorRow, Law, Reading
 from twin.quantity import Monomial, Spec, Value

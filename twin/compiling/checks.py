@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from data.errors import closest
+from twin.compiling.cells import several
 from twin.compiling.laws import mechanism_of
-from twin.compiling.scope import several
 from twin.network import Network
 from twin.quantity import convert
 from twin.schema import MechanismPart, TwinPart

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import closest
+from twin.compiling.cells import Scope, several
 from twin.compiling.parameters import SHARE
-from twin.compiling.scope import Scope, several
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
 from twin.network import Heat, Law, Outlet, Port
 from twin.quantity import same_dimension
 from twin.schema import MechanismPart
-
-Array = NDArray[np.float64]
 
 
 def mechanism_of(name: str, given: MechanismPart) -> Mechanism:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from data.errors import closest
-from twin.materials import MATERIALS
 from twin.quantity import Monomial, Parameter, Spec, Value, parameter
-from twin.schema import Body, TwinPart
+from twin.schema import MATERIALS, Body, TwinPart
 
 CAPACITY = Spec("capacity", "J/K", "a heat capacity")
 MASS = Spec("mass", "kg", "a mass")

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
+from data.arrays import Numeric
 from twin.quantity import Spec
 
 if TYPE_CHECKING:
     from twin.schema import MechanismPart, TwinPart
 
-Array = NDArray[Any]  # float64, or complex128 while a derivative is taken
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
 # Where a diagnosis looks for a port's temperature: at the place acted at, at each surrounding, at each body linked
@@ -41,11 +42,11 @@ class View:
     the start is not known. step_s: the spacing of the last axis where a law works along it (sensors, paths).
     """
 
-    degC: Mapping[str, Array] = field(default_factory=dict)
-    rise_K: Mapping[str, Array] = field(default_factory=dict)
-    driver: Mapping[str, Array] = field(default_factory=dict)
-    time_s: Array = field(default_factory=lambda: np.zeros(1))
-    clock_h: Array = field(default_factory=lambda: np.full(1, np.nan))
+    degC: Mapping[str, Numeric] = field(default_factory=dict)
+    rise_K: Mapping[str, Numeric] = field(default_factory=dict)
+    driver: Mapping[str, Numeric] = field(default_factory=dict)
+    time_s: Numeric = field(default_factory=lambda: np.zeros(1))
+    clock_h: Numeric = field(default_factory=lambda: np.full(1, np.nan))
     step_s: float = np.nan
 
 
@@ -98,31 +99,31 @@ class Mechanism(ABC):
         usual |= {port: "surrounding" for port in cls.ports if port in SURROUNDING_PORTS}
         cls.port_roles = {**usual, **cls.port_roles}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """Heat into the places of `into`, W. A law with ports is temperature-dependent."""
         raise NotImplementedError
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """What the conductance of a link or exposure (drivers only), or another mechanism's heat, is multiplied by."""
         raise NotImplementedError
 
-    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+    def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """Added to an error channel, in the channel's unit."""
         raise NotImplementedError
 
-    def reading(self, seen: Array, view: View, p: Mapping[str, Array]) -> Array:
+    def reading(self, seen: Numeric, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """What a sensor or a probe shows of what it sees, in the channel's unit; time along the last axis."""
         raise NotImplementedError
 
-    def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
+    def surrounding_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """Added to a surrounding's temperature."""
         raise NotImplementedError
 
-    def start_K(self, view: View, p: Mapping[str, Array]) -> Array:
+    def start_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """Added to the start temperature of every place of `into`, K."""
         raise NotImplementedError
 
-    def at_work(self, view: View, p: Mapping[str, Array]) -> Array | None:
+    def at_work(self, view: View, p: Mapping[str, Numeric]) -> Numeric | None:
         """How far it works, 0 to 1, where it states windows of its own; None: while its drivers run, or always."""
         return None
 
@@ -143,7 +144,7 @@ class Mechanism(ABC):
         return next(s for s in cls.parameters if s.name == name)
 
 
-def real(a: Array) -> NDArray[np.float64]:
+def real(a: Numeric) -> NDArray[np.float64]:
     """The real part, for comparisons in `numpy.where` that must not see a derivative's imaginary part."""
     return np.real(a)
 
@@ -152,3 +153,48 @@ def real(a: Array) -> NDArray[np.float64]:
 def _effects(mechanism: type[Mechanism]) -> tuple[str, ...]:
     every = ("heat_W", "factor", "displacement", "reading", "surrounding_K", "start_K", "expand")
     return tuple(e for e in every if getattr(mechanism, e) is not getattr(Mechanism, e))
+
+
+ZERO_DEGC_K = 273.15
+
+
+def size(x: Any) -> Numeric:
+    """|x| by the sign of the real part, any shape."""
+    return np.asarray(np.where(real(x) < 0, -x, x))
+
+
+def power(x: Any, exponent: Any) -> Numeric:
+    """|x| ** exponent for exponents above 0, exactly 0 where x is 0; the arguments broadcast."""
+    rests = real(x) == 0
+    return np.asarray(np.where(rests, 0.0, np.where(rests, 1.0, size(x)) ** exponent))
+
+
+def steps_s(view: View) -> Numeric:
+    """Length of the interval that follows each time, s, shape of `time_s`; the last is as long as the one before it."""
+    if view.time_s.shape[-1] < 2:
+        return np.full(view.time_s.shape, view.step_s)
+    steps = np.diff(view.time_s, axis=-1)
+    return np.concatenate([steps, steps[..., -1:]], axis=-1)
+
+
+def course(share: Numeric, *values: Numeric) -> Numeric:
+    """The natural cubic spline through `values` at shares 0 … 1 of the range; beyond its ends, the end's value.
+
+    All arguments broadcast. Linear in the values, so that a fit of them stays easy; equal values give exactly
+    themselves.
+    """
+    inside = np.where(real(share) < 0, 0.0, np.where(real(share) > 1, 1.0, share))
+    points = inside * (len(values) - 1)
+    piece = np.minimum(np.floor(real(points)).astype(int), len(values) - 2)
+    beyond = points - piece
+    out = values[0]
+    for value, (cubic, square, slope, constant) in zip(values[1:], _pieces(len(values))[1:, :, piece], strict=True):
+        weight = ((cubic * beyond + square) * beyond + slope) * beyond + constant
+        out = out + weight * (value - values[0])
+    return np.asarray(out)
+
+
+@cache
+def _pieces(n: int) -> NDArray[np.float64]:
+    """Coefficients (n, 4, n - 1): what each value adds, by power from the third down and by piece."""
+    return np.moveaxis(CubicSpline(np.arange(n), np.eye(n), bc_type="natural").c, -1, 0)

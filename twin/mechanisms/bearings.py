@@ -10,8 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.analytic import power, size
-from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, PortRole, View, power, real, size
 from twin.quantity import Spec
 
 W_PER_RPM_NMM = 1.047e-4
@@ -43,7 +43,7 @@ class BearingViscous(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"lubrication": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         n = size(view.driver["speed"])
         film = p["viscosity"] * n
         per_f0 = np.where(real(film) < THIN_FILM, 160e-7, 1e-7 * power(film, VISCOSITY_EXPONENT))
@@ -74,7 +74,7 @@ class BearingLoad(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"load_factor": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         stress = (p["preload"] / p["static_capacity"]) ** p["load_exponent"]
         moment_Nmm = p["load_factor"] * stress * p["preload"] * p["mean_diameter"]
         return np.asarray(p["count"] * W_PER_RPM_NMM * size(view.driver["speed"]) * moment_Nmm)
@@ -103,7 +103,7 @@ class ViscosityFeedback(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"slope": 0.0}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"oil": "outlet"}
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(np.exp(-VISCOSITY_EXPONENT * p["slope"] * (view.degC["oil"] - p["reference"])))
 
 
@@ -128,6 +128,6 @@ class PreloadFeedback(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"kappa": 0.0}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"shaft": "outlet", "housing": "outlet"}
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         preload = 1.0 + p["kappa"] * (view.degC["shaft"] - view.degC["housing"])
         return power(np.where(real(preload) > 0, preload, 0.0), 1.0 + p["load_exponent"])

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.analytic import ZERO_DEGC_K, power, steps_s
-from twin.mechanisms.base import Array, Mechanism, View, real
+from data.arrays import Numeric
+from twin.mechanisms.base import ZERO_DEGC_K, Mechanism, View, power, real, steps_s
 from twin.quantity import Spec
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/m²/K⁴, CODATA 2018
@@ -35,7 +35,7 @@ class RotatingConvection(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
     shape = ("exponent",)
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(1.0 + p["gain"] * power(view.driver["speed"] / p["rated"], p["exponent"]))
 
 
@@ -59,7 +59,7 @@ class NaturalConvection(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"area": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         lead = view.degC["air"] - view.degC["body"]
         laminar = 1.42 * power(lead / p["height"], 0.25)
         turbulent = 1.31 * power(lead, 1.0 / 3.0)
@@ -86,7 +86,7 @@ class Radiation(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"area": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         body_K, other_K = view.degC["body"] + ZERO_DEGC_K, view.degC["surrounding"] + ZERO_DEGC_K
         # (a^4 - b^4) as a product: exactly 0 at equal temperatures, no cancellation near them
         difference_K4 = (other_K - body_K) * (other_K + body_K) * (other_K**2 + body_K**2)
@@ -116,13 +116,13 @@ class Draught(Mechanism):
     shape = ("start", "duration")
     scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"start": tuple(0.5 * k for k in range(1, 13))}
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(1.0 + (p["factor"] - 1.0) * self.at_work(view, p))
 
-    def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
+    def surrounding_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(-p["drop"] * self.at_work(view, p))
 
-    def at_work(self, view: View, p: Mapping[str, Array]) -> Array:
+    def at_work(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """How far it is open, 0 to 1, at every time: the edges take one interval, or a fit could not move them."""
         edge_s = np.fmax(steps_s(view), 1.0)  # where the step is not known, all but at once
         begin_s = 3600.0 * p["start"]
@@ -131,6 +131,6 @@ class Draught(Mechanism):
         return np.asarray(begun - done)
 
 
-def _ramp(x: Array) -> Array:
+def _ramp(x: Numeric) -> Numeric:
     """x within 0 to 1."""
     return np.where(real(x) <= 0.0, 0.0, np.where(real(x) >= 1.0, 1.0, x))

@@ -12,9 +12,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from data.arrays import Numeric
 from data.errors import closest
-from twin.compiling.scope import several
-from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
+from twin.compiling.cells import several
+from twin.mechanisms.base import Mechanism, PortRole, View, real
 from twin.quantity import Spec, Value
 from twin.schema import Body, ChainLink, ErrorChain, Link, MechanismPart, Tilt, TwinPart
 
@@ -123,7 +124,7 @@ class SpeedShift(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"shift": 0.0}
 
-    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+    def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["shift"] * (view.driver["speed"] / p["rated"]) ** 2)
 
 
@@ -154,7 +155,7 @@ class ScrewElongation(Mechanism):
     shape = ("fixed_end", "pretension")
     port_roles: ClassVar[Mapping[str, PortRole]] = {"screw": "body"}
 
-    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+    def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         over_K = view.rise_K["screw"] - p["pretension"]
         grows = (real(over_K) > 0) | (real(p["pretension"]) <= 0)
         distance_m = (view.driver["position"] - p["fixed_end"]) / 1000.0
@@ -180,7 +181,7 @@ class JointSlip(Mechanism):
     shape = ("gain",)
     port_roles: ClassVar[Mapping[str, PortRole]] = {"part": "body"}
 
-    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+    def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         free, limit = np.broadcast_arrays(p["gain"] * view.rise_K["part"], p["limit"])
         out = np.empty(free.shape, np.result_type(free, limit))
         stuck = before = np.zeros(free.shape[:-1])
@@ -190,7 +191,7 @@ class JointSlip(Mechanism):
         return out
 
 
-def _within(a: Array, limit: Array) -> Array:
+def _within(a: Numeric, limit: Numeric) -> Numeric:
     """Clipped to ± limit, analytic on each branch."""
     return np.where(real(a) > real(limit), limit, np.where(real(a) < -real(limit), -limit, a))
 

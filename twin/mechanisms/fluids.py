@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.analytic import steps_s
-from twin.mechanisms.base import Array, Mechanism, PortRole, View, real
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, PortRole, View, real, steps_s
 from twin.quantity import Spec
 
 
@@ -39,7 +39,7 @@ class JacketChiller(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     shape = ("supply", "set_point")
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         names = [s.name for s in self.parameters]
         jacket, step_s, *shared = np.broadcast_arrays(view.degC["jacket"], steps_s(view), *(p[n] for n in names))
         q = dict(zip(names, shared, strict=True))
@@ -54,20 +54,20 @@ class JacketChiller(Mechanism):
         missed_W = missed_W * step_s[..., :-1] / step_s[..., 1:]
         return np.asarray(heat + np.concatenate([0.0 * heat[..., :1], missed_W], axis=-1))
 
-    def starts_on(self, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+    def starts_on(self, jacket_degC: Numeric, p: Mapping[str, Numeric]) -> Numeric:
         """Whether coolant flows at the start, bool, in the shape that the arguments broadcast to."""
         return np.asarray(real(jacket_degC) > real(p["set_point"]))
 
-    def switched(self, on: Array, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+    def switched(self, on: Numeric, jacket_degC: Numeric, p: Mapping[str, Numeric]) -> Numeric:
         """The state after a temperature is reached, bool, from the state before it."""
         beyond = real(jacket_degC - p["set_point"])
         return np.asarray((beyond >= real(p["hysteresis"])) | (on & (beyond > -real(p["hysteresis"]))))
 
-    def flow_W(self, jacket_degC: Array, p: Mapping[str, Array]) -> Array:
+    def flow_W(self, jacket_degC: Numeric, p: Mapping[str, Numeric]) -> Numeric:
         """Heat into the jacket while the coolant flows, W."""
         return np.asarray(p["conductance"] * (p["supply"] - jacket_degC))
 
-    def _states(self, jacket: Array, p: Mapping[str, Array]) -> Array:
+    def _states(self, jacket: Numeric, p: Mapping[str, Numeric]) -> Numeric:
         """On or off at every time: as the last temperature outside the band said, all times at once."""
         above, below = self.switched(np.asarray(False), jacket, p), ~self.switched(np.asarray(True), jacket, p)
         says = above | below
@@ -93,5 +93,5 @@ class CuttingFluid(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"tank": "surrounding"}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["conductance"] * view.driver["flow"] * (view.degC["tank"] - view.degC["body"]))

@@ -10,7 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.base import Array, Mechanism, PortRole, View
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, PortRole, View
 from twin.quantity import Spec
 
 REFERENCE_DEGC = 20.0  # ISO 1
@@ -46,7 +47,7 @@ class FreeFlux(Mechanism):
     off: ClassVar[Mapping[str, float]] = {s.name: 0.0 for s in parameters}
     proposable = False  # it would explain anything
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["constant"] + _second_order(view, p, view.degC["body"] - REFERENCE_DEGC))
 
 
@@ -87,11 +88,11 @@ class FreeShift(Mechanism):
     proposable = False  # it would explain anything
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "body"}
 
-    def displacement(self, view: View, p: Mapping[str, Array]) -> Array:
+    def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(_second_order(view, p, view.rise_K["body"]))
 
 
-def _second_order(view: View, p: Mapping[str, Array], over_K: Array) -> Array:
+def _second_order(view: View, p: Mapping[str, Numeric], over_K: Numeric) -> Numeric:
     u, v = view.driver.get("level", 0.0), view.driver.get("other", 0.0)
     driven = p["linear"] * u + p["square"] * u**2 + (p["cross"] * u + p["square_cross"] * u**2) * v
     return driven + (p["per_K"] + p["product"] * u) * over_K

@@ -7,8 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.base import Array, Mechanism, View
-from twin.quantity import Spec
+from data.arrays import Numeric
+from data.errors import closest
+from twin.mechanisms.base import Mechanism, PortRole, View
+from twin.quantity import Spec, Value
+from twin.schema import Link, MechanismPart, TwinPart
 
 
 class JointConductance(Mechanism):
@@ -32,5 +35,54 @@ class JointConductance(Mechanism):
     parameters = (Spec("ratio", "1", "conductance of the joint over the one assumed", 1.0, 0.7, 0.01, 100.0),)
     off: ClassVar[Mapping[str, float]] = {"ratio": 1.0}
 
-    def factor(self, view: View, p: Mapping[str, Array]) -> Array:
+    def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["ratio"] ** view.driver.get("closed", 1.0))
+
+
+class HeatBridge(Mechanism):
+    """A link under the mechanism's own name: a bracket, a hose, a circuit board, or air and radiation between two.
+
+    `at`: {body: …, other: …}. Two bodies that face each other exchange about 6 W/m²/K by radiation at room
+    temperature, which over tens of kelvins no recording tells from conduction.
+    """
+
+    key = "heat_bridge"
+    far_apart = True
+    of_network = True
+    words = "heat path between two bodies"
+    equation = "P = conductance (T_other - T_body)"
+    source = "Fourier 1822; Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, sec. 3.1, 1 to 50 W/K"
+    signature = "one body follows another that no link of the file joins it with, late and by a share"
+    acts_at = ("node",)
+    ports = ("body", "other")
+    parameters = (Spec("conductance", "W/K", "conductance between the two bodies", 5.0, 1.0, 0.0, 1e5),)
+    off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"other": "unlinked"}
+
+    def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
+        """Raises ValueError: a link of this name, not two places, unknown parameters; it starts with the key."""
+        if name in twin.links:
+            raise ValueError(f"mechanisms.{name}: a link is called {name!r} already; rename the mechanism")
+        for p in part.parameters:
+            if p != "conductance":
+                raise ValueError(
+                    f"mechanisms.{name}.parameters: {self.key} has no parameter {p!r}; {closest(p, ['conductance'])}"
+                )
+        link = Link(between=_ends(name, part), conductance=self._conductance(part), words=part.words or self.words)
+        return twin.model_copy(update={"links": {**twin.links, name: link}})
+
+    def _conductance(self, part: MechanismPart) -> Value:
+        """As the file gives it, with the Spec's value and bounds where it does not."""
+        (spec,) = self.parameters
+        value = part.parameters.get("conductance") or Value(value=f"{spec.value} {spec.unit}", source=self.source)
+        return value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
+
+
+def _ends(name: str, part: MechanismPart) -> tuple[str, str]:
+    at = part.at if isinstance(part.at, Mapping) else {}
+    body, other = at.get("body"), at.get("other")
+    if set(at) != {"body", "other"} or not isinstance(body, str) or not isinstance(other, str):
+        raise ValueError(
+            f"mechanisms.{name}.at: expected the two bodies that exchange heat, e.g. at: {{body: bed, other: column}}"
+        )
+    return body, other

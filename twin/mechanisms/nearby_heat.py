@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twin.mechanisms.analytic import steps_s
-from twin.mechanisms.base import Array, Mechanism, View, real
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, View, real, steps_s
 from twin.quantity import Spec
 
 
@@ -26,7 +26,7 @@ class CabinetHeat(Mechanism):
     parameters = (Spec("heat", "W", "heat that reaches the machine", 200.0, 0.8, 0.0, 10e3),)
     off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["heat"] * view.driver.get("running", 1.0))
 
 
@@ -54,7 +54,7 @@ class HydraulicUnit(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
     shape = ("duty", "period")
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         period_s, step_s = 60.0 * p["period"], steps_s(view)
         begun_s, done_s = (_run_s(t, p["duty"], period_s) for t in (view.time_s, view.time_s + step_s))
         return np.asarray(p["heat"] * (done_s - begun_s) / step_s * view.driver.get("running", 1.0))
@@ -80,7 +80,7 @@ class Sun(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"irradiance": 0.0}
     shape = ("rise", "set")
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         since_h, day_h = view.clock_h - p["rise"], p["set"] - p["rise"]
         shines = (real(since_h) > 0) & (real(since_h) < real(day_h))  # never where the clock is nan or the day empty
         height = np.sin(np.pi * np.where(shines, since_h, 0.0) / np.where(shines, day_h, 1.0))
@@ -100,12 +100,12 @@ class CuttingHeat(Mechanism):
     parameters = (Spec("share", "1", "share of the power that warms these places", 0.05, 0.7, 0.0, 1.0, "logit"),)
     off: ClassVar[Mapping[str, float]] = {"share": 0.0}
 
-    def heat_W(self, view: View, p: Mapping[str, Array]) -> Array:
+    def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         power_W = view.driver["power"]
         return np.asarray(p["share"] * np.where(real(power_W) > 0, power_W, 0.0))
 
 
-def _run_s(time_s: Array, duty: Array, period_s: Array) -> Array:
+def _run_s(time_s: Numeric, duty: Numeric, period_s: Numeric) -> Numeric:
     """Time run since the start, s: the integral of the on/off cycle."""
     turns = time_s / period_s
     whole = np.floor(real(turns))

@@ -10,9 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from data.arrays import Numeric
 from data.errors import closest
-from twin.compiling.scope import several
-from twin.mechanisms.base import Array, Mechanism, PortRole, View
+from twin.compiling.cells import several
+from twin.mechanisms.base import Mechanism, PortRole, View
 from twin.quantity import Spec, Value
 from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart
 
@@ -65,7 +66,7 @@ class Stratification(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"gradient": 0.0}
 
-    def surrounding_K(self, view: View, p: Mapping[str, Array]) -> Array:
+    def surrounding_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(p["gradient"] * p["height"])
 
 
@@ -174,3 +175,23 @@ def _recorded(name: str, key: str, twin: TwinPart) -> str:
         which = " and ".join(recorded) or "none"
         raise ValueError(f"mechanisms.{name}.{key}: recorded surroundings are {which}; name the one that is meant")
     return recorded[0]
+
+
+class InitialState(Mechanism):
+    """A body that is warmer or colder at the first sample than the first readings say."""
+
+    key = "initial_state"
+    words = "start away from equilibrium"
+    equation = "T(0) = first reading + excess"
+    source = "Carslaw and Jaeger (1959), Conduction of Heat in Solids: an initial state as a sum of decaying modes"
+    signature = "drift before any load that decays with the slow time constants and does not depend on the speed"
+    acts_at = ("start",)
+    parameters = (
+        Spec(
+            "excess", "K", "temperature at the start above what the first readings say", 0.0, 2.0, -50.0, 50.0, "linear"
+        ),
+    )
+    off: ClassVar[Mapping[str, float]] = {"excess": 0.0}
+
+    def start_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
+        return np.asarray(p["excess"])

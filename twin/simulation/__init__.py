@@ -1,5 +1,6 @@
 """From a network and its inputs to temperatures, readings, displacement and their derivatives."""
 
-from twin.simulation.run import TOLERANCE_K, Simulation, choose_substeps, simulate, simulation_of, start_of
+from twin.simulation.run import TOLERANCE_K, Simulation, choose_substeps, simulate, simulation_of
+from twin.simulation.start import start_of
 
 __all__ = ["TOLERANCE_K", "Simulation", "choose_substeps", "simulate", "simulation_of", "start_of"]

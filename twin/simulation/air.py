@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from twin.network import CompiledSurrounding, Law, Network
-from twin.simulation.inputs import Inputs
-from twin.simulation.law_calls import parameters_of
-
-Array = NDArray[np.float64]
+from twin.simulation.inputs import Inputs, parameters_of
 
 
 @dataclass(frozen=True)

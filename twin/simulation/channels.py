@@ -11,17 +11,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Numeric
 from twin.mechanisms.base import View
 from twin.network import Law, Network, Port
 from twin.simulation.air import Air
-from twin.simulation.inputs import Inputs, intervals_at_rows
-from twin.simulation.law_calls import STEP, parameters_of, stepped
-from twin.simulation.sources import Places
+from twin.simulation.balance import Places
+from twin.simulation.inputs import STEP, Inputs, intervals_at_rows, parameters_of, stepped
 
-Array = NDArray[Any]
-Seen = tuple[Array | None, Mapping[str, Array]]  # what a law makes something of, and its ports' temperatures
+Seen = tuple[Numeric | None, Mapping[str, Numeric]]  # what a law makes something of, and its ports' temperatures
 
 
 @dataclass(frozen=True)
@@ -32,9 +30,9 @@ class Tangents:
     surroundings; `parameters` numbers Q's unknown by the parameter's number.
     """
 
-    degC: Array
-    chain: Array
-    air_K: Array
+    degC: Numeric
+    chain: Numeric
+    air_K: Numeric
     parameters: Mapping[int, int]
 
 
@@ -47,13 +45,15 @@ class Rows:
 
     inputs: Inputs
     every: int
-    values: Array  # (P, n)
-    degC: Array
-    chain: Array
+    values: Numeric  # (P, n)
+    degC: Numeric
+    chain: Numeric
     air: Air
     places: Places
 
-    def law(self, law: Law, effect: str, seen: Array | None, tangents: Tangents | None, d_seen: Array | None) -> Any:
+    def law(
+        self, law: Law, effect: str, seen: Numeric | None, tangents: Tangents | None, d_seen: Numeric | None
+    ) -> Any:
         """A law's effect (P, B, K) on what it sees, and, with tangents, its derivative (Q, B, K), else None."""
         if law.asleep and tangents is None:
             return seen if seen is not None else np.zeros((1, 1, 1)), None
@@ -72,7 +72,7 @@ class Rows:
             d_out[tangents.parameters[j]] += np.broadcast_to(moved, shape)[0].imag / STEP
         return out, d_out
 
-    def _pass_on(self, law: Law, effect: str, at: Seen, moved: Seen, d_out: Array) -> None:
+    def _pass_on(self, law: Law, effect: str, at: Seen, moved: Seen, d_out: Numeric) -> None:
         """Write what a law makes of the derivatives of what it sees, for the unknowns that move any of it."""
         (seen, degC), (d_seen, d_degC) = at, moved
         moving = [d for d in (d_seen, *d_degC.values()) if d is not None]
@@ -90,36 +90,38 @@ class Rows:
         d_out[which] = self._call(law, effect, ahead, degC, self.values).imag / STEP
 
     @cached_property
-    def time_s(self) -> Array:
+    def time_s(self) -> Numeric:
         return self.inputs.time_s[:, :: self.every]
 
     @cached_property
-    def _clock_h(self) -> Array:
+    def _clock_h(self) -> Numeric:
         if np.isnan(self.inputs.clock_h).all():
             return np.full(self.time_s.shape, np.nan)
         return np.asarray((self.inputs.clock_h[:, None] + self.time_s / 3600.0) % 24.0)
 
     @cached_property
-    def _drivers(self) -> dict[str, Array]:
+    def _drivers(self) -> dict[str, Numeric]:
         """By channel in the interval that begins at each row (`intervals_at_rows`)."""
         at = intervals_at_rows(self.inputs.time_s.shape[1] - 1, self.every)
         return {channel: series[:, at] for channel, series in self.inputs.drivers.items()}
 
     @cached_property
-    def _air(self) -> list[Array]:
+    def _air(self) -> list[Numeric]:
         return [self.air.borders(s, self.every) for s in range(self.air.steady_degC.shape[1])]
 
-    def _call(self, law: Law, effect: str, seen: Array | None, degC: Mapping[str, Array], values: Array) -> Array:
+    def _call(
+        self, law: Law, effect: str, seen: Numeric | None, degC: Mapping[str, Numeric], values: Numeric
+    ) -> Numeric:
         driver = {role: self._drivers[c] for role, c in law.drivers.items()}
         view = View(degC, _Rises(degC), driver, self.time_s, self._clock_h, self._step_s)
         p = parameters_of(law, values, 2)
         method = getattr(law.mechanism, effect)
         return np.asarray(method(view, p) if seen is None else method(seen, view, p))
 
-    def _port(self, port: Port) -> Array:
+    def _port(self, port: Port) -> Numeric:
         return self._air[port.surrounding] if port.cells is None else self.degC[self.places.number(port.cells)]
 
-    def _tangents_of(self, law: Law, tangents: Tangents) -> dict[str, Array]:
+    def _tangents_of(self, law: Law, tangents: Tangents) -> dict[str, Numeric]:
         """Derivatives (Q, B, K) of a law's ports."""
         return {
             role: tangents.air_K[:, port.surrounding]
@@ -137,12 +139,12 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class _Rises(Mapping[str, Array]):
+class _Rises(Mapping[str, Numeric]):
     """Temperatures less their first value, worked out for laws that ask."""
 
-    degC: Mapping[str, Array]
+    degC: Mapping[str, Numeric]
 
-    def __getitem__(self, role: str) -> Array:
+    def __getitem__(self, role: str) -> Numeric:
         return np.asarray(self.degC[role] - self.degC[role][..., :1])
 
     def __iter__(self) -> Iterator[str]:
@@ -164,7 +166,7 @@ def watch(network: Network, places: Places) -> None:
                 places.number(port.cells)
 
 
-def shown(rows: Rows, network: Network, tangents: Tangents | None = None) -> tuple[Array, Array, Array, Array]:
+def shown(rows: Rows, network: Network, tangents: Tangents | None = None) -> tuple[Numeric, Numeric, Numeric, Numeric]:
     """Readings (P, B, K, n_sensors) and errors (P, B, K, n_errors), and their tangents (Q, B, K, …) or empty arrays."""
     n_unknowns = 0 if tangents is None else tangents.degC.shape[1]
     out = []
@@ -180,7 +182,7 @@ def shown(rows: Rows, network: Network, tangents: Tangents | None = None) -> tup
     return readings, errors, d_readings, d_errors
 
 
-def _reading(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Array, Array | None]:
+def _reading(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Numeric, Numeric | None]:
     given = network.readings[k]
     place = rows.places.number(given.cells)
     seen, d_seen = rows.degC[place], None if tangents is None else tangents.degC[place]
@@ -189,7 +191,7 @@ def _reading(rows: Rows, network: Network, k: int, tangents: Tangents | None) ->
     return seen, d_seen
 
 
-def _error(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Array, Array | None]:
+def _error(rows: Rows, network: Network, k: int, tangents: Tangents | None) -> tuple[Numeric, Numeric | None]:
     """Chain and tilts, then the laws that displace, then what the probe makes of the sum."""
     given = network.errors[k]
     seen, d_seen = rows.chain[k], None if tangents is None else tangents.chain[k]

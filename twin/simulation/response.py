@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from data.arrays import Array
 from data.errors import InputError
-from twin.simulation.modes import Array, Modes
-from twin.simulation.pieces import Ints, Pieces
-from twin.simulation.recursion import Weights, advance, heat, weights_of
-from twin.simulation.schedule import Drive, Schedule
+from twin.simulation.modes import Modes, Weights, advance, heat, weights_of
+from twin.simulation.schedule import Drive, Ints, Pieces, Schedule
 
 __all__ = ["Drive", "Forcing", "Response", "Schedule", "States"]
 

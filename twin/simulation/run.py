@@ -13,19 +13,108 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError
 from twin.network import Network
-from twin.simulation.balance import check_values
-from twin.simulation.channels import shown
-from twin.simulation.coupling import Coupled
+from twin.simulation.balance import Balance, HeatSource, Places, Source, balance_of, check_values, sources_of
+from twin.simulation.channels import Rows, shown, watch
+from twin.simulation.coupling import Coupled, outlets, plain_modes, solve
 from twin.simulation.inputs import Inputs
-from twin.simulation.interval_means import bulge_K
-from twin.simulation.solved import Solved, rows_of, solved_balance
-from twin.simulation.start import checked_start, start_of
+from twin.simulation.response import Response, States
+from twin.simulation.start import checked_start, excess_K
 
-__all__ = ["Simulation", "choose_substeps", "simulate", "start_of"]
 
-Array = NDArray[np.float64]
+@dataclass(frozen=True)
+class Solved:
+    """One group of parameter sets, solved: the balance, its sources and the states at every row or border."""
+
+    balance: Balance
+    sources: Sequence[Source]
+    places: Places
+    start_degC: Array
+    response: Response
+    coupled: Coupled | None
+    states: States
+    asleep: Sequence[HeatSource] = ()  # heat of candidates, which does not count
+
+
+def solved_balance(
+    network: Network,
+    values: Array,
+    inputs: Inputs,
+    start_degC: Array,
+    tolerance_K: float,
+    every: int = 1,
+    offsets_K: Array | None = None,
+) -> Solved:
+    """Solve P sets, values (P, n), from start temperatures (P or 1, B, N) to which the laws of the start are added.
+
+    The states of a linear network stand at every `every`-th border, of another at all of them.
+    """
+    balance, places = balance_of(network, values, inputs, offsets_K), Places()
+    sources, asleep = sources_of(balance, places)
+    n_places = len(places.rows)
+    watch(network, places)
+    excess = excess_K(network, values, inputs)
+    if excess is not None:
+        start_degC = start_degC + excess
+    if not sources:
+        response = Response(plain_modes(balance), balance.schedule)
+        states = response.run(balance.forcing(response), start_degC, every)
+        return Solved(balance, sources, places, start_degC, response, None, states, asleep)
+    rows = np.array(places.rows[:n_places]).reshape(n_places, network.n_cells)
+    coupled = solve(balance, sources, rows, start_degC, tolerance_K)
+    response = Response(coupled.chord.modes, balance.schedule)
+    heat = balance.forcing(response) + response.forcing(outlets(balance, sources), coupled.series_W)
+    return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), asleep)
+
+
+def rows_of(solved: Solved, every: int, states_every: int) -> Rows:
+    """What sensors and errors look at, at the rows; the states stand at every `states_every`-th border."""
+    b, n_places = solved.balance, len(solved.places.rows)
+    matrix = seen_matrix(b.network, b.values, solved.places)
+    seen = np.moveaxis(solved.states.at(matrix, every // states_every), -1, 0)
+    chain = seen[n_places:] - seen[n_places:, ..., :1]
+    return Rows(b.inputs, every, b.values, seen[:n_places], chain, b.air, solved.places)
+
+
+def seen_matrix(network: Network, values: Array, places: Places) -> Array:
+    """Rows over cells (P, n_places + n_errors, N): the places, then the errors' chains and tilts."""
+    rows = np.array(places.rows).reshape(1, len(places.rows), network.n_cells)
+    errors = [e.matrix(values)[:, None] for e in network.errors]
+    return np.concatenate([np.repeat(rows, len(values), axis=0), *errors], axis=1)
+
+
+_SLOW = 0.1  # rate * dt below which the difference of the exact mean would cancel
+
+
+def bulge_K(solved: Solved, cells_degC: Array) -> Array:
+    """Mean over each interval less the mean of its two borders, (P, B, M, N), from all borders (P, B, M + 1, N).
+
+    A mode's mean is exactly ``(mean heat - change / dt) / rate``; where it hardly decays, the trapezoid corrected by
+    the end slopes (Euler and Maclaurin) is right to ``(rate dt)^4 / 720``.
+    """
+    balance, modes = solved.balance, solved.response.modes
+    terms = list(balance.known)
+    if solved.coupled is not None:
+        terms.append((outlets(balance, solved.sources), solved.coupled.series_W))
+    out = np.zeros((*cells_degC.shape[:2], *balance.inputs.dt_s.shape[1:], balance.network.n_cells))
+    for r in range(balance.regimes.count):
+        here = (balance.regimes.of == r) & balance.inputs.valid
+        dt_s = balance.inputs.dt_s[here][:, None]
+        rate, shape = modes.rate_per_s[:, None, r], modes.shape[:, r]
+        inverse = np.swapaxes(modes.inverse[:, r], -1, -2)
+        before, after = cells_degC[:, :, :-1][:, here] @ inverse, cells_degC[:, :, 1:][:, here] @ inverse
+        heat = np.zeros((2, *before.shape))
+        for directions, series in terms:
+            heat += np.moveaxis(series[:, :, here], (1, 3), (3, 0)) @ (directions[:, r] @ shape)
+        change = (after - before) / dt_s
+        mean = (heat.mean(axis=0) - change) / np.where(rate > 0, rate, 1.0)
+        slopes = heat[0] - rate * before - (heat[1] - rate * after)
+        bulge = np.where(rate * dt_s < _SLOW, dt_s / 12.0 * slopes, mean - (before + after) / 2.0)
+        out[:, here] = bulge @ np.swapaxes(shape, -1, -2)
+    return out
+
 
 TOLERANCE_K = 1e-3
 CHUNK_BYTES = 256 << 20  # of the series that one group of parameter sets works on

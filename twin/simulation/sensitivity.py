@@ -12,22 +12,17 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError, WorkError
 from twin.network import Network
+from twin.simulation.balance import Borders, Source
 from twin.simulation.channels import Rows, Tangents, shown
-from twin.simulation.inputs import Inputs
-from twin.simulation.law_calls import STEP
+from twin.simulation.inputs import STEP, Inputs
 from twin.simulation.response import Response
-from twin.simulation.run import TOLERANCE_K, Simulation, simulation_of
-from twin.simulation.solved import Solved, rows_of, seen_matrix, solved_balance
-from twin.simulation.sources import Borders, Source
+from twin.simulation.run import TOLERANCE_K, Simulation, Solved, rows_of, seen_matrix, simulation_of, solved_balance
 from twin.simulation.start import checked_start
-from twin.simulation.tangent_answer import Answer
-from twin.simulation.tangent_forcing import Unknown, UnknownsOf, few
-
-Array = NDArray[np.float64]
+from twin.simulation.tangent import Answer, Unknown, UnknownsOf, few
 
 RELATIVE = 1e-6  # to which derivatives of heat that needs the past converge
 ROUNDS = 60

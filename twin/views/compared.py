@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
 from twin.simulation import Simulation
-
-Array = NDArray[np.float64]
 
 RMS_COLUMNS = ("batch", "channel", "unit", "rows", "rms")
 

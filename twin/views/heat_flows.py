@@ -15,16 +15,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from data.arrays import Array
 from data.errors import InputError, closest
 from twin.network import Edge, Network
 from twin.quantity import values_of
 from twin.simulation import Simulation
 from twin.simulation.air import air_of
 from twin.simulation.inputs import Inputs
-from twin.simulation.regimes import regimes_of
+from twin.simulation.schedule import regimes_of
 from twin.views.overview import body_of
-
-Array = NDArray[np.float64]
 
 KINDS = ("heat", "storage", "loss", "link")
 _BEYOND = " beyond its mean"  # what the simulation calls an edge's heat beyond its regime's constant

@@ -13,7 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from data.arrays import Array
+
 Ints = NDArray[np.int64]
 
 _CROSSING, _HIDDEN, _STEEP = 6.0, 14.0, 1.0  # what a crossing, a body on a foreign link, a steep link cost, in pitches

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from cases import CASES, ZERO, U
 
-from twin.mechanisms.base import Array, Mechanism, View
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, View
 from twin.quantity import Spec
 
 TIME_S = np.arange(13) * 600.0
@@ -26,8 +27,8 @@ class Point:
 
     mechanism: Mechanism
     view: View
-    seen: Array
-    values: Mapping[str, Array]
+    seen: Numeric
+    values: Mapping[str, Numeric]
 
     @classmethod
     def of(cls, mechanism: Mechanism) -> Point:
@@ -41,7 +42,7 @@ class Point:
         values |= {name: np.array(v) for name, v in case.values.items()}
         return cls(mechanism, view, SEEN_DEGC + SLOPE_K_PER_S * TIME_S, values)
 
-    def effect(self, name: str) -> Array:
+    def effect(self, name: str) -> Numeric:
         """An effect over time, broadcast to (13,) where the law leaves the axis out."""
         law = getattr(self.mechanism, name)
         out = law(self.seen, self.view, self.values) if name == "reading" else law(self.view, self.values)
@@ -81,7 +82,7 @@ def units_of(mechanism: Mechanism) -> dict[str, str]:
     return {**mechanism.drivers, **{s.name: s.unit for s in mechanism.parameters}}
 
 
-def _quantity(number: Array, unit: str) -> Any:
+def _quantity(number: Numeric, unit: str) -> Any:
     if unit == "degC":
         return U.Quantity(number, "K") + ZERO
     return U.Quantity(number, "dimensionless" if unit == "1" else unit)

@@ -12,7 +12,8 @@ from scipy.linalg import expm
 from signatures_heat import HEAT, usual
 from small_machine import network_with
 
-from twin.mechanisms.base import Array, Mechanism, View
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, View
 
 TIME_S = np.arange(0.0, 4 * 3600.0, 60.0)
 STOP = len(TIME_S) // 2
@@ -22,7 +23,7 @@ COURSE = np.where(SINCE_S > 0, 20.0 + (WARMING[STOP] - 20.0) * np.exp(-SINCE_S /
 RATE = np.gradient(COURSE, TIME_S)
 
 
-def residual(m: Mechanism, seen: Array = COURSE, degC: Mapping[str, Any] | None = None, **p: float) -> Array:
+def residual(m: Mechanism, seen: Numeric = COURSE, degC: Mapping[str, Any] | None = None, **p: float) -> Numeric:
     view = View(time_s=TIME_S, step_s=60.0, degC=degC or {})
     return m.reading(seen, view, usual(m, **p)) - seen
 
@@ -73,7 +74,7 @@ def free_shift(m: Mechanism) -> None:
 def charge_strain(m: Mechanism) -> None:
     shape = usual(m, **{f"f{k}": 300.0 * np.sin(0.27 * k) for k in range(1, 13)})
 
-    def strain(current_A: float, rise_K: float = 0.0) -> Array:
+    def strain(current_A: float, rise_K: float = 0.0) -> Numeric:
         time_s = np.linspace(0.0, 3600.0 * 2.9 / current_A, 200)
         rise = {"body": np.full(200, rise_K)}
         return m.displacement(View(driver={"current": np.full(200, -current_A)}, rise_K=rise, time_s=time_s), shape)

@@ -9,32 +9,33 @@ import numpy as np
 import pytest
 from small_machine import network_with
 
-from twin.mechanisms.base import Array, Mechanism, View
+from data.arrays import Numeric
+from twin.mechanisms.base import Mechanism, View
 
 USUAL_RPM = np.array([1000.0, 2000.0, 4000.0, 8000.0])
 
 
-def usual(m: Mechanism, **other: float) -> dict[str, Array]:
+def usual(m: Mechanism, **other: float) -> dict[str, Numeric]:
     return {**{s.name: np.array(s.value) for s in m.parameters}, **{k: np.array(v) for k, v in other.items()}}
 
 
 def heat(
     m: Mechanism, degC: Mapping[str, Any] | None = None, p: Mapping[str, float] | None = None, **driver: Any
-) -> Array:
+) -> Numeric:
     view = View(
         degC={k: np.asarray(v) for k, v in (degC or {}).items()}, driver={k: np.asarray(v) for k, v in driver.items()}
     )
     return m.heat_W(view, usual(m, **(p or {})))
 
 
-def factor(m: Mechanism, degC: Mapping[str, Any] | None = None, **driver: Any) -> Array:
+def factor(m: Mechanism, degC: Mapping[str, Any] | None = None, **driver: Any) -> Numeric:
     view = View(
         degC={k: np.asarray(v) for k, v in (degC or {}).items()}, driver={k: np.asarray(v) for k, v in driver.items()}
     )
     return m.factor(view, usual(m))
 
 
-def run(rate: Callable[[Array, float], Any], start: Any, hours: float, step_s: float = 2.0) -> Array:
+def run(rate: Callable[[Numeric, float], Any], start: Any, hours: float, step_s: float = 2.0) -> Numeric:
     """Temperatures (n + 1, bodies) by explicit Euler; `rate` in K/s."""
     out = [np.asarray(start, dtype=float)]
     for k in range(int(hours * 3600 / step_s)):
@@ -42,7 +43,7 @@ def run(rate: Callable[[Array, float], Any], start: Any, hours: float, step_s: f
     return np.array(out)
 
 
-def exponent(watts: Array) -> Array:
+def exponent(watts: Numeric) -> Numeric:
     return np.diff(np.log(watts)) / np.diff(np.log(USUAL_RPM))
 
 
@@ -55,7 +56,7 @@ def bearing_load(m: Mechanism) -> None:
 
 
 def viscosity_feedback(m: Mechanism) -> None:
-    def rise(room: float) -> Array:
+    def rise(room: float) -> Numeric:
         return run(lambda T, t: (120.0 * factor(m, {"oil": T}) - 6.0 * (T - room)) / 8e3, room, 3.0) - room
 
     watts = factor(m, {"oil": rise(20.0) + 20.0})
@@ -64,7 +65,7 @@ def viscosity_feedback(m: Mechanism) -> None:
 
 
 def preload_feedback(m: Mechanism) -> None:
-    def rate(T: Array, t: float) -> Array:
+    def rate(T: Numeric, t: float) -> Numeric:
         shaft, housing = T
         watts = 75.0 * factor(m, {"shaft": shaft, "housing": housing})  # to each of them
         across = 14.0 * (shaft - housing)
@@ -110,7 +111,7 @@ def radiation(m: Mechanism) -> None:
 def draught(m: Mechanism) -> None:
     p = usual(m)
 
-    def rate(T: Array, t: float) -> Array:
+    def rate(T: Numeric, t: float) -> Numeric:
         view = View(time_s=np.array([t]))
         return 5.0 * m.factor(view, p) * (20.0 + m.surrounding_K(view, p) - T) / np.array([5e3, 50e3])
 
@@ -221,7 +222,7 @@ def supply_sag(m: Mechanism) -> None:
 
 
 def voltage_loss_heat(m: Mechanism) -> None:
-    def loss_W(current_A: float) -> Array:
+    def loss_W(current_A: float) -> Numeric:
         """Over the same charge, on a cell whose voltage falls by 20 mohm."""
         time_s = np.linspace(0.0, 3600.0 * 2.9 / current_A, 200)
         drawn = current_A * time_s / 3600.0

@@ -14,8 +14,8 @@ import test_mechanisms as promises
 import test_what_a_diagnosis_needs as needs
 from small_machine import BODIES, machine_with
 
-from twin.diagnosis.proposals.candidates import candidates
-from twin.diagnosis.scoring.asleep import asleep
+from diagnosis.candidates.library import candidates
+from diagnosis.screening.linearisation import asleep
 from twin.mechanisms import MECHANISMS
 from twin.schema import twin_part
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from twin.mechanisms.base import Mechanism, View
-from twin.mechanisms.battery import ChargeStrain, VoltageLossHeat
-from twin.mechanisms.course import course
+from twin.mechanisms.base import Mechanism, View, course
+from twin.mechanisms.electrical import ChargeStrain, VoltageLossHeat
 
 HOURS_S = 3600.0 * np.arange(5)
 DRAWN = np.array([-1.0, -1.0, 0.0, 2.0, 0.0])  # A: two hours of discharge, a rest, an hour of charge

@@ -9,9 +9,9 @@ from small_machine import machine_with
 
 from data.errors import InputError
 from data.machine import Machine
+from diagnosis.candidates.library import candidates
 from twin.compile import compile_network, expanded
-from twin.diagnosis.proposals.candidates import candidates
-from twin.mechanisms.heat_bridge import HeatBridge
+from twin.mechanisms.joints import HeatBridge
 from twin.schema import twin_part
 
 ENDS = {"body": "first", "other": "third"}

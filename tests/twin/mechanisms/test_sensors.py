@@ -11,9 +11,18 @@ from small_machine import network_with, part_with
 from data.errors import InputError
 from twin.compile import expanded
 from twin.mechanisms.base import View
-from twin.mechanisms.sensor_faults import SensorQuantised, SensorStuck, SensorSwap, TimeSkew
-from twin.mechanisms.sensors import SensorBonding, SensorDrift, SensorLag, SensorOffset, SensorSelfHeat
-from twin.mechanisms.start import InitialState
+from twin.mechanisms.sensors import (
+    SensorBonding,
+    SensorDrift,
+    SensorLag,
+    SensorOffset,
+    SensorQuantised,
+    SensorSelfHeat,
+    SensorStuck,
+    SensorSwap,
+    TimeSkew,
+)
+from twin.mechanisms.surroundings import InitialState
 
 EVEN = np.arange(0.0, 601.0, 30.0)
 UNEVEN = np.array([0.0, 1.0, 5.0, 30.0, 31.0, 95.0, 300.0, 900.0])

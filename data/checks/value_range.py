@@ -1,0 +1,184 @@
+"""Samples outside the plausible range of the machine file."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data.batch import Batch, Finding
+from data.checks.base import (
+    THERMAL,
+    Array,
+    Check,
+    clock,
+    constant_runs,
+    signals,
+    smallest_step,
+    span_words,
+    step_limit,
+    stretches,
+)
+from data.machine import Machine
+
+
+class OutOfRange(Check):
+    key = "out_of_range"
+    words = "outside the plausible range of the machine file"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        found = []
+        seen = signals(batch)
+        for name, channel in batch.channels.items():
+            if channel.low is None or channel.high is None:
+                continue
+            least, most = seen.extremes(name)
+            if least >= channel.low and most <= channel.high:
+                continue
+            v = batch.masked(name)  # an infinite value is out of range as well
+            with np.errstate(invalid="ignore"):
+                out = (v < channel.low) | (v > channel.high)
+            for a, b in stretches(out):
+                worst = v[a : b + 1][np.argmax(np.abs(v[a : b + 1] - 0.5 * (channel.low + channel.high)))]
+                found.append(
+                    self.finding(
+                        name,
+                        f"{name} reads {worst:.5g} {channel.unit} {span_words(batch, a, b)}, outside "
+                        f"{channel.low:g} to {channel.high:g}",
+                        float(batch.time_s[a]),
+                        float(batch.time_s[b]),
+                    )
+                )
+        return found
+
+
+_ROWS = 5
+
+
+class Saturated(Check):
+    """Five or more equal samples at the batch's extreme, at a full-scale value, reached by a jump.
+
+    Full scale is 1, 2, 2.5 or 5 times a power of ten, or an end of the machine file's range. The jump
+    keeps a quiet channel that happens to sit at a round value out of it.
+    """
+
+    key = "saturated"
+    words = "pinned at a full-scale value"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        found = []
+        seen = signals(batch)
+        for name in batch.names("error", "temperature", "ambient"):
+            if not seen.rests(name, _ROWS):
+                continue
+            channel, v = batch.channels[name], seen.values(name)
+            ends = seen.extremes(name)
+            rails = [_rail(e, smallest_step(batch, name), channel.low, channel.high, slack=1e-5) for e in ends]
+            if all(r is None or (channel.role != "error" and abs(r) < 100.0) for r in rails):
+                continue
+            for a, b in constant_runs(v, _ROWS):
+                if min(abs(v[a] - e) for e in ends) > 1e-6:
+                    continue
+                rail = _rail(float(v[a]), smallest_step(batch, name), channel.low, channel.high)
+                if rail is None or (channel.role != "error" and abs(rail) < 100.0):
+                    continue
+                arrived = _jump(v, a)
+                if arrived <= 0.05 * abs(rail):
+                    continue
+                if arrived > step_limit(seen.excess(name), channel.resolution):
+                    found.append(
+                        self.finding(
+                            name,
+                            f"{name} jumps by {arrived:.1f} {channel.unit} at {clock(batch.time_s[a])} to its "
+                            f"full scale {rail:g} {channel.unit} and stays there {span_words(batch, a, b)}",
+                            float(batch.time_s[a]),
+                            float(batch.time_s[b]),
+                        )
+                    )
+        return found
+
+
+def _jump(v: np.ndarray, row: int) -> float:
+    """Step up to the run from the last good rows before it; a resampled row may stand half-way."""
+    before = v[max(0, row - 3) : row]
+    before = before[np.isfinite(before)]
+    return float(np.max(np.abs(v[row] - before))) if len(before) else 0.0
+
+
+def _rail(value: float, resolution: float, low: float | None, high: float | None, slack: float = 0.0) -> float | None:
+    size = abs(value)
+    if size < 5.0 - slack:
+        return None
+    near = max(resolution, 1e-4 * size) + slack
+    decade = 10.0 ** np.floor(np.log10(size * 1.0001))
+    rails = [np.sign(value) * decade * k for k in (1.0, 2.0, 2.5, 5.0, 10.0)]
+    for rail in [*rails, low, high]:
+        if rail is not None and abs(value - rail) <= near:
+            return float(rail)
+    return None
+
+
+_HOT_START_DEGC = 45.0  # no machine stands this warm when a run starts
+_NEAR_K = 5.0  # sensors of one machine agree this well at its start
+_FAR_K = 15.0
+_TINY_UM = 0.5  # a machine that warms by 3 K moves by more than this
+
+
+class WrongUnit(Check):
+    key = "wrong_unit"
+    words = "level or scale fits another unit"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        starts = {n: _start(batch.values(n)) for n in batch.names(*THERMAL) if batch.channels[n].unit == "degC"}
+        starts = {n: v for n, v in starts.items() if np.isfinite(v)}
+        kelvin = {n for n, v in starts.items() if 200.0 < v < 350.0}
+        plain = [v for n, v in starts.items() if n not in kelvin]
+        usual = float(np.median(plain)) if plain else float("nan")
+        found = []
+        for name, start in starts.items():
+            if name in kelvin:
+                found.append(self._told(batch, name, f"starts at {start:.1f}", "K", start - 273.15, "degC"))
+            elif self._fahrenheit(start, usual):
+                found.append(self._told(batch, name, f"starts at {start:.1f}", "degF", (start - 32) / 1.8, "degC"))
+        return found + self._millimetres(batch, list(starts))
+
+    def _fahrenheit(self, start: float, usual: float) -> bool:
+        as_degc = (start - 32.0) / 1.8
+        if start > _HOT_START_DEGC and usual > _HOT_START_DEGC:
+            return -5.0 < as_degc < _HOT_START_DEGC  # every channel is in °F
+        return abs(as_degc - usual) < _NEAR_K and start - usual > _FAR_K
+
+    def _millimetres(self, batch: Batch, temperatures: list[str]) -> list[Finding]:
+        seen = signals(batch)
+        ends = [seen.extremes(n) for n in temperatures]
+        warmed = max((high - low for low, high in ends), default=0.0)
+        found = []
+        for name in batch.names("error"):
+            low, high = seen.extremes(name)
+            if batch.channels[name].unit != "um" or warmed < 3.0 or not high - low < _TINY_UM:
+                continue
+            v = _finite(batch.values(name))
+            if len(v) < 10:
+                continue
+            steps = np.abs(np.diff(v))
+            fine = (batch.channels[name].resolution or np.inf) / 10.0
+            if 0 < np.ptp(v) < _TINY_UM and (steps[steps > 0].min() < fine):
+                words = f"moves by only {np.ptp(v):.3g} while the temperatures move by {warmed:.1f} K"
+                found.append(self._told(batch, name, words, "mm", float(np.ptp(v)) * 1000.0, "um in all"))
+        return found
+
+    def _told(self, batch: Batch, name: str, seen: str, unit: str, value: float, canonical: str) -> Finding:
+        expected = batch.channels[name].unit
+        return self.finding(
+            name,
+            f"{name} {seen}, which is no plausible {expected} but as {unit} gives {value:.1f} {canonical}: "
+            f"set unit_in_file: {unit} for this channel",
+        )
+
+
+def _start(values: Array) -> float:
+    if len(ok := _finite(values[:50])) < 5:
+        ok = _finite(values)
+    return float(np.median(ok[:5])) if len(ok) else float("nan")
+
+
+def _finite(values: Array) -> Array:
+    return values[np.isfinite(values)]

@@ -1,0 +1,81 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+from data.errors import InputError, WorkError
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Put the content (text as UTF-8, lines as they are) at `path` in one step; on failure what stood there stays.
+
+    The folder must exist.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    scratch = path.with_name(f".{path.name}.{uuid4().hex}.part")
+    try:
+        with scratch.open("wb") as file:
+            file.write(content.encode("utf-8") if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def check_folder(folder: Path, files: Sequence[Path], overwrite: bool) -> None:
+    """Make the folder; nothing else is written.
+
+    Raises:
+        InputError: one of the files is there and `overwrite` is not set, or the folder cannot be written.
+    """
+    if folder.is_file():
+        raise InputError(f"--out {folder}: is a file, expected a folder; give another --out")
+    for file in files:
+        if file.is_dir():
+            raise InputError(f"{file}: is a folder, and a file of that name would be written; give another --out")
+        if file.exists() and not overwrite:
+            raise InputError(f"{file} exists; give another --out, or --overwrite to replace it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable.part"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written ({error.strerror}); give another folder") from None
+
+
+@contextmanager
+def staged(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """A scratch folder inside `folder`; when the block ends well, what it holds takes the place of `names` there.
+
+    They move in the order of `names`, each in one step; what was not written is removed, so that nothing of an earlier
+    call stays. When the block fails, `folder` is as it was.
+
+    Raises:
+        WorkError: the files cannot be written.
+    """
+    scratch = folder / f".{uuid4().hex}.part"
+    try:
+        scratch.mkdir()
+        yield scratch
+        written = {p.name for p in scratch.iterdir()}
+        if written - set(names):
+            raise ValueError(f"{sorted(written - set(names))}: not among the names of this folder")
+        for name in names:
+            if name in written:
+                (scratch / name).replace(folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise WorkError(f"{folder}: cannot be written ({error}); give another --out") from None
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

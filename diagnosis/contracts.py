@@ -1,0 +1,282 @@
+"""A candidate: what may be missing and where, as a change of a machine file's twin part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel
+
+from data.arrays import Array
+from data.batch import Batch
+from data.machine import Machine
+from diagnosis.fitting.regression import Filtered, Memory, memory_left
+from twin.calibration.fit_problem import Noise
+from twin.calibration.least_squares import State, x_of
+from twin.calibration.problem import CalibrationProblem
+from twin.quantity import Parameter, Value
+from twin.schema import MechanismPart, TwinPart
+
+PLACES = ("materials", "surroundings", "bodies", "links", "exposures", "mechanisms", "sensors", "errors")  # by name
+_INDEX = re.compile(r"^(\w+)\[(\d+)\]$")
+
+
+def with_parts(part: TwinPart, parts: Mapping[str, BaseModel | None]) -> TwinPart:
+    """The part with others in it by path ("bodies.bed"), new or in place of what was there; None takes one out."""
+    update: dict[str, dict[str, Any]] = {}
+    for path, given in parts.items():
+        group, name = path.split(".", 1)
+        members = update.setdefault(group, dict(getattr(part, group)))
+        if given is None:
+            members.pop(name, None)
+        else:
+            members[name] = given
+    return part.model_copy(update=update)
+
+
+def with_value(part: TwinPart, parameter: Parameter, **changes: Any) -> TwinPart:
+    """The part in which one parameter's value is changed (`value`, `spread`, `per_batch`, …), written out if it was
+    a default.
+
+    Raises:
+        ValueError: the part does not state it and cannot (a built-in material's property).
+    """
+    group, rest = parameter.name.split(".", 1)
+    name, steps = _split(part, group, rest)
+    members = dict(getattr(part, group))
+    if name not in members:
+        raise ValueError(f"twin.{parameter.name}: is no value of the machine file; state it there first")
+    members[name] = _changed(members[name], steps, parameter, changes)
+    return part.model_copy(update={group: members})
+
+
+def _split(part: TwinPart, group: str, rest: str) -> tuple[str, list[str]]:
+    """A member's name may hold dots of its own ("column@0.8-bed"): the longest that the part knows."""
+    words = rest.split(".")
+    for n in range(len(words) - 1, 0, -1):
+        if ".".join(words[:n]) in getattr(part, group):
+            return ".".join(words[:n]), words[n:]
+    return words[0], words[1:]
+
+
+def _changed(owner: Any, steps: list[str], parameter: Parameter, changes: dict[str, Any]) -> Any:
+    if isinstance(owner, MechanismPart) and len(steps) == 1:
+        old = owner.parameters.get(steps[0])
+        return owner.model_copy(update={"parameters": {**owner.parameters, steps[0]: _new(old, parameter, changes)}})
+    if isinstance(owner, MechanismPart) and steps[0] == "into" and isinstance(owner.into, dict):
+        place = ".".join(steps[1:])
+        old = owner.into[place]
+        new = _new(old if isinstance(old, Value) else None, parameter, changes)
+        return owner.model_copy(update={"into": {**owner.into, place: new}})
+    indexed = _INDEX.match(steps[0])
+    if indexed:
+        items = list(getattr(owner, indexed[1]))
+        items[int(indexed[2])] = _changed(items[int(indexed[2])], steps[1:], parameter, changes)
+        return owner.model_copy(update={indexed[1]: tuple(items)})
+    if len(steps) != 1 or not isinstance(owner, BaseModel):
+        raise ValueError(f"twin.{parameter.name}: is no value of the machine file; state it there first")
+    return owner.model_copy(update={steps[0]: _new(getattr(owner, steps[0]), parameter, changes)})
+
+
+def _new(old: Value | None, parameter: Parameter, changes: dict[str, Any]) -> Value:
+    base = old if old is not None else Value(value=parameter.value, source=parameter.source)
+    return base.model_copy(update=changes)
+
+
+Kind = Literal["node", "link", "sensor", "error"]
+RIVALS = ("wrong_parameter", "coarse_network", "varies_between_runs")  # no mechanisms: what else explains a mismatch
+
+
+@dataclass(frozen=True)
+class Where:
+    """A place: a body or surrounding (node), a link or exposure (link), a sensor or an error channel."""
+
+    kind: Kind
+    name: str
+
+
+@dataclass(frozen=True)
+class Change:
+    """A value of the machine file that a rival doubts: freed with this spread, or different from run to run."""
+
+    parameter: Parameter
+    spread: float | None = None  # in the fitting coordinate
+    per_batch: float | None = None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mechanism at one place, or a rival that needs no new physics.
+
+    `part` is the instance as a machine file would state it, every value fixed at `Spec.value`; `amplitudes` its
+    parameters that switch it off and the values at which they do; `shape` those that are freed beside them. A rival
+    that changes a value has a `change` instead, one that cuts a body has `parts`.
+    """
+
+    mechanism: str
+    where: Where
+    name: str  # unique; the instance's name in a machine file
+    words: str
+    part: MechanismPart | None = None
+    amplitudes: Mapping[str, float] = field(default_factory=dict)
+    shape: tuple[str, ...] = ()
+    fault: bool = False
+    change: Change | None = None
+    variant_of: str = ""  # the name of what this is at another value of its shape
+    parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
+
+    @property
+    def plain(self) -> str:
+        """The name, the same at every value at which its shape is looked for."""
+        return self.variant_of or self.name
+
+    def applied(self, part: TwinPart, values: Mapping[str, Value] | None = None) -> TwinPart:
+        """The twin part with this candidate in it; `values` replace its parameters' own.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        if self.change is not None:
+            new = {"spread": self.change.spread, "per_batch": self.change.per_batch}
+            return with_value(part, self.change.parameter, **{k: v for k, v in new.items() if v is not None})
+        if self.parts:
+            return with_parts(part, self.parts)
+        assert self.part is not None
+        if self.name in part.mechanisms:
+            raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")
+        given = self.part.model_copy(update={"parameters": {**self.part.parameters, **(values or {})}})
+        return with_parts(part, {f"mechanisms.{self.name}": given})
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
+
+    `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
+    recalibration takes; `moves` (p,) is how far the fit's parameters z go beside it, where that was asked for.
+    """
+
+    candidate: Candidate
+    gain: float
+    improved: int
+    absorbed: float
+    amplitudes: dict[str, float]
+    sd: float
+    column: int
+    moves: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)  # one is the same as itself alone: what is worked out of it may be kept by it
+class Fitted:
+    """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
+
+    machine: Machine
+    part: TwinPart
+    batches: tuple[Batch, ...]
+    problem: CalibrationProblem
+    state: State
+    runs: int = 0  # that the batches come from, where they are blocks of fewer
+
+    @cached_property
+    def x(self) -> Array:
+        return x_of(self.problem.unknowns, self.state.z)
+
+    @cached_property
+    def values(self) -> Array:
+        """Parameter values (n,) of the network."""
+        return self.problem.values_at(self.x)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """What the rows of each channel remember of each other, in what this fit leaves over."""
+        return memory_left(self.problem, self._left)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """What this fit leaves over in each channel, and how many rows count as one."""
+        filtered = Filtered(self.problem, self.memory)
+        return replace(
+            filtered.noise_of(self._left, self.state.arrow.effective_parameters()), inflation=self.memory.inflation
+        )
+
+    @cached_property
+    def _left(self) -> list[Array]:
+        return self.problem.residuals(self.x, self.state.nuisance)
+
+    @property
+    def step_s(self) -> float:
+        """The longest spacing of the recordings' rows."""
+        return max(b.step_s for b in self.batches)
+
+    @cached_property
+    def rows(self) -> Array:
+        """Rows (K,) of each channel in all batches."""
+        return np.bincount(np.concatenate(self.state.channels), minlength=len(self.problem.channels)).astype(float)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
+
+    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size. `alike` is the
+    gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the threshold.
+    `barred`: structure alone may make as much of it.
+    """
+
+    scored: Scored
+    gain: float
+    improved: int
+    cluster: int
+    log_prior: float
+    fitted: Fitted | None = None
+    alike: float | None = None
+    barred: bool = False
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.scored.candidate
+
+    @property
+    def level(self) -> float:
+        """The gain that ranks it."""
+        return self.gain if self.alike is None else self.alike
+
+    def standing(self, temperature: float) -> float:
+        """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
+        return self.level / temperature + self.log_prior
+
+
+# Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
+# Errors less their first sample, sensors in degC; gain in nats of left-out log score.
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "rms": ("batch", "channel", "unit", "rows", "before", "after", "floor"),
+    "series": ("batch", "channel", "unit", "time_s", "recorded", "before", "after"),
+    "acf": ("channel", "lag_s", "before", "after"),
+    "candidates": ("rank", "mechanism", "kind", "name", "words", "cluster", "gain", "improved", "batches", "absorbed",
+                   "amplitude", "unit", "probability"),
+    "map": ("kind", "place", "by", "label", "value", "unit", "z"),  # by: batch, regime, hour or since_start
+    "steps": ("step", "words", "gain", "threshold", "improved", "accepted"),
+    "refinements": ("what", "why", "before", "after"),
+    "limits": ("mechanism", "kind", "name", "words", "limit", "unit", "absorbed", "absorbed_by"),
+    "flux": ("kind", "place", "batch", "time_s", "value", "sd", "unit"),
+    "null": ("replicate", "gain", "floor"),
+}  # fmt: skip
+
+
+NEAR, FAR = "_near", "_far"  # how they are called
+
+
+def pieces_of(part: TwinPart) -> dict[str, str]:
+    """The bodies that are pieces of others around or far from a sensor, as a finer network states them."""
+    out = {}
+    for name in part.bodies:
+        for end in (NEAR, FAR):
+            if name.endswith(end):
+                ends = next((link.between for link in part.links.values() if link.between[0] == name), None)
+                if ends is not None:
+                    out[name] = ends[1]
+    return out

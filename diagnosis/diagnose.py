@@ -1,0 +1,301 @@
+"""What physics did the simulation leave out? From a machine file and its recordings to a diagnosis."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from diagnosis.contracts import Fitted, Where
+from diagnosis.drafting.draft import drafted_part
+from diagnosis.export.machine_file import changed_parts, with_deviations
+from diagnosis.findings import report_data as made
+from diagnosis.findings.conclude import caps, found_of, left_words, remainder, rms_of, slow_remainder, verdict_of
+from diagnosis.findings.report_data import UNLISTED, Rms, place_words
+from diagnosis.findings.schema import (
+    DetectionLimit,
+    Finding,
+    Findings,
+    FitSummary,
+    LeftOutRms,
+    NextExperiment,
+    Place,
+    Refinement,
+)
+from diagnosis.findings.statement import finding_of, verdict_statement
+from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.fitted import BASELINE_TOLERANCE, LeftOutRows, baseline, check, left_out_rows, settle
+from diagnosis.localisation.where_when import Located, locate
+from diagnosis.next_experiment.proposal import Proposal, settling_run
+from diagnosis.result import Diagnosis
+from diagnosis.screening.screen import limits
+from diagnosis.search.decision import Round
+from diagnosis.search.refits import Progress, Workers
+from diagnosis.search.residual import Leftover, instead, leftover
+from diagnosis.search.search import Search, search, start_worker
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import result
+from twin.compile import compile_network
+from twin.schema import TwinPart, twin_part
+
+
+@threadpool_limits.wrap(limits=1)  # small matrices: more threads cost time, and results must not depend on them
+def diagnose(
+    machine: Machine,
+    batches: Sequence[Batch],
+    *,
+    seed: int = 0,
+    processes: int = 1,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Locate, name, model and show what recordings have and the machine file's twin lacks.
+
+    Without a twin part the simplest network that the recordings support is drafted first. `processes` side by side for
+    refits; results do not depend on it. `cache` keeps the structural null by data and machine file.
+
+    Raises:
+        InputError: batches or a machine file that cannot be used; WorkError: the model fails at the priors' means.
+    """
+    begun = time.perf_counter()
+    check(machine, batches)
+    batches = sorted(batches, key=lambda b: b.batch_id)  # what is drawn for each must not depend on their order
+    tell = progress or (lambda step, n, of: None)
+    with Workers(processes, start_worker) as workers:
+        words: list[str] = []
+        drafted = machine.twin is None
+        if drafted:
+            draft = drafted_part(machine, batches, progress=lambda what, n, of: tell("draft", n, of))
+            part = draft.part
+            words += draft.words
+        else:
+            part = twin_part(machine)
+        batches, remarks = usable_batches(compile_network(machine, part=part), batches)
+        words += remarks
+        recordings = tuple(b.batch_id for b in batches)
+        batches, remarks = enough_batches(batches)
+        words += remarks
+        done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
+        final = settle(done.final) if done.accepted else done.final
+        done = replace(done, final=final)
+        tell("left out", 0, 0)
+        beside = workers.beside(partial(_located, done.baseline, batches))
+        left = leftover(done, seed)
+        if _physics(done):
+            done, left = instead(done, left, seed) or (done, left)
+        first = beside()
+    if isinstance(first, str):
+        words.append(f"no map of where and when: {first}")
+    mapped = first.map if isinstance(first, Located) else None
+    over_time = None
+    if left is not None:
+        located = first if done.final is done.baseline else _located(done.final, batches)
+        over_time = left.flux(located) if isinstance(located, Located) else None
+    return _diagnosis(
+        machine,
+        part,
+        recordings,
+        done,
+        stages(done),
+        mapped,
+        left,
+        over_time,
+        tuple(words),
+        drafted,
+        time.perf_counter() - begun,
+    )
+
+
+def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
+    """Every fit of the search, from the baseline to the last, and what it leaves of the batches left out."""
+    fits = [r.before for r in done.accepted] + [done.final]
+    return [(f, left_out_rows(f)) for f in fits]
+
+
+def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = None) -> Located | str:
+    """The map of what a fit cannot explain, or why there is none."""
+    try:
+        return locate(fitted.problem, fitted.x, fitted.state.nuisance, batches, progress=tell)
+    except (InputError, WorkError) as error:
+        return str(error)
+
+
+def _physics(done: Search) -> list[Round]:
+    """The rounds that found an effect, and not merely a network too coarse."""
+    return [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
+
+
+def _diagnosis(
+    machine: Machine,
+    part: TwinPart,
+    batches: tuple[str, ...],
+    done: Search,
+    steps: Sequence[tuple[Fitted, LeftOutRows]],
+    mapped: pd.DataFrame | None,
+    left: Leftover | None,
+    over_time: pd.DataFrame | None,
+    words: tuple[str, ...],
+    drafted: bool,
+    seconds: float,
+) -> Diagnosis:
+    final = left.fitted if left is not None else done.final
+    before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
+    named = _physics(done)
+    fit = result(final.problem, replace(final.state, noise=final.noise), BASELINE_TOLERANCE, "")
+    intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
+    rms_table = made.rms_table(before, after, final)
+    rms = rms_of(rms_table, final)
+    part_after = with_deviations(final)
+    run = settling_run(done, named)
+    separates = run.words if run is not None else ""
+    found = [
+        found_of(
+            done, r, part_after, intervals, rms_of(made.rms_table(*_around(done, r, steps), final), final), separates
+        )
+        for r in named
+    ]
+    if left is not None:
+        found.append(left.found(part_after, intervals, rms, caps(final.runs)))
+    found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
+    rest, slow = remainder(done), slow_remainder(rms, final)
+    listed = [f for f in found if f.mechanism not in UNLISTED]
+    verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
+    words += left_words(rest, slow, final.runs)
+    last = done.rounds[-1]
+    table = limits(last.before, last.screen, last.threshold)
+    told = _limits_told(table)
+    findings = tuple(finding_of(f) for f in found)
+    better = int((_per_batch(rms_table, "after") < _per_batch(rms_table, "before")).sum()) if found else 0
+    statement = verdict_statement(
+        verdict, found, rms, told, separates, [place_words(_where(n), part_after) for n in told]
+    )
+    everything = made.empty_tables() | {
+        "rms": rms_table,
+        "series": made.series_table(before, after, final),
+        "acf": made.acf_table(before, after, final),
+        "candidates": made.candidates_table(done.rounds),
+        "steps": made.steps_table(done.rounds),
+        "refinements": refinements(done),
+        "limits": table,
+        "null": made.null_table(last.null),
+    }
+    if mapped is not None:
+        everything["map"] = mapped
+    if over_time is not None:
+        everything["flux"] = over_time
+    return Diagnosis(
+        machine=machine,
+        findings=Findings(
+            machine=machine.machine,
+            batches=batches,
+            verdict=verdict,
+            findings=findings,
+            fit=_summary(rms, better, len(final.batches)),
+            detection_limits=told,
+            next_experiment=_next(run),
+            seconds=round(seconds, 1),
+            statement=statement,
+            simulated=any(b.simulated for b in final.batches),
+            drafted=drafted,
+            remarks=words,
+            refinements=tuple(
+                Refinement(what=what, why=why, before=b, after=a)
+                for what, why, b, a in rows_of(everything["refinements"])
+            ),
+        ),
+        part_before=done.baseline.part,
+        part_after=part_after,
+        simulated=any(b.simulated for b in final.batches),
+        drafted=drafted,
+        words=words,
+        tables=everything,
+        network=final.problem.network,
+        values={i.name: i.value for i in intervals.values()},
+        intervals=tuple(intervals.values()),
+        added=changed_parts(part, part_after),
+        notes=_notes(findings, len(batches)),
+        plan_text=run.plan_text if run is not None else None,
+        search=done,
+    )
+
+
+def _around(done: Search, r: Round, steps: Sequence[tuple[Fitted, LeftOutRows]]) -> tuple[LeftOutRows, LeftOutRows]:
+    """What is left of the batches left out before and after one accepted round."""
+    k = next(k for k, other in enumerate(done.accepted) if other is r)
+    return steps[k][1], steps[k + 1][1]
+
+
+def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
+    """By batch the mean over channels of log rms, noise taken in."""
+    level = pd.Series(np.log(np.hypot(table[column].to_numpy(float), table["floor"].to_numpy(float))))
+    return level.groupby(table["batch"].to_numpy()).mean()
+
+
+def refinements(done: Search) -> pd.DataFrame:
+    """What was cut finer before and between findings, with the left-out log score before and after, in nats."""
+    rows = [
+        (r.best.candidate.words, "the left-out error of its sensor was far above the noise", 0.0, r.best.gain)
+        for r in done.accepted
+        if r.best is not None and r.best.candidate.mechanism == "coarse_network"
+    ]
+    return pd.DataFrame(rows, columns=["what", "why", "before", "after"])
+
+
+def _limits_told(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
+    """Every candidate's limit; nan where no amplitude within bounds would have been seen."""
+    return tuple(
+        DetectionLimit(
+            mechanism=mechanism, where=Place(kind=kind, name=name), words=words,
+            limit=float(limit) if np.isfinite(limit) else None, unit=unit, absorbed=float(absorbed), absorbed_by=by,
+        )
+        for mechanism, kind, name, words, limit, unit, absorbed, by in rows_of(table)
+    )  # fmt: skip
+
+
+def rows_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """The table's rows as plain tuples."""
+    return list(table.itertuples(index=False, name=None))
+
+
+def _where(limit: DetectionLimit) -> Where:
+    return Where(limit.where.kind, limit.where.name)
+
+
+def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
+    return FitSummary(
+        left_out_rms=LeftOutRms(
+            before={r.key: r.before for r in rms},
+            after={r.key: r.after for r in rms},
+            noise_floor={r.key: r.noise for r in rms},
+        ),
+        batches_improved=better,
+        batches=n,
+    )
+
+
+def _next(run: Proposal | None) -> NextExperiment | None:
+    if run is None or not run.words:
+        return None
+    return NextExperiment(
+        separates=tuple(run.separates), run=run.words, hours=run.hours, file="next_run.yml" if run.plan_text else None
+    )
+
+
+def _notes(findings: Sequence[Finding], runs: int) -> dict[str, str]:
+    """Comments of a machine file on what was found."""
+    return {
+        f.name: f"found by a diagnosis of {runs} runs, probability {f.probability:.2f}; "
+        f"{f.evidence.get('gain_nats', 0.0):.0f} nats of left-out score"
+        for f in findings
+        if f.name
+    }

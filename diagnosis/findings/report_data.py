@@ -1,0 +1,338 @@
+"""What a diagnosis hands to those who word it: one effect, where, how large, how sure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from data.arrays import Array
+from diagnosis.contracts import COLUMNS, Fitted, Where
+from diagnosis.findings.schema import rms_key
+from diagnosis.fitting.fitted import LeftOutRows
+from diagnosis.search.decision import Round
+from diagnosis.search.null import Null
+from diagnosis.search.probability import explanations
+from twin.calibration.whiteness import lagged_sums
+from twin.compiling.cells import several
+from twin.mechanisms import MECHANISMS
+from twin.schema import MechanismPart, TwinPart
+
+_SPELT = {"um": "µm", "degC": "°C", "ohm": "Ω", "**2": "²", "**3": "³", "*": "·"}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its 90 % interval, in `unit`; nan where there is none."""
+
+    value: float
+    unit: str
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+def spelt(unit: str) -> str:
+    """``µm/K`` for um/K, ``N·m`` for N*m, nothing for 1."""
+    if unit == "1":
+        return ""
+    for written, read in _SPELT.items():
+        unit = unit.replace(written, read)
+    return unit
+
+
+def with_unit(number: str, unit: str) -> str:
+    """``10 W/K``, ``0.035/K`` for 1/K, ``0.4`` for a share."""
+    said = spelt(unit)
+    return f"{number}{said[1:]}" if said.startswith("1/") else f"{number} {said}".strip()
+
+
+def few(value: float, digits: int = 2) -> str:
+    """``0.12``, ``10``, ``1300``: so many significant digits, never an exponent."""
+    return "0" if value == 0 else _fixed(value, _decimals(value, digits))
+
+
+def as_given(value: float) -> str:
+    """``1``, ``0.95``, ``26000``: up to four digits, none of them an idle zero."""
+    text = few(value, 4)
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def amount(e: Estimate) -> str:
+    """``10 W/K (90 %: 9–12)``; the ends of the interval have the value's decimals."""
+    if not e.known:
+        return with_unit(few(e.value), e.unit)
+    half = abs(e.high - e.low) / 2
+    decimals = _decimals(max(abs(e.value), half), 2)
+    if half > 0:  # a narrow interval shows itself, but no value has more than four digits
+        decimals = max(decimals, min(_decimals(half, 1), _decimals(e.value, 4)))
+    low, high = _fixed(e.low, decimals), _fixed(e.high, decimals)
+    between = " to " if min(e.low, e.high) < 0 else "–"
+    return f"{with_unit(_fixed(e.value, decimals), e.unit)} (90 %: {low}{between}{high})"
+
+
+def percent(share: float) -> str:
+    """``8 %``, never 0 or 100."""
+    if share > 0.99:
+        return "over 99 %"
+    return "under 1 %" if share < 0.01 else f"{100 * share:.0f} %"
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """``a, b and c``."""
+    return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
+
+
+def _decimals(value: float, digits: int) -> int:
+    """Decimals that show a value with so many significant digits; below 0 before the point."""
+    if value == 0 or not math.isfinite(value):
+        return digits - 1
+    return digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+
+
+def _fixed(value: float, decimals: int) -> str:
+    if not math.isfinite(value):
+        return "?"
+    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
+
+
+UNLISTED = ("free_flux", "free_shift", "unlisted")  # what stands in for physics that no listed mechanism describes
+
+
+@dataclass(frozen=True)
+class Rms:
+    """Left-out errors of one channel without and with what was found, in `unit`; `noise` is what noise alone leaves."""
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    noise: float = math.nan
+    sensor: bool = False  # False: an error channel
+
+    @property
+    def key(self) -> str:
+        return rms_key(self.channel, self.unit)
+
+    @property
+    def times_noise(self) -> float:
+        """What is left after all that was found over the given noise; 0 where none is given."""
+        return self.after / self.noise if self.noise > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Other:
+    """Another explanation; `alike`: these runs cannot tell it from the one found."""
+
+    mechanism: str
+    where: Where
+    place: str
+    probability: float
+    beside: str = ""
+    alike: bool = True
+
+
+@dataclass(frozen=True)
+class Found:
+    """One effect that a diagnosis found.
+
+    `mechanism` is a registry key or a rival's, `place` and `beside` come from `place_words` and `beside_words`. For a
+    wrong parameter `parameters` are by path ("exposures.front-air.conductance") and `was` has the file's values; for
+    what varies between runs the one estimate is its sd, as a share where the unit is 1. `size` is what sentences call
+    the effect's size where no parameter is (root mean square watts of a `free_flux`). `separates`: the run that would
+    tell the alternatives apart ("a night switched off"), `caps`: what keeps the probability from being higher ("3 runs
+    only").
+    """
+
+    mechanism: str
+    where: Where
+    place: str
+    parameters: Mapping[str, Estimate]
+    probability: float
+    name: str = ""
+    beside: str = ""
+    others: tuple[Other, ...] = ()
+    regime: str = "always"
+    windows: tuple[tuple[str, float, float], ...] = ()
+    rms: tuple[Rms, ...] = ()
+    separates: str = ""
+    caps: tuple[str, ...] = ()
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+    was: Mapping[str, float] = field(default_factory=dict)
+    size: Estimate | None = None
+
+    @property
+    def main(self) -> tuple[str, ...]:
+        """Its parameters that say how large it is: the mechanism's amplitudes, else the first that was fitted."""
+        scales = (MECHANISMS[self.mechanism].off or {}) if self.mechanism in MECHANISMS else {}
+        own = tuple(p for p in scales if p in self.parameters)
+        fitted = [p for p, e in self.parameters.items() if e.known]
+        return tuple(p for p in own if p in fitted) or own[:1] or tuple(fitted[:1]) or tuple(self.parameters)[:1]
+
+    @property
+    def tied(self) -> tuple[Other, ...]:
+        """Explanations that these runs cannot tell from it and that are at least half as probable."""
+        if self.probability > 0.9:
+            return ()
+        return tuple(o for o in self.others if o.alike and o.probability >= self.probability / 2)
+
+
+def times_noise(rms: Sequence[Rms]) -> float:
+    """Left-out errors after all that was found over the given noise, the median over channels; 0 where none is."""
+    return float(np.nanmedian([r.times_noise for r in rms if r.noise > 0] or [0.0]))
+
+
+def place_words(where: Where, part: TwinPart) -> str:
+    """``the bed``, ``the shaft and the front bearing housing`` of a link, channels by their name.
+
+    A body goes by its `words`, or by its name with blanks for underscores (words with a colon explain, not name).
+    """
+    if where.kind == "link" and where.name in part.links:
+        return listed([_thing(p, part) for p in part.links[where.name].between])
+    if where.kind == "link" and where.name in part.exposures:
+        exposure = part.exposures[where.name]
+        return listed([_thing(p, part) for p in (exposure.of, exposure.to)])
+    return _thing(where.name, part) if where.kind == "node" else where.name
+
+
+def beside_words(given: MechanismPart, where: Where, part: TwinPart) -> str:
+    """What else a mechanism looks at: ``surrounding: the room, speed: spindle_rpm``; nothing for the place itself."""
+    ports = given.at if isinstance(given.at, Mapping) else {}
+    at = {port: listed([_thing(p, part) for p in several(places)]) for port, places in ports.items()}
+    told = [f"{port.replace('_', ' ')}: {place}" for port, place in at.items() if place != place_words(where, part)]
+    if isinstance(given.drivers, Mapping):
+        told += [f"{role.replace('_', ' ')}: {channel}" for role, channel in given.drivers.items()]
+    elif given.drivers:
+        told.append(f"driver: {given.drivers}")
+    if where.kind != "node" and isinstance(given.at, str):
+        told.insert(0, _thing(given.at, part))
+    on = [target for target in several(given.acts_on) if target != where.name]
+    if on:
+        told.insert(0, f"{'with' if where.kind == 'sensor' else 'acts on'}: {listed(on)}")
+    return ", ".join(told)
+
+
+def _thing(place: str, part: TwinPart) -> str:
+    """A body or surrounding with its article; numbered ones (node3) have none."""
+    name, _, at = place.partition("@")
+    held = part.bodies.get(name) or part.surroundings.get(name)
+    words = held.words if held and held.words and ":" not in held.words else name.replace("_", " ")
+    article = "" if words[-1].isdigit() or words.split()[0].lower() in ("a", "an", "the") else "the "
+    return f"{article}{words}{f' at {at}' if at else ''}"
+
+
+LAGS = 40
+
+
+def empty_tables() -> dict[str, pd.DataFrame]:
+    return {name: pd.DataFrame(columns=list(columns)) for name, columns in COLUMNS.items()}
+
+
+def rms_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:
+    """Left-out rms by batch and channel, with the noise that the machine file states."""
+    noise = dict(zip(fitted.problem.channels, fitted.problem.noise, strict=True))
+    out = before.rms.rename(columns={"rms": "before"})
+    out["after"] = after.rms["rms"]
+    out["floor"] = out["channel"].map(noise)
+    return out[list(COLUMNS["rms"])]
+
+
+def series_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:
+    """Recorded and predicted series of the batches left out."""
+    problem = fitted.problem
+    parts = []
+    for k, m in enumerate(problem.measured):
+        time_s = fitted.batches[k].time_s
+        parts.append(
+            pd.DataFrame({
+                "batch": m.batch_id,
+                "channel": [problem.channels[c] for c in m.channel],
+                "unit": [problem.units[c] for c in m.channel],
+                "time_s": time_s[m.row],
+                "recorded": m.value,
+                "before": m.value - before.error[k],
+                "after": m.value - after.error[k],
+            })
+        )  # fmt: skip
+    out = pd.concat(parts, ignore_index=True)
+    sensors = {r.channel for r in problem.network.readings}
+    out.loc[out["channel"].isin(sensors), "unit"] = "degC"
+    return out
+
+
+def acf_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:
+    """Autocorrelation of the left-out errors, pooled over batches."""
+    problem = fitted.problem
+    rows: list[tuple[str, float, float, float]] = []
+    for c, name in enumerate(problem.channels):
+        first, step_s = _acf(before.error, fitted, c)
+        second, _ = _acf(after.error, fitted, c)
+        rows += [(name, k * step_s, a, b) for k, (a, b) in enumerate(zip(first, second, strict=True))]
+    return pd.DataFrame(rows, columns=list(COLUMNS["acf"]))
+
+
+def _acf(errors: Sequence[Array], fitted: Fitted, channel: int) -> tuple[Array, float]:
+    total, step_s = np.zeros(LAGS), 0.0
+    for k, m in enumerate(fitted.problem.measured):
+        at = m.channel == channel
+        if at.sum() < 3:
+            continue
+        step_s = m.stride * fitted.batches[k].step_s
+        series = np.full(int((m.row[at][-1] - m.row[at][0]) // m.stride) + 1, np.nan)
+        series[(m.row[at] - m.row[at][0]) // m.stride] = errors[k][at]
+        sums = lagged_sums(series)[0][:LAGS]
+        total[: len(sums)] += sums
+    return (total / total[0] if total[0] > 0 else total), step_s
+
+
+def candidates_table(rounds: Sequence[Round]) -> pd.DataFrame:
+    """All that was tried in full or in its cluster, round by round, the likeliest first."""
+    rows: list[tuple[object, ...]] = []
+    for done in rounds:
+        n = len(done.before.batches)
+        for e in explanations(done)[0]:
+            s, c = e.tried.scored, e.tried.candidate
+            amplitude, unit = _amplitude(e.tried.scored.amplitudes, c.mechanism)
+            gain = e.tried.gain if e.tried.alike is None else e.tried.alike  # as they were compared
+            rows.append(
+                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.words, e.tried.cluster, gain,
+                 e.tried.improved, n, s.absorbed, amplitude, unit, e.probability)
+            )  # fmt: skip
+    return pd.DataFrame(rows, columns=list(COLUMNS["candidates"]))
+
+
+def _amplitude(amplitudes: dict[str, float], mechanism: str) -> tuple[float, str]:
+    if not amplitudes or mechanism not in MECHANISMS:
+        return float(np.exp(amplitudes["factor"])) if "factor" in amplitudes else np.nan, "1"
+    name = max(amplitudes, key=lambda a: abs(amplitudes[a]))
+    off = (MECHANISMS[mechanism].off or {}).get(name, 0.0)
+    return (
+        (off + amplitudes[name], MECHANISMS[mechanism].spec(name).unit)
+        if name in (MECHANISMS[mechanism].off or {})
+        else (amplitudes[name], "1")
+    )
+
+
+def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
+    rows = [
+        (k + 1, r.best.candidate.words, r.best.gain, r.threshold, r.best.improved, r.accepted)
+        for k, r in enumerate(rounds)
+        if r.best is not None
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS["steps"]))
+
+
+def null_table(null: Null) -> pd.DataFrame:
+    """The largest gain of any candidate in each recording of a refined machine, and its left-out rms over the noise."""
+    gain = null.gain.ravel()
+    floor = np.sqrt(np.nanmean(null.mean_squares, axis=-1)).ravel()
+    return pd.DataFrame({"replicate": np.arange(len(gain)), "gain": gain, "floor": floor})

@@ -1,0 +1,251 @@
+"""A twin part at its best fit, and how well it predicts batches left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from data.arrays import Array
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from diagnosis.contracts import Fitted, pieces_of
+from diagnosis.fitting.regression import Filtered, left_where_own_follow, memory_left, settle_filtered, whitened, whiter
+from twin.calibration.estimate import check_batches
+from twin.calibration.fit_problem import Noise
+from twin.calibration.least_squares import State, descend, settled, x_of, z_bounds
+from twin.calibration.problem import EVERY_S, CalibrationProblem, Nuisances
+from twin.compile import compile_network
+from twin.network import Network
+from twin.schema import TwinPart
+from twin.simulation.inputs import Inputs, inputs_of
+
+_NO_PIECES: Mapping[str, str] = {}
+
+
+def on_network(
+    problem: CalibrationProblem,
+    batches: Sequence[Batch],
+    network: Network,
+    free_starts: bool = False,
+    pieces: Mapping[str, str] = _NO_PIECES,
+) -> CalibrationProblem:
+    """The same recordings posed to a network with more bodies, laws or drivers.
+
+    A new body starts as the one that it is linked with most strongly; with `free_starts` each batch may say otherwise.
+    `pieces` of a body, {piece: body}, start with it: a piece that started as it liked would be a store of its own.
+    """
+    inputs = problem.inputs
+    if not _drives(inputs, network):
+        inputs = inputs_of(network, list(batches)).refined(inputs.every)
+    start = np.full((problem.inputs.n_batches, network.n_cells), np.nan)
+    nuisances = Nuisances.of(network)
+    start_K = nuisances.start_K.copy()
+    for name, cells in network.bodies.items():
+        before = problem.start_degC[:, problem.network.bodies[name]] if name in problem.network.bodies else None
+        if before is not None:  # a body that is cut finer starts at its mean
+            start[:, cells] = before if before.shape[1] == len(cells) else before.mean(axis=1, keepdims=True)
+    for k, (name, cells) in enumerate(network.bodies.items()):
+        if name not in problem.network.bodies:
+            start[:, cells] = _beside(network, start, cells)[:, None]
+            if len(start_K) and name in pieces:
+                start_K[list(network.bodies).index(pieces[name]), cells] = network.start_spread_K
+            if len(start_K) and (not free_starts or name in pieces):
+                start_K[k] = 0.0
+    return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
+
+
+def _drives(inputs: Inputs, network: Network) -> bool:
+    """Whether inputs of another network hold all that drives this one: what was worked out of them serves again."""
+    recorded = {s.channel for s in network.surroundings if s.channel}
+    first = {*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)}
+    drivers = set(network.drivers) <= set(inputs.drivers)
+    return drivers and recorded == set(inputs.recorded) and first <= set(inputs.first)
+
+
+def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
+    """Each batch's own unknowns in the new network's order; what is new stands at its prior's mean, 0."""
+    names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
+    out = []
+    for own in nuisance:
+        shared = np.array([own[before[n]] if n in before else 0.0 for n in names])
+        out.append(np.concatenate([shared, own[old.nuisances.shared :]]))
+    return out
+
+
+def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Array:
+    """The parameters that both networks fit at their old place, the others at their priors' mean."""
+    by_name = {u.name: u.prior + u.spread * v for u, v in zip(old.unknowns, z, strict=True)}
+    return np.array([(by_name.get(u.name, u.prior) - u.prior) / u.spread for u in new.unknowns])
+
+
+def _names(problem: CalibrationProblem) -> list[str]:
+    bodies = list(problem.network.bodies) if len(problem.nuisances.start_K) else []
+    air = [f"surrounding {problem.network.surroundings[s].name}" for s in problem.nuisances.surroundings]
+    varying = [problem.network.parameters[k].name for k in problem.nuisances.parameters]
+    return bodies + air + varying
+
+
+def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
+    """The start temperature (B,) of the known cell that new ones are linked with most strongly."""
+    conductance = -network.conductance_W_per_K(network.values)[cells].sum(axis=0)
+    conductance[np.isnan(start[0])] = -np.inf
+    return np.asarray(start[:, int(np.argmax(conductance))])
+
+
+REFIT_STEPS, REFIT_TOLERANCE = 1, 0.1  # of a refit: whether a candidate is in the running needs no more
+
+
+def refitted(
+    old: Fitted,
+    part: TwinPart,
+    at: Mapping[str, float] | None = None,
+    steps: int = REFIT_STEPS,
+    tolerance: float = REFIT_TOLERANCE,
+) -> Fitted:
+    """The same recordings fitted by a changed twin part, from the old fit; `at` gives values where to begin.
+
+    What is new begins otherwise at its value in the part, which is its prior's centre where that is not stated.
+
+    Noise and memory are estimated again before every step; no channel counts as noisier, and no row remembers longer,
+    than in the old fit: none is given up for a start that is still far off.
+
+    Raises:
+        InputError: the part does not compile; WorkError: it cannot be simulated there.
+    """
+    network = compile_network(old.machine, part=part)
+    problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
+    z = carried_z(old.problem, problem, old.state.z)
+    known = {u.name for u in old.problem.unknowns}
+    for k, u in enumerate(problem.unknowns):
+        p = network.parameters[network.index(u.name)]
+        begin = at.get(u.name) if at else None
+        if begin is None and u.name not in known:
+            begin = p.value
+        if begin is not None:
+            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
+    z = np.clip(z, *z_bounds(problem.unknowns))
+    nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
+    state = State.at(
+        Filtered(problem, old.memory), z, nuisance, Noise(old.noise.factor, np.ones(len(problem.channels)))
+    )
+    left = left_where_own_follow(problem, state)
+    filtered, state = _counted(old, problem, state, left, old.state.arrow.effective_parameters())
+    for _ in range(steps):
+        state = descend(filtered, state, 1, tolerance)
+        left = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
+        filtered, state = _counted(old, problem, state, left, state.arrow.effective_parameters())
+    return replace(old, part=part, problem=problem, state=state)
+
+
+def _counted(
+    old: Fitted, problem: CalibrationProblem, state: State, left: list[Array], parameters: float
+) -> tuple[Filtered, State]:
+    """The state with rows that remember no longer, and channels no noisier, than in the old fit and in what is left."""
+    filtered = Filtered(problem, whiter(old.memory, memory_left(problem, left)))
+    here = filtered.noise_of(left, parameters)
+    noise = replace(state.noise, factor=np.minimum(here.factor, state.noise.factor))
+    return filtered, State.at(filtered, state.z, state.nuisance, noise)
+
+
+def settle(fitted: Fitted, steps: int = 4, tolerance: float = 0.01, rounds: int = 10) -> Fitted:
+    """The same fit taken on to its optimum, noise and memory estimated until it stands."""
+    return replace(fitted, state=settle_filtered(fitted.problem, fitted.state, steps, tolerance, rounds))
+
+
+BASELINE_TOLERANCE, BASELINE_STEPS = 1e-2, 40
+# Every channel's noise to begin with, and rows that count as one: alike, so that none is given up for others.
+MISFIT, SMOOTH = 3.0, 20.0
+ROWS = 60  # of a usual batch, at least: a run of ten minutes is no less a run than one of six hours
+
+
+def check(machine: Machine, batches: Sequence[Batch]) -> None:
+    """Raises InputError: no batches, one of another machine, or the same twice."""
+    if not batches:
+        raise InputError(f"machine {machine.machine}: no batches to diagnose; give recordings")
+    check_batches(machine, batches)
+
+
+def baseline(
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    progress: Callable[[str, int, int], None] | None = None,
+    runs: int = 0,
+) -> Fitted:
+    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it; `runs` that they
+    come from, where they are blocks of fewer.
+
+    Raises:
+        InputError: batches of another machine, twice the same, or that cannot be simulated.
+        WorkError: the model fails at the priors' means.
+    """
+    check(machine, batches)
+    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
+    steps = 0
+
+    def told(_: str) -> None:
+        nonlocal steps
+        steps += 1
+        if progress:
+            progress("baseline", steps, 0)
+
+    k = len(problem.channels)
+    alike = Noise(np.full(k, MISFIT), np.full(k, SMOOTH))
+    state, _ = settled(problem, tolerance=BASELINE_TOLERANCE, max_iterations=BASELINE_STEPS, progress=told, noise=alike)
+    return settle(Fitted(machine, part, tuple(batches), problem, state, runs or len(batches)))
+
+
+def spacing_s(batches: Sequence[Batch]) -> float:
+    """Seconds from one row that is looked at to the next."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # none: told where they are simulated
+    return min(EVERY_S, lengths[len(lengths) // 2] / ROWS) or EVERY_S
+
+
+RMS_COLUMNS = ("batch", "channel", "unit", "rows", "rms")
+
+
+@dataclass(frozen=True)
+class LeftOutRows:
+    """Measured less predicted (n_b,) of every batch in the channels' units, and the rms by batch and channel."""
+
+    error: list[Array]
+    rms: pd.DataFrame
+
+
+def left_out_rows(fitted: Fitted) -> LeftOutRows:
+    """Every batch predicted by all others."""
+    problem, state = fitted.problem, fitted.state
+    weight = 1.0 / fitted.noise.factor**2
+    blocks = list(problem.linearise(fitted.x, state.nuisance))
+    rows = [
+        whitened(b, v, state.z, problem.unknowns, (), weight, fitted.memory)
+        for b, v in zip(blocks, state.nuisance, strict=True)
+    ]
+    own = [w.jacobian.T @ w.jacobian for w in rows]
+    to = [w.jacobian.T @ w.target for w in rows]
+    information, total = np.sum(own, axis=0) + np.eye(len(state.z)), np.sum(to, axis=0)
+    low, high = z_bounds(problem.unknowns)
+    spread = np.array([u.spread for u in problem.unknowns])
+    errors = []
+    table = []
+    for k, (block, w) in enumerate(zip(blocks, rows, strict=True)):
+        z = np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high)
+        moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
+        known, aim = (w.innovations((rows.T * w.scale).T) for rows in (block.nuisance, moved))
+        normal = known.T @ known + np.eye(known.shape[1])
+        nuisance: Array = np.asarray(np.linalg.solve(normal, known.T @ aim), float)
+        one = problem.only([k])
+        residual = one.residuals(x_of(problem.unknowns, z), [nuisance])[0]
+        m = problem.measured[k]
+        errors.append(residual * problem.noise[m.channel])
+        for c in m.usable.tolist():
+            at = m.channel == c
+            rms = float(np.sqrt(np.mean(errors[-1][at] ** 2)))
+            table.append((m.batch_id, problem.channels[c], problem.units[c], int(at.sum()), rms))
+    return LeftOutRows(errors, pd.DataFrame(table, columns=list(RMS_COLUMNS)))

@@ -1,0 +1,195 @@
+"""A network in which every candidate is asleep: one linearisation shows what each of them would do.
+
+A candidate stands at the values that switch it off, so the simulation is the baseline's; the derivatives by its
+amplitudes are its signatures (the first-order response, Lindley 1958's score direction).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data.arrays import Array
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from diagnosis.contracts import Candidate, Fitted
+from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
+from twin.calibration.least_squares import x_of
+from twin.compile import compile_network
+from twin.mechanisms import MECHANISMS
+from twin.network import Heat, Law, Network
+from twin.quantity import Parameter, Value
+from twin.schema import TwinPart
+
+MARK = "candidate "  # a parameter's source that says whose amplitude it is
+NEARLY_OFF = 1e-12  # where a share cannot be 0
+
+
+@dataclass(frozen=True)
+class Asleep:
+    """`amplitudes` numbers, by candidate, the parameters of `network` that would wake it; `left_out` says why not."""
+
+    network: Network
+    amplitudes: Mapping[str, tuple[int, ...]]
+    left_out: Mapping[str, str]
+
+
+def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) -> Asleep:
+    """The machine's network with all candidates that have values to be off at; those that do not compile are told."""
+    smooth = [c for c in candidates if c.amplitudes]
+    left_out: dict[str, str] = {}
+    try:
+        network = compile_network(machine, part=_with(part, smooth))
+    except InputError:
+        for c in smooth:
+            try:
+                compile_network(machine, part=_with(part, [c]))
+            except InputError as error:
+                left_out[c.name] = str(error)
+        smooth = [c for c in smooth if c.name not in left_out]
+        network = compile_network(machine, part=_with(part, smooth))
+    names = {_instance(c) for c in smooth}
+    network = _sleeping(network, names)
+    found: dict[str, list[int]] = defaultdict(list)
+    parameters = list(network.parameters)
+    by_mark = {(_instance(c), a): [] for c in smooth for a in c.amplitudes}  # type: dict[tuple[str, str], list[str]]
+    for c in smooth:
+        for a in c.amplitudes:
+            by_mark[_instance(c), a].append(c.name)
+    owner = {c.name: c for c in smooth}
+    rivals = [c for c in candidates if c.change is not None]
+    for c in rivals:
+        assert c.change is not None
+        j = network.index(c.change.parameter.name)
+        if not parameters[j].free:  # in its own scale: what is doubted is a factor
+            parameters[j] = replace(parameters[j], free=True, spread=1.0)
+        found[c.name].append(j)
+    for j, p in enumerate(parameters):
+        if not p.source.startswith(MARK):
+            continue
+        instance, _, amplitude = p.source.removeprefix(MARK).partition(".")
+        parameters[j] = _free(p)
+        for name in by_mark[instance, amplitude]:
+            if _is_of(owner[name], p):
+                found[name].append(j)
+    return Asleep(
+        replace(network, parameters=tuple(parameters)), {k: tuple(v) for k, v in sorted(found.items())}, left_out
+    )
+
+
+def _with(part: TwinPart, candidates: Sequence[Candidate]) -> TwinPart:
+    """All candidates in the twin part; those that write the same bodies for other errors share one instance."""
+    groups: dict[str, list[Candidate]] = defaultdict(list)
+    for c in candidates:
+        groups[_instance(c)].append(c)
+    mechanisms = dict(part.mechanisms)
+    for name, members in groups.items():
+        first = members[0]
+        assert first.part is not None
+        mechanism = MECHANISMS[first.mechanism]
+        values = {**first.part.parameters, **{k: Value(value=v) for k, v in mechanism.ghost.items()}}
+        for amplitude, off in first.amplitudes.items():
+            near = mechanism.spec(amplitude).scale == "logit" and off <= 0
+            values[amplitude] = Value(value=NEARLY_OFF if near else off, source=f"{MARK}{name}.{amplitude}")
+        changed = first.part.model_copy(update={"parameters": values})
+        if len(members) > 1:
+            on = tuple(str(c.part.acts_on) for c in members if c.part is not None)
+            changed = changed.model_copy(update={"acts_on": on})
+        mechanisms[name] = changed
+    return part.model_copy(update={"mechanisms": mechanisms})
+
+
+def _instance(c: Candidate) -> str:
+    """What it is called in the twin part: without the error where several errors may share what it writes."""
+    if c.where.kind == "error" and "expand" in MECHANISMS[c.mechanism].effects():
+        return c.name.replace(f"{c.mechanism}_{c.where.name}_", f"{c.mechanism}_", 1)
+    return c.name
+
+
+def _is_of(c: Candidate, p: Parameter) -> bool:
+    """Whether a marked parameter is this candidate's: of what an instance writes, the part of its own error."""
+    return not p.name.startswith("errors.") or p.name.startswith(f"errors.{c.where.name}.")
+
+
+def _free(p: Parameter) -> Parameter:
+    """An amplitude as a plain signed number, so that its derivative is not scaled away where it is 0."""
+    return replace(p, free=True, scale="linear", spread=1.0, low=-np.inf, high=np.inf, source="")
+
+
+def _sleeping(network: Network, names: set[str]) -> Network:
+    """The laws of these names put to sleep; heat that one of them multiplies stays awake without it."""
+
+    def put(law: Law) -> Law:
+        return replace(law, asleep=True) if law.name in names else law
+
+    heats: list[Heat] = []
+    for heat in network.heats:
+        awake = tuple(f for f in heat.factors if f.name not in names)
+        base = replace(heat, law=put(heat.law), factors=awake)
+        heats.append(base)
+        heats += [replace(base, factors=(*awake, put(f))) for f in heat.factors if f.name in names]
+    return replace(
+        network,
+        heats=tuple(heats),
+        factors=tuple(put(f) for f in network.factors),
+        surroundings=tuple(replace(s, effects=tuple(map(put, s.effects))) for s in network.surroundings),
+        readings=tuple(replace(r, effects=tuple(map(put, r.effects))) for r in network.readings),
+        errors=tuple(
+            replace(e, effects=tuple(map(put, e.effects)), readings=tuple(map(put, e.readings))) for e in network.errors
+        ),
+        starts=tuple((put(law), cells) for law, cells in network.starts),
+    )
+
+
+def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
+    """By candidate the change (n_b,) of every batch's rows, in units of the given noise, at its usual values.
+
+    The second mapping says why others are left out: they do not compile, or the recordings contradict them outright.
+    """
+    out: dict[str, list[Array]] = {}
+    left_out: dict[str, str] = {}
+    before = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
+    for c in proposed:
+        if c.amplitudes or c.part is None:
+            continue
+        try:
+            swap = c.mechanism == "sensor_swap"
+            change = _exchanged(fitted, c, before) if swap else difference(fitted, c.applied(fitted.part), before)
+        except (InputError, WorkError) as error:
+            left_out[c.name] = str(error)
+            continue
+        if change is not None:
+            out[c.name] = change
+    return out, left_out
+
+
+def difference(fitted: Fitted, part: TwinPart, before: Sequence[Array]) -> list[Array]:
+    """What a changed twin part shows beyond the fit whose residuals are `before`, (n_b,) of every batch.
+
+    Raises:
+        InputError, WorkError: the part does not compile or cannot be simulated.
+    """
+    problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
+    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
+    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
+    return [b - a for b, a in zip(before, after, strict=True)]
+
+
+def _exchanged(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array] | None:
+    """Two labels exchanged move no heat: the simulation is read the other way round; None if that fits worse."""
+    assert c.part is not None and c.part.acts_on is not None
+    one, other = (fitted.problem.channels.index(name) for name in c.part.acts_on)
+    noise = fitted.problem.noise
+    out, gain = [], 0.0
+    for m, r in zip(fitted.problem.measured, before, strict=True):
+        change = r * 0.0
+        a, b = m.channel == one, m.channel == other
+        if a.sum() == b.sum() and (m.row[a] == m.row[b]).all():
+            shown_a, shown_b = m.value[a] - r[a] * noise[one], m.value[b] - r[b] * noise[other]
+            change[a], change[b] = (shown_b - shown_a) / noise[one], (shown_a - shown_b) / noise[other]
+        gain += float(r @ r - (r - change) @ (r - change))
+        out.append(change)
+    return out if gain > 0 else None

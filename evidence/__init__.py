@@ -1,0 +1,1 @@
+"""Evidence: the sealed examination of the diagnosis, and published studies reproduced."""

@@ -1,0 +1,182 @@
+"""What scoring needs of each case once the key is open: the answer that was stored, and the true model beside it."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from diagnosis.findings.schema import Findings, read_findings
+from evidence.proof.sealing.examinee import FINDINGS, PLAN, read_case
+from evidence.proof.sealing.folder import ProofFolder, files_digest, read_json, source_digest, write_json
+from evidence.proof.sealing.isolation import own_source
+from evidence.proof.sealing.opening import Opened
+from evidence.proof.sealing.running import RUN, Examinee, examine
+from evidence.proof.sealing.seal import Done
+
+if TYPE_CHECKING:
+    from evidence.proof.scoring.answer_key import Stored
+    from evidence.proof.scoring.true_model import TrueModel
+
+
+def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Examinee | None = None) -> Findings | None:
+    """Findings of the case with one more recording; None where the run cannot be done or the diagnosis fails.
+
+    What the same source answered before is read from the folder `kept`. Whoever answers sees as little as before.
+    """
+    source = source_digest()
+    if not (kept / RUN).exists() or read_json(kept / RUN)["source_digest"] != source:
+        with tempfile.TemporaryDirectory(prefix="thermodrift-") as place:
+            more = Path(place) / "case"
+            shutil.copytree(case, more)
+            try:
+                _add(more, plan, key)
+            except InputError:  # a plan that this plant cannot do settles nothing
+                return None
+            files = examine(more, by or Examinee(rivals=None), source)
+        shutil.rmtree(kept, ignore_errors=True)
+        kept.mkdir()
+        for name, content in files.items():
+            (kept / name).write_bytes(content)
+    return read_findings(kept / FINDINGS) if (kept / FINDINGS).exists() else None
+
+
+def _add(case: Path, plan: str, key: Mapping[str, Any]) -> None:
+    """One more recording in a case's folder, and its machine file with the sensor that the plan asked for."""
+    from plants.planned import execute
+    from plants.plant import csv_text, machine_text
+
+    drawn = key["redraw"]
+    done = execute(drawn["seed"], {**drawn["effects"], **drawn["decoys"]}, plan, drawn["plant"], **drawn["options"])
+    (case / "machine.yml").write_text(machine_text(done.machine), encoding="utf-8")
+    text = csv_text(done.machine.machine, done.table)
+    (case / "recordings" / f"{done.batch.batch_id}.csv").write_text(text, encoding="utf-8")
+
+
+REDRAWN = ("elements", "volumes")  # plants that can be drawn again without an effect
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One case: what was stored, and its true model or why there is none."""
+
+    stored: Stored
+    truth: TrueModel | None
+    trouble: str = ""
+
+
+def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | None = None) -> dict[str, Judged]:
+    """Every case that counts. True models take seconds each and are kept in PROOF/judged for the next opening.
+
+    Raises:
+        WorkError: the folder cannot be written.
+    """
+    kept = folder.path / "judged"
+    kept.mkdir(exist_ok=True)
+    source = scoring_source()
+    tasks = [
+        (folder.cases / n, folder.answers / n, kept / f"{n}.json", kept / n, opened.answers[n], source)
+        for n in opened.counting
+    ]
+    out: dict[str, Judged] = {}
+    for name, judged in _judged(tasks, workers):
+        out[name] = judged
+        if done is not None:
+            done("judge", len(out), len(tasks))
+    return dict(sorted(out.items()))
+
+
+def _judged(tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[tuple[str, Judged]]:
+    """Names and what `judge` gives, as they come."""
+    if workers == 1:
+        yield from ((task[0].name, judge(*task)) for task in tasks)
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        waiting = {pool.submit(judge, *task): task[0].name for task in tasks}
+        yield from ((waiting[future], future.result()) for future in as_completed(waiting))
+
+
+def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, Any], source: str) -> Judged:
+    """One case; its true model is read from the file `kept` where the same source worked it out.
+
+    `again` is the folder that keeps what was found once the proposed run had been done.
+    """
+    from evidence.proof.scoring.answer_key import read_stored
+
+    with threadpool_limits(limits=1), tempfile.TemporaryDirectory(prefix="thermodrift-") as lake:
+        machine, batches = read_case(case, Path(lake))
+        stored = read_stored(answer, machine, batches)
+        if key["kind"] == "confounded" and (answer / PLAN).exists():
+            stored = replace(stored, again=executed(case, (answer / PLAN).read_text(encoding="utf-8"), key, again))
+        held = read_json(kept) if kept.exists() else {}
+        if held.get("source") != source:
+            truth, trouble = _true(machine, batches, key)
+            held = {"source": source, "truth": _plain(asdict(truth)) if truth else None, "trouble": trouble}
+            write_json(kept, held)
+    return Judged(stored, _truth(held["truth"]), held["trouble"])
+
+
+def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tuple[TrueModel | None, str]:
+    from evidence.proof.scoring.true_model import true_model
+
+    try:
+        return true_model(machine, batches, key, _redraw(key) if key["plant"] in REDRAWN else None), ""
+    except (InputError, WorkError) as error:
+        return None, str(error)
+
+
+def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch]]]:
+    """The same case without one of its effects."""
+    from evidence.proof.spec import CaseSpec
+    from evidence.proof.suite import build, without, write_built
+
+    spec = CaseSpec(**key["redraw"])
+
+    def redraw(effect: str) -> tuple[Machine, list[Batch]]:
+        with tempfile.TemporaryDirectory(prefix="thermodrift-") as place:
+            case = Path(place) / "case"
+            write_built(build(without(spec, effect)), case)
+            return read_case(case, Path(place) / "lake")
+
+    return redraw
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: what is no number is null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
+    from evidence.proof.scoring.true_model import TrueModel
+
+    if plain is None:
+        return None
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
+    before, true, floor = (number(plain[k]) for k in ("error_before", "error_true", "error_floor"))
+    gains, thresholds, bars = (tuple(map(number, plain[k])) for k in ("gain_nats", "threshold_nats", "bar_nats"))
+    sizes = tuple((value, low, high) for value, low, high in plain["sizes"])
+    return TrueModel(before, true, floor, gains, thresholds, bars, tuple(plain["visible"]), sizes)
+
+
+def scoring_source() -> str:
+    """Digest of all that an answer is judged with."""
+    root, _ = own_source()
+    return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))

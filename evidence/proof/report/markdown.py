@@ -1,0 +1,106 @@
+"""The part of docs/proof.md that a sealed run writes: root, date, version, results by plant, shortfalls."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pandas as pd
+
+from data.errors import InputError
+from data.files import write_atomic
+from evidence.proof.report import labels as words
+from evidence.proof.report import shortfall
+from evidence.proof.report.page import headline
+from evidence.proof.report.tables import Cell, ProofRun, goal_rows, shortfalls
+from reports.labels import NOTHING
+
+BEGIN, END = "<!-- result: written by thermodrift prove open --publish -->", "<!-- end of result -->"
+_BLOCK = re.compile(f"{re.escape(BEGIN)}.*?{re.escape(END)}", re.DOTALL)
+NO_RUN = "No sealed proof has been run on this version yet, so there is no result to show."
+
+
+def publish_proof(path: Path, run: ProofRun | None) -> None:
+    """Put a run's result between the two markers of a Markdown file; nothing else of it changes.
+
+    Raises:
+        InputError: the file cannot be read or written, has no pair of markers, or the run is of a development suite
+            or opened in part.
+    """
+    if run is not None and (run.suite != "sealed" or run.partial):
+        got = "a development suite" if run.suite != "sealed" else "a proof opened in part"
+        raise InputError(f"--publish {path}: got {got}, expected a sealed suite with all answers; leave --publish out")
+    try:
+        text = path.read_text(encoding="utf-8")
+        if len(_BLOCK.findall(text)) != 1:
+            raise InputError(f"--publish {path}: expected one pair of lines {BEGIN} and {END}; put them where it goes")
+        write_atomic(path, _BLOCK.sub(lambda _: f"{BEGIN}\n\n{proof_markdown(run)}\n{END}", text))
+    except OSError as error:
+        raise InputError(f"--publish {path}: cannot be read or written ({error.strerror}); give another file") from None
+
+
+def proof_markdown(run: ProofRun | None) -> str:
+    """The block between the markers; without a run it says so."""
+    if run is None:
+        return NO_RUN + "\n"
+    goals = run.table("goals")
+    lines = [f"**{headline(run)}** {words.origin(run.plants)}".rstrip(), ""]
+    lines += [f"{said}\n" for said in ([words.NOT_SEALED] if run.suite != "sealed" else [])]
+    lines += [f"{said}\n" for said in ([words.PARTIAL] if run.partial else [])]
+    lines += [
+        f"- Sealed root: `{run.root}`",
+        f"- Sealed {_stamp(run.sealed)}, opened {_stamp(run.opened)}, thermodrift {run.version}",
+        f"- Source that answered: `{run.source_digest}`",
+        f"- Cases: {run.cases} sealed, {len(run.table('outcomes'))} count, {len(run.void)} void, "
+        f"{len(run.failed)} failed (counted as wrong)",
+        "",
+    ]
+    lines += _table(goals, run.plants)
+    short = shortfalls(goals)
+    missed = [*(f"- {said}" for said in short), *_by_plant(goals, run.plants)]
+    lines += ["", "Goals that are missed:", "", *missed] if missed else ["", "No goal is missed on any plant."]
+    lines += _shortfall(run)
+    return "\n".join(lines) + "\n"
+
+
+def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
+    heads = [f"{words.plant_label(p)} ({words.plant_origin(p)})" for p in plants]
+    cells = ["measure", "goal", f"all plants ({words.origin(plants)})", "90 %", "n", "met", words.INFORMED, *heads]
+    out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
+    for g in goal_rows(goals, plants):
+        met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)
+        interval, n = g.whole.interval or NOTHING, g.whole.n or NOTHING
+        out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, [g.informed, *g.plants])]))
+    return [*out, "", f"{words.INFORMED.capitalize()}: {words.meaning(words.INFORMED)}"]
+
+
+def _shortfall(run: ProofRun) -> list[str]:
+    """Why goals are missed: reasons by plant, and false claims by mechanism."""
+    own = shortfall.tables(run, each=False)
+    out = ["", " ".join(shortfall.sentences(run))] if own else []
+    for table in own:
+        heads = [f"{c.title} ({c.unit})" if c.unit else c.title for c in table.columns]
+        rule = ["---:" if c.kind == "number" else "---" for c in table.columns]
+        out += ["", f"{table.caption}, {words.origin(run.plants)}:", "", _line(heads), _line(rule)]
+        out += [_line([str(cell) for cell in row.cells]) for row in table.rows]
+    return out
+
+
+def _plant(cell: Cell) -> str:
+    said = f"{cell.value} (n {cell.n})" if cell.n else cell.value
+    return f"**{said}**" if cell.met == "no" else said
+
+
+def _by_plant(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
+    """Goals that are met over all plants and missed on one."""
+    whole = set(goals.loc[(goals["plant"] == "all") & goals["met"].eq(False), "measure"])
+    rest = goals[~goals["measure"].isin(whole)]
+    return [f"- plant {words.plant_letter(p)} alone, {said}" for p in plants for said in shortfalls(rest, p)]
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |"
+
+
+def _stamp(utc: str) -> str:
+    return f"{pd.Timestamp(utc):%Y-%m-%d %H:%M} UTC" if utc else NOTHING

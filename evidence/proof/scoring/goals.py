@@ -1,0 +1,292 @@
+"""The goals, one entry each: what is measured, over which cases, and what was wanted before any case was drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import beta
+
+from evidence.proof.scoring.outcomes import visible_physics
+
+LEVEL = 0.9
+DRAWS = 1000
+Statistic = Callable[[NDArray[np.float64]], float]
+
+
+def clopper_pearson(right: int, n: int) -> tuple[float, float]:
+    """Exact interval of a share (Clopper and Pearson 1934); 0 and 1 of no cases."""
+    tail = (1.0 - LEVEL) / 2.0
+    low = float(beta.ppf(tail, right, n - right + 1)) if right > 0 else 0.0
+    high = float(beta.ppf(1.0 - tail, right + 1, n - right)) if right < n else 1.0
+    return low, high
+
+
+def bootstrap(values: pd.Series, statistic: Statistic, seed: int = 0) -> tuple[float, float]:
+    """Percentile interval (Efron 1979) of a statistic; whole cases (the index) are drawn, as their terms agree.
+
+    Raises:
+        ValueError: no values.
+    """
+    ordered = values.sort_index(kind="stable")
+    _, first = np.unique(ordered.index.to_numpy(), return_index=True)
+    groups = np.split(np.asarray(ordered, float), first[1:])
+    return of_groups(groups, lambda chosen: statistic(np.concatenate(chosen)), seed)
+
+
+def of_groups(
+    groups: Sequence[NDArray[np.float64]], statistic: Callable[[Sequence[NDArray[np.float64]]], float], seed: int = 0
+) -> tuple[float, float]:
+    """The same of any statistic of groups that are drawn whole."""
+    if not groups:
+        raise ValueError("bootstrap: no values")
+    rng = np.random.default_rng(seed)
+    drawn = [statistic([groups[k] for k in rng.integers(len(groups), size=len(groups))]) for _ in range(DRAWS)]
+    tail = (1.0 - LEVEL) / 2.0
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return float(low), float(high)
+
+
+Select = Callable[[pd.DataFrame, pd.DataFrame], pd.Series]
+Sizes = Callable[[pd.DataFrame, pd.DataFrame], pd.DataFrame]
+Better = Literal["higher", "lower"]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was wanted of a measure: a share, or a number with its unit."""
+
+    measure: str
+    wanted: float
+    better: Better
+    unit: str | None = field(default=None, kw_only=True)
+
+    @property
+    def words(self) -> str:
+        sign = "≥" if self.better == "higher" else "≤"
+        wanted = f"{100 * self.wanted:g} %" if self.unit is None else f"{self.wanted:g} {self.unit}".strip()
+        return f"{sign} {wanted}"
+
+    def met(self, value: float) -> bool:
+        return value >= self.wanted if self.better == "higher" else value <= self.wanted
+
+
+@dataclass(frozen=True)
+class Goal(Wanted):
+    """`of` gives the values from outcomes and terms, indexed by case; `statistic` None: they are yes or no, a share.
+
+    `informed` gives those of an answer that has all that is true in its model, refitted, and claims of it what is held
+    to pass the same bars: what it misses, these recordings do not give with such bars. None where that says nothing.
+    """
+
+    of: Select
+    statistic: Statistic | None = None
+    informed: Select | None = field(default=None, kw_only=True)
+
+
+def quantile(share: float) -> Statistic:
+    return lambda values: float(np.quantile(values, share))
+
+
+def mean(values: NDArray[np.float64]) -> float:
+    return float(np.mean(values))
+
+
+def _cases(column: str, *kinds: str, visible: bool = False) -> Select:
+    """A column of the cases of these kinds (none named: all), of those only that are visible."""
+
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        at = outcomes["kind"].isin(kinds) if kinds else pd.Series(True, outcomes.index)
+        if visible:
+            at &= outcomes["visible"].fillna(False).astype(bool)
+        return _known(outcomes[at], column)
+
+    return select
+
+
+def _known(rows: pd.DataFrame, column: str) -> pd.Series:
+    return rows.set_index("case")[column].dropna()
+
+
+def _false_alarms(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("false_claims", "nothing", "decoy")(outcomes, terms) > 0
+
+
+def _detected(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("detected", visible=True)(outcomes, terms)
+
+
+def _all_visible(kind: str) -> Select:
+    """`all_named` of the cases in which every term is visible."""
+
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        at = (outcomes["kind"] == kind) & (outcomes["visible_terms"] == outcomes["terms"]).fillna(False)
+        return _known(outcomes[at], "all_named")
+
+    return select
+
+
+def _claims_of_two(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    """Every claim of a case with two effects: whether it is true."""
+    rows = outcomes[(outcomes["kind"] == "two") & outcomes["claims"].notna()]
+    true = {
+        case: [True] * max(int(claims) - int(false), 0) + [False] * int(false)
+        for case, claims, false in zip(rows["case"], rows["claims"], rows["false_claims"], strict=True)
+    }
+    index = [case for case, own in true.items() for _ in own]
+    return pd.Series([v for own in true.values() for v in own], index=index, dtype="boolean")
+
+
+def _sized(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
+    """Visible physics that was found and whose amplitude both sides state."""
+    rows = visible_physics(terms)
+    return _both_stated(rows[rows["found"].fillna(False).astype(bool)])
+
+
+def _both_stated(rows: pd.DataFrame) -> pd.DataFrame:
+    at = rows["amplitude_true"].notna() & rows["amplitude_found"].notna()
+    return rows[at & (rows["amplitude_true"] != 0)].set_index("case")
+
+
+def _amplitude_error(sizes: Sizes) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = sizes(outcomes, terms)
+        return (rows["amplitude_found"] - rows["amplitude_true"]).abs() / rows["amplitude_true"].abs()
+
+    return select
+
+
+def _covered(sizes: Sizes) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = sizes(outcomes, terms).dropna(subset=["low90", "high90"])
+        return (rows["low90"] <= rows["amplitude_true"]) & (rows["amplitude_true"] <= rows["high90"])
+
+    return select
+
+
+def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
+    """Visible physics that a candidate states, and whether the true model's gain passes the bars: `passes`."""
+    rows = visible_physics(terms)
+    rows = rows[rows["gain_nats"].notna() & rows["bar_nats"].notna()]
+    return rows.assign(passes=(rows["gain_nats"] > rows["bar_nats"]).astype(bool))
+
+
+def _informed(*kinds: str) -> Select:
+    """By case of these kinds (none named: all) with a visible effect that a candidate states, whether one passes."""
+
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        rows = _claimable(terms)
+        return (rows[rows["kind"].isin(kinds)] if kinds else rows).groupby("case")["passes"].any()
+
+    return select
+
+
+def _informed_all(kind: str) -> Select:
+    def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+        named = _claimable(terms).groupby("case")["passes"].all()
+        at = (outcomes["kind"] == kind) & (outcomes["visible_terms"] == outcomes["terms"]).fillna(False)
+        return named[named.index.isin(outcomes.loc[at, "case"])]
+
+    return select
+
+
+def _informed_sizes(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
+    """Those that pass, with the amplitudes that the true model fits in place of those found."""
+    rows = _claimable(terms).drop(columns=["amplitude_found", "low90", "high90"])
+    rows = rows.rename(columns=lambda c: {"informed_amplitude": "amplitude_found"}.get(c, c.removeprefix("informed_")))
+    return _both_stated(rows[rows["passes"]])
+
+
+def _flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _cases("flagged_unlisted", "unlisted", visible=True)(outcomes, terms)
+
+
+def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
+    return _known(outcomes[outcomes["kind"] != "unlisted"], "flagged_unlisted")
+
+
+ONE = ("one", "invisible")  # of one listed effect each; which can be seen the true model says
+_ERROR, _INFORMED_ERROR = _amplitude_error(_sized), _amplitude_error(_informed_sizes)
+_COVERED, _INFORMED_COVERED = _covered(_sized), _covered(_informed_sizes)
+GOALS: tuple[Goal, ...] = (
+    Goal("false alarms, nothing missing", 0.01, "lower", _false_alarms),
+    Goal("detection, visible", 0.97, "higher", _detected, informed=_informed()),
+    Goal(
+        "place exact, one visible effect",
+        0.92,
+        "higher",
+        _cases("place_exact", *ONE, visible=True),
+        informed=_informed(*ONE),
+    ),
+    Goal(
+        "place exact or neighbour, one visible effect",
+        0.99,
+        "higher",
+        _cases("place_near", *ONE, visible=True),
+        informed=_informed(*ONE),
+    ),
+    Goal(
+        "mechanism first, one visible effect",
+        0.95,
+        "higher",
+        _cases("first_right", *ONE, visible=True),
+        informed=_informed(*ONE),
+    ),
+    Goal(
+        "mechanism within the reported set",
+        0.98,
+        "higher",
+        _cases("in_set", *ONE, visible=True),
+        informed=_informed(*ONE),
+    ),
+    Goal(
+        "mean size of the reported set", 2.0, "lower", _cases("set_size", *ONE, visible=True), mean, unit="explanations"
+    ),
+    Goal("when: overlap in time, mean", 0.8, "higher", _cases("overlap", *ONE, visible=True), mean, unit=""),
+    Goal("amplitude error, median", 0.12, "lower", _ERROR, quantile(0.5), informed=_INFORMED_ERROR),
+    Goal("amplitude error, 90 % quantile", 0.40, "lower", _ERROR, quantile(0.9), informed=_INFORMED_ERROR),
+    Goal("90 % intervals that cover, at least", 0.85, "higher", _COVERED, informed=_INFORMED_COVERED),
+    Goal("90 % intervals that cover, at most", 0.95, "lower", _COVERED, informed=_INFORMED_COVERED),
+    Goal(
+        "left-out error closed, median",
+        0.95,
+        "higher",
+        _cases("closed", "one", visible=True),
+        quantile(0.5),
+        informed=_informed("one"),
+    ),
+    Goal(
+        "left-out error closed, worst tenth",
+        0.80,
+        "higher",
+        _cases("closed", "one", visible=True),
+        quantile(0.1),
+        informed=_informed("one"),
+    ),
+    Goal("two visible effects: both named", 0.85, "higher", _all_visible("two"), informed=_informed_all("two")),
+    Goal("two effects: claims that are true", 0.97, "higher", _claims_of_two),
+    Goal("three visible effects: all named", 0.65, "higher", _all_visible("three"), informed=_informed_all("three")),
+    Goal(
+        "confounded: the set holds the truth",
+        0.97,
+        "higher",
+        _cases("set_holds_truth", "confounded", visible=True),
+        informed=_informed("confounded"),
+    ),
+    Goal("confounded: the proposed run settles it", 0.90, "higher", _cases("settled", "confounded", visible=True)),
+    Goal("unlisted: flagged", 0.95, "higher", _flagged, informed=_informed("unlisted")),
+    Goal("listed or nothing: falsely flagged as unlisted", 0.03, "lower", _falsely_flagged),
+    Goal(
+        "unlisted: driver found",
+        0.85,
+        "higher",
+        _cases("driver_right", "unlisted", visible=True),
+        informed=_informed("unlisted"),
+    ),
+    Goal("time of one case, median", 30.0, "lower", _cases("seconds"), quantile(0.5), unit="s"),
+    Goal("time of one case, 90 % quantile", 30.0, "lower", _cases("seconds"), quantile(0.9), unit="s"),
+)

@@ -1,0 +1,350 @@
+"""The twin with the true terms in it, refitted: what a perfect answer would reach, and which terms can be seen at all.
+
+A term is visible when, with the others in, it cuts the left-out error of some channel by a tenth and gains more on the
+left-out batches than structure alone does (99 % quantile of the structural null, without a diagnosis' own margin).
+What no candidate states is compared with the same case redrawn without it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from diagnosis.candidates.discretisation import no_news
+from diagnosis.candidates.free_forms import OF_BODY, Form, Level, candidate_of
+from diagnosis.candidates.priors import start_values
+from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
+from diagnosis.drafting.draft import drafted_part
+from diagnosis.findings.conclude import parameters_told
+from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.fitting.fitted import BASELINE_TOLERANCE, baseline, left_out_rows, refitted, settle
+from diagnosis.fitting.regression import Memory, whiter
+from diagnosis.screening.screen import Screen, alone, proposed, screen
+from diagnosis.search.acceptance import least_gain
+from diagnosis.search.null import MARGIN, Null, null_beside, structural_null
+from diagnosis.search.refits import SMALLER, improved
+from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
+from evidence.proof.scoring.matching import Sized, counted_as, exact, sized
+from twin.calibration.identifiability import Interval, intervals90
+from twin.calibration.least_squares import result
+from twin.compile import compile_network
+from twin.mechanisms import MECHANISMS
+from twin.quantity import Value
+from twin.schema import TwinPart, twin_part
+
+
+def true_candidates(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> list[Scored]:
+    """The candidates at the term's place with its mechanism, best first in the screen.
+
+    The key does not say by which channel the twin would drive it, or which bodies it would look at besides.
+    """
+    own = [s for s in seen.scored if _is(term, s.candidate)]
+    own = [s for s in own if s.candidate.where.name == term.where.name] or own
+    if own:
+        return sorted(own, key=lambda s: -s.gain)
+    unseen = next((c for c in every if _is(term, c)), None)  # what cannot be switched off has no signature
+    return [] if unseen is None else [Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)]
+
+
+def open_shape(term: TrueTerm, s: Scored) -> bool:
+    """Whether it has a shape that the key does not state: the screen saw it at one value of that alone."""
+    return not set(s.candidate.shape) <= set(term.parameters or {})
+
+
+def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
+    """The law of a heat that no list has, as the key states it; None where it states none or a driver is not recorded.
+
+    It is the one of no list that `true_candidates` looks for among the candidates.
+    """
+    role, *drivers = term.form or ("",)
+    if not role or not all(name in b.table.columns for name in drivers for b in fit.batches):
+        return None
+    level, other, *_ = (*(Level(name, "", 1.0, False) for name in drivers), None, None)
+    body = term.where.name if role in OF_BODY else ""
+    return candidate_of([Form(Where("node", term.where.name), role, level, other, body)])
+
+
+def each_its_own(terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]) -> list[Scored | None]:
+    """By term the first of its choices, none twice: of what two terms want, each has first what is driven as its key
+    says. A cabinet's heat and a pump's at one body are two candidates of one mechanism."""
+    wanted = Counter(own[0].candidate.name for own in choices if own)
+    out: list[Scored | None] = []
+    for term, own in zip(terms, choices, strict=True):
+        twice = bool(own) and wanted[own[0].candidate.name] > 1
+        first = sorted(own, key=lambda s: not _driven_as(term, s.candidate)) if twice else own
+        taken = {s.candidate.name for s in out if s is not None}
+        out.append(next((s for s in first if s.candidate.name not in taken), None))
+    return out
+
+
+def begun_at_truth(
+    term: TrueTerm, s: Scored, now: Fitted, share: float = 1.0
+) -> tuple[Mapping[str, Value], Mapping[str, float]]:
+    """`start_values` of a refit, with the key's values to begin with, amplitudes at this share of them; priors are
+    what a diagnosis would have."""
+    c = s.candidate
+    if c.mechanism not in MECHANISMS or c.change is not None:
+        return start_values(s, now)
+    mechanism = MECHANISMS[c.mechanism]
+    known = {n: v for n, (v, _) in (term.parameters or {}).items() if n in {p.name for p in mechanism.parameters}}
+    told = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
+    amplitudes = {a: share * v for a, v in {**s.amplitudes, **told}.items()}
+    values, at = start_values(replace(s, amplitudes=amplitudes), now)
+    shaped = {
+        name: given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": given.value})
+        for name, given in values.items()
+        if name in known and name not in (mechanism.off or {})
+    }
+    return {**values, **shaped}, at
+
+
+def with_terms(
+    part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted, share: float = 1.0
+) -> tuple[TwinPart, dict[str, float]]:
+    """The twin part with these candidates in it, and where a refit begins; `share` as in `begun_at_truth`.
+
+    Raises:
+        ValueError: two of them take the same name.
+    """
+    at: dict[str, float] = {}
+    for term, s in zip(terms, found, strict=True):
+        values, begin = begun_at_truth(term, s, now, share)
+        part = s.candidate.applied(part, values)
+        at.update(begin)
+    return part, at
+
+
+def _driven_as(term: TrueTerm, c: Candidate) -> bool:
+    """Whether it is driven by the channel that the key names; by none, where the key names none."""
+    drivers = c.part.drivers if c.part is not None else None
+    channels = set(drivers.values()) if isinstance(drivers, Mapping) else {drivers} - {None}
+    return term.driver in channels if term.driver else not channels
+
+
+def _is(term: TrueTerm, c: Candidate) -> bool:
+    return counted_as(c.mechanism) == counted_as(term.mechanism) and exact(Spot(c.where.kind, c.where.name), term)
+
+
+def _said(number: float, unit: str) -> str | float:
+    return float(f"{number:.6g}") if unit == "1" else f"{number:.6g} {unit}"
+
+
+CUT = 0.1  # of a channel's left-out error: less is not worth a name
+Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
+
+
+@dataclass(frozen=True)
+class TrueModel:
+    """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
+    of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis asks of such a gain before it claims it; nan where
+    nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval
+    as a diagnosis would tell them (`amplitude.sized`).
+
+    `visible` None: not known, as no candidate states the term and the case could not be redrawn.
+    """
+
+    error_before: float
+    error_true: float
+    error_floor: float
+    gain_nats: tuple[float, ...]
+    threshold_nats: tuple[float, ...]
+    bar_nats: tuple[float, ...]
+    visible: tuple[bool | None, ...]
+    sizes: tuple[Sized, ...]
+
+
+@threadpool_limits.wrap(limits=1)
+def true_model(
+    machine: Machine,
+    batches: Sequence[Batch],
+    answer: Mapping[str, Any],
+    redraw: Redraw | None = None,
+    seed: int = 0,
+) -> TrueModel:
+    """The true model of a case whose key is open.
+
+    Args:
+        answer: the key as the vault's JSON gives it.
+        redraw: from an effect's key to machine and batches of the same case without that effect.
+
+    Raises:
+        InputError: recordings or a machine file that cannot be used; WorkError: the machine file's model fails.
+    """
+    key = AnswerKey.from_json(answer)
+    fit = _fit(machine, batches)
+    level = _level(fit)
+    if not key.terms:
+        return TrueModel(level, level, 1.0, (), (), (), (), ())
+    every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
+    seen = screen(fit, every)
+    found, full = _chosen(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
+    stated = [k for k, s in enumerate(found) if s is not None]
+    if full is None:
+        full, stated = fit, []
+    judged = [
+        _judged(fit, full, key.terms, found, k, stated, seed)
+        if k in stated
+        else _redrawn(fit, t, redraw, _null(fit, seed))
+        for k, t in enumerate(key.terms)
+    ]
+    others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
+    best = full if stated and not others else others[0] if others else fit  # an unlisted effect stands alone
+    numbers = zip(*((j.gain, j.threshold, j.bar, j.visible, j.size) for j in judged), strict=True)
+    return TrueModel(level, _level(best), 1.0, *numbers)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    gain: float = float("nan")
+    threshold: float = float("nan")
+    bar: float = float("nan")
+    visible: bool | None = None
+    size: Sized = (None, None, None)
+    fitted: Fitted | None = None  # of the case redrawn
+
+
+def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
+    part = twin_part(machine) if machine.twin is not None else drafted_part(machine, batches).part
+    usable, _ = usable_batches(compile_network(machine, part=part), sorted(batches, key=lambda b: b.batch_id))
+    parts, _ = enough_batches(usable)
+    return baseline(machine, part, parts, None, len(usable))
+
+
+def _null(fit: Fitted, seed: int) -> Null:
+    every = proposed(fit)
+    seen = screen(fit, every)
+    return structural_null(fit, seen.evidence, seen.columns(no_news(every, fit)), seed)
+
+
+def _chosen(
+    fit: Fitted, terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]
+) -> tuple[list[Scored | None], Fitted | None]:
+    """By term the candidate that states it best, by the screen, or by refits where that saw one shape of many; and the
+    fit with all of them.
+
+    A test bar's growth gained 152 nats from the shaft, which the screen had preferred, and 539 from the front bearing.
+    """
+    found = each_its_own(terms, choices)
+    several = [k for k, own in enumerate(choices) if len(own) > 1 and open_shape(terms[k], own[0])]
+    if not several:
+        return found, _with(fit, terms, found)
+    for k in several:
+        every = [[*found[:k], s, *found[k + 1 :]] for s in choices[k]]
+        fits = [_with(fit, terms, one) for one in every]
+        gains = [-np.inf if full is None else _gain(fit, full, whiter(fit.memory, full.memory)) for full in fits]
+        best = int(np.argmax(gains))
+        found, full = every[best], fits[best]
+    return found, full
+
+
+def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> Fitted | None:
+    """The fit with the terms that are stated in it at its optimum; None where it cannot be simulated.
+
+    As a diagnosis does, it begins with less where all of it cannot: heat that feeds itself runs away in a network whose
+    values are off.
+    """
+    own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
+    for share in (1.0, *SMALLER):
+        try:
+            part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
+            return settle(refitted(fit, part, at))
+        except (InputError, WorkError):
+            continue
+        except ValueError:  # one candidate twice
+            return None
+    return None
+
+
+def _judged(
+    fit: Fitted,
+    full: Fitted,
+    terms: Sequence[TrueTerm],
+    found: Sequence[Scored | None],
+    which: int,
+    stated: Sequence[int],
+    seed: int,
+) -> _Judged:
+    """One term with the others in: the better of two fits without it is what it must beat."""
+    others = [k for k in stated if k != which]
+    own = [(terms[k], s) for k in others if (s := found[k]) is not None]
+    part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
+    try:
+        back = refitted(full, part)
+        # where the first fit stands at its optimum, a second one only shows whether it had stopped short
+        without = [settle(back)] if others else [settle(back, steps=4, tolerance=0.05, rounds=2), fit]
+    except (InputError, WorkError):
+        return _Judged()
+    memory = whiter(full.memory, without[0].memory)
+    scores = [_score(w, memory) for w in without]
+    best = int(np.argmax(scores))
+    s = found[which]
+    assert s is not None
+    beside = null_beside(without[best], full, s.candidate, seed)
+    if beside is None:  # a value that is doubted, labels that are swapped
+        beside = _null(without[best], seed), _score(full, memory)
+    structure = beside[0].threshold(beside[1], name=s.candidate.name, margin=1.0)
+    out = _beyond(without[best], full, memory, structure)
+    better = improved(alone(without[best], memory), alone(full, memory))
+    least = least_gain(Tried(s, out.gain, better, 0, 0.0, full), len(full.batches))
+    size = _size(full, s, terms[which], beside[0].scatter(s.candidate.name, beside[1]))
+    return replace(out, bar=max(least, MARGIN * structure), size=size)
+
+
+@lru_cache(maxsize=1)
+def _known(full: Fitted) -> dict[str, Interval]:
+    """The intervals of a fit's parameters, by name; the last fit's are kept: each of its terms asks."""
+    state = replace(full.state, noise=full.noise)
+    return {i.name: i for i in intervals90(result(full.problem, state, BASELINE_TOLERANCE, ""), full.problem.unknowns)}
+
+
+def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
+    """The term's amplitude in the true model, told as a diagnosis tells it."""
+    told, _ = parameters_told(full, s.candidate, _known(full), scatter)
+    parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in told.items()}
+    return sized(s.candidate.mechanism, parameters, term)
+
+
+def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
+    """The case with the term against the case without it, each with the machine file alone."""
+    if redraw is None:
+        return _Judged()
+    other = _fit(*redraw(term.effect))
+    memory = whiter(fit.memory, other.memory)
+    return replace(_beyond(fit, other, memory, null.threshold(_score(other, memory), margin=1.0)), fitted=other)
+
+
+def _beyond(before: Fitted, after: Fitted, memory: Memory, threshold: float) -> _Judged:
+    gain = _gain(before, after, memory)
+    old, new = _rms(before), _rms(after)
+    cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
+    return _Judged(gain, threshold, visible=bool(gain > threshold and cut >= CUT))
+
+
+def _gain(before: Fitted, after: Fitted, memory: Memory) -> float:
+    return _score(after, memory) - _score(before, memory)
+
+
+def _score(fitted: Fitted, memory: Memory) -> float:
+    return float(alone(fitted, memory).base_score()[0])
+
+
+def _rms(fitted: Fitted) -> dict[str, float]:
+    """Left-out rms by channel over all rows."""
+    table = left_out_rows(fitted).rms
+    square = (table["rms"] ** 2 * table["rows"]).groupby(table["channel"]).sum()
+    rows = table["rows"].groupby(table["channel"]).sum()
+    return {str(c): float(np.sqrt(square[c] / rows[c])) for c in square.index}
+
+
+def _level(fitted: Fitted) -> float:
+    noise = dict(zip(fitted.problem.channels, fitted.problem.noise, strict=True))
+    return float(np.sqrt(np.mean([(value / noise[c]) ** 2 for c, value in _rms(fitted).items()])))

@@ -1,0 +1,105 @@
+"""The process that answers one case: it shuts itself in, then diagnoses what lies in its place, and writes there.
+
+Started by `evidence.proof.sealing.running` with its task as JSON on standard input. Its place holds `case` (machine
+file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
+Only the standard library and names of packages are imported before the walls stand.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import data  # noqa: F401 - found before the walls stand, since the folder around it cannot be listed behind them
+from evidence.proof.sealing.isolation import allowed, confine
+
+TOLD, FINDINGS, RIVALS = "told.json", "findings.json", "rivals.json"
+PLAN, SERIES = "next_run.yml", "series.csv"
+
+
+def main() -> None:
+    """Answer the case; `told.json` says how far it came, under which protection, and what went wrong."""
+    task = json.loads(sys.stdin.read())
+    place = Path(task["place"])
+    import_from = [Path(p) for p in task["import_from"]]
+    told: dict[str, Any] = {"stage": "shut in", "isolation": confine(allowed(place, import_from), place / "witness")}
+    sys.path[:0] = task["import_from"]
+    diagnose = _function(task["diagnose"])
+    rivals = _function(task["rivals"]) if task["rivals"] else None
+    _tell(place, told)
+    try:
+        begun, begun_cpu = perf_counter(), process_time()
+        diagnosis = diagnose(*read_case(place / "case", place / "answer" / "lake"), seed=0, processes=1, cache=None)
+        told |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
+        told["processor_seconds"] = round(process_time() - begun_cpu, 2)
+        _write_diagnosis(place, diagnosis)
+        _tell(place, told)
+        if rivals is not None:
+            _write(place, RIVALS, _json(rivals(diagnosis)))
+        _tell(place, told | {"stage": "done"})
+    except Exception as error:  # whatever it is, it is the answer to this case
+        _tell(place, told | {"error": _one_line(error)})
+
+
+def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
+    """Machine and batches of a case as `thermodrift diagnose` reads them: into a lake, here an own one, and checked.
+
+    Raises:
+        InputError: a machine file or recordings that cannot be used.
+    """
+    from data.checks import check_machine
+    from data.errors import InputError
+    from data.ingest import ingest
+    from data.lake import Lake
+    from data.machine import load_machine
+
+    machine = load_machine(case / "machine.yml")
+    held = Lake(lake)
+    report = ingest([case / "recordings"], machine, held)
+    if not report.batches:
+        reasons = [r.reason for r in report.quarantined]
+        raise InputError(reasons[0] if reasons else "recordings: no recording that the machine file asks for")
+    return machine, check_machine(held.load_all(machine.machine), machine)
+
+
+def _write_diagnosis(place: Path, diagnosis: Any) -> None:
+    """The findings, the next run's plan if there is one, and the series that a picture of the case would show."""
+    from diagnosis.findings.schema import as_json
+
+    _write(place, FINDINGS, as_json(diagnosis.findings))
+    if diagnosis.plan_text is not None:
+        _write(place, PLAN, diagnosis.plan_text)
+    rms, series = diagnosis.tables["rms"], diagnosis.tables["series"]
+    if len(rms) and len(series):
+        squares = rms.assign(share=rms["rows"] * (rms["after"] / rms["floor"]) ** 2).groupby("channel")
+        worst = (squares["share"].sum() / squares["rows"].sum()).idxmax()
+        _write(place, SERIES, series[series["channel"] == worst].to_csv(index=False, float_format="%.5g"))
+
+
+def _function(where: str) -> Any:
+    module, name = where.split(":")
+    return getattr(import_module(module), name)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+
+
+def _write(place: Path, name: str, text: str) -> None:
+    """Whole or not at all."""
+    scratch = place / "answer" / f"{name}.part"
+    scratch.write_text(text, encoding="utf-8")
+    scratch.replace(place / "answer" / name)
+
+
+def _tell(place: Path, told: dict[str, Any]) -> None:
+    _write(place, TOLD, _json(told))
+
+
+def _one_line(error: Exception) -> str:
+    words = " ".join(str(error).split())
+    return words if type(error).__name__ in ("InputError", "WorkError") else f"{type(error).__name__}: {words}"

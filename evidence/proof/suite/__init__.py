@@ -1,0 +1,6 @@
+"""Suites of cases for the proof: what each is asked to be, and how it is built."""
+
+from evidence.proof.suite.build import Built, batches_of, build, real_suite, without, write_built
+from evidence.proof.suite.suite import small_suite, suite
+
+__all__ = ["Built", "batches_of", "build", "real_suite", "small_suite", "suite", "without", "write_built"]

@@ -1,0 +1,181 @@
+"""The size at which each effect is at the detection limit, measured on development plants.
+
+    python -m evidence.proof.suite.limits --plant volumes [--seeds 3] [--effects sun,draught]
+
+renews `limits.yml`. A plant that lacks nothing is drawn and the machine file's twin fitted to its recordings. What an
+effect adds is the difference of two simulations without noise. It is at the limit where its very own signature, beside
+all that is recalibrated, gains more on batches left out than structure alone gives once in a hundred cases, improves
+three of four batches, and cuts the left-out error of some channel by a tenth: where a perfect answer could be seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from threadpoolctl import threadpool_limits
+
+from data.arrays import Array
+from data.batch import Batch
+from data.files import write_atomic
+from diagnosis.candidates.discretisation import no_news
+from diagnosis.contracts import Fitted
+from diagnosis.fitting.fitted import baseline
+from diagnosis.screening.evidence import Evidence
+from diagnosis.screening.screen import alone, proposed, screen
+from diagnosis.search.decision import IMPROVED
+from diagnosis.search.null import structural_null
+from evidence.proof.suite.setting import setting
+from evidence.proof.suite.sizes import ALL_OR_NOTHING, most
+from plants.effects import EFFECTS
+from plants.options import stream
+from plants.plant import draw, posed
+from plants.structure import FEATURES, Plant
+from twin.schema import twin_part
+
+HOW = (
+    "Size at which an effect's own signature, with all that is recalibrated projected out, gains more on batches left "
+    "out than the 99 % quantile of the structural null, in three of four batches, and cuts the left-out error of a "
+    "channel by a tenth; median over development plants that lack nothing else."
+)
+CUT = 0.1
+SIZES = np.geomspace(0.005, 40.0, 109)
+SELDOM = ("mandrel",)  # most machines are measured without one
+TABLE = Path(__file__).with_name("limits.yml")
+CLEAN = {"noise_K": 0.0, "noise_um": 0.0, "quantisation_K": 1e-6}
+EVEN = {"missing": 0.0, "early_s": 0.0, "gaps": 0.0, "absent": 0.0}  # rows that can be subtracted
+STEP_S = 60.0  # of the solver
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A fitted plant that lacks nothing, what can be told on it, and how to draw it again."""
+
+    seed: int
+    plant: str
+    options: Mapping[str, Any]
+    fitted: Fitted
+    evidence: Evidence
+    threshold: float  # nats
+
+    @classmethod
+    def of(cls, seed: int, plant: str, stated: Sequence[str]) -> Bench:
+        """The plant of a seed whose machine file states these features and whose plant has no others."""
+        lacks = [f for f in FEATURES if f not in stated]
+        options = {**setting(seed, "development"), **EVEN, "has": list(stated), "lacks": lacks, "solver_s": STEP_S}
+        case = draw(seed, plant=plant, **options)
+        fitted = baseline(case.machine, twin_part(case.machine), case.batches, None, len(case.batches))
+        every = proposed(fitted)
+        seen = screen(fitted, every)
+        loose = no_news(every, fitted)
+        columns = seen.columns(loose)
+        null = structural_null(fitted, seen.evidence, columns)
+        evidence = alone(fitted, fitted.memory)
+        return cls(seed, plant, options, fitted, evidence, null.threshold(float(evidence.base_score()[0])))
+
+    def clean(self, sizes: Mapping[str, float]) -> list[Batch]:
+        """The same runs without noise, with effects of these sizes."""
+        return draw(self.seed, sizes=sizes, plant=self.plant, **{**self.options, **CLEAN}).batches
+
+    @cached_property
+    def plain(self) -> list[Batch]:
+        return self.clean({})
+
+    def signature(self, effect: str, size: float) -> list[Array]:
+        """What the effect adds to every batch's rows, in units of the noise."""
+        problem = self.fitted.problem
+        out = []
+        for m, one, other in zip(problem.measured, self.clean({effect: size}), self.plain, strict=True):
+            added = [one.values(c) - other.values(c) for c in problem.channels]
+            out.append(m.of(np.stack(added, axis=1)) / problem.noise[m.channel])
+        return out
+
+    def limit(self, effect: str) -> float:
+        """The size at the detection limit: from size 1, and once more from there, as few effects are quite linear."""
+        if effect == "wrong_parameter":
+            return float(np.sqrt(2.0 * self.threshold) / self._doubt(effect, 1.0))
+        if effect in ALL_OR_NOTHING:
+            return self._times(self.signature(effect, 1.0))
+        size = 1.0
+        for _ in range(2):
+            at = min(size, most(effect))
+            size = self._times([rows / at for rows in self.signature(effect, at)])
+        return size
+
+    def _times(self, rows: Sequence[Array]) -> float:
+        """How many times these rows can be seen; the largest of `SIZES` where none of them can."""
+        batches = tuple(replace(b, columns=b.of(r)[:, None]) for b, r in zip(self.evidence.batches, rows, strict=True))
+        evidence = replace(self.evidence, batches=batches, low=np.full(1, -np.inf), high=np.full(1, np.inf))
+        targets = [b.target[:, None] + b.columns * SIZES for b in batches]
+        gain, _, falls = evidence.gains(targets)
+        base = evidence.mean_squares(evidence.left_out())
+        with_it = evidence.mean_squares(evidence.left_out(targets))
+        cut = np.nanmax(1.0 - np.sqrt(np.maximum(base, 1.0) / np.maximum(with_it, 1.0)), axis=1)
+        improved = np.mean(falls[:, :, 0] > 0, axis=1)
+        seen = (gain[:, 0] > self.threshold) & (cut > CUT) & (improved >= IMPROVED)
+        return float(SIZES[np.argmax(seen)] if seen.any() else SIZES[-1])
+
+    def _plant(self) -> Plant:
+        return posed(self.seed, {}, self.plant, **self.options).plant
+
+    def _doubt(self, effect: str, size: float) -> float:
+        """How many prior sd a value of the file is off, as far as the recordings say so."""
+        drawn = EFFECTS[effect](self._plant(), size, stream(self.seed, f"effect {effect}"))
+        ((path, factor),) = drawn.misread().items()
+        unknowns = self.fitted.problem.unknowns
+        at = next(k for k, u in enumerate(unknowns) if u.name == path or u.name.startswith(f"{path}."))
+        left = self.fitted.state.arrow.covariance[at, at]
+        return float(abs(np.log(factor)) / unknowns[at].spread * np.sqrt(max(1.0 - left, 0.0)))
+
+
+@threadpool_limits.wrap(limits=1)
+def measured(plant: str, seeds: Sequence[int], effects: Sequence[str]) -> Iterator[tuple[str, int, float]]:
+    """(effect, seed, size at the limit); a withheld effect where the machine file leaves out that feature alone."""
+    for seed in seeds:
+        benches: dict[str | None, Bench] = {}
+        for effect in effects:
+            withheld = EFFECTS[effect].withholds
+            if withheld not in benches:
+                benches[withheld] = Bench.of(seed, plant, [f for f in FEATURES if f not in {withheld, *SELDOM}])
+            yield effect, seed, benches[withheld].limit(effect)
+
+
+def renewed(table: Mapping[str, Any], plant: str, found: Sequence[tuple[str, int, float]]) -> dict[str, Any]:
+    """The table with these effects of a plant measured anew."""
+    by_effect: dict[str, list[float]] = {}
+    for effect, _, size in found:
+        by_effect.setdefault(effect, []).append(size)
+    limits = {p: dict(rows) for p, rows in table.get("limits", {}).items()}
+    plants = {p: dict(rows) for p, rows in table.get("plants", {}).items()}
+    for effect, sizes in by_effect.items():
+        limits.setdefault(plant, {})[effect] = float(f"{np.median(sizes):.3g}")
+        plants.setdefault(plant, {})[effect] = [float(f"{s:.3g}") for s in sizes]
+    return {"how": HOW, "limits": limits, "plants": plants}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plant", default="volumes")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=101)
+    parser.add_argument("--effects", default=",".join(EFFECTS))
+    parser.add_argument("--dry", action="store_true", help="print only")
+    args = parser.parse_args()
+    found = []
+    for row in measured(args.plant, range(args.first, args.first + args.seeds), args.effects.split(",")):
+        print(f"{row[0]:24} plant {row[1]}  {row[2]:.3g}", flush=True)
+        found.append(row)
+    if args.dry:
+        return
+    table = yaml.safe_load(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
+    write_atomic(TABLE, yaml.safe_dump(renewed(table, args.plant, found), sort_keys=False, width=120))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""The mean run: what is known of the error from the clock alone, and from the place on the axis where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+
+from data.arrays import Array
+from data.errors import InputError
+from data.sweeps import position_bins
+from features.design import Design
+from models.base import Family
+
+_NEED = 1  # rows
+
+
+class MeanCurve(Family):
+    """The mean over the training batches of the error at the same time since the start.
+
+    Beyond the longest batch the last value holds; between recorded times it is interpolated. `fitted`: time_s (t,),
+    error_um (t,). A channel along an axis has such a curve for each position, and between positions it is on a line:
+    then `fitted` has along (the position channel), position_mm (m,), and curve k is at first[k] : first[k + 1].
+    """
+
+    key = "mean_curve"
+    words = "mean error curve of the training batches over the time since the start"
+    source = "baseline"
+    effort = "quick"
+    uses_inputs = False
+    rank = 1
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self.fit_folds(design, [train])[0]
+
+    def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
+        """One fitted copy per fold.
+
+        Raises:
+            InputError: no recorded error in a fold.
+        """
+        if design.along:
+            return [self._along_axis(design, sorted(set(fold))) for fold in folds]
+        ok = np.isfinite(design.y_um)
+        grid_s, place = np.unique(np.round(design.time_s[ok], 6), return_inverse=True)
+        count = np.zeros((design.n_batches, len(grid_s)))
+        total_um = np.zeros_like(count)
+        np.add.at(count, (design.group[ok], place), 1.0)
+        np.add.at(total_um, (design.group[ok], place), design.y_um[ok])
+        out = []
+        for fold in folds:
+            train = sorted(set(fold))
+            n = count[train].sum(axis=0)
+            seen = n > 0
+            if seen.sum() < _NEED:
+                raise _nothing_recorded(design, train)
+            mean_um = total_um[train].sum(axis=0)[seen] / n[seen]
+            out.append(self._learned(design, {"time_s": grid_s[seen], "error_um": mean_um}))
+        return out
+
+    def _along_axis(self, design: Design, train: Sequence[int]) -> Self:
+        position_mm = design.position_mm(design.along)
+        rows = np.flatnonzero(np.isfinite(design.y_um) & np.isfinite(position_mm) & np.isin(design.group, train))
+        if len(rows) < _NEED:
+            raise _nothing_recorded(design, train)
+        bins = position_bins(position_mm[rows])
+        at, which = np.unique(np.stack([bins, np.round(design.time_s[rows], 6)]), axis=1, return_inverse=True)
+        count = np.bincount(which)
+        places, first = np.unique(at[0], return_index=True)
+        place = np.searchsorted(places, bins)
+        mean_mm = np.bincount(place, position_mm[rows]) / np.bincount(place)
+        return self._learned(
+            design,
+            {
+                "along": design.along,
+                "position_mm": mean_mm,
+                "first": np.append(first, len(count)),
+                "time_s": at[1],
+                "error_um": np.bincount(which, design.y_um[rows]) / count,
+            },
+        )
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        time_s, error_um = self.fitted["time_s"], self.fitted["error_um"]
+        if "along" not in self.fitted:
+            return [np.interp(design.time_s[design.rows(k)], time_s, error_um) for k in batches]
+        curves = [slice(a, b) for a, b in pairwise(self.fitted["first"].tolist())]
+        position_mm = design.position_mm(self.fitted["along"])
+        out = []
+        for k in batches:
+            rows = design.rows(k)
+            at_s = design.time_s[rows]
+            table_um = np.array([np.interp(at_s, time_s[c], error_um[c]) for c in curves])
+            out.append(_on_line(position_mm[rows], self.fitted["position_mm"], table_um))
+        return out
+
+    def n_parameters(self) -> int:
+        """Values of the curves."""
+        return len(self.fitted.get("error_um", ()))
+
+
+def _on_line(at_mm: Array, position_mm: Array, table_um: Array) -> Array:
+    """Row by row (n,) the table (m, n) at the row's position, linear between the m positions, held beyond; NaN there
+    where there is none."""
+    if len(position_mm) == 1:
+        return np.where(np.isfinite(at_mm), table_um[0], np.nan)
+    left = np.clip(np.searchsorted(position_mm, at_mm) - 1, 0, len(position_mm) - 2)
+    share = np.clip((at_mm - position_mm[left]) / (position_mm[left + 1] - position_mm[left]), 0.0, 1.0)
+    row = np.arange(len(at_mm))
+    return np.asarray((1.0 - share) * table_um[left, row] + share * table_um[left + 1, row])
+
+
+def _nothing_recorded(design: Design, train: Sequence[int]) -> InputError:
+    names = ", ".join(design.batch_ids[k] for k in train) or "(none)"
+    return InputError(
+        f"mean_curve: batches {names} have 0 usable rows (target {design.target!r} recorded and not "
+        f"masked), expected at least {_NEED}; add batches"
+    )
+
+
+class Zero(Family):
+    """Predicts 0 µm: the line that every model has to beat."""
+
+    key = "zero"
+    words = "no model: predicts zero error"
+    source = "baseline"
+    effort = "quick"
+    uses_inputs = False
+    rank = 0
+
+    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        return self._learned(design, {})
+
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        return [np.zeros(len(design.time_s[design.rows(k)])) for k in batches]

@@ -1,0 +1,94 @@
+"""Small helpers of the families that run along a batch: rows padded to one rectangle, steps, words for errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from threading import RLock
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.arrays import Array
+from data.batch import Batch
+from data.errors import InputError
+from features.design import Design
+from features.rises import hold_last
+
+
+def padded(design: Design, values: Array) -> Array:
+    """Rows (n, …) laid out per batch, (K, longest, …), zeros behind a batch's end."""
+    at_batch, at_row = _places(design)
+    lengths = np.diff(design.offsets)
+    out = np.zeros((design.n_batches, int(lengths.max(initial=0)), *values.shape[1:]))
+    out[at_batch, at_row] = values
+    return out
+
+
+def unpadded(design: Design, values: Array) -> Array:
+    """The inverse of `padded`: (K, longest, …) back to rows (n, …)."""
+    at_batch, at_row = _places(design)
+    return values[at_batch, at_row]
+
+
+def by_batch(design: Design, columns: Array, wanted: Sequence[Sequence[int]]) -> list[list[Array]]:
+    """Columns (n, F) of all rows cut to the batches that each of them is wanted for."""
+    return [[columns[design.rows(k), f] for k in batches] for f, batches in enumerate(wanted)]
+
+
+def bridged(design: Design, values: Array) -> Array:
+    """Values (n, p) with holes held batch by batch; NaN where a batch has none at all."""
+    if np.isfinite(values).all():
+        return values
+    out = values.copy()
+    for k in range(design.n_batches):
+        for j in range(values.shape[1]):
+            out[design.rows(k), j] = hold_last(values[design.rows(k), j])
+    return out
+
+
+def steps_s(design: Design) -> Array:
+    """Sampling step of every batch, s, (K,); NaN for a batch of one row."""
+    out = np.full(design.n_batches, np.nan)
+    for k in range(design.n_batches):
+        time_s = design.time_s[design.rows(k)]
+        if len(time_s) > 1:
+            out[k] = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
+    return out
+
+
+def too_few_rows(key: str, design: Design, train: Sequence[int], got: int, need: int) -> InputError:
+    """The error of a training set with too few usable rows."""
+    names = [design.batch_ids[k] for k in train]
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return InputError(
+        f"family {key}: got {got} usable rows of {design.target or 'the target'} in {shown or 'no batch'}, "
+        f"need at least {need}; give more batches or overrule a check in the machine file"
+    )
+
+
+def _places(design: Design) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return design.group, np.arange(len(design.group)) - design.offsets[design.group]
+
+
+T = TypeVar("T")
+
+
+class Recent(Generic[T]):
+    """Remembers what was made of the same batch objects under the same key, the last `most` of them."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._held: list[tuple[Hashable, tuple[Batch, ...], T]] = []
+        self._lock = RLock()
+
+    def of(self, key: Hashable, batches: tuple[Batch, ...], make: Callable[[], T]) -> T:
+        """What is remembered, or what `make` makes now."""
+        with self._lock:
+            for i, (k, held, thing) in enumerate(self._held):
+                if k == key and len(held) == len(batches) and all(a is b for a, b in zip(held, batches, strict=True)):
+                    self._held.append(self._held.pop(i))
+                    return thing
+            made = make()
+            self._held = [*self._held, (key, batches, made)][-self._most :]
+            return made

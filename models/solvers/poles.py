@@ -1,0 +1,390 @@
+"""Where a transfer function's poles stand: a search over a grid by leave-batch-out, then each pole by itself.
+
+All of it on sums per batch. The search is one coordinate after the other: poles that all sources share, which
+sources take part, the penalty. Folds ask for the same few candidates, so each is solved once for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.arrays import Array, Mask
+from features.design import Design, Moments
+from features.rises import hold_last
+from models.linear import EPS
+from models.solvers.batches import padded, steps_s, unpadded
+from models.solvers.pooled_sums import Blocks, Pool, left_out_mean_S_um
+from models.thermal_exponential import lag_response
+
+TAUS_S = np.geomspace(120.0, 43200.0, 15)
+EXPONENTS = (1.0, 1.5, 2.0)
+DRIVERS = ("speed", "load", "room")  # kinds of sources that come with the drivers
+_LOG_TAUS = np.log(TAUS_S)
+_PITCH = float(_LOG_TAUS[1] - _LOG_TAUS[0])
+_NODES = 6
+_THERMAL = ("temperature", "ambient")
+_LIKE_1_K = {"rpm": 1000.0, "mm/min": 1000.0}  # drivers in other units count as they are
+
+
+@dataclass(frozen=True)
+class Source:
+    """What acts: `kind` says what is made of the channel or input `name`.
+
+    input: a chosen input as the design has it. speed: (|n| / 1000 rpm)^exponent. load: |another driver|. room: the
+    ambient rise. gap: T − T_ambient of a sensor at the batch's start, held; a machine that does not start in
+    equilibrium relaxes as if this step acted on it.
+    """
+
+    kind: str
+    name: str
+    exponent: float = 1.0
+
+    @property
+    def direct(self) -> bool:
+        """Whether it may also act without a lag: a step at the start would only shift the error's zero."""
+        return self.kind != "gap"
+
+    def signal(self, design: Design) -> Array:
+        """Its values (n,), holes held; NaN throughout a batch that has none of it."""
+        if self.kind == "input":
+            return _held(design, design.x[:, design.inputs.index(self.name)])
+        if self.kind in ("speed", "load"):
+            column = design.driver_names.index(self.name) if self.name in design.driver_names else None
+            if column is None:
+                return np.full(len(design.time_s), np.nan)
+            scale = _LIKE_1_K.get(design.driver_units[column], 1.0)
+            return np.asarray((np.abs(_held(design, design.drivers[:, column])) / scale) ** self.exponent)
+        if self.kind == "room":
+            return _temperature(design, self.name) - _first(design, self.name)
+        return _first(design, self.name) - _first(design, ambient_of(design))
+
+
+def drivers_of(design: Design) -> list[Source]:
+    """What every batch of a design has of speed (one source per exponent), other drivers and ambient rise."""
+    found = []
+    for name, unit in zip(design.driver_names, design.driver_units, strict=True):
+        if name not in design.inputs:
+            found += [Source("speed", name, m) for m in EXPONENTS] if unit == "rpm" else [Source("load", name)]
+    room = ambient_of(design)
+    found += [Source("room", room)] if room and room not in design.inputs else []
+    return [s for s in found if np.isfinite(s.signal(design)).all()]
+
+
+def gaps_of(design: Design) -> list[Source]:
+    """The gaps of those inputs that are plain rises of temperatures, where every batch has them."""
+    room = ambient_of(design)
+    channels = design.batches[0].channels if room else {}
+    names = [n for n in design.inputs if n != room and n in channels and channels[n].role in _THERMAL]
+    found = [Source("gap", n) for n in names]
+    return [s for s in found if np.isfinite(s.signal(design)).all()]
+
+
+def responses(design: Design, signals: Array, tau_s: Array) -> Array:
+    """τ dv/dt + v = u from v = 0 at each batch's first row, (n, S): one time constant per signal, (S,).
+
+    Exact for a signal held over the step before its sample.
+    """
+    steps = steps_s(design)
+    laid = padded(design, signals)
+    out = np.empty_like(laid)
+    for tau in np.unique(tau_s):
+        some = np.flatnonzero(tau_s == tau)
+        flat = laid[:, :, some].transpose(2, 0, 1).reshape(-1, laid.shape[1])
+        lagged = lag_response(flat, float(tau), np.tile(steps, len(some)))
+        out[:, :, some] = lagged.reshape(len(some), *laid.shape[:2]).transpose(1, 2, 0)
+    return unpadded(design, out)
+
+
+@dataclass(frozen=True)
+class Dictionary:
+    """The columns of S sources on a design: first the signals themselves, then their responses to every τ.
+
+    Column `(t + 1) S + s` is source s behind `TAUS_S[t]`.
+    """
+
+    design: Design
+    sources: tuple[Source, ...]
+
+    @cached_property
+    def table(self) -> Design:
+        """All columns as a design on the same usable rows."""
+        own = self.design
+        signals = np.column_stack([s.signal(own) for s in self.sources])
+        columns = [signals, *(responses(own, signals, np.full(len(self.sources), tau)) for tau in TAUS_S)]
+        x = np.nan_to_num(np.column_stack(columns))
+        y_um = np.where(own.usable, own.y_um, np.nan)
+        return replace(own, inputs=tuple(map(str, range(x.shape[1]))), x=x, y_um=y_um, input_units=(), _columns=None,
+                       _parent=None)  # fmt: skip
+
+    def places(self, which: Sequence[int], poles: Sequence[int]) -> list[int]:
+        """Columns of some sources: the direct ones, then all behind each pole of the grid."""
+        direct = [s for s in which if self.sources[s].direct]
+        return [*direct, *((t + 1) * len(self.sources) + s for t in poles for s in which)]
+
+    def block(self, which: Sequence[int]) -> list[int]:
+        """All columns of some sources, in the order that `combination` counts them."""
+        return [t * len(self.sources) + s for t in range(len(TAUS_S) + 1) for s in which]
+
+
+def combination(log_tau: Array, direct: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Weights over a dictionary's columns that give poles of any place, and their slopes by log τ.
+
+    Args:
+        log_tau: (F, S, L), the L poles of each of S sources in F fits. direct: which sources act directly, (S,).
+
+    Returns:
+        (F, (T + 1) S, D + L S): D direct columns, then pole by pole; and (F, (T + 1) S, L S).
+    """
+    n_fits, n_sources, n_poles = log_tau.shape
+    weight, slope = _interpolated(log_tau)
+    own, at = np.arange(n_sources), np.flatnonzero(direct)
+    lagged = np.zeros((n_fits, len(TAUS_S) + 1, n_sources, n_poles, n_sources))
+    moved = np.zeros_like(lagged)
+    for pole in range(n_poles):
+        lagged[:, 1:, own, pole, own] = weight[:, :, pole].transpose(0, 2, 1)
+        moved[:, 1:, own, pole, own] = slope[:, :, pole].transpose(0, 2, 1)
+    head = np.zeros((n_fits, (len(TAUS_S) + 1) * n_sources, len(at)))
+    head[:, at, np.arange(len(at))] = 1.0
+    shape = (n_fits, head.shape[1], n_poles * n_sources)
+    return np.concatenate([head, lagged.reshape(shape)], axis=2), moved.reshape(shape)
+
+
+def _interpolated(log_tau: Array) -> tuple[Array, Array]:
+    """Lagrange weights over the grid and their derivatives, (…, T)."""
+    place = (log_tau - _LOG_TAUS[0]) / _PITCH
+    first = np.clip(np.floor(place).astype(int) - _NODES // 2 + 1, 0, len(TAUS_S) - _NODES)
+    away = (place - first)[..., None] - np.arange(_NODES)
+    weight, slope = np.zeros((*log_tau.shape, len(TAUS_S))), np.zeros((*log_tau.shape, len(TAUS_S)))
+    for a in range(_NODES):
+        others = [b for b in range(_NODES) if b != a]
+        scale = float(np.prod([a - b for b in others]))
+        product = away[..., others].prod(axis=-1) / scale
+        change = sum(away[..., [b for b in others if b != c]].prod(axis=-1) for c in others) / (scale * _PITCH)
+        np.put_along_axis(weight, first[..., None] + a, product[..., None], axis=-1)
+        np.put_along_axis(slope, first[..., None] + a, np.asarray(change)[..., None], axis=-1)
+    return weight, slope
+
+
+def only(design: Design, batches: Sequence[int]) -> Design:
+    """Some batches of a design, in the order given."""
+    rows = np.concatenate([np.arange(design.offsets[k], design.offsets[k + 1]) for k in batches])
+    offsets = np.concatenate([[0], np.cumsum(np.diff(design.offsets)[list(batches)])]).astype(np.int64)
+    return replace(design, batch_ids=tuple(design.batch_ids[k] for k in batches), x=design.x[rows],
+                   y_um=design.y_um[rows], time_s=design.time_s[rows], offsets=offsets,
+                   drivers=design.drivers[rows] if design.driver_names else design.drivers,
+                   batches=tuple(design.batches[k] for k in batches) if design.batches else (), _columns=None,
+                   _parent=None)  # fmt: skip
+
+
+def ambient_of(design: Design) -> str:
+    """The first ambient channel; "" where the design has no batches or they have none."""
+    names = design.batches[0].names("ambient") if design.batches else ()
+    return names[0] if names else ""
+
+
+def _held(design: Design, values: Array) -> Array:
+    parts = [hold_last(values[design.rows(k)]) for k in range(design.n_batches)]
+    return np.concatenate([*parts, np.empty(0)])
+
+
+def _temperature(design: Design, name: str) -> Array:
+    """A channel's temperature (n,), holes held; NaN throughout a batch that has none."""
+    out = np.full(len(design.time_s), np.nan)
+    for k, batch in enumerate(design.batches):
+        if name in batch.channels:
+            out[design.rows(k)] = hold_last(batch.masked(name))
+    return out
+
+
+def _first(design: Design, name: str) -> Array:
+    """Its value at each batch's start, held, (n,)."""
+    values = _temperature(design, name)
+    return values[design.offsets[design.group]] if len(values) else values
+
+
+PENALTIES = np.geomspace(1e1, 1e-7, 9)
+_COARSE = (1, 4, 7, 10, 13)  # of the grid: 3 min to 8 h
+_FEW_PENALTIES = PENALTIES[2::2]  # while poles are sought
+_BATCHES_PER_GAP = 2  # a gap is one number a batch
+_STEPS, _LONGEST_STEP = 8, 0.7  # in log τ
+_LOOSENESS = 0.5  # prior standard deviation of a pole's log τ about the shared one
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Poles of the grid that all sources share, the speed's exponent (0: no drivers), and whether gaps take part."""
+
+    poles: tuple[int, ...] = ()
+    exponent: float = 0.0
+    gaps: bool = False
+
+    def sources(self, dictionary: Dictionary) -> list[int]:
+        """Which sources of a dictionary take part."""
+        takes = {"input": True, "gap": self.gaps and bool(self.poles), **dict.fromkeys(DRIVERS, self.exponent > 0)}
+        return [
+            i
+            for i, s in enumerate(dictionary.sources)
+            if takes[s.kind] and (s.kind != "speed" or s.exponent == self.exponent)
+        ]
+
+
+class Search:
+    """The best candidate and penalty of every training set, masks (F, B) over the dictionary's blocks of rows."""
+
+    def __init__(self, dictionary: Dictionary, moments: Moments, masks: Mask) -> None:
+        self.dictionary, self.moments, self.masks = dictionary, moments, masks
+        self._scores: dict[Candidate, Array] = {}
+
+    def run(self, n_poles: int) -> tuple[list[Candidate], Array]:
+        """A candidate and a penalty k (F,) per set."""
+        exponents = tuple(dict.fromkeys(s.exponent for s in self.dictionary.sources if s.kind in DRIVERS))
+        least = _BATCHES_PER_GAP * sum(s.kind == "gap" for s in self.dictionary.sources)
+        start = Candidate((), exponents[0] if exponents else 0.0)
+        best = [replace(start, gaps=0 < least <= n) for n in self.masks.sum(axis=1)]
+        if n_poles > 0:
+            best = self._better(best, lambda c: [c, *(replace(c, poles=(a,)) for a in _COARSE)])
+        if n_poles > 1:
+            best = self._better(best, _second_pole)
+        best = self._better(best, lambda c: [c, replace(c, gaps=False)])
+        if exponents:
+            best = self._better(best, lambda c: [c, *(replace(c, exponent=m) for m in (0.0, *exponents))])
+        penalty = np.zeros(len(self.masks))
+        for candidate in dict.fromkeys(best):
+            some = [f for f, own in enumerate(best) if own == candidate]
+            penalty[some] = self.penalties(candidate, some)
+        return best, penalty
+
+    def penalties(self, candidate: Candidate, sets: Sequence[int] | None = None) -> Array:
+        """The best k of a candidate for some of the sets, None all."""
+        masks = self.masks if sets is None else self.masks[list(sets)]
+        return PENALTIES[np.argmin(self._left_out(candidate, masks, PENALTIES), axis=1)]
+
+    def _better(self, best: Sequence[Candidate], others: Callable[[Candidate], list[Candidate]]) -> list[Candidate]:
+        """Every set's least of what stands beside its best; equal scores keep the first."""
+        tried = [list(dict.fromkeys(others(candidate))) for candidate in best]
+        asked: dict[Candidate, list[int]] = {}
+        for f, candidates in enumerate(tried):
+            for candidate in candidates:
+                asked.setdefault(candidate, []).append(f)
+        for candidate, sets in asked.items():
+            score = self._scores.setdefault(candidate, np.full(len(best), np.nan))
+            if new := [f for f in sets if np.isnan(score[f])]:
+                score[new] = self._left_out(candidate, self.masks[new], _FEW_PENALTIES).min(axis=1)
+        return [c[int(np.argmin([self._scores[one][f] for one in c]))] for f, c in enumerate(tried)]
+
+    def _left_out(self, candidate: Candidate, masks: Mask, penalties: Array) -> Array:
+        columns = self.dictionary.places(candidate.sources(self.dictionary), candidate.poles)
+        return left_out_mean_S_um(
+            Blocks.of(self.moments.subset(columns)), masks, False, lambda pool: gains(pool, penalties)
+        )
+
+
+def gains(pool: Pool, penalties: Array) -> Array:
+    """Ridge (S, p, G): (XX + k trace(XX)/p) g = Xy for every penalty k."""
+    alpha = _mean_diagonal(pool.xx)
+    out = np.empty((*pool.xy.shape, len(penalties)))
+    matrix = pool.xx.copy()
+    diagonal = np.einsum("sjj->sj", matrix)
+    own = diagonal.copy()
+    for g, k in enumerate(penalties):
+        diagonal[:] = own + k * alpha[:, None]
+        out[:, :, g] = np.linalg.solve(matrix, pool.xy[:, :, None])[:, :, 0]
+    return out
+
+
+def _second_pole(c: Candidate) -> list[Candidate]:
+    """One more pole beside the first, on the coarse grid."""
+    if len(c.poles) != 1:
+        return [c]
+    return [c, *(replace(c, poles=tuple(sorted((c.poles[0], b)))) for b in _COARSE if b != c.poles[0])]
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Gains at given poles: weight and slope of `combination`, ridge alpha (F,), gain (F, p), sum of squares (F,)."""
+
+    log_tau: Array
+    weight: Array
+    slope: Array
+    alpha: Array
+    gain: Array
+    sse: Array
+
+    @classmethod
+    def at(cls, log_tau: Array, pool: Pool, yy: Array, direct: NDArray[np.bool_], penalty: Array) -> Self:
+        weight, slope = combination(log_tau, direct)
+        across = weight.transpose(0, 2, 1)
+        matrix, right = across @ pool.xx @ weight, (across @ pool.xy[:, :, None])[:, :, 0]
+        alpha = penalty * _mean_diagonal(matrix)
+        ridge = alpha[:, None, None] * np.eye(matrix.shape[1])
+        gain = np.asarray(np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0], float)
+        square = np.einsum("fj,fj->f", gain, (matrix @ gain[:, :, None])[:, :, 0])
+        sse = np.maximum(yy - 2.0 * np.einsum("fj,fj->f", gain, right) + square, 0.0)
+        return cls(log_tau, weight, slope, alpha, gain, sse)
+
+    def cost(self, shared: Array, hold: Array) -> Array:
+        away = ((self.log_tau - shared[:, None, :]) ** 2).sum(axis=(1, 2))
+        return np.asarray(self.sse + self.alpha * (self.gain**2).sum(axis=1) + hold * away)
+
+    def step(self, pool: Pool, shared: Array, hold: Array) -> Array:
+        """The Gauss–Newton step in log τ, (F, S, L), gains moving along."""
+        n_fits, n_sources, n_poles = self.log_tau.shape
+        p, n_lags = self.gain.shape[1], n_sources * n_poles
+        columns = np.concatenate([self.weight, self.slope * self.gain[:, None, p - n_lags :]], axis=2)
+        across = columns.transpose(0, 2, 1)
+        rest = pool.xy - (pool.xx @ self.weight @ self.gain[:, :, None])[:, :, 0]
+        right = (across @ rest[:, :, None])[:, :, 0]
+        away = (self.log_tau - shared[:, None, :]).transpose(0, 2, 1).reshape(n_fits, -1)
+        right -= np.concatenate([self.alpha[:, None] * self.gain, hold[:, None] * away], axis=1)
+        matrix = across @ pool.xx @ columns
+        ridge = [np.repeat(self.alpha[:, None], p, axis=1), np.repeat(hold[:, None], n_lags, axis=1)]
+        np.einsum("fjj->fj", matrix)[:] += np.concatenate(ridge, axis=1)
+        step = np.linalg.solve(matrix, right[:, :, None])[:, p:, 0]
+        return np.clip(step, -_LONGEST_STEP, _LONGEST_STEP).reshape(n_fits, n_poles, -1).transpose(0, 2, 1)
+
+    def where(self, better: NDArray[np.bool_], other: Self) -> Self:
+        """`other` in the fits where it is better."""
+        parts = {
+            name: np.where(better.reshape(-1, *[1] * (old.ndim - 1)), getattr(other, name), old)
+            for name, old in vars(self).items()
+        }
+        return replace(self, **parts)
+
+
+def refined(
+    pool: Pool, yy: Array, direct: NDArray[np.bool_], shared: Array, penalty: Array, rows: Array
+) -> tuple[Array, Array]:
+    """Each source's poles by itself: penalised Gauss–Newton on log τ, shortened until it helps (variable projection).
+
+    Minimises `|y − Σ g v|² + α |g|² + σ² m |log τ − log τ_shared|² / looseness²`: α is the ridge of `gains`, σ² the
+    residual variance, and the m rows of a batch count as one observation, because they are not independent.
+
+    Args:
+        pool: sums over the dictionary's columns of the S sources in the order of `Dictionary.block`, F sets.
+        yy: the target's centred sum of squares, (F,). shared: log τ of the poles that all sources start from, (F, L).
+        penalty: k of `gains`, (F,). rows: mean rows per batch, (F,).
+
+    Returns:
+        log τ (F, S, L) and gains (F, D + L S) of the columns of `combination`.
+    """
+    now = _Solved.at(np.repeat(shared[:, None, :], len(direct), axis=1), pool, yy, direct, penalty)
+    share = np.ones(len(shared))
+    for _ in range(_STEPS if shared.shape[1] else 0):
+        hold = rows * now.sse / np.maximum(pool.count, 1.0) / _LOOSENESS**2 + EPS * (yy + 1.0)
+        moved = now.log_tau + share[:, None, None] * now.step(pool, shared, hold)
+        trial = _Solved.at(np.clip(moved, *np.log(TAUS_S[[0, -1]])), pool, yy, direct, penalty)
+        better = trial.cost(shared, hold) < now.cost(shared, hold)
+        now, share = now.where(better, trial), np.where(better, np.minimum(2.0 * share, 1.0), 0.3 * share)
+    return now.log_tau, now.gain
+
+
+def _mean_diagonal(matrix: Array) -> Array:
+    """trace/p (S,) of (S, p, p); 1 where nothing moves."""
+    mean = np.einsum("sjj->s", matrix) / matrix.shape[1]
+    return np.where(mean > 0, mean, 1.0)

@@ -1,0 +1,146 @@
+"""Training sets as sums over blocks of rows: pooled, fitted, and judged on blocks left out, without reading a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.arrays import Array, Mask
+from features.design import Moments
+
+FLAT = 1e-12  # an input that moves less than this part of its own size does not move
+AT_ONCE = 4_000_000  # numbers in a stack of covariances
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Centred sums of S sets of rows: count (S,), mean_x (S, p), mean_y (S,), xx (S, p, p), xy (S, p).
+
+    xx and xy are of the inputs divided by `scale` (S, p), which is 1 where all inputs are in K. `loss` (S,) says
+    how much the sums about the common origin exceed the centred ones: the digits that centring cost.
+    """
+
+    count: Array
+    mean_x: Array
+    mean_y: Array
+    xx: Array
+    xy: Array
+    scale: Array
+    loss: Array
+
+    def correlation(self) -> tuple[Array, Array]:
+        """xx of the inputs over their own spread (S, p, p), and that spread (S, p); a flat input stands alone."""
+        spread = np.sqrt(np.einsum("sjj->sj", self.xx))
+        flat = spread == 0
+        spread = np.where(flat, 1.0, spread)
+        out = self.xx / (spread[:, :, None] * spread[:, None, :])
+        np.einsum("sjj->sj", out)[flat] = 1.0
+        return out, spread
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Sums over B blocks of rows, each about its own mean, so that pooling them cancels nothing."""
+
+    count: Array
+    mean_x: Array
+    mean_y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+    raw: Array  # (B, p) sums of squares about the moments' origin
+    origin: Array  # (p,)
+
+    @classmethod
+    def of(cls, m: Moments) -> Blocks:
+        n = np.maximum(m.count, 1.0)
+        mean_x, mean_y = m.sum_x / n[:, None], m.sum_y / n
+        xx = m.xx - m.sum_x[:, :, None] * mean_x[:, None, :]
+        xy = m.xy - m.sum_x * mean_y[:, None]
+        raw = np.einsum("bjj->bj", m.xx)
+        moves = np.einsum("bjj->bj", xx) > FLAT * raw
+        xx *= moves[:, :, None] & moves[:, None, :]
+        yy = np.maximum(m.yy - m.sum_y * mean_y, 0.0)
+        return cls(m.count, mean_x, mean_y, xx, xy * moves, yy, raw, m.shift_x)
+
+    def pool(self, masks: Mask, scaled: bool) -> Pool:
+        """Sets of blocks, masks (S, B), each as one training set; `scaled` divides inputs by their std there."""
+        sets, p = len(masks), self.mean_x.shape[1]
+        take = masks.astype(float)
+        weight = take * self.count
+        count = weight.sum(axis=1)
+        n = np.maximum(count, 1.0)
+        mean_x, mean_y = weight @ self.mean_x / n[:, None], weight @ self.mean_y / n
+        root = np.sqrt(weight)
+        between = root[:, :, None] * (self.mean_x - mean_x[:, None, :])
+        between_y = root * (self.mean_y - mean_y[:, None])
+        across = between.transpose(0, 2, 1)
+        xx = (take @ self.xx.reshape(len(self.xx), -1)).reshape(sets, p, p) + across @ between
+        xy = take @ self.xy + (across @ between_y[:, :, None])[:, :, 0]
+        raw = take @ self.raw
+        square = np.einsum("sjj->sj", xx)
+        moves = square > n[:, None] * (FLAT * (np.abs(self.origin) + np.sqrt(raw / n[:, None]))) ** 2
+        if not moves.all():
+            xx *= moves[:, :, None] & moves[:, None, :]
+            xy *= moves
+        safe = np.where(moves, square, 1.0)
+        loss = np.where(moves, raw / safe, 1.0).max(axis=1, initial=1.0)
+        scale = np.sqrt(np.where(moves, square, n[:, None]) / n[:, None]) if scaled else np.ones((sets, p))
+        if scaled:
+            xx, xy = xx / (scale[:, :, None] * scale[:, None, :]), xy / scale
+        return Pool(count, mean_x, mean_y, xx, xy, scale, loss)
+
+    def left_out_S_um(self, block: NDArray[np.int64], pool: Pool, which: NDArray[np.int64], coef: Array) -> Array:
+        """S (V, G) in µm of left-out blocks (V,) under the models coef (S, p, G) fitted on pool[which]."""
+        beta = coef[which]
+        square = np.einsum("vjg,vjg->vg", beta, self.xx[block] @ beta)
+        cross = (self.xy[block][:, None, :] @ beta)[:, 0]
+        away = (self.mean_x[block] - pool.mean_x[which])[:, None, :] @ beta
+        bias = (self.mean_y[block] - pool.mean_y[which])[:, None] - away[:, 0]
+        n = self.count[block][:, None]
+        sse = self.yy[block][:, None] - 2.0 * cross + square + n * bias**2
+        return np.sqrt(np.maximum(sse, 0.0) / np.maximum(n - 1.0, 1.0))
+
+
+def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> NDArray[np.int64]:
+    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,)."""
+    return np.asarray(np.argmin(left_out_mean_S_um(blocks, masks, scaled, path), axis=1))
+
+
+def left_out_mean_S_um(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> Array:
+    """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
+
+    `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
+    training sets are fitted once.
+    """
+    outer, left, sets, which = inner_sets(masks)
+    step = max(1, AT_ONCE // blocks.mean_x.shape[1] ** 2)
+    S_um: Array | None = None
+    for start in range(0, len(sets), step):
+        pool = blocks.pool(sets[start : start + step], scaled)
+        rows = np.flatnonzero((which >= start) & (which < start + step))
+        part = blocks.left_out_S_um(left[rows], pool, which[rows] - start, path(pool))
+        S_um = np.empty((len(left), part.shape[1])) if S_um is None else S_um
+        S_um[rows] = part
+    assert S_um is not None
+    border = np.searchsorted(outer, np.arange(len(masks)))
+    total = np.add.reduceat(S_um, border, axis=0)
+    return np.asarray(total / masks.sum(axis=1, keepdims=True))
+
+
+def inner_sets(masks: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask, NDArray[np.int64]]:
+    """Every training set, masks (F, B), without each of its blocks in turn; V in all.
+
+    Returns:
+        outer set (V,) and block left out (V,), the distinct inner sets, and which of these it is (V,).
+    """
+    outer, left = np.nonzero(masks)
+    inner = masks[outer]
+    inner[np.arange(len(left)), left] = False
+    packed = np.packbits(inner, axis=1)
+    key = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[1])))[:, 0]
+    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    return outer, left, inner[first], which

@@ -1,0 +1,1 @@
+"""Reports: pages, tables and pictures from what the inner rooms return."""

@@ -1,0 +1,180 @@
+"""The page as data: header, one part per error channel, the findings of the recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from data.errors import InputError
+from data.files import write_atomic
+from data.registry import Registry
+from features.selectors import SELECTORS
+from models import FAMILIES
+from models.protocols import PromotionRule
+from models.result import GridResult, Training
+from reports.comparison import story as records
+from reports.comparison import tables
+from reports.comparison.channel import Channel, channel_part
+from reports.comparison.story import Verdict, promoted_cell, verdict
+from reports.comparison.tables import protocols_of, scored
+from reports.labels import count, decimals, family_label, listed, number, selector_label
+from reports.layout import Table
+from reports.rendering import FORMATS, template_environment
+
+_FEW_FINDINGS = 12
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything that the templates show."""
+
+    title: str
+    machines: str
+    simulated: bool
+    facts: tuple[tuple[str, str], ...]
+    verdicts: tuple[Verdict, ...]
+    overview: Table
+    channels: tuple[Channel, ...]
+    findings_words: str
+    findings: tuple[Table, ...]  # a summary where there are many, then every finding
+    few_findings: bool
+    excluded: Table | None
+    rule: str
+    families: tuple[tuple[str, str], ...]
+    selectors: tuple[tuple[str, str], ...]
+    sources: tuple[tuple[str, str], ...]
+
+
+def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
+    """Collect the page. Trainings of one machine and channel are compared; the newest stands for the channel.
+
+    Raises:
+        InputError: no training, or one without a judged cell.
+    """
+    if not trainings:
+        raise InputError("report: got no training; give at least one tracked training")
+    groups = _grouped(trainings)
+    machines = list(dict.fromkeys(t.result.machine for t in trainings))
+    newest = [group[0] for group in groups]
+    names = [_name(t, len(machines) > 1) for t in newest]
+    channels, overview, verdicts = [], [], []
+    for i, (name, group) in enumerate(zip(names, groups, strict=True)):
+        protocol = protocols_of(group[0].result)[0]
+        cells = scored(group[0].result, protocol, rule)
+        if cells.empty:
+            raise InputError(f"report: training {group[0].training_id} has no cell with a finite score; train again")
+        choices = [promoted_cell(t, rule, protocols_of(t.result)[0], t is group[0]) for t in group]
+        digits = decimals(choices[0].S_std_um, choices[0].n_batches)
+        said = verdict(name, group[0], choices[0])
+        verdicts.append(said)
+        overview.append((name, cells, choices[0], digits))
+        channels.append(channel_part(f"c{i + 1}", name, group, choices, said, rule))
+    results = [t.result for t in newest]
+    simulated = any(t.simulated or t.result.simulated for t in trainings)
+    found = records.findings_of(results)
+    n_batches = sum(len(set().union(*(r.batches["batch_id"] for r in results if r.machine == m))) for m in machines)
+    left = records.excluded(list(zip(names, results, strict=True)), simulated)
+    every = (records.findings(found, simulated),) if len(found) else ()
+    many = (records.findings_by_channel(found, simulated),) if len(found) > _FEW_FINDINGS else ()
+    return Page(
+        title=f"Thermal error models of {listed(machines)}",
+        machines=listed(machines),
+        simulated=simulated,
+        facts=_facts(newest, names, n_batches),
+        verdicts=tuple(verdicts),
+        overview=tables.overview(overview, protocols_of(results[0])[0], simulated),
+        channels=tuple(channels),
+        findings_words=records.findings_words(found, n_batches),
+        findings=many + every,
+        few_findings=not many,
+        excluded=left if left.rows else None,
+        rule=_rule_words(rule),
+        families=_members(FAMILIES, results, "family", family_label),
+        selectors=_members(SELECTORS, results, "selector", selector_label),
+        sources=tuple(
+            (f"{_name(t, len(machines) > 1)}, {t.started:%Y-%m-%d %H:%M} UTC", t.training_id) for t in trainings
+        ),
+    )
+
+
+def _members(
+    registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]
+) -> tuple[tuple[str, str], ...]:
+    """Label and words of every member that was tried, in the registry's order."""
+    tried = set().union(*(r.cells[column] for r in results))
+    return tuple((label(key), registry[key].words.removeprefix(f"{label(key)}: ")) for key in registry if key in tried)
+
+
+def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
+    """Per machine and channel in the given order, newest first."""
+    groups: dict[tuple[str, str], list[Training]] = {}
+    for t in trainings:
+        groups.setdefault((t.result.machine, t.result.target), []).append(t)
+    return [sorted(g, key=lambda t: t.started, reverse=True) for g in groups.values()]
+
+
+def _name(training: Training, several: bool) -> str:
+    return f"{training.result.machine} {training.result.target}" if several else training.result.target
+
+
+def _facts(newest: Sequence[Training], names: Sequence[str], n_batches: int) -> tuple[tuple[str, str], ...]:
+    batches = pd.concat([t.result.batches for t in newest], ignore_index=True)
+    starts = sorted(str(s)[:10] for s in batches.get("start", pd.Series(dtype=str)).dropna() if str(s))
+    span = f", {starts[0]} to {starts[-1]}" if starts else ""
+    ambient = batches.get("start_ambient_degC", pd.Series(dtype=float)).to_numpy(float)
+    ambient = ambient[np.isfinite(ambient)]
+    speeds = sorted(set(batches.get("speed", pd.Series(dtype=str)).astype(str)), key=_speed_order)
+    protocols = list(dict.fromkeys(p for t in newest for p in protocols_of(t.result)))
+    trained = sorted(f"{t.started:%Y-%m-%d %H:%M}" for t in newest)
+    facts = [
+        ("Error channels" if len(names) > 1 else "Error channel", listed(list(names))),
+        ("Recordings", f"{count(n_batches, 'batch')}{span}"),
+        ("Start ambient", f"{number(ambient.min())} to {number(ambient.max())} °C" if len(ambient) else ""),
+        ("Spindle", listed([s for s in speeds if s != "unknown"])),
+        ("Judged by", listed(protocols)),
+        ("Trained", trained[0] + (f" to {trained[-1]}" if trained[-1] != trained[0] else "") + " UTC"),
+    ]
+    return tuple((k, v) for k, v in facts if v)
+
+
+def _speed_order(words: str) -> tuple[float, str]:
+    first = words.split(" ")[0]
+    return (float(first), words) if first.replace(".", "", 1).isdigit() else (math.inf, words)
+
+
+def _rule_words(r: PromotionRule) -> str:
+    return (
+        f"The rule takes the cell of least {r.score} by {r.protocol} among those whose points are stable "
+        f"(at least {r.min_tsp_stability:g}); within {r.tie_percent:g} % the simpler one. "
+        "A newcomer replaces the champion only if it is better on the same batches "
+        f"(paired sign-flip test, {100 * r.significance:g} %, at least {r.min_batches} batches)."
+    )
+
+
+def write_report(trainings: Sequence[Training], path: Path, rule: PromotionRule) -> Path:
+    """One page from tracked trainings; the suffix of `path`, .html or .md, decides the format.
+
+    The HTML page holds everything it needs and asks no network. The folder is made; the file appears whole or not
+    at all.
+
+    Raises:
+        InputError: no training given, one without a judged cell, another suffix, or a place that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS:
+        raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html or .md")
+    shown = page(trainings, rule)
+    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
+    html = path.suffix == ".html"
+    text = template_environment(html).get_template(f"report{path.suffix}.j2").render(page=shown, written=written)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text)
+    except OSError as error:
+        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
+    return path

@@ -1,0 +1,300 @@
+"""What became of a training, in plain sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from data.errors import InputError
+from models.promotion import Choice, decide, pick
+from models.protocols import PromotionRule
+from models.result import GridResult, Training
+from reports.comparison.tables import picked
+from reports.labels import between, cell_label, count, decimals, number, p_words, plus_minus
+from reports.layout import Column, Row, Table
+
+_FINDING_KEYS = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
+
+
+def findings_of(results: Sequence[GridResult]) -> pd.DataFrame:
+    """The findings of all results, each once, by machine, batch and channel."""
+    parts = [r.findings.reindex(columns=_FINDING_KEYS).assign(machine=r.machine) for r in results if len(r.findings)]
+    if not parts:
+        return pd.DataFrame(columns=[*_FINDING_KEYS, "machine"])
+    every = pd.concat(parts, ignore_index=True).drop_duplicates()
+    return every.sort_values(["machine", "batch_id", "channel", "start_s"], kind="stable").reset_index(drop=True)
+
+
+def findings_words(found: pd.DataFrame, n_batches: int) -> str:
+    """One sentence about all findings."""
+    if found.empty:
+        return f"The checks raised no finding in {count(n_batches, 'batch')}; every recorded sample was used."
+    overruled = found["overruled"].map(_text).astype(bool)
+    masked = int((found["masks"].map(_yes) & ~overruled).sum())
+    with_any = found[["machine", "batch_id"]].drop_duplicates()
+    where = f"{count(len(found), 'finding')} in {len(with_any)} of {count(n_batches, 'batch')}"
+    words = f"{where}: {masked} masked for training"
+    noted = len(found) - masked - int(overruled.sum())
+    words += f", {noted} noted only" if noted else ""
+    return words + (f", {int(overruled.sum())} overruled by the machine file" if overruled.any() else "") + "."
+
+
+def findings(found: pd.DataFrame, simulated: bool) -> Table:
+    """Every finding: where, when, what, and whether it was masked."""
+    rows = [
+        Row(
+            (
+                str(f["batch_id"]),
+                _text(f["channel"]) or "all channels",
+                str(f["check"]).replace("_", " "),
+                between(_time(f["start_s"]), _time(f["end_s"])),
+                _text(f["words"]),
+                _effect(f),
+            )
+        )
+        for f in found.to_dict("records")
+    ]
+    columns = (
+        Column("batch"),
+        Column("channel"),
+        Column("check"),
+        Column("when", "h:min from start"),
+        Column("what was found", "", "wide"),
+        Column("for training"),
+    )
+    return Table("Every finding", columns, tuple(rows), simulated)
+
+
+def findings_by_channel(found: pd.DataFrame, simulated: bool) -> Table:
+    """The findings counted per check and channel."""
+    table = found.assign(
+        channel=found["channel"].map(lambda c: _text(c) or "all channels"),
+        overruled=found["overruled"].map(_text).astype(bool),
+    )
+    table["masked"] = table["masks"].map(_yes) & ~table["overruled"]
+    rows = []
+    for (check, channel), part in table.groupby(["check", "channel"], sort=True):
+        rows.append(
+            Row(
+                (
+                    str(check).replace("_", " "), str(channel), str(len(part)), str(part["batch_id"].nunique()),
+                    str(int(part["masked"].sum())), str(int(part["overruled"].sum())),
+                )
+            )
+        )  # fmt: skip
+    columns = (
+        Column("check"),
+        Column("channel"),
+        Column("findings", "", "number"),
+        Column("batches", "", "number"),
+        Column("masked", "", "number"),
+        Column("overruled", "", "number"),
+    )
+    return Table("Findings per check and channel", columns, tuple(rows), simulated)
+
+
+def excluded(results: Sequence[tuple[str, GridResult]], simulated: bool) -> Table:
+    """Channels that no cell may use, batches and folds left out, families that failed, with the error channels."""
+    of: dict[tuple[str, str], list[str]] = {}
+    for name, result in results:
+        for row in result.excluded.to_dict("records"):
+            targets = of.setdefault((str(row["channel"]), str(row["reason"])), [])
+            if name not in targets:
+                targets.append(name)
+    rows = [
+        Row((what, why, "all" if len(targets) == len(results) > 1 else ", ".join(targets)))
+        for (what, why), targets in of.items()
+    ]
+    columns = (Column("what"), Column("why", "", "wide"), Column("error channel"))
+    return Table("Left out: channels, folds and failed families", columns, tuple(rows), simulated)
+
+
+def trainings(rows: Sequence[tuple[Training, Choice, int]]) -> Table:
+    """The trainings of one channel, newest first."""
+    out = []
+    for i, (t, choice, digits) in enumerate(rows):
+        earlier = rows[i + 1][0].result.batches if i + 1 < len(rows) else None
+        new, gone = changed_batches(t.result.batches, earlier) if earlier is not None else ([], [])
+        p = t.promotion
+        out.append(
+            Row(
+                (
+                    f"{t.started:%Y-%m-%d %H:%M}",
+                    str(len(t.result.batches)),
+                    f"+{len(new)}" + (f" −{len(gone)}" if gone else "") if earlier is not None else "–",
+                    cell_label(choice.selector, choice.family, choice.n_tsp),
+                    plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+                    f"{p['outcome']} (version {p['version']})" if p else "not promoted",
+                )
+            )
+        )
+    columns = (
+        Column("trained (UTC)"),
+        Column("batches", "", "number"),
+        Column("new batches", "", "number"),
+        Column("model"),
+        Column("S_mean ± S_std", "µm", "number"),
+        Column("outcome"),
+    )
+    caption = "The trainings, each judged on its own batches"
+    return Table(caption, columns, tuple(out), rows[0][0].simulated)
+
+
+def changed_batches(now: pd.DataFrame, earlier: pd.DataFrame) -> tuple[list[str], list[str]]:
+    """Batches of now that the earlier training lacked (or knew with other content), and those that are gone."""
+    a = dict(zip(now["batch_id"].astype(str), now["digest"].astype(str), strict=True))
+    b = dict(zip(earlier["batch_id"].astype(str), earlier["digest"].astype(str), strict=True))
+    return [k for k, digest in a.items() if b.get(k) != digest], [k for k in b if k not in a]
+
+
+def _effect(finding: dict[Any, Any]) -> str:
+    reason = _text(finding["overruled"])
+    if reason:
+        return f"used; overruled: {reason}"
+    return "masked" if _yes(finding["masks"]) else "used; noted only"
+
+
+def _time(value: object) -> float:
+    return float(value) if isinstance(value, int | float | np.floating) else math.nan
+
+
+def _text(value: object) -> str:
+    return "" if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA else str(value)
+
+
+def _yes(value: object) -> bool:
+    return bool(value) if isinstance(value, bool | np.bool_) else True
+
+
+def interval_words(comparison: dict[str, float], digits: int = 2) -> str:
+    """``0.60 µm better (90 %: 0.20 to 1.00)`` of a paired comparison."""
+    d = float(comparison["difference_um"])
+    sign = 1.0 if d >= 0 else -1.0
+    ends = sorted([sign * float(comparison["low_um"]), sign * float(comparison["high_um"])])
+    words = f"{number(abs(d), digits)} µm {'better' if d >= 0 else 'worse'}"
+    return f"{words} (90 %: {number(ends[0], digits)} to {number(ends[1], digits)} µm)"
+
+
+_CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unchanged", "": "not promoted"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One channel's outcome: a chip, a sentence, a caution (empty where there is none)."""
+
+    channel: str
+    outcome: str
+    chip: str
+    words: str
+    caution: str = ""
+
+
+def promoted_cell(training: Training, rule: PromotionRule, protocol: str, nested: bool = False) -> Choice:
+    """The cell that was promoted; without a promotion the one that the rule would take.
+
+    Args:
+        nested: with the score of choosing itself, as recorded at the promotion, else computed now.
+    """
+    mean, std = (float(training.promotion.get(f"nested_S_{n}_um", math.nan)) for n in ("mean", "std"))
+    if nested and not math.isfinite(mean) and protocol == rule.protocol:
+        own = decide(training.result, rule)
+    else:
+        own = replace(picked(training.result, rule, protocol), nested_S_mean_um=mean, nested_S_std_um=std)
+    cell = str(training.promotion.get("cell", ""))
+    if cell and cell != own.cell:
+        try:
+            return pick(training.result.cells, rule.model_copy(update={"protocol": protocol}), cell)
+        except InputError:
+            pass  # promoted from another grid: the rule's own choice is shown instead
+    return own
+
+
+def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
+    """Who is champion and why."""
+    p = training.promotion
+    outcome = str(p.get("outcome", ""))
+    digits = decimals(choice.S_std_um, choice.n_batches)
+    score = (
+        f"{plus_minus(choice.S_mean_um, choice.S_std_um, digits)} µm on left-out batches "
+        f"({choice.protocol}, {count(choice.n_batches, 'batch')}{_nested(choice, digits)})"
+    )
+    model = cell_label(choice.selector, choice.family, choice.n_tsp)
+    if outcome == "champion":
+        words = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
+    elif outcome == "challenger":
+        words = (
+            f"Version {p['champion_version']} stays champion; version {p['version']}, {model}, is challenger: "
+            f"{score}; {_why_challenger(p)}."
+        )
+    elif outcome == "unchanged":
+        words = (
+            f"Nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
+            f"Version {p['champion_version']} is champion."
+        )
+    else:
+        words = f"Nothing was promoted. The rule would take {model}: {score}."
+    why = str(p.get("caution", "")) if p else choice.caution
+    caution = f"Do not trust this model: {why}." if why else ""
+    return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), words, caution)
+
+
+def mark_of(training: Training) -> str:
+    """What the chosen cell's model is now: champion, challenger, or only chosen."""
+    p = training.promotion
+    if not p:
+        return "chosen"
+    return "champion" if p["version"] == p["champion_version"] else "challenger"
+
+
+def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
+    """The paired comparison with the champion as label and value; empty where there was none."""
+    c = promotion.get("comparison")
+    if not c:
+        return []
+    old = promotion.get("against")
+    return [
+        ("batches in common", f"{c['n_batches']}"),
+        ("mean S of the newcomer", f"{number(c['new_S_mean_um'], 2)} µm"),
+        (f"mean S of the champion{f' (version {old})' if old else ''}", f"{number(c['old_S_mean_um'], 2)} µm"),
+        ("newcomer against champion", interval_words(c) if math.isfinite(c["low_um"]) else number(math.nan)),
+        ("better on", f"{c['n_better']} of {count(c['n_batches'], 'batch')}"),
+        ("one-sided paired sign-flip test", p_words(c["p_value"]) if math.isfinite(c["p_value"]) else "–"),
+        ("decision", "replaces the champion" if promotion["outcome"] == "champion" else "the champion stays"),
+    ]
+
+
+def _why_champion(p: dict[str, Any]) -> str:
+    c = p.get("comparison")
+    forced = p.get("forced", False)
+    if not c:
+        return "put in place by force" if forced else "it is the first model of this machine and channel"
+    old = p.get("against")
+    words = f"replaces version {old}" if old else "replaces the former champion"
+    words += " by force" if forced and not c["better"] else ""
+    if not math.isfinite(c["difference_um"]):
+        return words
+    return f"{words}, {interval_words(c)} on {count(c['n_batches'], 'batch')}"
+
+
+def _why_challenger(p: dict[str, Any]) -> str:
+    c = p.get("comparison")
+    if not c:
+        return "it could not be compared with the champion" + (f" ({p['obstacle']})" if p.get("obstacle") else "")
+    if "need at least" in str(c.get("words", "")):
+        return str(c["words"]).replace(": the champion stays", "")
+    return (
+        f"on {count(c['n_batches'], 'batch')} it is {interval_words(c)}, {p_words(c['p_value'])}: "
+        "not shown to be better"
+    )
+
+
+def _nested(choice: Choice, digits: int) -> str:
+    if not math.isfinite(choice.nested_S_mean_um):
+        return ""
+    score = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
+    return f"; {score} µm when a batch has no say in the choice of its model either"

@@ -1,0 +1,1 @@
+"""Reports of a twin: network picture, calibration, simulated runs, thermal tests."""

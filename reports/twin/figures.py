@@ -1,0 +1,256 @@
+"""Figures of the twin. Each takes data and returns a figure; none computes a result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from data.arrays import Array
+from data.batch import Batch
+from reports.labels import BLUE, INK, ORANGE, count, number
+from reports.twin.iso230_3 import _COLOURS, _canvas, _free, _legend, _plain, png
+from twin.views.compared import Compared
+from twin.views.overview import ModeView, time_words
+
+MUTED, GRID = "#5a6572", "#eef1f4"
+SIGNED = LinearSegmentedColormap.from_list("signed", ["#004d7a", "#5fa3cf", "#ffffff", "#e99a66", "#963f00"])
+SIZE = LinearSegmentedColormap.from_list("size", ["#ffffff", "#8ebbd9", "#0b5a8f"])
+_WIDTH_IN, _COLUMNS = 10.5, 4
+
+
+def fit_figure(shown: Compared) -> Figure:
+    """Small multiples: recorded and simulated above, their difference below, a column per channel."""
+    n = len(shown.channels)
+    columns = min(_COLUMNS, max(n, 1))
+    rows = max(math.ceil(n / columns), 1)
+    fig = Figure(figsize=(_WIDTH_IN, 2.35 * rows + 0.75))
+    top, low, wide = 1 - 0.62 / fig.get_figheight(), 0.5 / fig.get_figheight(), 1.0
+    hours = shown.time_s / 3600
+    for k in range(n):
+        r, c = divmod(k, columns)
+        left = 0.055 + c * (0.945 / columns)
+        width = wide * 0.945 / columns - 0.045
+        cell = (top - low) / rows
+        bottom = top - (r + 1) * cell
+        upper = fig.add_axes((left, bottom + 0.40 * cell, width, 0.43 * cell))
+        lower = fig.add_axes((left, bottom + 0.14 * cell, width, 0.22 * cell), sharex=upper)
+        _pair(upper, lower, hours, shown, k, bottom_row=k + columns >= n)
+    _head(fig, f"{shown.batch_id}: recorded and simulated", shown.simulated)
+    y = 1 - 0.52 / fig.get_figheight()
+    for x, words, color in (
+        (0.055, "recorded", INK),
+        (0.145, "simulated", BLUE),
+        (0.240, "recorded − simulated", ORANGE),
+    ):
+        fig.text(x, y, f"— {words}", fontsize=8.5, color=color, va="center")
+    return fig
+
+
+def _pair(upper: Axes, lower: Axes, hours: Array, shown: Compared, k: int, bottom_row: bool) -> None:
+    for ax in (upper, lower):
+        _calm(ax)
+    upper.plot(hours, shown.recorded[k], color=INK, lw=1.0, label="recorded")
+    upper.plot(hours, shown.computed[k], color=BLUE, lw=1.8, alpha=0.9, label="simulated")
+    lower.plot(hours, shown.residual[k], color=ORANGE, lw=1.0, label="residual")
+    lower.axhline(0, color=MUTED, lw=0.6)
+    unit = _unit(shown.units[k])
+    level = "°C" if unit == "K" else unit
+    title = f"{shown.channels[k]}, {level}"
+    upper.set_title(title.replace("$", r"\$"), fontsize=9, loc="left", color=INK, pad=3)
+    upper.set_title(f"rms {number(float(shown.rms[k]), 2)} {unit}", fontsize=8, loc="right", color=ORANGE, pad=3)
+    upper.tick_params(labelbottom=False)
+    lower.set_xlim(hours[0], hours[-1] if hours[-1] > hours[0] else hours[0] + 1)
+    lower.locator_params(axis="y", nbins=3)
+    upper.locator_params(axis="y", nbins=4)
+    if bottom_row:
+        lower.set_xlabel("time, h", fontsize=8, labelpad=1)
+    else:
+        lower.tick_params(labelbottom=False)
+
+
+def residual_map(shown: Compared) -> Figure:
+    """Channel × time: recorded less simulated; temperatures and displacements each on their own colours."""
+    groups = _by_unit(shown.units)
+    heights = [0.26 * len(g) + 0.05 for g in groups.values()]
+    high = sum(heights) + 0.62 * len(heights) + 0.55
+    fig = Figure(figsize=(_WIDTH_IN, high))
+    y = high - 0.55
+    hours = shown.time_s / 3600
+    for (unit, at), h in zip(groups.items(), heights, strict=True):
+        ax = fig.add_axes((0.12, (y - h) / high, 0.76, h / high))
+        values = shown.residual[at]
+        top = _top(values)
+        step = (hours[-1] - hours[0]) / max(len(hours) - 1, 1) or 1.0
+        extent = (hours[0] - step / 2, hours[-1] + step / 2, len(at) - 0.5, -0.5)
+        image = ax.imshow(
+            values, aspect="auto", cmap=SIGNED, vmin=-top, vmax=top, extent=extent, interpolation="nearest"
+        )
+        ax.set_yticks(range(len(at)), [shown.channels[i].replace("$", r"\$") for i in at], fontsize=8)
+        ax.tick_params(labelsize=8, length=2, color=MUTED)
+        ax.set_facecolor("#d5dbe1")  # nothing usable recorded
+        ax.spines[:].set_visible(False)
+        bar = fig.colorbar(image, cax=fig.add_axes((0.895, (y - h) / high, 0.012, h / high)))
+        bar.set_label(_unit(unit), fontsize=8)
+        bar.ax.tick_params(labelsize=7.5, length=2)
+        bar.outline.set_visible(False)
+        y -= h + 0.62
+        ax.set_xlabel("time, h", fontsize=8, labelpad=1)
+    _head(fig, f"{shown.batch_id}: residual, recorded − simulated", shown.simulated)
+    return fig
+
+
+def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of every batch and channel") -> Figure:
+    """Batch × channel with its numbers; the colour counts within the channels of one unit.
+
+    Args:
+        rms: batch, channel, unit, rms, as `twin.views.compared.rms_table` gives it.
+    """
+    batches, channels = list(dict.fromkeys(rms["batch"])), list(dict.fromkeys(rms["channel"]))
+    unit = rms.drop_duplicates("channel").set_index("channel")["unit"]
+    wide = rms.pivot(index="batch", columns="channel", values="rms").reindex(index=batches, columns=channels)
+    values = wide.to_numpy(float)
+    high = 0.27 * len(batches) + 1.2
+    fig = Figure(figsize=(_WIDTH_IN, high))
+    ax = fig.add_axes((0.16, 0.08 / high, 0.83, 0.27 * len(batches) / high))
+    shade = np.zeros_like(values)
+    for u in dict.fromkeys(unit):
+        at = [i for i, c in enumerate(channels) if unit[c] == u]
+        shade[:, at] = values[:, at] / max(float(np.nanmax(values[:, at], initial=0.0)), 1e-12)
+    ax.imshow(shade, aspect="auto", cmap=SIZE, vmin=0, vmax=1, interpolation="nearest")
+    for i in range(len(batches)):
+        for j in range(len(channels)):
+            if np.isfinite(values[i, j]):
+                text = number(values[i, j], 2 if values[i, j] < 9.95 else 1)
+                ax.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if shade[i, j] > 0.6 else INK)
+    ax.set_yticks(range(len(batches)), [b.replace("$", r"\$") for b in batches], fontsize=8)
+    names = [f"{c.replace('_', chr(10)) if len(c) > 9 else c}\n{_unit(unit[c])}".replace("$", r"\$") for c in channels]
+    ax.set_xticks(range(len(channels)), names, fontsize=8)
+    ax.xaxis.tick_top()
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    ax.set_xticks(np.arange(len(channels) + 1) - 0.5, minor=True)
+    ax.set_yticks(np.arange(len(batches) + 1) - 0.5, minor=True)
+    ax.grid(which="minor", color="white", lw=1.5)
+    ax.tick_params(which="minor", length=0)
+    _head(fig, title, simulated)
+    return fig
+
+
+def mode_shapes(views: Sequence[ModeView], simulated: bool, most: int = 6) -> Figure:
+    """The slowest modes: a panel each, a bar per body, the greatest amplitude 1; darker bars store more of the heat."""
+    shown = views[:most]
+    bodies = list(shown[0].shape)
+    high = 0.2 * len(bodies) + 1.6
+    fig = Figure(figsize=(_WIDTH_IN, high))
+    for k, v in enumerate(shown):
+        width = 0.875 / len(shown)
+        ax = fig.add_axes((0.115 + k * width, 0.30 / high, width - 0.012, 0.2 * len(bodies) / high))
+        _calm(ax)
+        size = [v.shape[b] for b in bodies]
+        strong = max(v.weight.values())
+        for i, b in enumerate(bodies):
+            color = BLUE if size[i] >= 0 else ORANGE
+            ax.barh(i, size[i], height=0.72, color=color, alpha=0.25 + 0.75 * math.sqrt(v.weight[b] / strong))
+        ax.axvline(0, color=INK, lw=0.8)
+        ax.set(xlim=(-1.08, 1.08), ylim=(len(bodies) - 0.4, -0.6))
+        ax.set_xticks([-1, 0, 1], ["−1", "0", "1"])
+        ax.set_yticks(range(len(bodies)), [b.replace("$", r"\$") for b in bodies] if k == 0 else [""] * len(bodies))
+        ax.set_title(time_words(v.time_constant_s), fontsize=11, color=INK, loc="left", pad=40, fontweight="bold")
+        ax.annotate(
+            _wrapped(v.words, 23), (0, 1), (0, 37), xycoords="axes fraction", textcoords="offset points",
+            fontsize=7.2, color=MUTED, va="top",
+        )  # fmt: skip
+    _head(fig, "Slowest thermal modes", simulated)
+    return fig
+
+
+def _wrapped(words: str, most: int) -> str:
+    import textwrap
+
+    lines = textwrap.wrap(words, most)
+    return "\n".join(lines if len(lines) <= 3 else [*lines[:2], lines[2][: most - 1] + "…"]).replace("$", r"\$")
+
+
+def _head(fig: Figure, title: str, simulated: bool) -> None:
+    high, wide = fig.get_figheight(), fig.get_figwidth()
+    y = 1 - 0.2 / high
+    fig.text(0.1 / wide, y, title.replace("$", r"\$"), fontsize=11.5, color=INK, fontweight="bold", va="center")
+    if simulated:
+        fig.text(1 - 0.1 / wide, y, "SIMULATED", fontsize=10, color=ORANGE, fontweight="bold", ha="right", va="center")
+
+
+def _calm(ax: Axes) -> None:
+    ax.tick_params(labelsize=7.5, color=MUTED, length=2.5)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("#b5bec8")
+    ax.grid(color=GRID, lw=0.8)
+    ax.set_axisbelow(True)
+
+
+def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
+    out: dict[str, list[int]] = {}
+    for i, u in enumerate(units):
+        out.setdefault(u, []).append(i)
+    return out
+
+
+def _top(values: Array) -> float:
+    good = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(good, 0.995)) or 1.0 if len(good) else 1.0
+
+
+def _unit(unit: str) -> str:
+    return {"um": "µm", "um/m": "µm/m", "degC": "°C"}.get(unit, unit)
+
+
+_MOST_PANELS = 8
+
+
+def overview_png(plans: Sequence[tuple[str, Batch]]) -> bytes:
+    """The overview of (name, batch) pairs as PNG."""
+    return png(overview(plans))
+
+
+def overview(plans: Sequence[tuple[str, Batch]]) -> Figure:
+    """One panel per error channel, one for the warmest sensor, one per driver that moves; one line per plan."""
+    first = plans[0][1]
+    drivers = [n for n in first.names("driver", "position") if any(np.ptp(b.values(n)) > 0 for _, b in plans)]
+    errors, sensors = first.names("error"), first.names("temperature")
+    panels = [(1.9, n) for n in errors] + ([(1.9, "")] if sensors else []) + [(1.0, n) for n in drivers]
+    if not panels:
+        panels = [(1.9, n) for n in first.channels][:1]
+    fig, axes = _canvas([height for height, _ in panels[:_MOST_PANELS]])
+    for ax, (_, channel) in zip(axes, panels, strict=False):
+        for k, (name, batch) in enumerate(plans):
+            hours, colour = batch.time_s / 3600, _COLOURS[k % len(_COLOURS)]
+            dash = ("-", "--", ":", "-.")[k // len(_COLOURS) % 4]
+            if channel:
+                how = "steps-post" if channel in drivers else "default"
+                ax.plot(hours, batch.values(channel), lw=1.3, color=colour, ls=dash, drawstyle=how, label=_short(name))
+            else:
+                warmest = np.max([batch.values(n) for n in sensors], axis=0)
+                ax.plot(hours, warmest, lw=1.3, color=colour, ls=dash, label=_short(name))
+        unit = _plain(first.channels[channel].unit) if channel else "°C"
+        ax.set_ylabel(f"{_free(channel) if channel else 'warmest sensor'}\n({unit})", fontsize=8)
+        ax.margins(x=0, y=0.08)
+        if channel in errors:
+            ax.axhline(0, color="#5a6572", lw=0.6)
+    _legend(axes[0])
+    axes[-1].set_xlabel("time (h)", fontsize=9)
+    height_in = fig.get_figheight()
+    title = f"{_free(first.machine)}, {count(len(plans), 'run plan')}"
+    fig.text(0.075, 1 - 0.24 / height_in, title, fontsize=11, fontweight="bold", va="center")
+    fig.text(0.988, 1 - 0.24 / height_in, "SIMULATED", fontsize=11, color=ORANGE, fontweight="bold", ha="right",
+             va="center")  # fmt: skip
+    return fig
+
+
+def _short(name: str, most: int = 20) -> str:
+    text = name if len(name) <= most else name[: most - 1] + "…"
+    return _free(text)

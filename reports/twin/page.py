@@ -1,0 +1,280 @@
+"""The report of a twin: machine, network, parameters, fit, residuals, heat, modes on one page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from data.batch import Batch
+from data.errors import InputError
+from data.files import write_atomic
+from data.machine import Machine
+from reports.layout import Table
+from reports.rendering import FORMATS, template_environment
+from reports.twin import tables
+from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
+from reports.twin.flows import flow_picture, heat_stack
+from reports.twin.network_picture import counted, network_picture, picture_bytes
+from twin.calibration import Calibration
+from twin.calibration.identifiability import Interval
+from twin.compile import compile_network, expanded
+from twin.network import Network
+from twin.quantity import Parameter
+from twin.schema import twin_part
+from twin.simulation import choose_substeps, simulate
+from twin.simulation.inputs import Inputs, inputs_of
+from twin.simulation.start import Steady, steady_state
+from twin.views.compared import Compared, compared, rms_table
+from twin.views.heat_flows import HeatFlows, heat_flows
+from twin.views.overview import ModeView, Overview, machine_modes, mode_views, overview
+
+PICTURES = (".svg", ".png", ".html")
+MOST_BATCHES = 4
+_HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class TwinData:
+    """What the report is made of; whatever is empty is left out of the page.
+
+    `intervals` by parameter and `left_out` (`LeftOut.by_channel()`) come from a calibration, `compared` and `flows`
+    from a simulation. `origin` says in words where the values come from, `findings` are sentences for the engineer.
+    """
+
+    view: Overview
+    parameters: Sequence[Parameter]
+    origin: str = "as the machine file states them"
+    intervals: Mapping[str, Interval] = field(default_factory=dict)
+    findings: Sequence[str] = ()
+    left_out: pd.DataFrame | None = None
+    compared: Sequence[Compared] = ()
+    flows: Sequence[HeatFlows] = ()
+    modes: Sequence[ModeView] = ()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure on the page."""
+
+    words: str
+    source: str  # a data: address
+    simulated: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """A section: tables, pictures, notes."""
+
+    anchor: str
+    title: str
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    notes: tuple[str, ...] = ()
+    folded: tuple[Table, ...] = ()
+    findings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class TwinPage:
+    """Everything that the templates show."""
+
+    title: str
+    simulated: bool
+    words: str
+    facts: tuple[tuple[str, str], ...]
+    parts: tuple[Part, ...]
+
+
+def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST_BATCHES) -> Path:
+    """One page that holds everything it needs and asks no network; .md has the tables and no pictures.
+
+    Figures are drawn of the `most_batches` with the greatest residual; the map shows all. The file appears whole or
+    not at all.
+
+    Raises:
+        InputError: another suffix, or a place that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS:
+        raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html or .md")
+    html = path.suffix == ".html"
+    page = twin_page(data, most_batches, pictures=html)
+    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
+    text = template_environment(html).get_template(f"twin{path.suffix}.j2").render(page=page, written=written)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text)
+    except OSError as error:
+        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
+    return path
+
+
+def write_picture(path: Path | str, view: Overview) -> Path:
+    """The network alone, as .svg or .png, or as .html with the table of its bodies.
+
+    Raises:
+        InputError: another suffix, or a place that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in PICTURES:
+        raise InputError(f"picture {path}: got suffix {path.suffix!r}, expected .svg, .png or .html")
+    if path.suffix == ".html":
+        return write_twin_report(path, TwinData(view, ()))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(picture_bytes(network_picture(view), path.suffix[1:]))
+    except OSError as error:
+        raise InputError(f"picture {path}: cannot be written ({error.strerror}); give another place") from None
+    return path
+
+
+def twin_page(data: TwinData, most_batches: int = MOST_BATCHES, pictures: bool = True) -> TwinPage:
+    """Collect the page."""
+    view = data.view
+    parts = [_network(data, pictures)]
+    parts += [_parameters(data)] if data.parameters else []
+    parts += [_fit(data, most_batches, pictures)] if data.compared or data.left_out is not None else []
+    parts += [_heat(data, most_batches, pictures)] if data.flows else []
+    parts += [_modes(data, pictures)] if data.modes else []
+    facts = [("Machine", view.machine), ("Network", counted(view)), ("Values", data.origin)]
+    batches = list(dict.fromkeys([c.batch_id for c in data.compared] + [f.batch_id for f in data.flows]))
+    if batches:
+        named = ", ".join(batches[:3]) + (f" and {len(batches) - 3} more" if len(batches) > 3 else "")
+        facts.append(("Batches", named))
+    simulated = view.simulated or any(c.simulated for c in data.compared)
+    return TwinPage(f"Twin of {view.machine}", simulated, view.description, tuple(facts), tuple(parts))
+
+
+def _network(data: TwinData, pictures: bool) -> Part:
+    shown = [_picture(network_picture(data.view), "Thermal network and error chains", data.view.simulated, "svg")]
+    return Part("network", "Network", (tables.bodies(data.view),), tuple(shown) if pictures else ())
+
+
+def _parameters(data: TwinData) -> Part:
+    free, fixed = (tables.parameters(data.parameters, data.intervals, f, data.view.simulated) for f in (True, False))
+    return Part("parameters", "Parameters", (free,), folded=(fixed,), findings=tuple(data.findings))
+
+
+def _fit(data: TwinData, most: int, pictures: bool) -> Part:
+    chosen = worst(data.compared, most)
+    own = [tables.left_out(data.left_out, data.view.simulated)] if data.left_out is not None else []
+    notes, shown = [], []
+    if data.compared:
+        notes.append("Displacements count from their first reading. Residual: recorded − simulated.")
+    if len(chosen) < len(data.compared):
+        notes.append(f"Drawn: the {len(chosen)} of {len(data.compared)} batches with the greatest residual.")
+    if pictures and data.compared:
+        simulated = any(c.simulated for c in data.compared)
+        words = "Residual rms of every batch and channel"
+        shown.append(_picture(rms_map(rms_table(data.compared), simulated), words, simulated))
+        for c in chosen:
+            shown.append(_picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated))
+            shown.append(_picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated))
+    return Part("fit", "Simulated against recorded", tuple(own), tuple(shown), tuple(notes))
+
+
+def _heat(data: TwinData, most: int, pictures: bool) -> Part:
+    shown = []
+    for f in data.flows[:most] if pictures else ():
+        moment = min(_HOUR_S, 0.5 * float(f.time_s[-1]))
+        shown.append(_picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated))
+        words = f"{f.batch_id}: heat through the network"
+        shown.append(_picture(flow_picture(data.view, f, moment), words, f.simulated, "svg"))
+    notes = ("Every watt is computed, also where a recording gave drivers and surroundings.",)
+    return Part("heat", "Where the watts go", tuple(tables.heat(f) for f in data.flows[:most]), tuple(shown), notes)
+
+
+def _modes(data: TwinData, pictures: bool) -> Part:
+    simulated = data.view.simulated
+    shown = (
+        (_picture(mode_shapes(data.modes, simulated), "Shapes of the slowest modes", simulated),) if pictures else ()
+    )
+    return Part("modes", "Time constants and modes", (tables.modes(data.modes, data.view),), shown)
+
+
+def worst(parts: Sequence[Compared], most: int) -> list[Compared]:
+    """The batches with the greatest residual, each channel by its median over all batches; in their own order."""
+    table = rms_table(parts)
+    if table.empty:
+        return list(parts[:most])
+    usual = table.groupby("channel")["rms"].transform("median").replace(0.0, np.nan)
+    size = (table["rms"] / usual).groupby(table["batch"], sort=False).mean().fillna(0.0)
+    chosen = set(size.sort_values(ascending=False, kind="stable").index[:most])
+    return [c for c in parts if c.batch_id in chosen]
+
+
+def _picture(figure: Figure, words: str, simulated: bool, kind: str = "png") -> Picture:
+    content = base64.b64encode(picture_bytes(figure, kind)).decode("ascii")
+    mime = "image/svg+xml" if kind == "svg" else "image/png"
+    return Picture(words, f"data:{mime};base64,{content}", simulated)
+
+
+AIR_DEGC = 20.0
+
+
+def twin_data(
+    machine: Machine,
+    batches: Sequence[Batch] = (),
+    calibration: Calibration | None = None,
+    most_flows: int = MOST_BATCHES,
+) -> TwinData:
+    """Simulate the batches free-running from their first readings, with the calibrated values where there are some.
+
+    The watts of the network picture are those at the greatest value that each driver had in the batches.
+
+    Raises:
+        InputError: no twin part, or recordings that cannot drive it.
+    """
+    network = compile_network(machine) if calibration is None else calibration.network
+    part = expanded(twin_part(machine))
+    inputs = inputs_of(network, batches) if batches else None
+    if inputs is not None:
+        inputs = inputs.refined(choose_substeps(network, network.values, inputs))
+    drivers, steady = _steady(network, inputs)
+    view = overview(network, part, machine.description, machine.simulated, steady, drivers)
+    modes = machine_modes(network, None if steady is None else steady.factor)
+    rise = None if steady is None else steady.degC - AIR_DEGC
+    done = simulate(network, network.values, inputs, keep_cells=True) if inputs is not None else None
+    flows = []
+    if done is not None and inputs is not None:
+        flows = [heat_flows(done, inputs, batch=k) for k in range(min(most_flows, len(batches)))]
+    return TwinData(
+        view,
+        network.parameters,
+        _origin(calibration),
+        {} if calibration is None else {i.name: i for i in calibration.intervals90},
+        () if calibration is None else _findings(calibration),
+        None if calibration is None or calibration.left_out is None else calibration.left_out.by_channel(),
+        [] if done is None else compared(done, batches),
+        flows,
+        mode_views(network, modes, rise),
+    )
+
+
+def _steady(network: Network, inputs: Inputs | None) -> tuple[dict[str, float] | None, Steady | None]:
+    if inputs is None and network.drivers:
+        return None, None
+    drivers = {n: float(inputs.drivers[n].max()) for n in network.drivers} if inputs is not None else {}
+    try:
+        return drivers, steady_state(network, drivers, AIR_DEGC)
+    except InputError:  # the picture then shows laws without watts
+        return None, None
+
+
+def _origin(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return "as the machine file states them"
+    n = len(calibration.batches)
+    return f"calibrated on {n} {'simulated ' if calibration.simulated else ''}{'batch' if n == 1 else 'batches'}"
+
+
+def _findings(calibration: Calibration) -> tuple[str, ...]:
+    """What the fit says of itself, of what the recordings leave open, and of its residuals."""
+    said = [calibration.fit.words, *(u.words for u in calibration.undetermined)]
+    return tuple(s for s in (*said, *calibration.whiteness_in_words.values()) if s)

@@ -1,0 +1,165 @@
+"""The tables of a twin: bodies, parameters, modes, heat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+
+from reports.labels import NOTHING, number, percent
+from reports.layout import Column, Row, Table
+from reports.twin.network_picture import capacity_words
+from twin.calibration.identifiability import Interval
+from twin.quantity import Parameter
+from twin.views.heat_flows import HeatFlows
+from twin.views.overview import ModeView, Overview, time_words
+
+_UNITS = {"1": "", "um": "µm", "um/K": "µm/K", "um/m/K": "µm/m/K", "degC": "°C", "m**2": "m²", "mm**2/s": "mm²/s",
+          "W/m**2/K": "W/m²/K"}  # fmt: skip
+_KINDS = {"heat": "put in", "storage": "stored in", "loss": "taken by", "link": "through"}
+_KNOWN = 0.5  # posterior sd by prior sd, below which the recordings say more than the prior
+
+
+def bodies(view: Overview) -> Table:
+    """Bodies, capacities, time constants, counts of parameters."""
+    rows = [
+        Row((b.name, b.words or NOTHING, capacity_words(b), time_words(b.time_constant_s), f"{b.free}", f"{b.fixed}"))
+        for b in view.bodies
+    ]
+    columns = (
+        Column("body"), Column("what it is", kind="wide"), Column("heat capacity", kind="number"),
+        Column("time constant", kind="number"), Column("free", "parameters", "number"),
+        Column("fixed", "parameters", "number"),
+    )  # fmt: skip
+    notes = (
+        "Time constant: the body's capacity by all conductances that touch it, its neighbours held.",
+        f"A link's parameters count for both ends; the whole twin has {view.free} free and {view.fixed} fixed ones.",
+    )
+    return Table("Bodies", columns, tuple(rows), view.simulated, notes=notes)
+
+
+def parameters(given: Sequence[Parameter], intervals: Mapping[str, Interval], free: bool, simulated: bool) -> Table:
+    """Every free (or fixed) parameter: value, prior and, when calibrated, its 90 % interval and what it rests on."""
+    rows, told = [], any(p.source for p in given if p.free == free)
+    for p in given:
+        if p.free != free:
+            continue
+        cells = [p.name, p.words, quantity(p.value, p.unit)]
+        found = intervals.get(p.name)
+        if free:
+            cells.append(prior_words(p))
+        if intervals and free:
+            cells.append(interval_words(found, p.unit))
+            cells.append(NOTHING if found is None else "recordings" if found.prior_shrinkage < _KNOWN else "prior")
+        cells += [p.source or NOTHING] if told else []
+        rows.append(Row(tuple(cells)))
+    columns = [Column("parameter"), Column("what it is", kind="wide"), Column("value", kind="number")]
+    columns += [Column("prior", kind="number")] if free else []
+    columns += [Column("90 % interval", kind="number"), Column("rests on")] if intervals and free else []
+    columns += [Column("source", kind="wide")] if told else []
+    notes = []
+    if free:
+        notes.append("Prior: centre ×/÷ one standard deviation of the logarithm, or centre ± one standard deviation.")
+    if intervals and free:
+        notes.append("Rests on: the recordings where they halve the prior's standard deviation, else the prior.")
+    caption = "Free parameters" if free else "Fixed parameters"
+    return Table(caption, tuple(columns), tuple(rows), simulated, notes=tuple(notes))
+
+
+def prior_words(p: Parameter) -> str:
+    """``14 W/K ×/÷ 1.65``, ``0 ± 0.2 K`` or, of a share, its range of one standard deviation."""
+    if not math.isfinite(p.spread):
+        return NOTHING
+    if p.scale == "log":
+        return f"{quantity(p.prior_value, p.unit)} ×/÷ {math.exp(p.spread):.2f}"
+    if p.scale == "linear":
+        return f"{p.prior_value:.4g} ± {quantity(p.spread, 'K' if p.unit == 'degC' else p.unit)}"
+    x = float(p.to_x(p.prior_value))
+    return f"{float(p.from_x(x - p.spread)):.2f} to {float(p.from_x(x + p.spread)):.2f}"
+
+
+def interval_words(found: Interval | None, unit: str) -> str:
+    if found is None:
+        return NOTHING
+    scale, shown = _scale(max(abs(found.low), abs(found.high)), unit)
+    return f"{_three(found.low / scale)} to {_three(found.high / scale)} {shown}".strip().replace("-", "−")
+
+
+def _three(value: float) -> str:
+    """Three digits, without a power of ten up to a million."""
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def quantity(value: float, unit: str) -> str:
+    """``165 kJ/K``: four digits and the unit as people write it."""
+    scale, shown = _scale(abs(value), unit)
+    return f"{value / scale:.4g} {shown}".strip().replace("-", "−")
+
+
+def _scale(size: float, unit: str) -> tuple[float, str]:
+    if unit in ("J/K", "W", "N") and size >= 1e3:
+        return 1e3, f"k{unit}"
+    return 1.0, _UNITS.get(unit, unit)
+
+
+def modes(views: Sequence[ModeView], view: Overview, most: int = 10) -> Table:
+    """Time constants, what moves against what, and how much of each displacement comes with that time constant."""
+    channels = list(views[0].error) if views else []
+    units = {c.channel: _UNITS.get(c.unit, c.unit) for c in view.chains}
+    rows = [
+        Row((time_words(v.time_constant_s), v.words, *(x for c in channels for x in _brought(v, c))))
+        for v in views[:most]
+    ]
+    columns = [Column("time constant"), Column("what moves", kind="wide")]
+    for c in channels:
+        columns += [Column(c, units[c], "number", f"{c} unit"), Column(c, "share", "number", f"{c} share")]
+    notes = (
+        "What the mode brings to the displacement of the steady state, arriving as 1 − exp(−t / time constant). "
+        "Share: its magnitude by the sum of all magnitudes; modes of opposite sign cancel.",
+    )
+    return Table("Time constants", tuple(columns), tuple(rows), view.simulated, notes=notes if channels else ())
+
+
+def _brought(v: ModeView, channel: str) -> tuple[str, str]:
+    return number(v.error[channel], 1, sign=True), percent(v.share[channel])
+
+
+def heat(flows: HeatFlows) -> Table:
+    """Where a batch's energy went, and whether it adds up."""
+    totals: pd.DataFrame = flows.totals()
+    totals = totals[totals["kind"] != "link"]
+    rows = [
+        Row(
+            (
+                _KINDS[str(r["kind"])],
+                str(r["name"]),
+                number(r["energy_kJ"], 0),
+                number(r["mean_W"], 1),
+                percent(r["share"]).replace("-", "−"),
+            )
+        )
+        for r in totals.to_dict("records")
+    ]
+    columns = (
+        Column(""), Column("where"), Column("energy", "kJ", "number"), Column("mean", "W", "number"),
+        Column("of the heat put in", kind="number"),
+    )  # fmt: skip
+    gap_J = float(abs(flows.gap_W @ flows.dt_s))
+    note = f"Put in less stored less taken: {gap_J:.1g} J. Negative: a body that cooled, a surrounding that gave heat."
+    return Table(f"{flows.batch_id}: where the energy went", columns, tuple(rows), flows.simulated, notes=(note,))
+
+
+def left_out(table: pd.DataFrame, simulated: bool) -> Table:
+    """The error on batches that a calibration never saw, by channel."""
+    rows = []
+    for r in table.to_dict("records"):
+        unit = _UNITS.get(str(r["unit"]), str(r["unit"]))
+        numbers = [number(float(r[k]), 2) for k in ("left_out", "left_out_sd", "before", "zero")]
+        rows.append(Row((str(r["channel"]), unit, f"{r['batches']}", *numbers)))
+    columns = (
+        Column("channel"), Column("unit"), Column("batches", kind="number"), Column("left out", "rms", "number"),
+        Column("its spread", "sd", "number"), Column("as before", "rms", "number"),
+        Column("if nothing moved", "rms", "number"),
+    )  # fmt: skip
+    return Table("Batches left out of the calibration, predicted", columns, tuple(rows), simulated)

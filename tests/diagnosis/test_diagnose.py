@@ -1,0 +1,255 @@
+"""From recordings to a verdict: every verdict once, recordings with faults, and input that cannot be used."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine
+from diagnosis.contracts import COLUMNS
+from diagnosis.diagnose import diagnose
+from diagnosis.findings.schema import Findings
+from diagnosis.result import Diagnosis
+from tests.diagnosis.small_cases import DRIFT, runs, two_bodies
+from tests.twin.machines import TWO_BODIES, machine
+from tests.twin.recordings import drawn, empty_batches, recorded
+from twin.compile import compile_network
+from twin.schema import twin_part
+
+LAMP = {"law": "cabinet_heat", "into": "shaft", "parameters": {"heat": "100 W"}}
+PUMP = {"law": "cabinet_heat", "into": "head", "drivers": "vacuum", "parameters": {"heat": "14 W"}}
+PER_LEVEL_AND_KELVIN = {
+    "law": "free_flux", "into": "head", "at": {"body": "head"}, "drivers": {"level": "vacuum"},
+    "parameters": {"product": "6 W/K"},
+}  # fmt: skip
+
+
+def clamped(unit: str = "kPa", **changes: Any) -> Machine:
+    """Two bodies with a vacuum chuck, of which no listed law knows anything; in unit 1 some switched ones do."""
+    channels = {**TWO_BODIES["channels"], "vacuum": {"role": "driver", "unit": unit}}
+    return machine({**TWO_BODIES, "channels": channels}, **changes)
+
+
+def clamped_runs(hidden: dict[str, Any], count: int = 8, unit: str = "kPa") -> list[Batch]:
+    truth = clamped(unit, **{f"mechanisms__{k}": v for k, v in hidden.items()})
+    known, network = compile_network(clamped(unit)), compile_network(truth)
+    values = dict(zip((p.name for p in known.parameters), drawn(known, np.random.default_rng(1)), strict=True))
+    batches = []
+    for k, b in enumerate(empty_batches(clamped(unit), count)):
+        first_s = 1200.0 + 1800.0 * (k % 4)
+        on = (b.time_s >= first_s) & (b.time_s < first_s + 4800.0)
+        batches.append(replace(b, table=b.table.assign(vacuum=on.astype(float))))
+    return recorded(truth, batches, np.array([values.get(p.name, p.value) for p in network.parameters]), seed=1)
+
+
+CASES: dict[str, Callable[[], tuple[Machine, list[Batch]]]] = {
+    "consistent": lambda: (two_bodies(), runs(two_bodies())),
+    "explained": lambda: (two_bodies(), runs(two_bodies(), {"own": DRIFT}, count=8)),
+    "undecidable": lambda: (clamped("1"), clamped_runs({"own": PUMP}, unit="1")),
+    "unlisted": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN})),
+    "partly_explained": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN, "lamp": LAMP})),
+}
+
+
+@cache
+def diagnosed(verdict: str) -> Diagnosis:
+    return diagnose(*CASES[verdict]())
+
+
+@pytest.mark.parametrize("verdict", CASES)
+def test_every_verdict_where_it_is_due(verdict: str) -> None:
+    done = diagnosed(verdict)
+    told = done.findings
+    assert told.verdict == verdict
+    assert bool(told.findings) == (verdict != "consistent")
+    assert told.statement and all(f.statement for f in told.findings)
+    again = Findings.model_validate_json(told.model_dump_json(by_alias=True))
+    assert again.verdict == verdict and len(again.findings) == len(told.findings)
+
+
+@pytest.mark.parametrize("verdict", CASES)
+def test_every_table_is_there_and_of_its_columns(verdict: str) -> None:
+    done = diagnosed(verdict)
+    assert {k: tuple(t.columns) for k, t in done.tables.items()} == dict(COLUMNS)
+    for name in ("rms", "series", "acf", "limits", "null", "map"):
+        assert len(done.tables[name]), name
+    assert len(done.tables["flux"]) > 0 if verdict in ("unlisted", "partly_explained") else True
+    assert done.simulated and not done.drafted
+    probability = done.tables["candidates"]["probability"]
+    assert ((probability >= 0) & (probability <= 0.99)).all()
+
+
+@pytest.mark.parametrize("verdict", ["explained", "unlisted", "partly_explained"])
+def test_with_what_was_found_only_noise_is_left(verdict: str) -> None:
+    rms = diagnosed(verdict).findings.fit.left_out_rms
+    for key, after in rms.after.items():
+        before, noise = rms.before[key], rms.noise_floor[key]
+        assert after is not None and before is not None and noise is not None
+        assert after < 1.15 * noise and after <= 1.05 * before
+    assert max(rms.before[k] / rms.after[k] for k in rms.after) > 3  # type: ignore[operator]
+
+
+def test_what_was_found_is_a_part_of_the_machine() -> None:
+    done = diagnosed("explained")
+    (found,) = done.findings.findings
+    assert (found.mechanism, found.where.kind, found.where.name) == ("sensor_drift", "sensor", "t_head")
+    rate = found.parameters["rate"]
+    assert rate.interval90 is not None and rate.unit == "K/h"
+    low, high = rate.interval90
+    assert low is not None and high is not None and low < 0.3 < high
+    assert found.probability > 0.9
+    assert set(done.added) == {f"mechanisms.{found.name}"}
+    network = compile_network(done.machine, part=done.part_after)
+    fitted = {i.name for i in done.intervals}
+    assert f"mechanisms.{found.name}.rate" in fitted and fitted <= {p.name for p in network.parameters}
+    assert done.part_before == twin_part(done.machine)
+
+
+def test_no_listed_mechanism_is_said_with_its_size() -> None:
+    for verdict in ("unlisted", "partly_explained"):
+        told = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
+        assert len(told) == 1 and "no listed mechanism" in told[0].statement
+        product = told[0].parameters["product"]
+        assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
+
+
+def test_what_listed_mechanisms_only_share_in_is_told_whole() -> None:
+    """By vacuum and speed together: a switched heat of the library takes over some of it."""
+    by_both = {
+        "law": "free_flux", "into": "head", "at": {"body": "head"}, "drivers": {"level": "rpm", "other": "vacuum"},
+        "parameters": {"cross": "0.03 W"},
+    }  # fmt: skip
+    done = diagnose(clamped("1"), clamped_runs({"own": by_both}, unit="1"))
+    (found,) = done.findings.findings
+    assert (done.findings.verdict, found.mechanism, found.where.name) == ("unlisted", "free_flux", "head")
+    assert found.parameters["cross"].value == pytest.approx(0.03, rel=0.1)
+    assert re.search(r"[1-9]\d W into the head \(it follows rpm vacuum\)", found.statement)
+
+
+def test_part_of_it_has_a_name_of_its_own() -> None:
+    named = [f for f in diagnosed("partly_explained").findings.findings if f.mechanism != "free_flux"]
+    assert [(f.mechanism, f.where.name) for f in named] == [("cabinet_heat", "shaft")]
+    assert named[0].parameters["heat"].value == pytest.approx(100.0, rel=0.05)
+
+
+def test_what_cannot_be_told_apart_is_told_together() -> None:
+    done = diagnosed("undecidable")
+    first = done.findings.findings[0]
+    told = {(first.mechanism, first.where.name), *((a.mechanism, a.where.name) for a in first.alternatives)}
+    assert told >= {("cabinet_heat", "head"), ("electrical_heat", "head")}
+    assert 0.4 < first.probability < 0.7
+    assert done.findings.next_experiment is None  # no run tells two names of one law apart
+
+
+def test_where_nothing_is_missing_limits_are_told() -> None:
+    done = diagnosed("consistent")
+    assert done.part_after == done.part_before == twin_part(done.machine)
+    assert done.findings.fit.batches_improved == 0 and not done.added
+    limits = [x for x in done.findings.detection_limits if x.limit is not None]
+    assert len(limits) > 20 and all(x.limit > 0 for x in limits if x.limit is not None)
+
+
+def test_the_order_of_the_recordings_does_not_matter() -> None:
+    known, batches = CASES["consistent"]()
+    done, again = diagnosed("consistent"), diagnose(known, batches[::-1])
+    assert done.findings.model_dump(exclude={"seconds"}) == again.findings.model_dump(exclude={"seconds"})
+    for name, table in done.tables.items():
+        pd.testing.assert_frame_equal(again.tables[name], table)
+
+
+# Recordings as they are
+
+
+def changed(channel: str, change: Callable[[np.ndarray, int], np.ndarray]) -> list[Batch]:
+    out = []
+    for k, b in enumerate(runs(two_bodies(), {"own": LAMP}, count=4)):
+        out.append(replace(b, table=b.table.assign(**{channel: change(b.table[channel].to_numpy(), k)})))
+    return out
+
+
+def lamp_of(done: Diagnosis, rel: float) -> None:
+    first = done.findings.findings[0]
+    assert (first.mechanism, first.where.name) == ("cabinet_heat", "shaft")
+    assert first.parameters["heat"].value == pytest.approx(100.0, rel=rel)
+
+
+def test_a_fifth_of_the_samples_missing() -> None:
+    def holes(values: np.ndarray, k: int) -> np.ndarray:
+        gone = np.random.default_rng(k).random(len(values)) < 0.2
+        return np.where(gone, np.nan, values)
+
+    given = changed("t_shaft", holes)
+    for channel in ("t_head", "z"):
+        given = [
+            replace(b, table=b.table.assign(**{channel: holes(b.table[channel].to_numpy(), 10 + k)}))
+            for k, b in enumerate(given)
+        ]
+    lamp_of(diagnose(two_bodies(), given), 0.1)
+
+
+def test_a_sensor_that_shows_half_kelvins() -> None:
+    lamp_of(diagnose(two_bodies(), changed("t_shaft", lambda v, k: np.round(2 * v) / 2)), 0.1)
+
+
+def test_a_channel_that_was_not_always_recorded() -> None:
+    done = diagnose(two_bodies(), changed("t_head", lambda v, k: np.full(len(v), np.nan) if k % 2 else v))
+    lamp_of(done, 0.1)
+    rows = done.tables["rms"]
+    assert len(rows[rows["channel"] == "t_head"]) == 2 and len(rows[rows["channel"] == "z"]) == 4
+
+
+def test_two_runs_are_cut_and_nothing_is_too_sure() -> None:
+    known = two_bodies()
+    given = [
+        recorded(two_bodies(mechanisms__own=LAMP), [b], seed=k)[0]
+        for k, b in enumerate(empty_batches(known, 2, hours=12.0))
+    ]
+    done = diagnose(known, given)
+    assert done.findings.batches == ("b00", "b01")
+    assert any(w.startswith("2 runs only: cut into 4 blocks") for w in done.words)
+    lamp_of(done, 0.15)
+    assert max(f.probability for f in done.findings.findings) <= 0.7
+
+
+# What cannot be used
+
+
+def test_a_run_of_another_machine() -> None:
+    given = runs(two_bodies(), count=4)
+    given[2] = replace(given[2], machine="lathe")
+    with pytest.raises(InputError, match="batch b02: is of machine 'lathe', expected 'two_bodies'; leave it out"):
+        diagnose(two_bodies(), given)
+
+
+def test_the_same_run_twice() -> None:
+    given = runs(two_bodies(), count=4)
+    with pytest.raises(InputError, match="batch b01: given 2 times; give it once"):
+        diagnose(two_bodies(), [*given, given[1]])
+
+
+def test_no_runs_at_all() -> None:
+    with pytest.raises(InputError, match="machine two_bodies: no batches to diagnose; give recordings"):
+        diagnose(two_bodies(), [])
+
+
+def test_without_a_twin_part_temperatures_are_needed() -> None:
+    bare = two_bodies().model_copy(update={"twin": None})
+    channels = {n: c for n, c in bare.channels.items() if c.role != "temperature"}
+    bare = bare.model_copy(update={"channels": channels})
+    given = [
+        replace(b, channels={n: c for n, c in b.channels.items() if n in channels},
+                table=b.table.drop(columns=["t_shaft", "t_head"]))
+        for b in runs(two_bodies(), count=4)
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="temperature") as error:
+        diagnose(bare, given)
+    assert "two_bodies" in str(error.value) and "\n" not in str(error.value)

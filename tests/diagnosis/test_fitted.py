@@ -1,0 +1,168 @@
+"""Refits find what was concealed; batches left out are predicted as by fits that never saw them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.arrays import Array
+from diagnosis.candidates.alternatives import coarse_candidates
+from diagnosis.contracts import Fitted
+from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, pieces_of, refitted, settle
+from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent, fitted, four_bodies, runs
+from twin.calibration.estimate import LeftOut, leave_batch_out
+from twin.calibration.identifiability import intervals90
+from twin.calibration.least_squares import result
+from twin.quantity import Value
+from twin.schema import MechanismPart, TwinPart
+
+CONDUCTANCE = "exposures.head-floor.conductance"
+
+
+def with_floor(part: TwinPart) -> TwinPart:
+    own = {
+        "conductance": Value(value="10 W/K", spread=1.5),
+        "temperature": Value(value="16 degC", spread="4 K"),
+        "follow": Value(value=0.5, spread=0.8),
+    }
+    floor = MechanismPart.model_validate({**FLOOR, "parameters": own})
+    return part.model_copy(update={"mechanisms": {**part.mechanisms, "floor": floor}})
+
+
+@cache
+def with_the_floor() -> Fitted:
+    return settle(refitted(cold_floor(), with_floor(cold_floor().part), {CONDUCTANCE: 3.0}))
+
+
+@cache
+def by_refits() -> LeftOut:
+    """Every batch predicted by a calibration on all others."""
+    return leave_batch_out(consistent().problem, reweight=False)
+
+
+@cache
+def predicted() -> LeftOutRows:
+    return left_out_rows(consistent())
+
+
+def value_by_name(done: Fitted) -> dict[str, float]:
+    """Of the free parameters."""
+    return {u.name: u.value(v) for u, v in zip(done.problem.unknowns, done.x, strict=True)}
+
+
+def test_a_refit_from_a_bent_baseline_finds_the_truth() -> None:
+    done = with_the_floor()
+    fit = result(done.problem, done.state, 0.01, "")
+    told = {i.name: i for i in intervals90(fit, done.problem.unknowns)}
+    found = told[CONDUCTANCE]
+    assert found.value == pytest.approx(8.0, rel=0.1)
+    assert told["surroundings.floor.value"].value == pytest.approx(18.0, abs=0.2)
+    assert told["surroundings.floor.follow"].value == pytest.approx(0.5, abs=0.05)
+
+
+def test_without_it_parameters_are_bent_and_with_it_they_are_not() -> None:
+    truth = value_by_name(consistent())
+    bent, right = (
+        max(abs(np.log(value_by_name(f)[name] / truth[name])) for name in truth)
+        for f in (cold_floor(), with_the_floor())
+    )
+    assert bent > 0.3
+    assert right < 0.1
+
+
+def test_it_begins_where_it_is_told() -> None:
+    part = with_floor(cold_floor().part)
+    begun = refitted(cold_floor(), part, {CONDUCTANCE: 3.0}, steps=0)
+    assert value_by_name(begun)[CONDUCTANCE] == pytest.approx(3.0)
+    beyond = refitted(cold_floor(), part, {CONDUCTANCE: 1e9}, steps=0)
+    assert value_by_name(beyond)[CONDUCTANCE] == pytest.approx(1000.0)  # its bound
+
+
+def test_a_better_part_leaves_less_noise() -> None:
+    before, after = cold_floor(), with_the_floor()
+    assert before.noise.factor.max() > 10
+    assert after.noise.factor.max() < 1.3
+    assert (after.rows == before.rows).all() and after.rows.sum() == sum(map(len, after.state.channels))
+
+
+def test_settling_lowers_the_cost_to_where_it_stands() -> None:
+    rough = refitted(cold_floor(), with_floor(cold_floor().part))
+    fine = settle(rough)
+    assert len(fine.state.history) > len(rough.state.history)
+    again = settle(fine)
+    assert np.abs(again.state.z - fine.state.z).max() < 0.1
+
+
+def test_pieces_of_bodies_are_known_by_name() -> None:
+    known = four_bodies()
+    now = fitted(known, runs(known, count=4))
+    every = coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0]))
+    found = [pieces_of(c.applied(now.part)) for c in every]
+    assert {"t_head_near": "head"} in found and {"t_head_far": "head"} in found
+    assert pieces_of(now.part) == {}
+
+
+def test_left_out_batches_are_predicted_as_by_fits_without_them() -> None:
+    """By refits of all others from the priors' mean, then the batch's own start and offset from its rows."""
+    done, noise = consistent(), consistent().problem.noise
+    for k, (fold, got) in enumerate(zip(by_refits().folds, predicted().error, strict=True)):
+        expected = own_start_estimated(done, k, fold.values)
+        scale = noise[done.problem.measured[k].channel]
+        assert np.abs((got - expected) / scale).max() < 0.15
+        inside = done.problem.residuals(done.x, done.state.nuisance)[k]
+        assert np.abs(got / scale - inside).max() > 1.5 * np.abs((got - expected) / scale).max()
+
+
+def own_start_estimated(done: Fitted, k: int, values: Array) -> Array:
+    """Measured less simulated of batch k (n_k,) at these parameter values, its own unknowns at their best."""
+    one, network = done.problem.only([k]), done.problem.network
+    x = np.array([float(network.parameters[j].to_x(values[j])) for j in network.free])
+    own: Array = np.zeros(done.problem.nuisance_sizes[k])
+    for _ in range(5):
+        (block,) = one.linearise(x, [own])
+        weight = done.noise.weight[block.channel]
+        normal = (block.nuisance.T * weight) @ block.nuisance + np.eye(len(own))
+        own = np.asarray(
+            np.linalg.solve(normal, (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own)), float
+        )
+    return one.residuals(x, [own])[0] * done.problem.noise[done.problem.measured[k].channel]
+
+
+def test_their_rms_is_near_that_of_free_running_ones() -> None:
+    """Sensors' start is known to their noise either way; an error's first sample shifts a free-running batch."""
+    both = pd.merge(predicted().rms, by_refits().table, on=["batch", "channel", "unit", "rows"])
+    assert len(both) == len(predicted().rms) == 18
+    for channel, own in both.groupby("channel"):
+        ratio = float(np.sqrt((own["rms"] ** 2).mean() / (own["left_out"] ** 2).mean()))
+        low = 0.9 if str(channel).startswith("t_") else 0.5
+        assert low < ratio < 1.05, channel
+
+
+def test_the_table_is_the_rms_of_the_rows() -> None:
+    done = predicted()
+    for k, m in enumerate(consistent().problem.measured):
+        own = done.rms[done.rms["batch"] == m.batch_id].set_index("channel")
+        for c, name in enumerate(consistent().problem.channels):
+            error = done.error[k][m.channel == c]
+            assert own.loc[name, "rms"] == pytest.approx(float(np.sqrt(np.mean(error**2))))
+            assert own.loc[name, "rows"] == len(error)
+    assert dict(zip(done.rms["channel"], done.rms["unit"], strict=True)) == {"t_shaft": "K", "t_head": "K", "z": "um"}
+
+
+def test_a_heat_that_was_found_may_enter_half_of_its_body() -> None:
+    found = MechanismPart(law="cabinet_heat", into="bed", parameters={"heat": Value(value="50 W", spread=1.0)})
+    now = fitted(four_bodies(), runs(four_bodies(), count=4))
+    part = now.part.model_copy(update={"mechanisms": {**now.part.mechanisms, "found": found}})
+    before = refitted(now, part)
+    squares = np.full(4, 100.0)
+    (cut,) = [c for c in coarse_candidates(before, squares, most=0) if "found" in c.name]
+    after = refitted(before, cut.applied(part))
+    assert after.part.bodies["bed"].cells == 2 and after.part.sensors["t_bed"].at == "bed@0.25"
+    assert after.part.mechanisms["found"].into == "bed@0.25"
+    cells = after.problem.network.bodies["bed"]
+    capacity = after.problem.network.capacity_J_per_K(after.values)[cells]
+    assert capacity[0] == pytest.approx(capacity[1])  # what is cut off is not added
+    assert coarse_candidates(now, squares, most=0) == []

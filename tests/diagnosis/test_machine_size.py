@@ -1,0 +1,86 @@
+"""What is usual of a mechanism goes with the machine's size; a structural one is fitted from what the screen saw."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from diagnosis.candidates.library import candidates
+from diagnosis.candidates.priors import TYPICAL_W_PER_K, at_size, log_prior, size_of, start_values
+from diagnosis.contracts import Fitted, Scored
+from diagnosis.fitting.fitted import refitted
+from tests.diagnosis.small_cases import FLOOR, cold_floor, four_bodies
+from twin.compile import compile_network
+from twin.mechanisms import MECHANISMS
+from twin.quantity import Value, convert
+from twin.schema import MechanismPart, twin_part
+
+SMALL = {"bodies", "links", "exposures"}
+
+
+def of_grams() -> Any:
+    """The four bodies as a thing of a thousandth."""
+    given = four_bodies()
+    twin = dict(given.twin or {})
+    for group in SMALL:
+        twin[group] = {k: _smaller(v) for k, v in twin[group].items()}
+    return given.model_copy(update={"twin": twin})
+
+
+def _smaller(given: Any) -> Any:
+    if isinstance(given, dict):
+        return {k: _smaller(v) if k in ("value", "capacity") else v for k, v in given.items()}
+    number, unit = str(given).split()
+    return f"{float(number) / 1e3:g} {unit}"
+
+
+def standing(machine: Any) -> Fitted:
+    """As much of a fit as a size needs."""
+    network = compile_network(machine)
+    return cast(Fitted, SimpleNamespace(problem=SimpleNamespace(network=network), values=network.values))
+
+
+def bridge(conductance_W_per_K: float) -> Scored:
+    found = candidates(four_bodies(), twin_part(four_bodies()), ["heat_bridge"])[0]
+    return Scored(found, 5.0, 6, 0.5, {"conductance": conductance_W_per_K}, 1e-4, 0)
+
+
+def test_a_machine_tool_is_of_the_usual_size_and_grams_are_not() -> None:
+    assert size_of(cold_floor()) == size_of(standing(four_bodies())) == 1.0
+    small = size_of(standing(of_grams()))
+    assert 1e-4 < small < 1e-3
+    links_W_per_K = (15e-3 * 15e-3 * 20e-3 * 1e-3 * 4e-3 * 10e-3) ** (1 / 6)
+    assert small == pytest.approx(links_W_per_K / TYPICAL_W_PER_K)
+
+
+def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:
+    spec = MECHANISMS["heat_bridge"].spec("conductance")
+    assert at_size(spec, 1.0) is spec
+    assert at_size(spec, 1e-3).value == pytest.approx(5e-3)
+    assert at_size(MECHANISMS["radiation"].spec("area"), 1e-3).value == pytest.approx(1e-3)
+    for key, name in (("supply_sag", "sag"), ("joint_conductance", "ratio"), ("sensor_drift", "rate")):
+        assert at_size(MECHANISMS[key].spec(name), 1e-3) is MECHANISMS[key].spec(name)
+
+
+def test_what_is_usual_on_a_board_is_plausible_there_and_absurd_on_a_machine() -> None:
+    board, machine = standing(of_grams()), cold_floor()
+    seen = bridge(3e-3)
+    assert log_prior(seen, board) > -0.5 > -8.0 > log_prior(seen, machine)
+    assert log_prior(bridge(5.0), machine) > -0.5
+
+
+def test_a_structural_one_begins_at_what_the_screen_saw_about_the_usual_value() -> None:
+    values, _ = start_values(bridge(2.8), cold_floor())
+    own = values["conductance"]
+    assert own.value is not None and own.prior is not None
+    assert (convert(own.value, "W/K"), convert(own.prior, "W/K")) == (2.8, 5.0)
+    floor = Value(value="3 W/K", prior="10 W/K", spread=1.5)
+    part = cold_floor().part
+    given = MechanismPart.model_validate({**FLOOR, "parameters": {"conductance": floor}})
+    begun = refitted(cold_floor(), part.model_copy(update={"mechanisms": {**part.mechanisms, "floor": given}}), steps=0)
+    name = "exposures.head-floor.conductance"
+    assert begun.values[begun.problem.network.index(name)] == pytest.approx(3.0)
+    (u,) = [u for u in begun.problem.unknowns if u.name == name]
+    assert u.value(u.prior) == pytest.approx(10.0)

@@ -1,0 +1,106 @@
+"""Few runs are cut into blocks that are left out in turn; nothing of the recordings is lost or moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Finding
+from data.errors import InputError
+from diagnosis.fitting.batches import ENOUGH, SHORTEST_ROWS, enough_batches, usable_batches
+from tests.diagnosis.small_cases import runs, two_bodies
+from twin.compile import compile_network
+
+
+def some(count: int) -> list[Batch]:
+    return runs(two_bodies(), count=count)
+
+
+def test_enough_batches_stay_as_they_are() -> None:
+    given = some(4)
+    assert enough_batches(given) == (given, ())
+
+
+@pytest.mark.parametrize(("count", "blocks"), [(1, 2), (2, 4), (3, 6)])
+def test_fewer_are_cut_as_far_as_their_rows_allow(count: int, blocks: int) -> None:
+    given = some(count)
+    assert given[0].n_rows == 49  # two blocks of 24 rows or more
+    out, words = enough_batches(given)
+    assert len(out) == blocks
+    assert min(b.n_rows for b in out) >= SHORTEST_ROWS
+    assert [b.batch_id for b in out] == [f"b{k:02d}_{n}" for k in range(count) for n in (1, 2)]
+    (told,) = words
+    assert told.startswith(f"{count} run{'s' if count > 1 else ''} only: cut into {blocks} blocks")
+
+
+def test_a_long_run_gives_four_blocks() -> None:
+    (long,) = some(1)
+    table = pd.concat([long.table] * 4, ignore_index=True)
+    table["time_s"] = long.step_s * np.arange(len(table))
+    out, _ = enough_batches([replace(long, table=table)])
+    assert len(out) == ENOUGH
+
+
+def test_blocks_hold_the_same_rows_at_the_same_time_of_day() -> None:
+    (given,) = some(1)
+    out, _ = enough_batches([given])
+    again = pd.concat([b.table for b in out], ignore_index=True)
+    pd.testing.assert_frame_equal(again.drop(columns="time_s"), given.table.drop(columns="time_s"))
+    at = 0
+    for b in out:
+        assert b.time_s[0] == 0.0 and b.step_s == given.step_s
+        assert given.start is not None and b.start == given.start + pd.Timedelta(seconds=float(given.time_s[at]))
+        at += b.n_rows
+    assert (out[0].machine, out[0].channels, out[0].simulated) == (given.machine, given.channels, given.simulated)
+
+
+def test_what_was_masked_stays_masked() -> None:
+    (given,) = some(1)
+    masks = (
+        Finding("stuck", "t_head", "in the first half", 600.0, 1800.0),
+        Finding("jump", "t_shaft", "in the second", 9000.0, 9900.0),
+        Finding("gap", "z", "across the cut", 6600.0, 8100.0),
+        Finding("noise", "room", "from then on", 12000.0, None),
+    )
+    masked = replace(given, findings=masks)
+    out, _ = enough_batches([masked])
+    for channel in ("t_head", "t_shaft", "z", "room"):
+        np.testing.assert_array_equal(np.concatenate([b.masked(channel) for b in out]), masked.masked(channel))
+
+
+def test_a_run_too_short_to_cut_stays_whole() -> None:
+    (given,) = some(1)
+    short = replace(given, table=given.table.iloc[:30])
+    out, words = enough_batches([short])
+    assert out == [short] and words[0].startswith("1 run only: cut into 1 block")
+
+
+def with_hole(batch: Batch) -> Batch:
+    """Without the room's temperature for twenty minutes."""
+    table = batch.table.copy()
+    table.loc[(table["time_s"] > 1200) & (table["time_s"] < 2400 + 300), "room"] = np.nan
+    return replace(batch, table=table)
+
+
+def test_a_hole_that_cannot_be_bridged_costs_its_run_alone() -> None:
+    known = two_bodies()
+    network = compile_network(known)
+    every = runs(known, count=6)
+    given = [with_hole(every[0]), *every[1:]]
+    kept, words = usable_batches(network, given)
+    assert [b.batch_id for b in kept] == [b.batch_id for b in every[1:]]
+    assert len(words) == 1
+    assert words[0].startswith(f"left out: batch {every[0].batch_id}: channel 'room' has no value from ")
+    assert usable_batches(network, every) == (every, ())
+
+
+def test_where_few_are_left_the_first_hole_is_told() -> None:
+    known = two_bodies()
+    every = runs(known, count=6)
+    for holes in (3, 6):
+        given = [with_hole(b) if k < holes else b for k, b in enumerate(every)]
+        with pytest.raises(InputError, match=f"^batch {every[0].batch_id}: channel 'room' has no value from "):
+            usable_batches(compile_network(known), given)

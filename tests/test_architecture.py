@@ -1,0 +1,113 @@
+"""The rooms: imports point one way, no cycle stands anywhere, and simulated machines share no code with the twin."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ALLOWED: Mapping[str, set[str]] = {
+    "data": set(),
+    "features": {"data"},
+    "twin": {"data"},
+    "models": {"data", "features", "twin"},
+    "diagnosis": {"data", "twin"},
+    "plants": {"data"},
+    "reports": {"data", "features", "models", "twin", "diagnosis"},
+    "evidence": {"data", "features", "models", "twin", "diagnosis", "plants", "reports"},
+    "pipelines": {"data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence"},
+}
+ORCHESTRATION = {"prefect", "mlflow", "typer"}
+PLANTS_MAY_USE = {"data", "plants", "numpy", "scipy", "pandas", "yaml", "skfem"}
+IMPORT_ALL = """
+import importlib, json, sys
+for name in json.load(sys.stdin):
+    importlib.import_module(name)
+print(json.dumps(sorted(sys.modules)))
+"""
+
+
+def _modules() -> dict[str, Path]:
+    found = {}
+    for room in ALLOWED:
+        for path in (ROOT / room).rglob("*.py"):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+MODULES = _modules()
+
+
+def _imported(path: Path) -> Iterator[str]:
+    """Every module that a file imports, in functions and under TYPE_CHECKING too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            for a in node.names:
+                full = f"{node.module}.{a.name}"
+                yield full if full in MODULES else str(node.module)
+
+
+GRAPH = {name: {other for other in _imported(path) if other != name} for name, path in MODULES.items()}
+
+
+def test_a_file_imports_only_what_its_room_may() -> None:
+    wrong = [
+        (name, other)
+        for name, others in GRAPH.items()
+        for other in others
+        if (top := other.split(".")[0]) in ALLOWED and top != (room := name.split(".")[0]) and top not in ALLOWED[room]
+    ]
+    assert not wrong
+
+
+def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
+    wrong = [
+        (name, other)
+        for name, others in GRAPH.items()
+        for other in others
+        if other.split(".")[0] in ORCHESTRATION and not name.startswith("pipelines")
+    ]
+    assert not wrong
+
+
+def test_no_cycle() -> None:
+    """Repeatedly take away what imports nothing that is left; a cycle cannot be taken away."""
+    left = {name: {o for o in others if o in MODULES} for name, others in GRAPH.items()}
+    while free := {name for name, others in left.items() if not others & left.keys()}:
+        left = {name: others for name, others in left.items() if name not in free}
+    assert not left, f"import cycles among {sorted(left)}"
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if m.split(".")[0] == "plants"))
+def test_a_plant_names_nothing_of_the_twin(module: str) -> None:
+    """A plant that shared code with what is examined on it would prove nothing; registries name modules in strings."""
+    foreign = {o.split(".")[0] for o in GRAPH[module]} - PLANTS_MAY_USE - set(sys.stdlib_module_names)
+    assert not foreign
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+    assert not {s for s in text if ":" in s and s.split(".")[0] in ALLOWED.keys() - {"plants"}}
+
+
+def test_a_fresh_interpreter_with_all_plants_has_nothing_of_the_twin() -> None:
+    every = sorted(m for m in MODULES if m.split(".")[0] == "plants")
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORT_ALL],
+        input=json.dumps(every),
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = {m.split(".")[0] for m in json.loads(done.stdout)}
+    assert "plants" in loaded and not loaded & (ALLOWED.keys() - {"plants", "data"})

@@ -1,1 +1,0 @@
-"""What no mechanism lists: its terms as candidates, and the search among them once all that is listed was tried."""

@@ -1,5 +1,0 @@
-"""Rivals of the diagnosis on the same fits: plain methods, and the diagnosis with one of its rules taken out."""
-
-from twin.proof.rivals.asked import rivals
-
-__all__ = ["rivals"]
