@@ -32,9 +32,9 @@ bench: $(READY)
 clean:
 	rm -rf .venv var .mypy_cache .ruff_cache .hypothesis *.egg-info
 
-lock: $(READY)  ## renew the lock file from requirements-dev.in
-	$(BIN)/pip install --quiet --upgrade -r requirements-dev.in
-	(echo "# Every direct and indirect version, from requirements-dev.in; \`make lock\` renews it."; \
+lock: $(READY)  ## renew the lock file within the ranges of pyproject.toml
+	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]'
+	(echo "# Every direct and indirect version, within pyproject.toml's ranges; \`make lock\` renews it."; \
 	 $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f) > requirements.lock
 
 $(READY): requirements.lock pyproject.toml

@@ -28,9 +28,9 @@ from data.machine import Machine, load_machine
 from data.recording import read_batches
 from plants.sample.sample_year import PROBE_NOISE_UM, PROBE_STEP_UM, TEMPERATURE_STEP_K, write_sample_year
 from twin.calibration import TOLERANCE, calibrate
-from twin.calibration.estimate import leave_batch_out
+from twin.calibration.estimate import CalibrationOptions, leave_batch_out
 from twin.calibration.identifiability import intervals90
-from twin.calibration.least_squares import fit
+from twin.calibration.least_squares import FitOptions, fit
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.network import Network
@@ -57,7 +57,7 @@ def seconds(machine: Machine, batches: list[Batch], repeats: int) -> None:
         done = calibrate(machine, batches)
         wall.append(time.perf_counter() - begun)
         cpu.append(time.process_time() - used)
-        print(f"  wall {wall[-1]:.2f} s, cpu {cpu[-1]:.2f} s: {done.fit.words}")
+        print(f"  wall {wall[-1]:.2f} s, cpu {cpu[-1]:.2f} s: {done.fit.message}")
     for name, each in (("wall", wall), ("cpu", cpu)):
         print(f"{name}: min {min(each):.2f} s, median {statistics.median(each):.2f} s of {repeats}")
 
@@ -65,9 +65,9 @@ def seconds(machine: Machine, batches: list[Batch], repeats: int) -> None:
 def left_out(machine: Machine, batches: list[Batch], processes: int) -> None:
     begun = time.perf_counter()
     problem = CalibrationProblem.of(compile_network(machine), batches)
-    found = leave_batch_out(problem, processes)
+    found = leave_batch_out(problem, CalibrationOptions(processes=processes))
     print(found.by_channel().round(2).to_string(index=False))
-    print(f"{found.words}; {time.perf_counter() - begun:.0f} s in {processes} processes")
+    print(f"{found.summary}; {time.perf_counter() - begun:.0f} s in {processes} processes")
 
 
 def own_recordings(network: Network, batches: list[Batch], values: NDArray[np.float64], seed: int) -> list[Batch]:
@@ -100,12 +100,12 @@ def coverage(machine: Machine, batches: list[Batch], repetitions: int) -> None:
             p = network.parameters[k]
             values[k] = np.clip(p.from_x(p.to_x(p.prior_value) + p.spread * rng.standard_normal()), p.low, p.high)
         problem = CalibrationProblem.of(network, own_recordings(network, batches, values, seed))
-        done = fit(problem, tolerance=TOLERANCE, reweight=True)
+        done = fit(problem, FitOptions(tolerance=TOLERANCE, reweight=True))
         truth = np.array([network.parameters[k].to_x(values[k]) for k in network.free])
         away.append((done.x - truth) / np.sqrt(np.diag(done.covariance)))
         found = intervals90(done, problem.unknowns)
         held.append([i.low <= values[network.index(i.name)] <= i.high for i in found])
-        print(f"  {seed + 1}: {np.mean(held[-1]):.3f} held; {done.words}", flush=True)
+        print(f"  {seed + 1}: {np.mean(held[-1]):.3f} held; {done.message}", flush=True)
     cases = np.array(held)
     print(f"{cases.mean():.3f} of {cases.size} cases held; sd of (value - truth) / sd {np.std(away):.2f}")
     worst = np.argsort(cases.mean(axis=0))[:5]

@@ -24,13 +24,15 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from data.processes import Processes
 from diagnosis.contracts import Candidate, Fitted, Scored
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.fitted import baseline
 from diagnosis.localisation.where_when import locate
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, alone, proposed, screen
-from diagnosis.search.null import TWINS, structural_null
-from diagnosis.search.refits import Workers, refit
+from diagnosis.search.null import structural_null
+from diagnosis.search.refits import refit
 from diagnosis.search.shortlist import shortlist
 from plants.plant import Case, draw
 from twin.calibration.least_squares import State
@@ -138,7 +140,7 @@ def steps_table(p: Posed, repeats: int) -> None:
     for step, seconds in steps_of(p, repeats):
         unit = unit or seconds
         goal = f"   goal {1e3 * SCREEN_GOAL_S:.0f} ms" if step == "screen" else ""
-        goal = f"   {TWINS} finer machines" if step == "null" else goal
+        goal = f"   {POLICY.null_machines} finer machines" if step == "null" else goal
         print(f"{step:38} {1e3 * seconds:8.1f} {seconds / unit:7.1f}×{goal}", flush=True)
     print()
 
@@ -161,7 +163,7 @@ def side_by_side(p: Posed, processes: int) -> None:
     print(f"{f'{len(work)} refits side by side':38} {'wall s':>8} {'ratio':>8}")
     one = 0.0
     for n in range(1, processes + 1):
-        with Workers(n) as workers:
+        with Processes(n) as workers:
             list(workers.map(partial(refit, p.fitted), work[:n] * 2))
             start = time.perf_counter()
             list(workers.map(partial(refit, p.fitted), work))

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from features.design import Design
 from models import FAMILIES
-from models.judging import Judged
+from models.judging import FamilyScores
 from models.linear import Blocks
 from models.protocols import Fold
 
@@ -60,7 +60,7 @@ def folds_of(batches: int) -> list[Fold]:
 def seconds_per_fold(design: Design, family: str, **options: int) -> float:
     folds = folds_of(design.n_batches)
     start = time.perf_counter()
-    Judged.run(design, FAMILIES[family](**options), folds, [(design, list(range(len(folds))))])
+    FamilyScores.run(design, FAMILIES[family](**options), folds, [(design, list(range(len(folds))))])
     return (time.perf_counter() - start) / len(folds)
 
 

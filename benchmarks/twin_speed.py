@@ -137,7 +137,9 @@ def year_table(all_ways: list[Way], repeats: int, gemm: float, copy: float) -> d
     for way in all_ways:
         network = way.network
         kept, start = year(network)
-        simulate(network, network.values, kept, start)
+        by_minute = replace(kept, every=6)
+        for given in (kept, by_minute):
+            simulate(network, network.values, given, start)
         fresh, again, coarse, bare = [], [], [], []
         balance = balance_of(network, network.values[None], kept)
         response = Response(plain_modes(balance), balance.schedule)
@@ -147,7 +149,7 @@ def year_table(all_ways: list[Way], repeats: int, gemm: float, copy: float) -> d
             new = replace(kept)
             fresh.append(timed(simulate, network, network.values, new, start)[0])
             again.append(timed(simulate, network, network.values, kept, start)[0])
-            coarse.append(timed(simulate, network, network.values, kept, start, every=6)[0])
+            coarse.append(timed(simulate, network, network.values, by_minute, start)[0])
             if not way.feedback:
                 bare.append(timed(response.outputs, forcing, start, every_cell)[0])
         out[way.name] = ms(again), ms(bare) if bare else ms(coarse)
@@ -173,9 +175,10 @@ def sets_table(all_ways: list[Way], n_sets: int, repeats: int) -> None:
     for way, n in [(all_ways[0], n_sets), (all_ways[1], n_sets), (all_ways[2], max(n_sets // 10, 1))]:
         network = way.network
         inputs, start = year(network)
+        inputs = replace(inputs, every=30)
         values = np.repeat(network.values[None], n, axis=0)
         values[:, network.free] *= np.exp(rng.normal(0.0, 0.1, (n, len(network.free))))
-        took = [timed(simulate, network, values, inputs, start, every=30)[0] for _ in range(repeats)]
+        took = [timed(simulate, network, values, inputs, start)[0] for _ in range(repeats)]
         target = f"{TARGET_MS['set']:7.0f}" if not way.feedback else ""
         print(f"{way.name:42} {n:5} {ms(took) / n:11.2f} {target}")
 
@@ -190,12 +193,14 @@ def jacobian_table(way: Way, repeats: int) -> None:
         coarse = replace(
             inputs, time_s=inputs.time_s[:, ::every], n_intervals=inputs.n_intervals // every,
             drivers={n: v[:, ::every] for n, v in inputs.drivers.items()},
-            recorded={n: v[:, ::every] for n, v in inputs.recorded.items()},
+            recorded={n: v[:, ::every] for n, v in inputs.recorded.items()}, every=30 // every,
         ).batch(slice(0, 12))  # fmt: skip
-        work = partial(sensitivities, network, network.values, coarse, start[:, :12], every=30 // every)
+        work = partial(sensitivities, network, network.values, coarse, start[:, :12])
         work()
         took = [timed(work)[0] for _ in range(repeats)]
-        alone = [timed(simulate, network, network.values, coarse, start[:, :12])[0] for _ in range(repeats)]
+        alone = [
+            timed(simulate, network, network.values, replace(coarse, every=1), start[:, :12])[0] for _ in range(repeats)
+        ]
         print(
             f"  steps of {step_s:3} s, rows every 300 s: {ms(took):8.0f} ms {spread(took)} = "
             f"{ms(took) / ms(alone):.0f} simulations; finite differences would take {len(network.free) + 1}"

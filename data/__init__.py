@@ -1,1 +1,1 @@
-"""Recordings in: machine files, readers, checks, the Parquet lake and the sample year."""
+"""Recordings: machine files, readers, checks, and the Parquet lake."""

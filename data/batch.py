@@ -36,23 +36,28 @@ class Channel:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found in the recordings: which check, where, when, in words with numbers.
+    """One thing found in the recordings: which check, where, when, and a message with numbers.
 
     `start_s`/`end_s` are times from the batch's start, both included; None means the batch's end
-    on that side. `channel` None means every channel. `masks` says that the stretch is kept out
+    on that side. `channel` None means every channel. `masks`: the interval is kept out
     of training; `overruled` gives the user's reason when the machine file lifts that.
     """
 
     check: str
     channel: str | None
-    words: str
+    message: str
     start_s: float | None = None
     end_s: float | None = None
     masks: bool = True
     overruled: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        return dict(self.__dict__)
+        """The fields under the keys that are stored; `from_dict` reads them back."""
+        return {"words" if k == "message" else k: v for k, v in self.__dict__.items()}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
+        return cls(**{"message" if k == "words" else k: v for k, v in stored.items()})
 
 
 @dataclass(frozen=True)

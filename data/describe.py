@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data import guess, guess_axes
+from data import guess
 from data.errors import InputError
-from data.guess import Guess
-from data.guess_axes import Group
+from data.guess import Guess, PositionGroup
 from data.machine import Machine, parse_machine
 from data.peek import Table, look, look_at, sheets_of
 from data.readers.csv import normalise
@@ -23,6 +21,7 @@ from data.readers.header import Layout
 from data.rows import Rows, join, stream
 from data.timegrid import repair_time
 from data.units import conversion, known_unit, quantity
+from data.yaml_edit import flow
 
 _MAX_FILES = 20
 _MAX_ROWS = 200_000
@@ -112,7 +111,7 @@ def _write(paths: Sequence[Path], table: Table, rows: Sequence[Rows], left_out: 
         alternatives = f" (or {', '.join(table.stamps[1:])})" if len(table.stamps) > 1 else ""
         unit = Guess("timestamp", f"its cells look like it{alternatives}")
     elif written := known_unit(table.units[table.time]):
-        unit = Guess(written if written in ("s", "min", "h") else "s", "the units row says so")
+        unit = Guess(written if written in ("s", "min", "h") else "s", "given in the units row")
     else:
         unit = guess.time_unit(time if table.header else "", interval, length)
     in_s = {"min": 60.0, "h": 3600.0}.get(unit.value, 1.0)
@@ -123,30 +122,30 @@ def _write(paths: Sequence[Path], table: Table, rows: Sequence[Rows], left_out: 
     of_group = {i for g in groups for i in g.places}
     columns = {n: _Column.of(table, i, longest.columns[n]) for n, i in names.items() if i not in of_group}
     roles = {r: [n for n, c in columns.items() if c.role.value == r] for r in ("error", "position")}
-    linked = guess_axes.along(roles["error"], roles["position"], longest)
+    linked = guess.along_axis(roles["error"], roles["position"], longest)
     if linked or groups:
         sweeps = [longest.columns[g.value] for g in linked.values()]
-        fine_s = guess_axes.step_s(longest.time_s * in_s, sweeps, [len(g.places) for g in groups])
+        fine_s = guess.sweep_step_s(longest.time_s * in_s, sweeps, [len(g.places) for g in groups])
         if fine_s < step_s:
             step_s, step_words = fine_s, "each reading of a sweep takes a row"
-    time_column = _yaml(time) if table.header else str(table.time)
-    pattern = f", format: {_yaml(_pattern(table))}" if _pattern(table) else ""
+    time_column = flow(time) if table.header else str(table.time)
+    pattern = f", format: {flow(_pattern(table))}" if _pattern(table) else ""
     folder = re.sub(r"[^a-z0-9_\-]+", "_", paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
     files = [p.name for p in paths]
     lines = [
         f"# Drafted from {len(files)} file{'s' * (len(files) > 1)}: {files[0]}{' … ' + files[-1] if files[1:] else ''}",
-        f"# ({table.words}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
+        f"# ({table.summary}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
         *(f"# left out: {line}" for line in left_out),
-        f"machine: {_yaml(folder)}  # guessed: the folder's name",
+        f"machine: {flow(folder)}  # guessed: the folder's name",
         "recording:",
-        f"  files: [{_yaml(_files(paths))}]  # guessed: the names of the files",
+        f"  files: {flow([_files(paths)])}  # guessed: the names of the files",
         f"  header: {'true' if table.header else 'false'}",
         f"  time: {{column: {time_column}, unit: {unit.value}{pattern}}}  # guessed: {unit.why}",
         f"  step_s: {step_s:g}  # guessed: {step_words}",
         f"  max_gap_s: {5 * usual_s:g}  # guessed: 5 {'steps' if step_s == usual_s else 'samples'}",
     ]
     if start := _start_in_name(paths):
-        lines.append(f"  start_from_name: {_yaml(start)}  # guessed: the files are named by date")
+        lines.append(f"  start_from_name: {flow(start)}  # guessed: the files are named by date")
     lines.append("channels:")
     for name, column in columns.items():
         lines += _channel(name, column, np.concatenate([r.columns[name] for r in rows]), linked.get(name))
@@ -156,7 +155,7 @@ def _write(paths: Sequence[Path], table: Table, rows: Sequence[Rows], left_out: 
         lines += _axis(group, stacked, [*columns])
     others = [c for i, c in enumerate(table.columns) if c and i != table.time and i not in table.numeric]
     if others and table.header:
-        lines.append(f"ignore: [{', '.join(map(_yaml, dict.fromkeys(others)))}]  # guessed: no numbers in them")
+        lines.append(f"ignore: {flow(list(dict.fromkeys(others)))}  # guessed: no numbers in them")
     text = "\n".join(lines) + "\n"
     parse_machine(text, "draft")
     return text
@@ -179,16 +178,16 @@ class _Column:
         in_row = known_unit(table.units[i])
         written = in_row or guess.unit_in_name(header)
         role = guess.role(header, written, longest)
-        return cls(header, written, in_row is not None, role, f"column: {_yaml(header) if table.header else i}")
+        return cls(header, written, in_row is not None, role, f"column: {flow(header) if table.header else i}")
 
 
-def _groups(table: Table) -> list[Group]:
+def _groups(table: Table) -> list[PositionGroup]:
     """Columns that are one error at several positions; what is in degrees is none."""
     places = [i for i in table.numeric if quantity(known_unit(table.units[i]) or "um") == "length"]
-    return guess_axes.groups(table.columns, places) if table.header else []
+    return guess.position_groups(table.columns, places) if table.header else []
 
 
-def _axis(group: Group, values: NDArray[np.float64], taken: Sequence[str]) -> list[str]:
+def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str]) -> list[str]:
     """Lines of the position channel and the error channel of columns that differ by a position."""
     words = re.sub(r"[^a-z]+", "_", group.pattern.partition("*")[0].lower()).strip("_")
     stem = group.letter or words or "axis"
@@ -196,7 +195,7 @@ def _axis(group: Group, values: NDArray[np.float64], taken: Sequence[str]) -> li
     if {position, error} & set(taken):
         position, error = f"{position}_2", f"{error}_2"
     why = Guess("error", f"{len(group.places)} columns whose names differ by a number")
-    column = _Column(group.pattern.partition("*")[0], None, False, why, f"columns: {_yaml(group.pattern)}")
+    column = _Column(group.pattern.partition("*")[0], None, False, why, f"columns: {flow(group.pattern)}")
     lines = _channel(error, column, values, Guess(position, "the number in the names is taken for the position"))
     return [
         f"  {position}:",
@@ -210,24 +209,24 @@ def _axis(group: Group, values: NDArray[np.float64], taken: Sequence[str]) -> li
 def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Guess | None) -> list[str]:
     """Lines of one channel; range and resolution show in all `values`."""
     role, written = column.role, column.written
-    unit = Guess(written, "the units row says so") if column.units_row and written else None
+    unit = Guess(written, "given in the units row") if column.units_row and written else None
     unit = unit or guess.unit(role.value, column.header, values)
     kept = {"temperature": "degC", "ambient": "degC", "error": "um"}.get(role.value, unit.value)
     convertible = quantity(kept) == quantity(unit.value)
     kept = kept if convertible else unit.value
-    lines = [f"  {_yaml(name)}:", f"    role: {role.value}  # guessed: {role.why}"]
+    lines = [f"  {flow(name)}:", f"    role: {role.value}  # guessed: {role.why}"]
     lines.append(
-        f"    unit: {_yaml(kept)}" + (f"  # guessed: {unit.why}" if kept == unit.value else "  # what the lake keeps")
+        f"    unit: {flow(kept)}" + (f"  # guessed: {unit.why}" if kept == unit.value else "  # what the lake keeps")
     )
-    if column.key != f"column: {_yaml(name)}":
+    if column.key != f"column: {flow(name)}":
         lines.append(f"    {column.key}")
     guessed = ["role", "unit"]
     if along is not None:
-        lines.append(f"    position: {_yaml(along.value)}  # guessed: {along.why}")
+        lines.append(f"    position: {flow(along.value)}  # guessed: {along.why}")
         guessed.append("position")
     factor, offset = 1.0, 0.0
     if kept != unit.value:
-        lines.append(f"    unit_in_file: {_yaml(unit.value)}  # guessed: {unit.why}")
+        lines.append(f"    unit_in_file: {flow(unit.value)}  # guessed: {unit.why}")
         guessed.append("unit_in_file")
         factor, offset = conversion(unit.value, kept, name)
     step = guess.resolution(values)
@@ -238,23 +237,10 @@ def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Gue
         low, high = np.nanmin(values) * factor + offset, np.nanmax(values) * factor + offset
         if span := guess.plausible_range(role.value, float(low), float(high)):
             lines.append(
-                f"    range: [{_number(span[0])}, {_number(span[1])}]  # guessed: seen {low:.4g} to {high:.4g}, widened"
+                f"    range: {flow([float(v) for v in span])}  # guessed: seen {low:.4g} to {high:.4g}, widened"
             )
             guessed.append("range")
-    return [*lines, f"    guessed: [{', '.join(guessed)}]"]
-
-
-def _number(x: float) -> str:
-    """A number that YAML reads as one: 1e+06 would be text."""
-    return repr(float(x)) if abs(x) < 1e15 else f"{x:.1f}"
-
-
-def _yaml(text: str | None) -> str:
-    """Plain where YAML reads it back as the same text, else quoted."""
-    text = text or ""
-    words = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
-    plain = re.fullmatch(r"[A-Za-z][\w%/\-]*", text, re.ASCII) and text.lower() not in words
-    return text if plain else json.dumps(text, ensure_ascii=False)
+    return [*lines, f"    guessed: {flow(guessed)}"]
 
 
 def _files(paths: Sequence[Path]) -> str:

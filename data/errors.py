@@ -1,4 +1,4 @@
-"""The two ways a command can end badly, each told in one line."""
+"""The two errors that end a command, each with a one-line message, and suggestions for unknown names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class WorkError(Exception):
 
 
 def closest(got: str, allowed: Iterable[str]) -> str:
-    """'did you mean …' for an unknown name, with the allowed ones: ``did you mean 'ridge'? Allowed: bp, ridge``."""
+    """Suggestion for an unknown name with all allowed ones: ``did you mean 'ridge'? Allowed: bp, ridge``."""
     names = sorted(allowed)
     near = difflib.get_close_matches(got, names, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""

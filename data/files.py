@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of single files and of groups of files."""
 
 from __future__ import annotations
 

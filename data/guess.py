@@ -1,14 +1,17 @@
-"""Guesses about a column that nobody has described: each with the reason, for a person to confirm."""
+"""Role, unit, resolution, range and position along an axis, guessed from columns' names and values with the reason."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from data.arrays import Array
 from data.readers.csv import normalise
+from data.rows import Rows
+from data.sweeps import position_bins
 from data.units import known_unit, quantity
 
 _TIME = re.compile(r"time|zeit|时间|時間|時刻|日時|timestamp|elapsed|datum|date|^t$|^t ?[\[(]")
@@ -75,7 +78,7 @@ def _role_of_values(values: Array) -> Guess:
     v = values[np.isfinite(values)]
     span = float(np.ptp(v)) if len(v) else 0.0
     if span == 0.0:
-        return Guess("driver", "it never changes; its values tell nothing")
+        return Guess("driver", "constant; its values give no information")
     jump = np.abs(np.diff(v))
     if jump.max() >= 0.25 * span and (np.mean(jump == 0) > 0.8 or jump.max() >= 0.6 * span):
         return Guess("driver", "it jumps between levels")
@@ -90,14 +93,14 @@ def unit(of_role: str, name: str, values: Array) -> Guess:
     """Unit in the file for a channel of that role."""
     written = unit_in_name(name)
     if written:
-        return Guess(written, "its name says so")
+        return Guess(written, "named so in the header")
     v = values[np.isfinite(values)]
     size = float(np.max(np.abs(v))) if len(v) else 0.0
     middle = float(np.median(v)) if len(v) else 0.0
     if of_role in ("temperature", "ambient"):
         if 230.0 <= middle <= 420.0:
             return Guess("K", f"values around {middle:.4g}")
-        return Guess("degC", f"values around {middle:.3g}; say degF if so")
+        return Guess("degC", f"values around {middle:.3g}; may be degF")
     if of_role == "error":
         if size < 0.5:
             return Guess("mm", f"never above {size:.2g}")
@@ -109,7 +112,7 @@ def unit(of_role: str, name: str, values: Array) -> Guess:
         return Guess("rpm", "usual for a speed")
     if re.search(r"feed|vorschub|進給|进给", folded):
         return Guess("mm/min", "usual for a feed")
-    return Guess("1", "the name does not say; put the true unit")
+    return Guess("1", "not in the name; enter the true unit")
 
 
 def resolution(values: Array) -> float | None:
@@ -129,7 +132,7 @@ def resolution(values: Array) -> float | None:
 
 
 def plausible_range(of_role: str, low: float, high: float) -> tuple[float, float] | None:
-    """Wider than what was seen, and as wide as is usual for the role; None where nothing was seen."""
+    """A range wider than the values and at least as wide as is usual for the role; None without finite values."""
     if not np.isfinite([low, high]).all():
         return None
     span = max(high - low, abs(high), 1e-6)
@@ -154,7 +157,7 @@ def time_unit(name: str, step: float, length: float) -> Guess:
     if written is None and (m := re.search(r"(?:^|[_ ])(s|min|h)$", normalise(name))):
         written = m[1]
     if written in ("s", "min", "h"):
-        return Guess(written, "its name says so")
+        return Guess(written, "named so in the header")
     if step < 0.02 and length < 200:
         return Guess("h", f"steps of {step:.3g} over {length:.4g} fit hours")
     if step < 1.0 and length >= 20 and step * length > 10:
@@ -165,3 +168,92 @@ def time_unit(name: str, step: float, length: float) -> Guess:
 def grid_step_s(interval_s: float) -> float:
     """The nearest usual step that is not finer than the samples."""
     return next((s for s in NICE_STEPS_S if s >= interval_s * 0.999), float(np.ceil(interval_s)))
+
+
+_LEAST_COLUMNS = 3
+_SWEEP_S = 120.0  # rows of a sweep under one time stamp may spread so far: a machine then warms by a tenth of a kelvin
+_NUMBER = re.compile(r"^(?P<before>[^\d]*?)(?P<mm>[-+]?\d+(?:[.,]\d+)?)(?P<after>[^\d]*)$")
+_POSITION_PREFIX = re.compile(r"(=|@|:|\bat|\bpos\w*|\bp|[xyz])\s*$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class PositionGroup:
+    """Columns that are one error at several positions: their pattern, places in the table, positions in mm."""
+
+    pattern: str
+    places: tuple[int, ...]
+    position_mm: tuple[float, ...]
+
+    @property
+    def letter(self) -> str:
+        """The axis, where the pattern begins with its letter."""
+        return self.pattern[:1].lower() if re.match(r"[xyz](?![a-z])", self.pattern, re.IGNORECASE) else ""
+
+
+def position_groups(columns: Sequence[str], places: Sequence[int]) -> list[PositionGroup]:
+    """Groups of three or more columns whose names differ by a number that reads as a position.
+
+    It does behind =, @, : or an axis' letter, before mm, or alone; 1, 2, 3, … behind a letter are sensors.
+    """
+    found: dict[str, list[tuple[int, float]]] = {}
+    for i in places:
+        if match := _NUMBER.match(columns[i].strip()):
+            pattern = f"{match['before']}*{match['after']}"
+            found.setdefault(pattern, []).append((i, float(match["mm"].replace(",", "."))))
+    out = []
+    for pattern, members in found.items():
+        before, _, after = pattern.partition("*")
+        mm = [m for _, m in members]
+        counted = mm in ([float(k + first) for k in range(len(mm))] for first in (0, 1))
+        explicit = "mm" in after.lower() or bool(re.search(r"[=@:]\s*$", before))
+        hinted = not counted and (not before.strip() or bool(_POSITION_PREFIX.search(before)))
+        if len(set(mm)) == len(mm) >= _LEAST_COLUMNS and (explicit or hinted):
+            out.append(PositionGroup(pattern, tuple(i for i, _ in members), tuple(mm)))
+    return out
+
+
+def along_axis(errors: Sequence[str], positions: Sequence[str], rows: Rows) -> dict[str, Guess]:
+    """Error channel -> the position channel that it seems to be read along, with the reason.
+
+    A sweep shows in rows that share a time stamp while the position changes, or in error and position that stand in the
+    same few rows.
+    """
+    out = {}
+    for error in errors:
+        candidates = [
+            (name, why) for name in positions if (why := _why(rows.columns[error], rows.columns[name], rows.time_s))
+        ]
+        if candidates:
+            name, why = max(candidates, key=lambda t: t[0][:1].lower() == error[:1].lower())
+            out[error] = Guess(name, why)
+    return out
+
+
+def _why(error: Array, position: Array, time_s: Array) -> str:
+    read = np.isfinite(error) & np.isfinite(position)
+    if read.sum() < _LEAST_COLUMNS or len(np.unique(position_bins(position[read]))) < 2:
+        return ""
+    stamps = time_s[read]
+    again = np.diff(stamps) == 0
+    if again.mean() >= 0.5 and (np.diff(position[read])[again] != 0).mean() > 0.5:
+        return "rows share a time stamp while the position changes"
+    if read.mean() < 0.9 and read.sum() >= 0.95 * max(np.isfinite(error).sum(), np.isfinite(position).sum()):
+        return "error and position stand in the same rows"
+    return ""
+
+
+def sweep_step_s(time_s: Array, positions: Sequence[Array], n_columns: Sequence[int]) -> float:
+    """A grid step that gives every reading of a sweep a row: position channels (n,), NaN between readings, and the
+    numbers of columns that are read at once.
+
+    Where readings have time stamps of their own it is the usual step at or below their spacing; under one stamp, one
+    that spreads a sweep over two minutes at most.
+    """
+    steps = [_SWEEP_S / n for n in n_columns]
+    for position in positions:
+        read = np.isfinite(position)
+        between_s = np.diff(time_s[read])
+        own = between_s[between_s > 0]
+        several = len(np.unique(position_bins(position[read])))
+        steps.append(float(np.median(own)) if len(own) > 0.5 * len(between_s) else _SWEEP_S / several)
+    return max((s for s in NICE_STEPS_S if s <= min(steps) * (1 + 1e-9)), default=NICE_STEPS_S[0])

@@ -1,4 +1,4 @@
-"""Recordings into the lake: read, check, store; what cannot be used goes to quarantine with the reason."""
+"""Ingest: read recordings, check them and store them in the lake; unusable files go to quarantine with the reason."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Ingested:
 
     `status`: new, unchanged, refreshed, new_version (see `data.lake`); conflict: left out because another file
     of the same ingest gave other content under this id; quarantined: the file, or what was left of it, cannot be
-    used. Rows are rows of the recording: `rows_in` = `rows_stored` + `rows_dropped`; None where nobody can count.
+    used. Rows are rows of the recording: `rows_in` = `rows_stored` + `rows_dropped`; None if unknown.
     `found`: what the checks of one batch found, with the machine file's overrules.
     """
 
@@ -189,7 +189,7 @@ def _collect(paths: Sequence[Path], machine: Machine) -> tuple[list[Path], list[
 
 
 def _ahead(batches: Generator[Batch, None, None]) -> Generator[Batch, None, None]:
-    """The batches; a second thread reads and checks the next one while the caller stores the present one."""
+    """The batches, read ahead by one in a second thread while the caller stores the current one."""
     try:
         with ThreadPoolExecutor(1) as pool:
             coming = pool.submit(next, batches, None)
@@ -208,15 +208,15 @@ def _checked(file: Path, machine: Machine) -> Generator[Batch, None, None]:
     except (InputError, WorkError):
         raise
     except Exception as error:  # an unforeseen kind of damage must not stop the other files
-        words = " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"{file}: cannot be used ({type(error).__name__}: {words}); expected a recording as the machine file "
+            f"{file}: cannot be used ({type(error).__name__}: {reason}); expected a recording as the machine file "
             f"of {machine.machine} describes it; export it again"
         ) from error
 
 
 def _count_rows(file: Path, machine: Machine) -> int | None:
-    """Data rows of an unusable file, None where nobody can tell."""
+    """Data rows of an unusable file; None if they cannot be counted."""
     try:
         if file.suffix == ".parquet":
             return int(pq.ParquetFile(file).metadata.num_rows)

@@ -1,18 +1,18 @@
-"""The Parquet lake: every version of every batch, kept safe from kills and from each other.
+"""Parquet lake: versioned storage of batches, atomic and safe for concurrent writers.
 
     ROOT/machine=NAME/year=YYYY/BATCH.parquet      the current version, for any reader (hive partitions)
     ROOT/_versions/machine=NAME/BATCH/*.parquet    every version ever stored, read-only
     ROOT/_quarantine/machine=NAME/                 files that could not be used, and reasons.jsonl
-    ROOT/_manifest.json                            the truth: versions of every batch
+    ROOT/_manifest.json                            versions of every batch; decides what exists
 
 Names with a leading underscore are skipped by the dataset discovery of pyarrow and pandas; DuckDB reads
 ``ROOT/*/*/*.parquet``.
 
-A version is a content (see `lakefile.content_digest`). Other findings, repairs or channel descriptions on
-the same content *refresh* the version: number and digest stay, the current file carries the new remarks,
-the file with the earlier ones stays too. Replacing `_manifest.json` is the moment of a commit; before it a
-new version file is invisible, after it `load` sees the new state. The current file follows at once; if a kill
-comes between, plain readers see the old version until the next write, which finds the batch under `pending`.
+A version is identified by its content (see `lakefile.content_digest`). New findings, repairs or channel descriptions
+for the same content *refresh* the version: number and digest stay, a new file holds the new remarks, and the earlier
+file is kept. Replacing `_manifest.json` commits a write: `load` gives the old state before it and the new state after.
+The current file is replaced next. If the process is killed in between, plain readers see the old version until the
+next write, which finds the batch under `pending`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def log_text(entries: list[Quarantined]) -> str:
 
 
 def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) -> Quarantined:
-    """What the log will say about `path`; hashes its bytes, writes nothing."""
+    """The log entry for `path`, with the hash of its bytes; writes nothing."""
     sha256, copy = "", None
     try:
         with path.open("rb") as file:
@@ -86,7 +86,7 @@ def copy_bytes(source: Path, target: Path) -> None:
 
 
 def ascii_if_broken(name: str) -> str:
-    """A file name in an unknown encoding with its stray bytes spelt out."""
+    """A file name with undecodable bytes escaped."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
@@ -184,7 +184,7 @@ class Lake:
         return stored
 
     def load(self, machine: str, batch_id: str, version: int | None = None) -> Batch:
-        """One batch, the current version unless told.
+        """One batch, by default its current version.
 
         Raises:
             InputError: no such machine, batch or version; the closest and the allowed ones.
@@ -241,7 +241,7 @@ class Lake:
         return entry.copy or folder / LOG
 
     def quarantined(self, machine: str) -> list[Quarantined]:
-        """What lies in quarantine for a machine, oldest first."""
+        """Quarantined files of a machine, oldest first."""
         return read_log(self.root / "_quarantine" / f"machine={safe_name(machine)}")
 
     @property
@@ -281,7 +281,7 @@ class Lake:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """The lake for us alone, rid of what a killed writer left half written."""
+        """Exclusive access, with files of an interrupted writer removed."""
         try:
             (self.root / "_tmp").mkdir(parents=True, exist_ok=True)
             with self._lock:
@@ -311,7 +311,7 @@ class Lake:
         _sync(target.parent)
 
     def _publish(self, manifest: dict[str, Any], batches: Iterable[Sequence[str]]) -> None:
-        """Let the current files of these batches be what the manifest says."""
+        """Replace the current files of these batches by those that the manifest names."""
         folders = set()
         for machine, batch_id in batches:
             entries = manifest["machines"][machine][batch_id]

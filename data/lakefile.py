@@ -1,6 +1,6 @@
 """One stored batch as one Parquet file: content digest, writing, reading, safe file names.
 
-A plain reader sees `time_s`, one float64 column per channel (null where nothing was recorded) and two
+A plain Parquet reader gets `time_s`, one float64 column per channel (null where nothing was recorded) and two
 constant columns, `batch` and `simulated`. Everything else of the batch is one JSON in the file's schema
 metadata under the key ``thermodrift``.
 """
@@ -36,7 +36,7 @@ def content_digest(batch: Batch) -> str:
     """SHA-256 (hex) of what was recorded: names, units, every float, start, labels, simulated.
 
     Independent of channel order and of NaN's bit pattern. Findings, repairs, roles, resolutions, ranges and
-    the source's path do not count: they say what we think of the content, see `remarks_digest`.
+    the source's path do not count: they describe the content, see `remarks_digest`.
 
     Raises:
         InputError: a table without `time_s`, a column that is not a channel, a reserved name, an unstorable label.
@@ -44,7 +44,7 @@ def content_digest(batch: Batch) -> str:
     columns = _columns(batch)
     names = sorted(columns)
     if batch.n_rows * len(names) > PARALLEL_VALUES:
-        with ThreadPoolExecutor(2) as pool:  # hashlib and numpy let go of the GIL
+        with ThreadPoolExecutor(2) as pool:  # hashlib and numpy release the GIL
             hashes = list(pool.map(lambda n: _hash_floats(columns[n]), names))
     else:
         hashes = [_hash_floats(columns[n]) for n in names]
@@ -60,7 +60,7 @@ def content_digest(batch: Batch) -> str:
 
 
 def remarks_digest(batch: Batch) -> str:
-    """SHA-256 (hex) of what the checks and the machine file say about the content: findings, repairs, channels."""
+    """SHA-256 (hex) of the remarks on the content: findings, repairs, channel descriptions."""
     meta = _meta(batch, "")
     return hashlib.sha256(_canonical({k: meta[k] for k in ("findings", "repairs", "channels")})).hexdigest()
 
@@ -110,7 +110,7 @@ def decode(path: Path, version: int = 1) -> Batch:
         digest=meta["digest"],
         version=version,
         repairs=meta["repairs"],
-        findings=tuple(Finding(**f) for f in meta["findings"]),
+        findings=tuple(Finding.from_dict(f) for f in meta["findings"]),
         labels=meta["labels"],
     )
 
@@ -209,8 +209,8 @@ def _plain(value: Any, where: str) -> Any:
 
 
 @dataclass(frozen=True)
-class OwnFile:
-    """The note inside a file: which machine, whether simulated, when it began, labels."""
+class NativeParquet:
+    """Metadata of a Parquet file written by thermodrift: machine, whether simulated, start, labels."""
 
     name: str
     note: Mapping[str, Any]
@@ -238,19 +238,19 @@ class OwnFile:
         )
 
     def marked(self, batch: Batch) -> Batch:
-        """The batch with the start and the labels that the file notes."""
+        """The batch with the start and the labels of the metadata."""
         start = self.note["start"]
         return replace(batch, start=None if start is None else pd.Timestamp(start), labels=self.note["labels"])
 
 
-def own_file(path: Path) -> OwnFile | None:
-    """The note of a file that thermodrift wrote; None for every other file, damaged ones included."""
+def native_parquet(path: Path) -> NativeParquet | None:
+    """Metadata of a Parquet file written by thermodrift; None for any other file, damaged ones included."""
     if path.suffix.lower() not in (".parquet", ".pq"):
         return None
     try:
         note = json.loads((pq.read_schema(path).metadata or {})[META_KEY])
         if note["schema"] != SCHEMA:
             return None
-        return OwnFile(path.name, {k: note[k] for k in ("machine", "simulated", "start", "labels")})
+        return NativeParquet(path.name, {k: note[k] for k in ("machine", "simulated", "start", "labels")})
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError):
         return None

@@ -1,4 +1,4 @@
-"""The machine file: one YAML file says what a machine's recordings mean."""
+"""Machine file: schema of the YAML file that describes a machine's recordings, and its loading."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from data.errors import InputError, closest
 from data.yaml_file import load_yaml, parse_yaml
 
 
-class _Part(BaseModel):
+class Section(BaseModel):
+    """A part of the machine file: unknown keys are errors, values do not change."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class TimeColumn(_Part):
+class TimeColumn(Section):
     """Which column is time. `unit` is s, min, h, or timestamp (then `format` may name a strptime pattern)."""
 
     column: str | int = "time_s"  # a header, or a 0-based position where the file has none
@@ -24,15 +26,15 @@ class TimeColumn(_Part):
     format: str | None = None
 
 
-class Stage(_Part):
+class Stage(Section):
     """One stage of a schedule row: how long (column name, h) and the driver columns that hold during it."""
 
     hours: str
     drivers: dict[str, str]  # driver channel -> column of the schedule file
 
 
-class Schedule(_Part):
-    """Drivers that stand in a table beside the recordings: one row a batch, up to several stages."""
+class Schedule(Section):
+    """Drivers from a table next to the recordings: one row per batch, one or more stages."""
 
     file: str
     batch_column: str
@@ -40,14 +42,14 @@ class Schedule(_Part):
     labels: dict[str, str] = {}  # batch label -> column
 
 
-class Split(_Part):
+class Split(Section):
     """Cut one long recording into batches where `driver` rises from 0; the stop that follows belongs to the batch."""
 
     driver: str
     min_run_s: Annotated[float, Field(gt=0)] = 600.0
 
 
-class Recording(_Part):
+class Recording(Section):
     """How a recording file becomes batches."""
 
     files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
@@ -60,7 +62,7 @@ class Recording(_Part):
     schedule: Schedule | None = None
 
 
-class ChannelPart(_Part):
+class ChannelPart(Section):
     """One channel: role, canonical unit, where it stands in the file, resolution and plausible range in that unit.
 
     `column` defaults to the channel's name; `unit_in_file` to `unit`. A driver that only the schedule gives has
@@ -88,8 +90,8 @@ class ChannelPart(_Part):
         return self
 
 
-class Overrule(_Part):
-    """The user's word against a check: findings that match lose their mask; `mask: true` adds a mask instead."""
+class Overrule(Section):
+    """An overruled check: matching findings lose their mask; `mask: true` adds a mask instead."""
 
     batch: str = "*"
     channel: str = "*"
@@ -100,7 +102,7 @@ class Overrule(_Part):
     reason: str
 
 
-class Machine(_Part):
+class Machine(Section):
     """A whole machine file."""
 
     machine: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]

@@ -1,4 +1,4 @@
-"""A first look at a file that nobody has described: header, units row, time column, columns of numbers."""
+"""Structure of an undescribed table: header, units row, time column, numeric columns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from data.units import known_unit
 
 @dataclass(frozen=True)
 class Table:
-    """What the first rows of a sheet show."""
+    """Structure of a sheet, from its first rows."""
 
     columns: tuple[str, ...]  # headers, or positions as text
     units: tuple[str, ...]  # of a units row, "" where none
@@ -30,7 +30,7 @@ class Table:
     time: int
     stamps: tuple[str, ...]  # strptime patterns that fit, if time is a timestamp
     numeric: tuple[int, ...]  # positions of the channels
-    words: str
+    summary: str
 
 
 def look(path: Path) -> Table:
@@ -61,7 +61,7 @@ def sheets_of(path: Path) -> AbstractContextManager[Sequence[Sheet]]:
 
 
 def look_at(sheet: Sheet, where: str) -> Table:
-    """What one sheet holds. Raises InputError as `look`."""
+    """Structure of one sheet. Raises InputError as `look`."""
     head = sheet.head
     first = next((i for i in range(len(head)) if _is_data(sheet, i)), None)
     if first is None:
@@ -86,13 +86,15 @@ def look_at(sheet: Sheet, where: str) -> Table:
         and any(parse_number(row[i], sheet.decimal) is not None for row in body)
     )
     if not numeric:
-        raise InputError(f"{where}: no column of numbers beside the time column {columns[time]!r}; record channels")
+        raise InputError(
+            f"{where}: no numeric column in addition to the time column {columns[time]!r}; record channels"
+        )
     texts = tuple(str(units[i] or "").strip() if i < len(units) else "" for i in range(width))
-    return Table(tuple(columns), texts, bool(header), first, time, stamps, numeric, sheet.words)
+    return Table(tuple(columns), texts, bool(header), first, time, stamps, numeric, sheet.summary)
 
 
 def _is_data(sheet: Sheet, i: int) -> bool:
-    """Does a stretch of like rows begin here, most of whose cells are numbers?"""
+    """True where similar rows begin, most of whose cells are numbers."""
     rows = [row for row in sheet.head[i : i + 3] if row]
     if not sheet.head[i] or len(rows) < 2 or len({len(r) for r in rows}) > 1 or len(rows[0]) < 2:
         return False

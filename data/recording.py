@@ -1,4 +1,4 @@
-"""One recording file to its batches: read, put in order, on the grid, in the units that the lake keeps.
+"""Reading of a recording file into batches: time repaired, values on the regular grid, in canonical units.
 
 `Batch.repairs` counts, for every batch; the keys of rows always add up: ``rows_in = rows_used + rows_dropped``.
 
@@ -29,6 +29,7 @@ from __future__ import annotations
 import datetime as dt
 import fnmatch
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from numpy.typing import NDArray
 
 from data.batch import Batch
 from data.errors import InputError
-from data.lakefile import own_file
+from data.lakefile import native_parquet
 from data.machine import Machine, Schedule
 from data.readers import has_reader, reader_for
 from data.readers.base import Sheet
@@ -68,7 +69,7 @@ def scheduled(
     """
     path = directory / schedule.file
     if not path.is_file():
-        raise InputError(f"{batch_ids[0]}: schedule {schedule.file!r} is missing beside the recording; put it there")
+        raise InputError(f"{batch_ids[0]}: schedule {schedule.file!r} is missing next to the recording; put it there")
     rows = read_text_table(path)
     columns = [schedule.batch_column, *schedule.labels.values()]
     columns += [c for stage in schedule.stages for c in (stage.hours, *stage.drivers.values())]
@@ -163,7 +164,7 @@ def read_batches(path: Path, machine: Machine, need_error: bool = True) -> Itera
     """
     _check_file(path)
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
-    own = own_file(path)
+    own = native_parquet(path)
     if own is None:
         yield from _file_batches(path, machine, need_error)
         return
@@ -192,7 +193,8 @@ def _file_batches(path: Path, machine: Machine, need_error: bool) -> Iterator[Ba
             batch_id = f"{path.stem}-{sheet.name}" if len(tables) + len(errors) > 1 else path.stem
             where = f"{path.name} sheet {sheet.name!r}" if several else path.name
             try:
-                yield from _sheet_batches(sheet, layout, machine, path, batch_id, where, need_error, extra, errors)
+                source = _Source(machine, path, batch_id, where, need_error, layout.sweeps)
+                yield from _sheet_batches(sheet, layout, source, extra, errors)
             except InputError as error:
                 errors.append(error)
             extra = {}
@@ -212,16 +214,27 @@ def _check_file(path: Path) -> None:
         )
 
 
+@dataclass(frozen=True)
+class _Source:
+    """Origin of a batch: `where` names it in messages; `sweeps` are the columns of errors along axes."""
+
+    machine: Machine
+    path: Path
+    batch_id: str
+    where: str
+    need_error: bool
+    sweeps: Columns
+
+
 def _sheet_batches(
-    sheet: Sheet, layout: Layout, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool,
-    extra: dict[str, int], errors: list[InputError],
-) -> Iterator[Batch]:  # fmt: skip
+    sheet: Sheet, layout: Layout, source: _Source, extra: dict[str, int], errors: list[InputError]
+) -> Iterator[Batch]:
+    machine, where = source.machine, source.where
     blocks = stream(sheet, layout, machine, where)
     split = machine.recording.split
     extra = {**extra, **layout.counts}
     if split is None:
-        rows = gather(blocks, sheet)
-        yield _batch(rows, layout.sweeps, machine, path, batch_id, where, need_error, extra, 0.0)
+        yield _batch(gather(blocks, sheet), source, extra, 0.0)
         return
     if split.driver not in machine.channels:
         raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
@@ -235,27 +248,24 @@ def _sheet_batches(
             yield rows
 
     for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
-        part_id = f"{batch_id}-{k + 1:02d}"
+        part = replace(source, batch_id=f"{source.batch_id}-{k + 1:02d}", where=f"{where} part {k + 1:02d}")
         try:
-            here = f"{where} part {k + 1:02d}"
-            yield _batch(rows, layout.sweeps, machine, path, part_id, here, need_error, extra, first[0])
+            yield _batch(rows, part, extra, first[0])
         except InputError as error:
             errors.append(error)
         extra = {}
 
 
-def _batch(
-    rows: Rows, sweeps: Columns, machine: Machine, path: Path, batch_id: str, where: str, need_error: bool,
-    extra: dict[str, int], file_start: float,
-) -> Batch:  # fmt: skip
+def _batch(rows: Rows, source: _Source, extra: dict[str, int], file_start: float) -> Batch:
     """`file_start` is the file's first time in s, needed where its name gives the start and the file is cut."""
-    recording = machine.recording
+    machine, path, where, recording = source.machine, source.path, source.where, source.machine.recording
     repaired = repair_time(rows.time_s, recording.max_gap_s)
     n_rows = len(rows)
     if len(repaired.order) < 2:
         raise _too_few(rows, len(repaired.order), machine, where)
     held = set(machine.names("driver"))
-    keep = slice(None) if _untouched(repaired.order, n_rows) else repaired.order
+    untouched = len(repaired.order) == n_rows and bool((np.diff(repaired.order) == 1).all())
+    keep = slice(None) if untouched else repaired.order
     values = {n: v[keep] for n, v in rows.columns.items()}
     unreadable = int(rows.unreadable.sum())
     filled = np.zeros(len(repaired.order), bool)
@@ -263,7 +273,7 @@ def _batch(
         if not filled.all():
             filled |= ~np.isnan(v)
     rows.columns.clear()
-    readings, read_counts = take_readings(values, repaired.time_s, machine, sweeps, where)
+    readings, read_counts = take_readings(values, repaired.time_s, machine, source.sweeps, where)
     grid = to_grid(repaired.time_s, values, held, recording.step_s, recording.max_gap_s, where)
     is_reading = np.zeros(len(filled), bool)
     for r in readings:
@@ -294,7 +304,7 @@ def _batch(
     labels: dict[str, object] = {}
     from_schedule: dict[str, np.ndarray] = {}
     if recording.schedule:
-        from_schedule, labels = scheduled(recording.schedule, path.parent, (batch_id, path.stem), grid.time_s)
+        from_schedule, labels = scheduled(recording.schedule, path.parent, (source.batch_id, path.stem), grid.time_s)
     for name, part in machine.channels.items():
         column = (from_schedule if part.source == "schedule" else grid.columns).get(name)
         if column is None and part.source == "schedule":
@@ -307,19 +317,15 @@ def _batch(
         else:
             here = f"machine file {machine.machine}: channel {name!r}"
             columns[name] = convert(column, part.unit_in_file or part.unit, part.unit, here)
-    _check_filled(columns, machine, where, need_error, unreadable)
+    _check_filled(columns, machine, where, source.need_error, unreadable)
     start = _start(path, machine, repaired.start, file_start)
     if start is None and recording.start_from_name:
         repairs["start_unreadable"] = 1
     return Batch(
-        machine=machine.machine, batch_id=batch_id, table=pd.DataFrame(columns, copy=False),
+        machine=machine.machine, batch_id=source.batch_id, table=pd.DataFrame(columns, copy=False),
         channels=machine.batch_channels(), start=start,
         simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
     )  # fmt: skip
-
-
-def _untouched(order: np.ndarray, n_rows: int) -> bool:
-    return len(order) == n_rows and bool((np.diff(order) == 1).all())
 
 
 def _too_few(rows: Rows, usable: int, machine: Machine, where: str) -> InputError:
@@ -335,14 +341,14 @@ def _too_few(rows: Rows, usable: int, machine: Machine, where: str) -> InputErro
 
 def _check_filled(columns: dict[str, np.ndarray], machine: Machine, where: str, need_error: bool, bad: int) -> None:
     """Something was recorded, and at least one error channel has a value."""
-    told = f"; {bad} cells are no numbers" if bad else ""
+    note = f"; {bad} cells are no numbers" if bad else ""
     from_file = [n for n, c in machine.channels.items() if c.source == "file"]
     if not any(np.isfinite(columns[n]).any() for n in from_file):
-        raise InputError(f"{where}: no channel has a value, all are empty or NaN{told}; record again")
+        raise InputError(f"{where}: no channel has a value, all are empty or NaN{note}; record again")
     errors = machine.names("error")
     if need_error and errors and not any(np.isfinite(columns[n]).any() for n in errors):
         raise InputError(
-            f"{where}: no error channel has a value, {', '.join(errors)} are all empty or NaN{told};"
+            f"{where}: no error channel has a value, {', '.join(errors)} are all empty or NaN{note};"
             " expected the displacement; record again"
         )
 
@@ -355,5 +361,5 @@ def _start(path: Path, machine: Machine, batch_start: float, file_start: float) 
             named = pd.Timestamp(dt.datetime.strptime(path.stem, pattern))
             return named + pd.Timedelta(seconds=batch_start - file_start) if machine.recording.split else named
         except ValueError:
-            pass  # counted as start_unreadable; a time column may still tell
+            pass  # counted as start_unreadable; a time column may still give the start
     return pd.Timestamp(0) + pd.Timedelta(seconds=round(batch_start, 6)) if stamped else None

@@ -1,4 +1,4 @@
-"""A registry: one line per member, imported only when it is used."""
+"""Registry of classes by key; the module of a member is imported at its first use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 from data.errors import InputError, closest
 
 Effort = Literal["quick", "usual", "complete", "on_request"]
-"""The least crossing that takes a member: one of seconds, the usual, the complete one, or only where it is named."""
+"""The smallest effort that includes a member: seconds, the usual, the complete set, or only on request by name."""
 
 EFFORTS: tuple[Effort, ...] = ("quick", "usual", "complete", "on_request")
 

@@ -182,7 +182,7 @@ class _Runs:
         self._min_run_s = min_run_s
         self._rows = 0  # of the blocks before
         self._begun: tuple[int, float] | None = None  # row and time of the run under way
-        self._told = False  # the run under way has been given out
+        self._reported = False  # the run under way is already among the results
 
     def starts(self, on: NDArray[np.bool_], time: Array) -> list[int]:
         """Rows, counted from the first block on, of the runs that are seen to be long enough within this block."""
@@ -198,10 +198,10 @@ class _Runs:
         for k, ((row, began_s), e) in enumerate(zip(begun, end, strict=True)):
             run_s = float(time[min(int(e), len(time) - 1)]) - began_s
             self.longest_s = max(self.longest_s, 0.0 if np.isnan(run_s) else run_s)
-            self._told = self._told and k == 0 and self._begun is not None
-            if run_s >= self._min_run_s and not self._told:
+            self._reported = self._reported and k == 0 and self._begun is not None
+            if run_s >= self._min_run_s and not self._reported:
                 found.append(row)
-                self._told = True
+                self._reported = True
         self._rows += len(on)
         self._begun = begun[-1] if on[-1] else None
         return found

@@ -1,9 +1,8 @@
-"""Readings along an axis: error at a position at an instant; a sweep reads every position once.
+"""Readings of errors along an axis, and their place on the grid. A sweep reads every position once.
 
-In a batch every reading has a row of its own: the grid's row nearest to its time, the order kept. So a sweep that has
-one time stamp lies on consecutive rows around it, one whose readings have stamps of their own at these. Readings of one
-position that fall into one row are averaged: a sweep there and back under one stamp becomes its mean, with stamps of
-their own both ways are kept. Between readings a batch has neither position nor error.
+Every reading gets a grid row of its own: the row nearest to its time, in the original order. A sweep under one time
+stamp therefore occupies consecutive rows around it. Readings of one position that fall into one row are averaged: a
+sweep there and back under one stamp becomes its mean. Rows between readings have neither position nor error.
 """
 
 from __future__ import annotations
@@ -66,9 +65,9 @@ class Readings:
             InputError: more readings than rows, or one whose row is more than `most_s` from its time.
         """
         time_s, position, errors = self._averaged(step_s)
-        step_words = f"recording.step_s is {step_s:g} s; lower it, a sweep takes one row for each position"
+        step_hint = f"recording.step_s is {step_s:g} s; lower it, a sweep takes one row for each position"
         if len(time_s) > n_rows:
-            raise InputError(f"{where}: {len(time_s)} readings along {self.channel} for {n_rows} rows: {step_words}")
+            raise InputError(f"{where}: {len(time_s)} readings along {self.channel} for {n_rows} rows: {step_hint}")
         count = np.arange(len(time_s))
         # rows that rise by one or more and are nearest to the times in the sum of squares
         first = isotonic_regression(time_s / step_s - count).x
@@ -77,7 +76,7 @@ class Readings:
         if away_s > most_s:
             raise InputError(
                 f"{where}: a reading along {self.channel} would stand {away_s:g} s from its time, expected at most "
-                f"recording.max_gap_s ({most_s:g} s): {step_words}"
+                f"recording.max_gap_s ({most_s:g} s): {step_hint}"
             )
         out = {}
         for name, values in {self.channel: position, **errors}.items():

@@ -1,11 +1,11 @@
-"""From irregular samples to a regular grid, without inventing anything across holes.
+"""Repair of a time column and resampling of irregular samples to a regular grid; long holes stay empty.
 
 Repair of the time column, in this order
 1. unreadable times: the row is dropped (`unparsable_time`);
 2. a lone row whose time is far off on both sides, or a first or last one ten recordings away: dropped
    (`time_outliers`);
 3. a step back beyond `max_gap_s` into time that is already covered: the clock was restarted or set back; the rest is
-   carried on one sampling interval after the last row (`clock_restarts`). How long the pause was nobody knows;
+   carried on one sampling interval after the last row (`clock_restarts`). The length of the pause is unknown;
 4. any other step back: rows out of order, sorted (`backward_steps` counts every step back that was found);
 5. equal times: averaged, drivers take the last (`duplicates` counts the rows beyond the first).
 

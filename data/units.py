@@ -1,65 +1,37 @@
-"""Units: what a recording's columns are measured in, and the way to the unit that the lake keeps."""
+"""Units: the names that machine files use, the spellings that recordings use, and conversion through pint."""
 
 from __future__ import annotations
 
-import math
 import unicodedata
 from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.errors import InputError, closest
 
-# unit -> (quantity, factor, offset): value in the quantity's first unit = factor * value + offset
-_UNITS: dict[str, tuple[str, float, float]] = {
-    "degC": ("temperature", 1.0, 0.0),
-    "K": ("temperature", 1.0, -273.15),
-    "degF": ("temperature", 5.0 / 9.0, -160.0 / 9.0),
-    "um": ("length", 1.0, 0.0),
-    "nm": ("length", 1e-3, 0.0),
-    "mm": ("length", 1e3, 0.0),
-    "cm": ("length", 1e4, 0.0),
-    "m": ("length", 1e6, 0.0),
-    "in": ("length", 25400.0, 0.0),
-    "mil": ("length", 25.4, 0.0),
-    "rpm": ("rotation", 1.0, 0.0),
-    "krpm": ("rotation", 1e3, 0.0),
-    "rev/s": ("rotation", 60.0, 0.0),
-    "rad/s": ("rotation", 30.0 / math.pi, 0.0),
-    "mm/min": ("feed", 1.0, 0.0),
-    "m/min": ("feed", 1e3, 0.0),
-    "mm/s": ("feed", 60.0, 0.0),
-    "m/s": ("feed", 6e4, 0.0),
-    "in/min": ("feed", 25.4, 0.0),
-    "s": ("time", 1.0, 0.0),
-    "ms": ("time", 1e-3, 0.0),
-    "min": ("time", 60.0, 0.0),
-    "h": ("time", 3600.0, 0.0),
-    "W": ("power", 1.0, 0.0),
-    "mW": ("power", 1e-3, 0.0),
-    "kW": ("power", 1e3, 0.0),
-    "A": ("current", 1.0, 0.0),
-    "mA": ("current", 1e-3, 0.0),
-    "V": ("voltage", 1.0, 0.0),
-    "mV": ("voltage", 1e-3, 0.0),
-    "N": ("force", 1.0, 0.0),
-    "kN": ("force", 1e3, 0.0),
-    "Nm": ("torque", 1.0, 0.0),
-    "bar": ("pressure", 1.0, 0.0),
-    "kPa": ("pressure", 0.01, 0.0),
-    "MPa": ("pressure", 10.0, 0.0),
-    "l/min": ("flow", 1.0, 0.0),
-    "l/h": ("flow", 1.0 / 60.0, 0.0),
-    "deg": ("angle", 1.0, 0.0),
-    "rad": ("angle", 180.0 / math.pi, 0.0),
-    "urad": ("angle", 180e-6 / math.pi, 0.0),
-    "arcsec": ("angle", 1.0 / 3600.0, 0.0),
-    "1": ("ratio", 1.0, 0.0),
-    "%": ("ratio", 0.01, 0.0),
-    "um/m": ("ratio", 1e-6, 0.0),
-    "m/m": ("ratio", 1.0, 0.0),
+# pint sees no difference between angle, rotation and ratio, which a channel must not mix
+_QUANTITIES: dict[str, tuple[str, ...]] = {
+    "temperature": ("degC", "K", "degF"),
+    "length": ("um", "nm", "mm", "cm", "m", "in", "mil"),
+    "rotation": ("rpm", "krpm", "rev/s", "rad/s"),
+    "feed": ("mm/min", "m/min", "mm/s", "m/s", "in/min"),
+    "time": ("s", "ms", "min", "h"),
+    "power": ("W", "mW", "kW"),
+    "current": ("A", "mA"),
+    "voltage": ("V", "mV"),
+    "force": ("N", "kN"),
+    "torque": ("Nm",),
+    "pressure": ("bar", "kPa", "MPa"),
+    "flow": ("l/min", "l/h"),
+    "angle": ("deg", "rad", "urad", "arcsec"),
+    "ratio": ("1", "%", "um/m", "m/m"),
 }
+_UNITS = {unit: kind for kind, units in _QUANTITIES.items() for unit in units}
+_OFFSET_UNITS = ("degC", "degF")  # their zero is not that of K: a difference needs pint's delta units
+_PINT = {"": "dimensionless", "1": "dimensionless", "%": "percent", "Nm": "N*m", "rev/s": "revolution/s", "mil": "thou"}
 
 # spellings found in recordings, folded by `_fold`
 _SPELLINGS: dict[str, str] = {
@@ -76,7 +48,7 @@ _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
 
 def _fold(text: str) -> str:
     folded = unicodedata.normalize("NFKC", text).strip().strip("[]()").strip()
-    return folded.replace("μ", "u").replace("⁻", "-").casefold()
+    return folded.replace("μ", "u").replace("\N{MINUS SIGN}", "-").casefold()
 
 
 _BY_FOLD = {**{_fold(u): u for u in _UNITS if u not in ("mW", "MPa")}, **{_fold(k): v for k, v in _SPELLINGS.items()}}
@@ -90,8 +62,21 @@ def known_unit(text: str) -> str | None:
 
 def quantity(unit: str) -> str | None:
     """What a unit measures (temperature, length, …), or None if the unit is not known."""
-    name = known_unit(unit)
-    return _UNITS[name][0] if name else None
+    return _UNITS.get(known_unit(unit) or "")
+
+
+@lru_cache(maxsize=1)
+def unit_registry() -> Any:
+    """The one pint registry, made at its first use: importing pint takes a third of a second."""
+    import pint
+
+    registry: Any = pint.UnitRegistry(cache_folder=None)
+    return registry
+
+
+def pint_name(unit: str) -> str:
+    """How pint spells a unit that has another name here."""
+    return _PINT.get(unit, unit)
 
 
 def conversion(unit_from: str, unit_to: str, where: str) -> tuple[float, float]:
@@ -102,21 +87,27 @@ def conversion(unit_from: str, unit_to: str, where: str) -> tuple[float, float]:
     """
     if unit_from == unit_to:
         return 1.0, 0.0
-    known: dict[str, tuple[str, float, float]] = {}
-    for unit in (unit_from, unit_to):
-        name = known_unit(unit)
+    names = [known_unit(unit) for unit in (unit_from, unit_to)]
+    for unit, name in zip((unit_from, unit_to), names, strict=True):
         if name is None:
             raise InputError(f"{where}: unknown unit {unit!r}; {closest(unit, _UNITS)}")
-        known[unit] = _UNITS[name]
-    (kind_from, factor_from, offset_from), (kind_to, factor_to, offset_to) = known[unit_from], known[unit_to]
-    if kind_from != kind_to:
+    one, other = (str(name) for name in names)
+    if _UNITS[one] != _UNITS[other]:
         raise InputError(
-            f"{where}: {unit_from!r} is a {kind_from} and cannot become {unit_to!r}, a {kind_to};"
+            f"{where}: {unit_from!r} is a {_UNITS[one]} and cannot become {unit_to!r}, a {_UNITS[other]};"
             " correct unit or unit_in_file"
         )
-    if (factor_from, offset_from) == (factor_to, offset_to):
+    return _factor_offset(one, other)
+
+
+@lru_cache
+def _factor_offset(one: str, other: str) -> tuple[float, float]:
+    if one == other:
         return 1.0, 0.0
-    return factor_from / factor_to, (offset_from - offset_to) / factor_to
+    deltas = [f"delta_{name}" if name in _OFFSET_UNITS else pint_name(name) for name in (one, other)]
+    registry = unit_registry()
+    factor = float(registry.Quantity(1.0, deltas[0]).to(deltas[1]).magnitude)
+    return factor, float(registry.Quantity(0.0, pint_name(one)).to(pint_name(other)).magnitude)
 
 
 def convert(values: NDArray[np.float64], unit_from: str, unit_to: str, where: str) -> NDArray[np.float64]:

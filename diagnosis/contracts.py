@@ -1,10 +1,11 @@
-"""A candidate: what may be missing and where, as a change of a machine file's twin part."""
+"""Types that the stages of a diagnosis share: candidates as changes of a twin part, fits, refits."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Any, Literal
 
@@ -21,7 +22,8 @@ from twin.calibration.problem import CalibrationProblem
 from twin.quantity import Parameter, Value
 from twin.schema import MechanismPart, TwinPart
 
-PLACES = ("materials", "surroundings", "bodies", "links", "exposures", "mechanisms", "sensors", "errors")  # by name
+# of a twin part, whose members have names
+PART_GROUPS = ("materials", "surroundings", "bodies", "links", "exposures", "mechanisms", "sensors", "errors")
 _INDEX = re.compile(r"^(\w+)\[(\d+)\]$")
 
 
@@ -56,11 +58,11 @@ def with_value(part: TwinPart, parameter: Parameter, **changes: Any) -> TwinPart
 
 def _split(part: TwinPart, group: str, rest: str) -> tuple[str, list[str]]:
     """A member's name may hold dots of its own ("column@0.8-bed"): the longest that the part knows."""
-    words = rest.split(".")
-    for n in range(len(words) - 1, 0, -1):
-        if ".".join(words[:n]) in getattr(part, group):
-            return ".".join(words[:n]), words[n:]
-    return words[0], words[1:]
+    steps = rest.split(".")
+    for n in range(len(steps) - 1, 0, -1):
+        if ".".join(steps[:n]) in getattr(part, group):
+            return ".".join(steps[:n]), steps[n:]
+    return steps[0], steps[1:]
 
 
 def _changed(owner: Any, steps: list[str], parameter: Parameter, changes: dict[str, Any]) -> Any:
@@ -88,7 +90,34 @@ def _new(old: Value | None, parameter: Parameter, changes: dict[str, Any]) -> Va
 
 
 Kind = Literal["node", "link", "sensor", "error"]
-RIVALS = ("wrong_parameter", "coarse_network", "varies_between_runs")  # no mechanisms: what else explains a mismatch
+
+
+class CandidateKind(StrEnum):
+    """What a candidate or a finding is, by its `mechanism` key; `LISTED` are the laws of the library."""
+
+    LISTED = "listed"
+    SENSOR_SWAP = "sensor_swap"
+    WRONG_PARAMETER = "wrong_parameter"
+    VARIES_BETWEEN_RUNS = "varies_between_runs"
+    COARSE_NETWORK = "coarse_network"
+    FREE_FLUX = "free_flux"
+    FREE_SHIFT = "free_shift"
+    UNLISTED = "unlisted"
+
+    @classmethod
+    def of(cls, mechanism: str) -> CandidateKind:
+        """The kind of a mechanism key."""
+        return cls._value2member_map_.get(mechanism, cls.LISTED)  # type: ignore[return-value]
+
+    @property
+    def is_physics(self) -> bool:
+        """Whether it is an effect, a fault or a wrong value, and no finer network."""
+        return self is not CandidateKind.COARSE_NETWORK
+
+    @property
+    def is_unlisted(self) -> bool:
+        """Whether it stands in for physics that no listed mechanism describes."""
+        return self in (CandidateKind.FREE_FLUX, CandidateKind.FREE_SHIFT, CandidateKind.UNLISTED)
 
 
 @dataclass(frozen=True)
@@ -101,7 +130,7 @@ class Where:
 
 @dataclass(frozen=True)
 class Change:
-    """A value of the machine file that a rival doubts: freed with this spread, or different from run to run."""
+    """A value of the machine file that is doubted: freed with this spread, or different from run to run."""
 
     parameter: Parameter
     spread: float | None = None  # in the fitting coordinate
@@ -110,17 +139,20 @@ class Change:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One mechanism at one place, or a rival that needs no new physics.
+    """One mechanism at one place, or an alternative that needs no new physics.
 
-    `part` is the instance as a machine file would state it, every value fixed at `Spec.value`; `amplitudes` its
-    parameters that switch it off and the values at which they do; `shape` those that are freed beside them. A rival
-    that changes a value has a `change` instead, one that cuts a body has `parts`.
+    Attributes:
+        part: the instance as a machine file would state it, every value fixed at `Spec.value`.
+        amplitudes: the parameters that switch it off, with the values at which they do.
+        shape: parameters that are freed with them.
+        change: of an alternative that changes a value.
+        parts: of an alternative that refines the network, by path.
     """
 
     mechanism: str
     where: Where
     name: str  # unique; the instance's name in a machine file
-    words: str
+    label: str
     part: MechanismPart | None = None
     amplitudes: Mapping[str, float] = field(default_factory=dict)
     shape: tuple[str, ...] = ()
@@ -128,6 +160,10 @@ class Candidate:
     change: Change | None = None
     variant_of: str = ""  # the name of what this is at another value of its shape
     parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
+
+    @property
+    def kind(self) -> CandidateKind:
+        return CandidateKind.of(self.mechanism)
 
     @property
     def plain(self) -> str:
@@ -157,7 +193,7 @@ class Scored:
     """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
 
     `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
-    recalibration takes; `moves` (p,) is how far the fit's parameters z go beside it, where that was asked for.
+    recalibration takes; `moves` (p,) is the linear step of the fit's parameters z with it, where that was computed.
     """
 
     candidate: Candidate
@@ -170,7 +206,7 @@ class Scored:
     moves: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)  # one is the same as itself alone: what is worked out of it may be kept by it
+@dataclass(frozen=True, eq=False)  # compared by identity, so that results may be cached by fit
 class Fitted:
     """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
 
@@ -192,12 +228,12 @@ class Fitted:
 
     @cached_property
     def memory(self) -> Memory:
-        """What the rows of each channel remember of each other, in what this fit leaves over."""
+        """The autocorrelation of each channel in this fit's residuals."""
         return memory_left(self.problem, self._left)
 
     @cached_property
     def noise(self) -> Noise:
-        """What this fit leaves over in each channel, and how many rows count as one."""
+        """The noise of each channel in this fit's residuals, and how many rows count as one."""
         filtered = Filtered(self.problem, self.memory)
         return replace(
             filtered.noise_of(self._left, self.state.arrow.effective_parameters()), inflation=self.memory.inflation
@@ -222,15 +258,15 @@ class Fitted:
 class Tried:
     """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
 
-    `cluster` numbers candidates that these recordings cannot tell apart; `log_prior` is of its size. `alike` is the
-    gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the threshold.
-    `barred`: structure alone may make as much of it.
+    `cluster` names the first of the candidates that these recordings cannot tell from it; `log_prior` is of its size.
+    `alike` is the gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the
+    threshold. `barred`: structure alone may gain as much with it.
     """
 
     scored: Scored
     gain: float
     improved: int
-    cluster: int
+    cluster: str
     log_prior: float
     fitted: Fitted | None = None
     alike: float | None = None
@@ -267,14 +303,14 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 
-NEAR, FAR = "_near", "_far"  # how they are called
+NEAR_SUFFIX, FAR_SUFFIX = "_near", "_far"
 
 
 def pieces_of(part: TwinPart) -> dict[str, str]:
     """The bodies that are pieces of others around or far from a sensor, as a finer network states them."""
     out = {}
     for name in part.bodies:
-        for end in (NEAR, FAR):
+        for end in (NEAR_SUFFIX, FAR_SUFFIX):
             if name.endswith(end):
                 ends = next((link.between for link in part.links.values() if link.between[0] == name), None)
                 if ends is not None:

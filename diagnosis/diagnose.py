@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,21 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from data.processes import Processes
 from diagnosis.contracts import Fitted, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.export.machine_file import changed_parts, with_deviations
 from diagnosis.findings import report_data as made
-from diagnosis.findings.conclude import caps, found_of, left_words, remainder, rms_of, slow_remainder, verdict_of
-from diagnosis.findings.report_data import UNLISTED, Rms, place_words
+from diagnosis.findings.conclude import (
+    caps,
+    found_of,
+    residual_ratio,
+    residual_remarks,
+    rms_of,
+    slow_residual_ratio,
+    verdict_of,
+)
+from diagnosis.findings.report_data import Rms, place_label
 from diagnosis.findings.schema import (
     DetectionLimit,
     Finding,
@@ -34,14 +43,15 @@ from diagnosis.findings.schema import (
 )
 from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import BASELINE_TOLERANCE, LeftOutRows, baseline, check, left_out_rows, settle
+from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, settle
 from diagnosis.localisation.where_when import Located, locate
 from diagnosis.next_experiment.proposal import Proposal, settling_run
+from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
-from diagnosis.screening.screen import limits
+from diagnosis.screening.screen import alone, limits
 from diagnosis.search.decision import Round
-from diagnosis.search.refits import Progress, Workers
-from diagnosis.search.residual import Leftover, instead, leftover
+from diagnosis.search.refits import Progress
+from diagnosis.search.residual import UnlistedEffect, in_place_of_listed, unlisted_effect
 from diagnosis.search.search import Search, search, start_worker
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
@@ -71,49 +81,41 @@ def diagnose(
     check(machine, batches)
     batches = sorted(batches, key=lambda b: b.batch_id)  # what is drawn for each must not depend on their order
     tell = progress or (lambda step, n, of: None)
-    with Workers(processes, start_worker) as workers:
-        words: list[str] = []
-        drafted = machine.twin is None
-        if drafted:
+    with Processes(processes, start_worker) as workers:
+        workers.warm_up()
+        remarks: list[str] = []
+        if machine.twin is None:
             draft = drafted_part(machine, batches, progress=lambda what, n, of: tell("draft", n, of))
             part = draft.part
-            words += draft.words
+            remarks += draft.remarks
         else:
             part = twin_part(machine)
-        batches, remarks = usable_batches(compile_network(machine, part=part), batches)
-        words += remarks
+        batches, more = usable_batches(compile_network(machine, part=part), batches)
+        remarks += more
         recordings = tuple(b.batch_id for b in batches)
-        batches, remarks = enough_batches(batches)
-        words += remarks
+        batches, more = enough_batches(batches)
+        remarks += more
         done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
         final = settle(done.final) if done.accepted else done.final
         done = replace(done, final=final)
         tell("left out", 0, 0)
-        beside = workers.beside(partial(_located, done.baseline, batches))
-        left = leftover(done, seed)
+        location = workers.submit(partial(_located, done.baseline, batches))
+        left = unlisted_effect(done, seed)
         if _physics(done):
-            done, left = instead(done, left, seed) or (done, left)
-        first = beside()
+            done, left = in_place_of_listed(done, left, seed) or (done, left)
+        first = location()
+    located: dict[str, pd.DataFrame] = {}
     if isinstance(first, str):
-        words.append(f"no map of where and when: {first}")
-    mapped = first.map if isinstance(first, Located) else None
-    over_time = None
+        remarks.append(f"no map of where and when: {first}")
+    else:
+        located["map"] = first.map
     if left is not None:
-        located = first if done.final is done.baseline else _located(done.final, batches)
-        over_time = left.flux(located) if isinstance(located, Located) else None
-    return _diagnosis(
-        machine,
-        part,
-        recordings,
-        done,
-        stages(done),
-        mapped,
-        left,
-        over_time,
-        tuple(words),
-        drafted,
-        time.perf_counter() - begun,
-    )
+        last = first if done.final is done.baseline else _located(done.final, batches)
+        if not isinstance(last, str):
+            located["flux"] = left.flux(last)
+    diagnosis = _diagnosis(part, recordings, done, left, located, tuple(remarks))
+    seconds = round(time.perf_counter() - begun, 1)
+    return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
 
 
 def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
@@ -132,52 +134,52 @@ def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = N
 
 def _physics(done: Search) -> list[Round]:
     """The rounds that found an effect, and not merely a network too coarse."""
-    return [r for r in done.accepted if r.best is not None and r.best.candidate.mechanism != "coarse_network"]
+    return [r for r in done.accepted if r.best is not None and r.best.candidate.kind.is_physics]
 
 
 def _diagnosis(
-    machine: Machine,
     part: TwinPart,
     batches: tuple[str, ...],
     done: Search,
-    steps: Sequence[tuple[Fitted, LeftOutRows]],
-    mapped: pd.DataFrame | None,
-    left: Leftover | None,
-    over_time: pd.DataFrame | None,
-    words: tuple[str, ...],
-    drafted: bool,
-    seconds: float,
+    left: UnlistedEffect | None,
+    located: Mapping[str, pd.DataFrame],
+    remarks: tuple[str, ...],
 ) -> Diagnosis:
+    """What was found, from the search for listed effects, the effect of no list, and the tables of its localisation."""
+    machine, steps = done.baseline.machine, stages(done)
     final = left.fitted if left is not None else done.final
     before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
     named = _physics(done)
-    fit = result(final.problem, replace(final.state, noise=final.noise), BASELINE_TOLERANCE, "")
+    fit = result(final.problem, replace(final.state, noise=final.noise), POLICY.baseline_tolerance, "")
     intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
     run = settling_run(done, named)
-    separates = run.words if run is not None else ""
-    found = [
-        found_of(
-            done, r, part_after, intervals, rms_of(made.rms_table(*_around(done, r, steps), final), final), separates
-        )
-        for r in named
-    ]
+    separates = run.label if run is not None else ""
+    found = []
+    for r in named:
+        own_rms = rms_of(made.rms_table(*_around(done, r, steps), final), final)
+        found.append(found_of(done, r, part_after, intervals, own_rms, separates))
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    rest, slow = remainder(done), slow_remainder(rms, final)
-    listed = [f for f in found if f.mechanism not in UNLISTED]
+    rest, slow = residual_ratio(done), slow_residual_ratio(rms, final)
+    listed = [f for f in found if not f.kind.is_unlisted]
     verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
-    words += left_words(rest, slow, final.runs)
+    remarks += residual_remarks(rest, slow, final.runs)
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
-    told = _limits_told(table)
+    detection_limits = _detection_limits(table)
     findings = tuple(finding_of(f) for f in found)
     better = int((_per_batch(rms_table, "after") < _per_batch(rms_table, "before")).sum()) if found else 0
     statement = verdict_statement(
-        verdict, found, rms, told, separates, [place_words(_where(n), part_after) for n in told]
+        verdict,
+        found,
+        rms,
+        detection_limits,
+        separates,
+        [place_label(Where(n.where.kind, n.where.name), part_after) for n in detection_limits],
     )
     everything = made.empty_tables() | {
         "rms": rms_table,
@@ -188,11 +190,9 @@ def _diagnosis(
         "refinements": refinements(done),
         "limits": table,
         "null": made.null_table(last.null),
+        **located,
     }
-    if mapped is not None:
-        everything["map"] = mapped
-    if over_time is not None:
-        everything["flux"] = over_time
+    simulated, drafted = any(b.simulated for b in final.batches), machine.twin is None
     return Diagnosis(
         machine=machine,
         findings=Findings(
@@ -201,13 +201,13 @@ def _diagnosis(
             verdict=verdict,
             findings=findings,
             fit=_summary(rms, better, len(final.batches)),
-            detection_limits=told,
+            detection_limits=detection_limits,
             next_experiment=_next(run),
-            seconds=round(seconds, 1),
+            seconds=None,  # set once all is done
             statement=statement,
-            simulated=any(b.simulated for b in final.batches),
+            simulated=simulated,
             drafted=drafted,
-            remarks=words,
+            remarks=remarks,
             refinements=tuple(
                 Refinement(what=what, why=why, before=b, after=a)
                 for what, why, b, a in rows_of(everything["refinements"])
@@ -215,9 +215,9 @@ def _diagnosis(
         ),
         part_before=done.baseline.part,
         part_after=part_after,
-        simulated=any(b.simulated for b in final.batches),
+        simulated=simulated,
         drafted=drafted,
-        words=words,
+        remarks=remarks,
         tables=everything,
         network=final.problem.network,
         values={i.name: i.value for i in intervals.values()},
@@ -243,15 +243,16 @@ def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
 
 def refinements(done: Search) -> pd.DataFrame:
     """What was cut finer before and between findings, with the left-out log score before and after, in nats."""
-    rows = [
-        (r.best.candidate.words, "the left-out error of its sensor was far above the noise", 0.0, r.best.gain)
-        for r in done.accepted
-        if r.best is not None and r.best.candidate.mechanism == "coarse_network"
-    ]
+    why = "the left-out error of its sensor was far above the noise"
+    rows = []
+    for r in done.accepted:
+        if r.best is not None and not r.best.candidate.kind.is_physics:
+            before = float(alone(r.before, r.before.memory).base_score()[0])
+            rows.append((r.best.candidate.label, why, before, before + r.best.gain))
     return pd.DataFrame(rows, columns=["what", "why", "before", "after"])
 
 
-def _limits_told(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
+def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:
     """Every candidate's limit; nan where no amplitude within bounds would have been seen."""
     return tuple(
         DetectionLimit(
@@ -267,10 +268,6 @@ def rows_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
     return list(table.itertuples(index=False, name=None))
 
 
-def _where(limit: DetectionLimit) -> Where:
-    return Where(limit.where.kind, limit.where.name)
-
-
 def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
     return FitSummary(
         left_out_rms=LeftOutRms(
@@ -284,10 +281,10 @@ def _summary(rms: Sequence[Rms], better: int, n: int) -> FitSummary:
 
 
 def _next(run: Proposal | None) -> NextExperiment | None:
-    if run is None or not run.words:
+    if run is None or not run.label:
         return None
     return NextExperiment(
-        separates=tuple(run.separates), run=run.words, hours=run.hours, file="next_run.yml" if run.plan_text else None
+        separates=tuple(run.separates), run=run.label, hours=run.hours, file="next_run.yml" if run.plan_text else None
     )
 
 

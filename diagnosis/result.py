@@ -24,7 +24,7 @@ class Diagnosis:
     """Everything that a report of a diagnosis consumes, and what its machine file and next run are written from.
 
     `part_before` is the refined and recalibrated baseline, `part_after` the same with what was found. `simulated`:
-    the recordings come from a simulation. `drafted`: the machine file had no twin part. `words` are remarks: what was
+    the recordings come from a simulation. `drafted`: the machine file had no twin part. `remarks` say what was
     refined, what caps the confidence. `tables` holds every key of `COLUMNS`; any of them may be empty.
 
     For the machine file, as `diagnosed_text` takes them: `network` of `part_after`, fitted `values` and `intervals` of
@@ -38,7 +38,7 @@ class Diagnosis:
     part_after: TwinPart
     simulated: bool
     drafted: bool
-    words: tuple[str, ...]
+    remarks: tuple[str, ...]
     tables: Mapping[str, pd.DataFrame]
     network: Network | None = None
     values: Mapping[str, float] = field(default_factory=dict)

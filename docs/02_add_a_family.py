@@ -16,10 +16,10 @@ from models.base import Family
 
 
 class NearestBatch(Family):
-    """The error of the training batch whose rises were most alike at the same time since start."""
+    """The error of the training batch whose rises were most similar at the same time since start."""
 
     key = "nearest_batch"
-    words = "the most similar training batch's own error"
+    summary = "the most similar training batch's own error"
     source = "an example"
     rowwise = False
 
@@ -34,7 +34,7 @@ class NearestBatch(Family):
         for k in batches:
             x = design.x[design.rows(k)]
             n = min(len(x), self.fitted["x_K"].shape[1])
-            # Only the past counts: the distance up to each row, so the prediction runs beside the machine.
+            # Only the past counts: the distance up to each row, so the prediction can run at the machine.
             distance = np.cumsum(np.square(self.fitted["x_K"][:, :n] - x[:n]).sum(axis=2), axis=1)
             nearest = distance.argmin(axis=0)
             predicted = self.fitted["y_um"][nearest, np.arange(n)]

@@ -1,4 +1,4 @@
-"""Batches stacked into arrays once, so that every selector, family and fold works on the same rows."""
+"""Batches stacked into arrays: the rows that all selectors, families and folds share, and their per-batch sums."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from features.rises import feature, feature_unit, zeroed_error_um
 
 @dataclass(frozen=True)
 class Moments:
-    """Per-batch sums over the usable rows: all that a linear family needs to know.
+    """Per-batch sums over the usable rows, sufficient for a linear family.
 
     count (K,), sum_x (K, p), sum_y (K,), xx (K, p, p), xy (K, p), yy (K,). Inputs and target are
     first shifted by `shift_x`, `shift_y` (fixed, only for conditioning: results do not depend on it).
@@ -45,7 +45,7 @@ class Design:
 
     Rows of batch k are offsets[k]:offsets[k+1]; they are consecutive on the regular grid and never
     cross a border. y_um is NaN where there is no usable target, x where there is no usable input;
-    `usable` marks rows fit for training. Short holes in x are the readers' and checks' business.
+    `usable` marks rows fit for training. Short holes in x are filled by readers and checks.
     `drivers` (n, d) are the first batch's driver channels as recorded (NaN where a batch lacks one), for the
     families that follow the load; empty where the design was made by hand. Units are in the same order as names.
     `batches` and `machine` are what it was built from, for families that need more than rows (the twin).
@@ -151,7 +151,7 @@ class Design:
 
     @cached_property
     def _holed(self) -> list[bool]:
-        """Inputs that are missing in some row with a target: only these tell the rows of two subsets apart."""
+        """Inputs that are missing in some row with a target: only these make the rows of two subsets differ."""
         missing = np.count_nonzero(~self._finite[np.isfinite(self.y_um)], axis=0)
         return [bool(m) for m in missing]
 

@@ -1,9 +1,8 @@
-"""Grey degrees: how much two curves go together, by distance (relational) or by area (absolute, relative, synthetic).
+"""Grey system theory: relational degrees of two curves, and least squares of the grey model GM(1,N).
 
-Over several batches the relational degree is taken row by row on the stacked rows: one scaling, one smallest
-and one largest distance for all of them, because the size of a batch's error is information. The area degrees
-follow time, so they belong to one batch: start and end of a stretch of consecutive rows. Over several
-batches take their mean over the batches; a sum across a border would mean nothing.
+The relational degree compares distances row by row; over several batches it uses the stacked rows with common scaling.
+The absolute, relative and synthetic degrees compare areas over time and are defined within one batch; for several
+batches use the mean over the batches.
 
 Sources: J. L. Deng (1989), Introduction to grey system theory, J. Grey System 1, 1–24 (relational degree);
 S. Liu and Y. Lin (2006), Grey Information, ch. 3 (absolute, relative and synthetic degree).
@@ -29,8 +28,8 @@ def relational_degree(x: Array, y: Array, rho: float = 0.5, scaling: Literal["in
 
     `interval` scales a sequence by its smallest and largest value to 0..1, `mean` divides it by its mean; never
     by the first value, which is 0 for a rise. A sequence that runs against y is mirrored (1 − x, 2 − x).
-    The smallest and largest distance are taken over all sequences and rows. A constant sequence says
-    nothing: its degree is 0 and it takes no part in those.
+    The smallest and largest distance are taken over all sequences and rows. The degree of a constant
+    sequence is 0, and it does not enter those distances.
 
     Raises:
         InputError: shapes that do not match, values that are not finite, or a mean of 0 under `mean`.

@@ -2,8 +2,8 @@
 
 For every displacement and tilt, over every period: range = greatest minus least reading; d(t) = change from the last
 reading before the period's start to its end, with sign; d(60 min) = the same to 60 min after the start. Readings are
-taken as they are, not smoothed; masked ones are left out. The standard itself was not at hand: nothing here claims
-that a test complies with it.
+taken as they are, not smoothed; masked ones are left out. The evaluation follows the standard's quantities;
+no compliance with it is claimed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NEAR, _ON_TARGET, _LEAST_SHARE, _LEAST_STAYS = 0.1, 0.02, 0.3, 2  # of the stro
 
 @dataclass(frozen=True)
 class Cycle:
-    """Where the axis stood: `stay` (rows,) numbers the stays, -1 on the way; `at_high` (stays,) tells which end."""
+    """Positioning cycle: `stay` (rows,) numbers the stays, -1 while moving; `at_high` (stays,) marks the far end."""
 
     channel: str
     low_mm: float
@@ -111,7 +111,7 @@ _STILL_RPM, _STILL_SHARE = 1.0, 0.01
 
 @dataclass(frozen=True)
 class Period:
-    """A stretch that is judged: from `start_s` to `end_s`, where the drivers change.
+    """An evaluated interval from `start_s` to `end_s`, where the drivers change.
 
     `zero_s` is the reading that changes count from, the last one before the start if there is one; `last_s` the last
     reading that still belongs to it.
@@ -129,19 +129,19 @@ class Period:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the drivers say: the kind, why, and the periods that belong to it; channel names where there are any."""
+class TestKind:
+    """The kind of test that the drivers show, an explanation, its periods, and the channels involved if any."""
 
     kind: Kind
-    words: str
+    explanation: str
     periods: tuple[Period, ...]
     speed: str | None
     feed: str | None
     cycle: Cycle | None
 
 
-def tell_kind(batch: Batch, start_s: float, end_s: float, kind: str | None, where: str) -> Told:
-    """The kind of test between two times of the batch; `kind` overrides what the drivers say.
+def kind_of_test(batch: Batch, start_s: float, end_s: float, kind: str | None, where: str) -> TestKind:
+    """The kind of test between two times of the batch; `kind` overrides the drivers.
 
     The spindle counts as running above 1 rpm and 1 % of its highest speed. An axis test needs a position channel that
     goes back and forth between two targets.
@@ -167,17 +167,17 @@ def tell_kind(batch: Batch, start_s: float, end_s: float, kind: str | None, wher
     guess, why = _guess(ran, speed, axes, cycle)
     found: Kind = kind or guess  # type: ignore[assignment]
     if found == "spindle" and (running is None or rpm is None or not ran):
-        raise InputError(f"{where}: kind 'spindle' was asked for, but {why[0].lower()}{why[1:]}; leave the kind out")
+        raise InputError(f"{where}: kind 'spindle' was requested, but {why[0].lower()}{why[1:]}; leave the kind out")
     if found == "linear_axis" and cycle is None:
         raise InputError(
-            f"{where}: kind 'linear_axis' was asked for, but no position channel cycles between two targets"
+            f"{where}: kind 'linear_axis' was requested, but no position channel cycles between two targets"
         )
     if found != "spindle" or running is None or rpm is None:
-        told = why if found == guess else f"Taken as asked. {why}"
-        return Told(found, told, (whole,), speed, feed, cycle if found == "linear_axis" else None)
+        explanation = why if found == guess else f"As requested. {why}"
+        return TestKind(found, explanation, (whole,), speed, feed, cycle if found == "linear_axis" else None)
     periods = _run_and_stop(time_s, running)
-    words = _spindle_words(str(speed), np.abs(rpm), running, periods, time_s)
-    return Told(found, words + (f" Meanwhile {axes}." if axes else ""), periods, speed, feed, None)
+    explanation = _spindle_text(str(speed), np.abs(rpm), running, periods, time_s)
+    return TestKind(found, explanation + (f" Meanwhile {axes}." if axes else ""), periods, speed, feed, None)
 
 
 def _held(batch: Batch, measured: str, rows: NDArray[np.bool_]) -> tuple[str | None, Array | None]:
@@ -202,7 +202,7 @@ def _guess(ran: bool, speed: str | None, axes: str, cycle: Cycle | None) -> tupl
         stood = "The spindle stood still" if speed else "No channel gives the spindle speed"
         return "other", f"{stood} while {axes}, and no position was recorded."
     if speed is None:
-        return "other", "No channel gives the spindle speed, so the kind of test cannot be told."
+        return "other", "No channel gives the spindle speed, so the kind of test is unknown."
     return "environment", "The spindle stood still all the time."
 
 
@@ -220,7 +220,7 @@ def _run_and_stop(time_s: Array, running: NDArray[np.bool_]) -> tuple[Period, ..
     return warm, Period("after the stop", float(time_s[stop]), end_s, float(time_s[last]), end_s)
 
 
-def _spindle_words(
+def _spindle_text(
     speed: str, rpm: Array, running: NDArray[np.bool_], periods: tuple[Period, ...], time_s: Array
 ) -> str:
     levels = np.unique(np.round(rpm[running]))
@@ -286,7 +286,7 @@ class ThermalTest:
     batch_id: str
     simulated: bool
     kind: Kind
-    words: str
+    explanation: str
     start_s: float
     end_s: float
     periods: tuple[Period, ...]
@@ -301,7 +301,7 @@ class ThermalTest:
 
     @property
     def title(self) -> str:
-        """The kind's name; a simulation says so."""
+        """The kind's name, marked if simulated."""
         return TITLES[self.kind] + (" (SIMULATED)" if self.simulated else "")
 
     def value(self, channel: str, quantity: str, period: str | None = None) -> float:
@@ -329,7 +329,7 @@ def thermal_test(
     start_s: float | None = None,
     end_s: float | None = None,
 ) -> ThermalTest:
-    """Judge a batch as the thermal test that its drivers make it, or as `kind`.
+    """Evaluate a batch as the thermal test that its drivers show, or as `kind`.
 
     `axes` maps labels to error channels ({"X": "disp_x"}); without it every error channel is taken, x, disp_y, z1
     under the labels X, Y, Z1. `pairs` name channels or labels. `start_s` and `end_s` state the period; default all.
@@ -341,7 +341,7 @@ def thermal_test(
     where = f"batch {batch.batch_id} of {batch.machine}"
     begin, end = _stated(batch, start_s, end_s, where)
     labels = _labels(batch, axes, where)
-    told = tell_kind(batch, begin, end, kind, where)
+    found = kind_of_test(batch, begin, end, kind, where)
     raw = {
         label: (batch.masked(name), batch.channels[name].unit, _digits(batch, name)) for label, name in labels.items()
     }
@@ -357,34 +357,34 @@ def thermal_test(
                 f"{where}: {name} has {rows.sum() - missing} readings from {clock(begin)} to {clock(end)} h,"
                 " expected at least 2; choose another period, or leave it out by axes"
             )
-        if missing and told.cycle is None:
+        if missing and found.cycle is None:
             notes.append(f"{name}: {missing} of {rows.sum()} readings are missing or masked.")
-        if told.cycle is None:
+        if found.cycle is None:
             traces.append(Trace(name, unit, batch.time_s[rows], values[rows], digits))
             continue
-        low, high = stays(told.cycle, batch.time_s, values)
-        parts = {f"{told.cycle.low_mm:g} mm": low, f"{told.cycle.high_mm:g} mm": high, "span": span(low, high)}
+        low, high = stays(found.cycle, batch.time_s, values)
+        parts = {f"{found.cycle.low_mm:g} mm": low, f"{found.cycle.high_mm:g} mm": high, "span": span(low, high)}
         traces += [
             Trace(f"{name} {n}" if n == "span" else f"{name} at {n}", unit, t, v, digits, True)
             for n, (t, v) in parts.items()
         ]  # fmt: skip
-    records = [r for p in told.periods for t in traces for r in _records(t, p, batch.step_s, batch.simulated)]
+    records = [r for p in found.periods for t in traces for r in _records(t, p, batch.step_s, batch.simulated)]
     notes += [
         f"{t.name} did not change at all {p.name if p.name.startswith('after') else f'in the {p.name}'}; was it read?"
-        for p in told.periods
+        for p in found.periods
         for t in traces
         if _stuck(t, p)
     ]
     notes += [
         f"{p.name[0].upper()}{p.name[1:]}: {clock(p.length_s)} h, shorter than 60 min, so there is no d(60 min)."
-        for p in told.periods
+        for p in found.periods
         if p.length_s < HOUR_S - batch.step_s / 2
     ]
     return ThermalTest(
-        batch.machine, batch.batch_id, batch.simulated, told.kind, told.words, begin, end, told.periods,
-        tuple(_zeroed(t, told.periods[0], batch.step_s) for t in traces),
-        pd.DataFrame(records), _temperatures(batch, rows), told.speed, told.feed,
-        told.cycle.channel if told.cycle else None, tuple(pairs), tuple(notes),
+        batch.machine, batch.batch_id, batch.simulated, found.kind, found.explanation, begin, end, found.periods,
+        tuple(_zeroed(t, found.periods[0], batch.step_s) for t in traces),
+        pd.DataFrame(records), _temperatures(batch, rows), found.speed, found.feed,
+        found.cycle.channel if found.cycle else None, tuple(pairs), tuple(notes),
     )  # fmt: skip
 
 
@@ -406,7 +406,7 @@ def _labels(batch: Batch, axes: Mapping[str, str] | None, where: str) -> dict[st
     """Label -> error channel."""
     errors = batch.names("error")
     if not errors:
-        raise InputError(f"{where}: no channel of role error, so no displacement to judge; record or simulate one")
+        raise InputError(f"{where}: no channel of role error, so no displacement to evaluate; record or simulate one")
     if axes is not None:
         for name in axes.values():
             if name not in errors:
@@ -472,7 +472,7 @@ def _records(trace: Trace, period: Period, step_s: float, simulated: bool) -> li
     values = trace.value[inside]
     first_hour = trace.time_s[inside] <= period.start_s + HOUR_S + 1e-6
     long_enough = period.length_s >= HOUR_S - step_s / 2
-    if trace.every_stay:  # stays come when they come: the first one is the zero
+    if trace.every_stay:  # stays are not at fixed times: the first one is the zero
         good = np.flatnonzero(np.isfinite(values))
         zero, last = (values[good[0]], values[good[-1]]) if len(good) else (np.nan, np.nan)
         t = trace.time_s[inside]

@@ -1,4 +1,4 @@
-"""Many small nets trained at once by Levenberg–Marquardt with weight decay, in torch."""
+"""Levenberg–Marquardt training of many small nets at once, with weight decay, in torch."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ _LEAST_KEPT = 0.25  # of the fall that the quadratic model promises, for a step 
 
 
 def train(
-    nets: Nets, x_t: Array, y: Array, known: Array, decay: float, iterations: int, device: str = "cpu"
+    nets: Nets, x_t: Array, y: Array, known: Array, decay: float, iterations: int
 ) -> tuple[Nets, NDArray[np.int64]]:
     """Every net's parameters after at most `iterations` damped Gauss–Newton steps, and the steps each took.
 
     Net s minimises `mean_n known·(y − ŷ)² + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known (S, n);
     known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that brings a quarter of the fall
     that the quadratic model promises, else × 10; a step that raises the loss is taken back) and stops by itself, so
-    a net's result does not depend on its neighbours. Float64 on any device; on the processor one thread, whatever
-    torch is set to: the matrices are small, and callers train side by side.
+    a net's result does not depend on its neighbours. Float64 in one thread, whatever torch is set to: the matrices are
+    small, and callers train in parallel.
 
     Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
     torch.get_num_threads()  # torch sets a thread's count at its first use there, which would undo the limit
     with openmp().limit(limits=1), torch.inference_mode():
-        tensors = [torch.tensor(a, dtype=torch.float64, device=device) for a in (nets.parameters, x_t, y, known)]
+        tensors = [torch.tensor(a, dtype=torch.float64) for a in (nets.parameters, x_t, y, known)]
         theta, steps = _trained(tensors, nets, decay, iterations)
-        return replace(nets, parameters=theta.cpu().numpy()), steps.cpu().numpy()
+        return replace(nets, parameters=theta.numpy()), steps.numpy()
 
 
 def outputs(theta: Tensor, x_t: Tensor, n_hidden: int, transfer: str = "tanh") -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Many small nets of one hidden layer and one shape, as plain arrays: all that a prediction needs."""
+"""Small neural nets with one hidden layer as plain arrays, evaluated without torch."""
 
 from __future__ import annotations
 

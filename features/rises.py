@@ -41,11 +41,11 @@ def feature(batch: Batch, name: str) -> Array:
     values = batch.masked(channel)
     thermal = batch.channels[channel].role in _THERMAL
     if kind == "start":
-        return np.full(batch.n_rows, _first(values))
+        return np.full(batch.n_rows, first_finite(values))
     if kind == "ambient":
         values = values - batch.masked(_ambient(batch, name))
-        return values - _first(values)
-    base = values - _first(values) if thermal else values
+        return values - first_finite(values)
+    base = values - first_finite(values) if thermal else values
     if kind == "rate":
         return _rate_per_h(base, batch.step_s)
     if match := _LAG.match(kind):
@@ -81,7 +81,7 @@ def zeroed_error_um(batch: Batch, target: str) -> Array:
     """
     values = batch.masked(target)
     channel = batch.channels[target].position
-    return values - (_first_sweep_um(batch, values, channel) if channel else _first(values))
+    return values - (_first_sweep_um(batch, values, channel) if channel else first_finite(values))
 
 
 def first_order_lag(values: Array, tau_s: float, step_s: float, start: float | None = None) -> Array:
@@ -118,7 +118,7 @@ def temperature_inputs(
 
 
 def _first_sweep_um(batch: Batch, error_um: Array, channel: str) -> Array:
-    """What the first sweep read at every row's position, (n,); NaN where there is no position, or none of its own."""
+    """The first sweep's error at every row's position, (n,); NaN without a position, or outside that sweep."""
     position_mm = batch.masked(channel)
     read = np.flatnonzero(np.isfinite(error_um) & np.isfinite(position_mm))
     if not len(read):
@@ -134,7 +134,8 @@ def _first_sweep_um(batch: Batch, error_um: Array, channel: str) -> Array:
     return out
 
 
-def _first(values: Array) -> float:
+def first_finite(values: Array) -> float:
+    """The first finite value; NaN where there is none."""
     ok = np.isfinite(values)
     return float(values[np.argmax(ok)]) if ok.any() else float("nan")
 

@@ -1,4 +1,4 @@
-"""How often a selector comes back with the same temperature-sensitive points (TSP)."""
+"""Stability of the selected temperature-sensitive points (TSP) over training sets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import combinations
 from data.errors import InputError
 from features.selectors.base import Diagnostic
 
-_STABLE = 0.7  # as the promotion rule asks
+_STABLE = 0.7  # as in the promotion rule
 
 
 def stability_over_batches(sets: Sequence[tuple[str, ...]]) -> Diagnostic:
@@ -20,8 +20,8 @@ def stability_over_batches(sets: Sequence[tuple[str, ...]]) -> Diagnostic:
     """
     value = tsp_stability(sets)
     rare = [f"{name} {100 * share:.0f} %" for name, share in tsp_frequency(sets).items() if share < 1.0]
-    words = "not in every fold: " + ", ".join(rare) if rare else "the same points whichever batch is left out"
-    return Diagnostic("stability over batches", value, _STABLE, value >= _STABLE, words)
+    comment = "not in every fold: " + ", ".join(rare) if rare else "the same points whichever batch is left out"
+    return Diagnostic("stability over batches", value, _STABLE, value >= _STABLE, comment)
 
 
 def tsp_stability(sets: Sequence[tuple[str, ...]]) -> float:

@@ -1,4 +1,4 @@
-"""The model families, one line each."""
+"""Registry of model families."""
 
 from data.registry import Registry
 

@@ -1,4 +1,4 @@
-"""A scikit-learn estimator around any row-by-row family, for arrays that are no recordings."""
+"""scikit-learn estimator that wraps a row-wise family, for plain arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spindle and feed axis together: an offset and a slope along the axis, the straight line that controls accept."""
+"""Family: offset and slope along a feed axis, the straight line that controls can compensate."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from data.arrays import Array, Index, Mask
 from data.errors import InputError
 from features.design import Design, Moments
 from models.base import Family
-from models.solvers.batches import too_few_rows
+from models.solvers.batches import fold_masks
 
-_NEW = 1e-8  # a term brings something new where at least this part of its square is left beside the terms chosen
+_NEW = 1e-8  # a term is independent if at least this share of its square is not explained by the chosen terms
 _ROUNDING = 1e-6  # of what no model leaves
 _BEYOND = (
     0.0,
@@ -156,7 +156,7 @@ class _Search:
         self.floor_um = np.zeros(len(self.border) - 1)
         everything = np.arange(len(self.floor_um))
         self.nothing_um = self._scores(everything, np.zeros((len(everything), 0), np.int64))
-        self.floor_um = _ROUNDING * self.nothing_um  # below, scores tell rounding from rounding
+        self.floor_um = _ROUNDING * self.nothing_um  # below, scores differ by rounding alone
 
     def run(self, max_terms: int, worth: float) -> list[tuple[tuple[int, ...], float]]:
         """Terms and score of each set."""
@@ -198,7 +198,7 @@ class _Search:
     def _with_one_more(self, sets: Index, chosen: Index) -> Array:
         """Scores (s, q) of sets with the terms chosen (s, m) and one more; infinite where that is nothing new.
 
-        Beside the chosen T a further term c has in every fit a part that T does not explain: W_c = xx_TT⁻¹ xx_Tc, the
+        Next to the chosen T a further term c has in every fit a part that T does not explain: W_c = xx_TT⁻¹ xx_Tc, the
         part's square d_c and its product r_c with what T leaves of the error. With b_c = r_c / d_c as its coefficient
         the left-out sum of squares is that of T less 2 b_c g_c − b_c² h_c, where g_c and h_c are the same product and
         square in the block left out.
@@ -273,8 +273,7 @@ class AxisCoupled(Family):
     best pair of an offset and a slope first, then the best term more up to `max_terms`; of the best of these models
     those terms go again that lower the score by less than the share `worth`. P0 is where the
     screw is held: `fixed_end_mm`, else the machine file's `fixed_end`, else chosen likewise among the ends of the
-    travel, its quarters, and quarters up to half a travel beyond. An input that drives both leaves P0 open: then it is
-    a matter of writing.
+    travel, its quarters, and quarters up to half a travel beyond. An input that drives both leaves P0 arbitrary.
 
     `fitted`: along (the position channel), fixed_end_mm, offset_inputs and offset_um_per_K (o,), slope_inputs and
     slope_um_per_mm_K (s,) (per K, or the input's own unit), inner_S_um, n_rows. NaN is predicted where the position
@@ -282,7 +281,7 @@ class AxisCoupled(Family):
     """
 
     key = "axis_coupled"
-    words = (
+    summary = (
         "offset by the spindle and slope by the screw along an axis, terms by leave-batch-out in the training batches"
     )
     source = "coupled-lathe study: fuzzy clustering, correlation, MLR for spindle offset and screw slope"
@@ -299,9 +298,6 @@ class AxisCoupled(Family):
             )
         self.fixed_end_mm, self.max_terms, self.worth = fixed_end_mm, max_terms, worth
 
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
-
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold, all at once from per-batch sums of the inputs and of position times input.
 
@@ -317,13 +313,7 @@ class AxisCoupled(Family):
             raise InputError(f"axis_coupled: no inputs given for {design.target}; name at least one channel")
         terms = expanded(design)
         batches = RawSums.of(terms.moments)
-        masks = np.zeros((len(folds), design.n_batches), bool)
-        for f, fold in enumerate(folds):
-            masks[f, list(fold)] = True
-            n_rows = int(batches.count[masks[f]].sum())
-            if n_rows < _LEAST_ROWS:
-                raise too_few_rows(self.key, design, fold, n_rows, _LEAST_ROWS)
-        masks &= batches.count > 0
+        masks = fold_masks(self.key, design, folds, batches.count, _LEAST_ROWS)
         ends_mm = self._ends_mm(design, masks)
         few = masks.sum(axis=1) < 3  # then contiguous quarters of the batches are left out, as in other families
         chosen: dict[int, Chosen] = {}
@@ -335,7 +325,7 @@ class AxisCoupled(Family):
         return [self._learned(design, self._plain(design, chosen[f])) for f in range(len(folds))]
 
     def _ends_mm(self, design: Design, masks: NDArray[np.bool_]) -> Array:
-        """Candidates of P0 for each training set, masks (F, K): (F, 1) where it is told, else (F, C)."""
+        """Candidates of P0 for each training set, masks (F, K): (F, 1) where it is given, else (F, C)."""
         part = None if design.machine is None else design.machine.channels.get(design.along)
         told_mm = self.fixed_end_mm if self.fixed_end_mm is not None or part is None else part.fixed_end
         if told_mm is not None:

@@ -1,4 +1,4 @@
-"""What every model family is.
+"""Base class of the model families.
 
 To add one: a class below `Family` in a file of its own and a line in `models/__init__.py`. It needs
 `fit_design` and `predict_design`; `fit_folds` only where many folds can be fitted at once.
@@ -31,7 +31,7 @@ class Family(ABC):
     """
 
     key: ClassVar[str]
-    words: ClassVar[str]
+    summary: ClassVar[str]
     source: ClassVar[str]
     uses_inputs: ClassVar[bool] = True  # False for baselines: every selector and n_tsp gives the same model
     closed_form: ClassVar[bool] = True  # False: iterative, so the grid takes a stated few n_tsp
@@ -39,8 +39,8 @@ class Family(ABC):
     needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
     needs_position: ClassVar[bool] = False  # True: only for error channels that are measured along an axis
     shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work
-    effort: ClassVar[Effort] = "complete"  # which crossings take it unless it is named
-    tells_sd: ClassVar[bool] = False  # True: `sd_um` says how sure a prediction is
+    effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
+    has_sd: ClassVar[bool] = False  # True: `sd_um` gives the predictive standard deviation
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
 
     def __init__(self) -> None:
@@ -48,13 +48,15 @@ class Family(ABC):
         self.target: str = ""
         self.fitted: Plain = {}
 
-    @abstractmethod
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """A new, fitted copy from the usable rows of the batches `train` of the design.
+
+        Override this or `fit_folds`: each is by default given by the other.
 
         Raises:
             InputError: too few usable rows, with the batches and what is needed.
         """
+        return self.fit_folds(design, [train])[0]
 
     @abstractmethod
     def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
@@ -91,12 +93,14 @@ class Family(ABC):
         return None
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value about the prediction, for families that tell it.
+        """Predictive standard deviation (n_k,) of a recorded value about the prediction, for families with `has_sd`.
 
         Raises:
             InputError: the family, or this choice of its options, has none.
         """
-        raise InputError(f"family {self.key}: tells no predictive sd; choose one that does, e.g. gaussian_process")
+        raise InputError(
+            f"family {self.key}: has no predictive standard deviation; choose one that has, e.g. gaussian_process"
+        )
 
     def fit(
         self, train_batches: Sequence[Batch], inputs: Sequence[str], target: str, machine: Machine | None = None

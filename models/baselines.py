@@ -1,4 +1,4 @@
-"""The mean run: what is known of the error from the clock alone, and from the place on the axis where there is one."""
+"""Baselines: mean error over the time since the start (and the position along an axis), and zero."""
 
 from __future__ import annotations
 
@@ -26,14 +26,11 @@ class MeanCurve(Family):
     """
 
     key = "mean_curve"
-    words = "mean error curve of the training batches over the time since the start"
+    summary = "mean error curve of the training batches over the time since the start"
     source = "baseline"
     effort = "quick"
     uses_inputs = False
     rank = 1
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold.
@@ -121,10 +118,10 @@ def _nothing_recorded(design: Design, train: Sequence[int]) -> InputError:
 
 
 class Zero(Family):
-    """Predicts 0 µm: the line that every model has to beat."""
+    """Predicts 0 µm: the baseline of every model."""
 
     key = "zero"
-    words = "no model: predicts zero error"
+    summary = "no model: predicts zero error"
     source = "baseline"
     effort = "quick"
     uses_inputs = False

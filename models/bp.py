@@ -1,4 +1,4 @@
-"""BP net: a p–h–1 network trained by Levenberg–Marquardt, in both published forms, tanh and linear."""
+"""Back-propagation net p–h–1 trained by Levenberg–Marquardt, with tanh or linear transfer."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class BP(Family):
 
     Inputs and target are standardised by the training rows of the fold. Batches are decimated evenly to at most
     `max_rows` usable rows each. Every net takes at most `iterations` Levenberg–Marquardt steps with weight `decay`
-    (on standardised data), the same for every fold: a net has no spare batch for early stopping in train-on-one,
-    and with tanh the decay bounds what it can say far away: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
+    (on standardised data), the same for every fold: train-on-one has no batch for early stopping.
+    With tanh the decay bounds the extrapolation: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
 
     Source: the year-round study's 2–3–1 net; M. Hagan and M. Menhaj, IEEE Trans. Neural Networks 5 (1994).
     """
 
     key = "bp"
-    words = "BP neural network, Levenberg–Marquardt"
+    summary = "BP neural network, Levenberg–Marquardt"
     source = "Hagan and Menhaj 1994"
     effort: ClassVar[Effort] = "usual"
     closed_form = False
@@ -59,9 +59,6 @@ class BP(Family):
             raise InputError(f"family {self.key}: unknown transfer {transfer!r}: {closest(transfer, TRANSFERS)}")
         self.hidden, self.starts, self.decay = int(hidden), int(starts), float(decay)
         self.iterations, self.max_rows, self.seed, self.transfer = int(iterations), int(max_rows), int(seed), transfer
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """All folds' nets trained as stacks of similar row counts.
@@ -133,7 +130,7 @@ class BPLinear(BP):
     """`BP` with linear transfer: one start, since every start leads to the same linear map."""
 
     key = "bp_linear"
-    words = "BP neural network with linear transfer: a linear map found iteratively"
+    summary = "BP neural network with linear transfer: a linear map found iteratively"
     source = "year-round PCR study; Hagan and Menhaj 1994"
     effort: ClassVar[Effort] = "complete"
     rank = 20

@@ -1,4 +1,4 @@
-"""What a grid crosses: the plan, and for one error channel the stacked rows, the folds and every selector's choices.
+"""Plan of a grid, and for one error channel its stacked rows, folds, selected inputs and the scoring of families.
 
 Folds share work: the rows are stacked once, a selector learns once per training set, and a set of inputs that
 several selectors or numbers of points arrive at is fitted once.
@@ -24,7 +24,7 @@ from features.selectors import SELECTORS
 from features.stability import tsp_stability
 from models import FAMILIES
 from models.base import Family
-from models.judging import Judged, score_table
+from models.judging import FamilyScores, score_table
 from models.protocols import PROTOCOLS, Fold, folds_of
 from models.result import CELL_KEYS
 
@@ -33,7 +33,7 @@ Inputs = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to cross. Selectors or families that are not named: those that a crossing of this `effort` takes.
+    """Selectors, families and protocols of a grid. If none are named: those that this `effort` includes.
 
     `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all.
     """
@@ -81,7 +81,7 @@ class Plan:
 
 
 def suits(family: str, channel: Channel) -> bool:
-    """Can this family be tried on this error channel? Others simply have no cell there."""
+    """True if the family can be used on this error channel."""
     return bool(channel.position) or not FAMILIES[family].needs_position
 
 
@@ -157,12 +157,12 @@ class FamilyResult:
 
 
 def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
-    """Batches that can teach or test: their error channel is not masked from end to end."""
+    """Batches whose error channel has at least two usable values."""
     return [b for b in batches if np.isfinite(b.masked(target)).sum() >= 2]
 
 
 def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine | None = None) -> Crossing:
-    """Stack the batches and let every selector choose on every training set.
+    """Stack the batches and run every selector on every training set.
 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
@@ -204,7 +204,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
 
 
 def cross_family(crossing: Crossing, key: str) -> FamilyResult:
-    """Fit and judge one family over all its cells, folds and protocols."""
+    """Fit and score one family over all its cells, folds and protocols."""
     family = FAMILIES[key]
     target = crossing.design.target
     cells = crossing.cells(family) if suits(key, crossing.batches[0].channels[target]) else []
@@ -213,30 +213,30 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
     for protocol, folds in crossing.folds.items():
         if not folds or not cells:
             continue
-        judged = Judged.run(crossing.design, family(), folds, crossing.needed(folds, cells))
+        judged = FamilyScores.run(crossing.design, family(), folds, crossing.needed(folds, cells))
         failures += [(f"family {key}", f"{protocol}, {text}") for text in judged.failures]
         picked = {cell: [judged.column.get((crossing.inputs(cell[0], f.train, cell[1]), i), -1)
                          for i, f in enumerate(folds)] for cell in cells}  # fmt: skip
-        told = [cell for cell in cells if min(picked[cell]) >= 0]
-        if not told:
+        scored = [cell for cell in cells if min(picked[cell]) >= 0]
+        if not scored:
             continue
-        columns = np.array([picked[cell] for cell in told], int)
+        columns = np.array([picked[cell] for cell in scored], int)
         table, summary = score_table(crossing.design.batch_ids, folds, judged, columns, protocol)
-        names = pd.DataFrame(told, columns=["selector", "n_tsp"]).assign(protocol=protocol, family=key)[CELL_KEYS]
-        inputs = [crossing.inputs(selector, crossing.everything, n_tsp) for selector, n_tsp in told]
+        names = pd.DataFrame(scored, columns=["selector", "n_tsp"]).assign(protocol=protocol, family=key)[CELL_KEYS]
+        inputs = [crossing.inputs(selector, crossing.everything, n_tsp) for selector, n_tsp in scored]
         summary = summary.assign(
             n_parameters=judged.n_parameters,
             rank=family.rank,
-            tsp_stability=[crossing.stability(protocol, *cell) for cell in told],
+            tsp_stability=[crossing.stability(protocol, *cell) for cell in scored],
             inputs=["|".join(i) for i in inputs],
             n_inputs=[len(i) for i in inputs],
             simulated=any(b.simulated for b in crossing.batches),
         )
-        repeated = names.loc[names.index.repeat(len(table) // len(told))].reset_index(drop=True)
+        repeated = names.loc[names.index.repeat(len(table) // len(scored))].reset_index(drop=True)
         scores.append(pd.concat([repeated, table], axis=1))
         summaries.append(pd.concat([names, summary], axis=1))
         if protocol == "leave-batch-out":
-            for (selector, n_tsp), row in zip(told, columns, strict=True):
+            for (selector, n_tsp), row in zip(scored, columns, strict=True):
                 predictions[f"{selector}|{key}|{n_tsp}"] = judged.left_out(crossing.design, folds, row)
     return FamilyResult(
         pd.concat(scores, ignore_index=True) if scores else pd.DataFrame(),
@@ -247,7 +247,7 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
 
 
 def refit(crossing: Crossing, selector: str, family: str, n_tsp: int) -> Family:
-    """A cell's model learned from all batches, ready to be promoted."""
+    """A cell's model fitted on all batches."""
     inputs = crossing.inputs(selector, crossing.everything, n_tsp)
     fitted: Family = FAMILIES[family]().fit_design(crossing.subset(inputs), crossing.everything)
     return fitted

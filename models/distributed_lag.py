@@ -1,4 +1,4 @@
-"""Distributed lag: the error follows what the sensors read now and before."""
+"""Family: distributed lags of the inputs (Koyck, Almon or free)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import Family
 from models.linear import Blocks, Task
-from models.solvers.batches import by_batch, steps_s, too_few_rows
+from models.solvers.batches import by_batch, fold_masks, steps_s
 from models.solvers.kernels import unit_scale
 from models.solvers.lags import (
     CRITERIA,
@@ -35,7 +35,7 @@ _LEAST_ROWS = 4
 class DistributedLag(Family):
     """`y_t = c + Σ_l Σ_i β_il x_i(t − l)` over inputs i and lags l, free-running: inputs only, never an earlier error.
 
-    `lags` says how the β of an input follow each other:
+    `lags` gives the form of the β of an input:
 
     - `koyck`: β_i0 free, then geometric, `β_il ∝ λ^l` without end: the input and its first-order lag. The decay, the
       same for all inputs, is one of `KOYCK_TAUS_S` (10 min … 11 h), or there is no lag at all;
@@ -47,14 +47,14 @@ class DistributedLag(Family):
     of the columns, keeps lags of collinear sensors apart. Order or decay, and k, are chosen by `order_by`:
     `leave_batch_out` inside the training batches (contiguous quarters of one or two), `aic` or `bic`. Residuals of
     a thermal run are autocorrelated: the criteria count `effective_rows`, n (1 − ρ)/(1 + ρ) with ρ the lag-one
-    autocorrelation of the residuals, and `fitted` tells both.
+    autocorrelation of the residuals, and `fitted` has both.
 
     Source: S. Almon, Econometrica 33 (1965); L. Koyck, Distributed lags and investment analysis (1954);
     effective rows: Bartlett (1935); criteria: Akaike (1974), Schwarz (1978).
     """
 
     key = "distributed_lag"
-    words = "distributed lag: temperatures of now and before, geometric, polynomial or free"
+    summary = "distributed lag: temperatures of now and before, geometric, polynomial or free"
     source = "Koyck 1954; Almon 1965"
     effort = "usual"
     rowwise = False
@@ -80,9 +80,6 @@ class DistributedLag(Family):
         self.lags, self.lag_min, self.max_lags = lags, float(lag_min), int(max_lags)
         self.degree, self.order_by = int(degree), order_by
 
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
-
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """All folds from the per-batch sums of the lagged inputs.
 
@@ -94,13 +91,8 @@ class DistributedLag(Family):
         responses, shapes = self._tried(design)
         columns = _columns(design, responses)
         moments = columns.moments
-        masks = np.zeros((len(folds), design.n_batches), bool)
-        for f, fold in enumerate(folds):
-            masks[f, list(fold)] = True
-            got = int(moments.count[masks[f]].sum()) if design.inputs else 0
-            if got < _LEAST_ROWS:
-                raise too_few_rows(self.key, design, fold, got, _LEAST_ROWS)
-        masks &= moments.count > 0
+        count = moments.count if design.inputs else np.zeros(design.n_batches)
+        masks = fold_masks(self.key, design, folds, count, _LEAST_ROWS)
         blocks = Blocks.of(moments)
         task = Task(columns, masks, blocks, blocks.pool(masks, False), False)
         coef, learned = LagRegression(shapes, self.order_by).solve(task)

@@ -1,4 +1,4 @@
-"""Elastic net, its penalty and mixing chosen by leave-batch-out."""
+"""Family: elastic net, penalty and mixing chosen by leave-batch-out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ElasticNet(Tuned):
     """
 
     key = "elastic_net"
-    words = "elastic net, penalty and mixing by leave-batch-out inside the training batches"
+    summary = "elastic net, penalty and mixing by leave-batch-out inside the training batches"
     source = "Zou and Hastie (2005), eq. 3; active sets: Lee, Battle, Raina and Ng (2007), algorithm 1"
     effort = "usual"
     rank = 15

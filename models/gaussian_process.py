@@ -1,4 +1,4 @@
-"""A Gaussian process whose rows belong to batches: it says how far a new batch may lie from its prediction."""
+"""Family: Gaussian process with a line, a smooth curve and batch-wise random effects."""
 
 from __future__ import annotations
 
@@ -78,18 +78,15 @@ class GaussianProcess(Family):
     """
 
     key = "gaussian_process"
-    words = "Gaussian process: line, curve about it, and what each batch has of its own"
+    summary = "Gaussian process: line, curve about it, and what each batch has of its own"
     source = "Rasmussen and Williams 2006; Laird and Ware 1982"
     closed_form = False
-    tells_sd = True
+    has_sd = True
     rank = 62
 
     def __init__(self, max_rows: int = 480) -> None:
         super().__init__()
         self.max_rows = int(max_rows)
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Folds that leave out one batch share one inverse per setting.
@@ -199,22 +196,22 @@ class _Problem:
         """Setting and noise in µm for each training set: all groups but one, or all of them (None)."""
         best, scores = [Setting()] * len(out), dict[Setting, Array]()
         for tries in _STEPS:
-            asked: dict[Setting, list[int]] = {}
+            sets_of: dict[Setting, list[int]] = {}
             for f, setting in enumerate(best):
                 for tried in tries(setting):
-                    asked.setdefault(tried, []).append(f)
-            for tried, sets in asked.items():
+                    sets_of.setdefault(tried, []).append(f)
+            for tried, sets in sets_of.items():
                 score = scores.setdefault(tried, np.full(len(out), np.nan))
                 if new := [f for f in sets if np.isnan(score[f])]:
                     left = self._left_out(tried)
-                    score[new] = [np.inf if left is None else _rms_um(*self._told(left, out[f])) for f in new]
-            best = [_least(tries(s), [scores[tried][f] for tried in tries(s)]) for f, s in enumerate(best)]
+                    score[new] = [np.inf if left is None else _rms_um(*self._residuals(left, out[f])) for f in new]
+            best = [tries(s)[int(np.argmin([scores[tried][f] for tried in tries(s)]))] for f, s in enumerate(best)]
         size_um = np.ones(len(out))
         for setting in dict.fromkeys(best):
             left = self._left_out(setting)
             for f, own in enumerate(best):
                 if own == setting and left is not None:
-                    size_um[f] = _size_um(*self._told(left, out[f]))
+                    size_um[f] = _size_um(*self._residuals(left, out[f]))
         return list(zip(best, size_um.tolist(), strict=True))
 
     def _left_out(self, setting: Setting) -> LeftOut | None:
@@ -225,9 +222,9 @@ class _Problem:
             return None
         return LeftOut.of(Kernel(covariance).inverse(1.0), self.y_um, self.group_rows)
 
-    def _told(self, left: LeftOut, f: int | None) -> tuple[Array, Array, Rows]:
+    def _residuals(self, left: LeftOut, f: int | None) -> tuple[Array, Array, Rows]:
         """Residuals and their variances over the noise (rows,) of every group left out, and the rows' groups."""
-        error, variance = left.alone() if f is None else left.beside(f)
+        error, variance = left.alone() if f is None else left.without(f)
         judged = self.known.reshape(error.shape).copy()
         if f is not None:
             judged[f] = False
@@ -241,11 +238,6 @@ _STEPS: tuple[Callable[[Setting], list[Setting]], ...] = (
     lambda s: [replace(s, own_line=v) for v in OWN_LINES],
     lambda s: [replace(s, line=v) for v in LINES],
 )
-
-
-def _least(settings: Sequence[Setting], scores: Sequence[float]) -> Setting:
-    """The first of the least score."""
-    return settings[int(np.argmin(scores))]
 
 
 def _rms_um(error: Array, variance: Array, group: Rows) -> float:

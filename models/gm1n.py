@@ -1,4 +1,4 @@
-"""GM(1,N): the grey model, cumulated sequences behind one first-order lag, always run free."""
+"""Family: grey model GM(1,N), free-running."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class GM1N(Family):
 
     a is kept in [step/`slowest_h`, 2]: below, the response has no end in sight (a near 0 divides, a < 0 explodes);
     above, it zigzags. Where least squares leaves that range, a is set to the bound, b is fitted anew, and `fitted`
-    says so in `bound`. Directions of the scaled sums below 1e-4 of the strongest are dropped. Training uses usable
+    records it in `bound`. Directions of the scaled sums below 1e-4 of the strongest are dropped. Training uses usable
     rows; the sums bridge holes by the last input and by a straight line in the error. Predictions bridge missing
     inputs by the last one, and are NaN where a batch lacks one wholly.
 
@@ -45,7 +45,7 @@ class GM1N(Family):
     """
 
     key = "gm1n"
-    words = "grey model GM(1,N), free-running"
+    summary = "grey model GM(1,N), free-running"
     source = "Deng 1989"
     effort = "quick"
     rowwise = False
@@ -60,9 +60,6 @@ class GM1N(Family):
             raise InputError(f"family gm1n: recent_rows {recent_rows}; expected at least 2 rows, or None for all")
         self.slowest_h = float(slowest_h)
         self.recent_rows = recent_rows
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Every fold from the batches' triangular factors: each batch is read once, whatever the number of folds.
@@ -108,8 +105,8 @@ class GM1N(Family):
     def predict_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
-        asked = sorted({k for batches in wanted for k in batches})
-        return by_batch(design, self._respond(design, fitted, asked), wanted)
+        every = sorted({k for batches in wanted for k in batches})
+        return by_batch(design, self._respond(design, fitted, every), wanted)
 
     def n_parameters(self) -> int:
         return 1 + len(self.inputs)

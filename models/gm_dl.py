@@ -1,4 +1,4 @@
-"""A grey model behind a distributed lag, piecewise by start temperature."""
+"""Family: grey model followed by a distributed lag, piecewise by start temperature."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class GMDL(Family):
     start temperature of its training batches. A batch that starts at T0 between neighbours Ta < T0 < Tb gets the
     weights (Tb − T0)/(Tb − Ta) and (T0 − Ta)/(Tb − Ta); outside the range the nearest stands alone. `bands` is their
     number, with equally many batches, or the temperatures between them, °C. A band of fewer than `least_batches`
-    training batches joins a neighbour; `fitted` tells the bands that are left. There is one band where start
+    training batches joins a neighbour; `fitted` has the resulting bands. There is one band where start
     temperatures are not known.
 
     `banded`: "lag" bands the distributed lag behind one grey model of all batches; "both" bands both layers. The grey
@@ -39,7 +39,7 @@ class GMDL(Family):
     """
 
     key = "gm_dl"
-    words = "grey model and distributed lag, piecewise by start temperature"
+    summary = "grey model and distributed lag, piecewise by start temperature"
     source = "Deng 1989; Almon 1965"
     closed_form = False
     rowwise = False
@@ -67,9 +67,6 @@ class GMDL(Family):
         self.least_batches, self.banded = int(least_batches), banded
         self.lags, self.lag_min, self.recent_rows, self.response = lags, float(lag_min), recent_rows, response
         self._layers()
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Grey models of all folds and pairs of batches left out from the same factors; equal bands are fitted once.
@@ -117,10 +114,10 @@ class GMDL(Family):
                 outputs_um[design.rows(k), 0] = predicted
             layer = layer_design(design, outputs_um)
             behind = [band for band, own in enumerate(f["grey_of_band"]) if own == i]
-            told = lag.predict_folds(
+            outputs = lag.predict_folds(
                 layer, [lag._learned(layer, _lag_of(f, b)) for b in behind], [batches] * len(behind)
             )
-            for band, own in zip(behind, told, strict=True):
+            for band, own in zip(behind, outputs, strict=True):
                 total = [t + share * p for t, share, p in zip(total, shares[:, band], own, strict=True)]
         return total
 

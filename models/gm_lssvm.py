@@ -1,4 +1,4 @@
-"""Grey models of several sequence lengths, corrected by an LS-SVM."""
+"""Family: grey models of several sequence lengths, corrected by an LS-SVM."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class GMLSSVM(Family):
     """
 
     key = "gm_lssvm"
-    words = "grey models of several lengths, corrected by an LS-SVM"
+    summary = "grey models of several lengths, corrected by an LS-SVM"
     source = "Deng 1989; Suykens et al. 2002; study of a THM6380 machining centre"
     closed_form = False
     rowwise = False
@@ -57,10 +57,7 @@ class GMLSSVM(Family):
             raise InputError(f"gm_lssvm: lengths {list(lengths)}; expected at least one, above 0 {lengths_in}")
         self.lengths, self.lengths_in = list(lengths), lengths_in
         self.tuning, self.max_rows, self.response, self.seed = tuning, int(max_rows), response, int(seed)
-        self._corrector(self.max_rows)  # tells an unknown tuning
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
+        self._corrector(self.max_rows)  # raises for an unknown tuning
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Grey models of all folds and pairs of batches left out from the same factors; an LS-SVM per fold.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields
-from multiprocessing import get_context
-from threading import Lock
 from types import TracebackType
 from typing import Self
 
@@ -17,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from data.batch import Batch, finding_table
 from data.machine import Machine
+from data.processes import Processes, Shared, one_thread
 from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
 from features.stability import stability_over_batches
@@ -26,50 +25,38 @@ from models.protocols import Fold, season, speed, start_ambient_degC
 from models.result import CELL_KEYS, GridResult
 from models.trust import error_against_distance
 
-_crossings: Mapping[str, Crossing] = {}  # of a worker process, set when it starts
-
 
 class Workers:
     """Crosses families of the given crossings (by error channel) in `n` processes; n = 1: in this one.
 
-    Most of a small fit's time is Python's own, so threads would take turns; processes do not. They are spawned, never
-    forked: a fork of a process that runs threads (an orchestrator's, OpenMP's) can hang. What a family raises is raised
-    here. Results do not depend on n. Families that share work over the error channels have one process more, all in it.
+    Most of a small fit's time is Python's own, so threads would take turns; processes do not. Calls may come from
+    several threads. Families that share work over the error channels have one process more, all in it.
     """
 
     def __init__(self, crossings: Mapping[str, Crossing], n: int) -> None:
-        self._crossings = crossings
-        self._pool = _processes(n, crossings) if n > 1 else None
-        self._sharing: ProcessPoolExecutor | None = None
-        self._lock = Lock()
+        self._pool, self._sharing = Processes(n, _start), Processes(1, _start, spawn=n > 1)
+        self._crossings = self._pool.shared(dict(crossings))
 
     def cross(self, job: tuple[str, str]) -> FamilyResult:
         """`cross_family` of (error channel, family); waits for it."""
-        if self._pool is None:
-            return cross_family(self._crossings[job[0]], job[1])
-        return self._pool_of(job).submit(_cross, job).result()
+        return self._pool_of(job[1]).submit(_cross, self._crossings, job)()
 
     def distances(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
-        """`error_against_distance` of (error channel, selector, family, n_tsp), beside what the crossing left there."""
-        if self._pool is None:
-            return error_against_distance(self._crossings[cell[0]], *cell[1:])
-        return self._pool_of((cell[0], cell[2])).submit(_distances, cell).result()
+        """`error_against_distance` of (error channel, selector, family, n_tsp), where the crossing left its results."""
+        return self._pool_of(cell[2]).submit(_distances, self._crossings, cell)()
 
-    def _pool_of(self, job: tuple[str, str]) -> ProcessPoolExecutor:
-        assert self._pool is not None
-        if not FAMILIES[job[1]].shares_targets:
-            return self._pool
-        with self._lock:
-            self._sharing = self._sharing or _processes(1, self._crossings)
-            return self._sharing
+    def _pool_of(self, family: str) -> Processes:
+        return self._sharing if FAMILIES[family].shares_targets else self._pool
 
     def __enter__(self) -> Self:
+        self._pool.__enter__()
+        self._sharing.__enter__()
+        self._crossings = self._pool.shared(self._crossings.get())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        for pool in (self._pool, self._sharing):
-            if pool is not None:
-                pool.shutdown(cancel_futures=True)
+        self._sharing.__exit__(kind, error, at)
+        self._pool.__exit__(kind, error, at)
 
 
 def workers_for(families: Sequence[str]) -> int:
@@ -190,19 +177,14 @@ def _diagnostics_table(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["selector", "n_tsp", *(f.name for f in fields(Diagnostic))])
 
 
-def _processes(n: int, crossings: Mapping[str, Crossing]) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(n, get_context("spawn"), _start, (dict(crossings),))
+def _start() -> None:
+    """First call in a worker process: to find it here loads the families, since only loaded libraries are limited."""
+    one_thread()
 
 
-def _start(crossings: Mapping[str, Crossing]) -> None:
-    global _crossings
-    _crossings = crossings
-    threadpool_limits(limits=1)
+def _cross(crossings: Shared[dict[str, Crossing]], job: tuple[str, str]) -> FamilyResult:
+    return cross_family(crossings.get()[job[0]], job[1])
 
 
-def _distances(cell: tuple[str, str, str, int]) -> pd.DataFrame:
-    return error_against_distance(_crossings[cell[0]], *cell[1:])
-
-
-def _cross(job: tuple[str, str]) -> FamilyResult:
-    return cross_family(_crossings[job[0]], job[1])
+def _distances(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> pd.DataFrame:
+    return error_against_distance(crossings.get()[cell[0]], *cell[1:])

@@ -1,4 +1,4 @@
-"""Gradient boosting of small trees on binned inputs."""
+"""Family: gradient boosting of small trees on binned inputs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _ROWS = 720  # that few batches may give together
 
 
 class HistGradientBoosting(Family):
-    """A constant and `n_trees` trees of at most `leaves` leaves, each grown on what those before it left.
+    """A constant and `n_trees` trees of at most `leaves` leaves, each grown on the residual of those before it.
 
     Every tree counts with `rate`; leaves hold at least `leaf` rows, or a twentieth of few; batches give at most
-    `max_rows` rows each, or 720 together. No early stopping: that would ask for batches to spare. Beyond the trained
+    `max_rows` rows each, or 720 together. No early stopping, which would need spare batches. Beyond the trained
     temperatures it stays constant.
 
     Source: J. Friedman, Greedy function approximation, Annals of Statistics 29 (2001); binned after G. Ke et al.,
@@ -27,7 +27,7 @@ class HistGradientBoosting(Family):
     """
 
     key = "hist_gradient_boosting"
-    words = "gradient boosting of small trees on binned inputs"
+    summary = "gradient boosting of small trees on binned inputs"
     source = "Friedman 2001; Ke et al. 2017"
     closed_form = False
     rank = 76

@@ -1,4 +1,4 @@
-"""Huber regression: least squares for the many, least absolute errors for the few rows far off."""
+"""Family: Huber regression, quadratic for small and linear for large residuals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Huber(Linear):
     """
 
     key = "huber"
-    words = "Huber regression: rows far off count linearly"
+    summary = "Huber regression: rows far off count linearly"
     source = "Huber (1964); scale and steps: Huber and Dutter (1974); the criterion: Owen (2007)"
     effort = "usual"
     rank = 16

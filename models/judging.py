@@ -1,4 +1,4 @@
-"""Judging one family under one protocol: every distinct set of inputs and fold, each fitted and scored once."""
+"""Scoring of one family under one protocol: every distinct set of inputs and fold, fitted and scored once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FITTED_ON, _FITTED_ON_ITERATIVE = 100, 4  # training batches, evenly chosen, th
 
 @dataclass(frozen=True)
 class _Column:
-    """One fitted model's predictions and, where it tells them, their standard deviations: by batch, (n_k,)."""
+    """One fitted model's predictions and, where available, their standard deviations: by batch, (n_k,)."""
 
     inputs: Inputs
     fold: int
@@ -36,7 +36,7 @@ class _Column:
 
 
 @dataclass
-class Judged:
+class FamilyScores:
     """Every distinct (inputs, fold) of one family under one protocol, with its scores on every tested batch."""
 
     column: dict[tuple[Inputs, int], int]
@@ -49,8 +49,8 @@ class Judged:
     @classmethod
     def run(
         cls, design: Design, family: Family, folds: Sequence[Fold], needed: Sequence[tuple[Design, list[int]]]
-    ) -> Judged:
-        """Fit and judge. `needed`: each distinct subset of the design's inputs with the folds it is wanted for."""
+    ) -> FamilyScores:
+        """Fit and score. `needed`: each distinct subset of the design's inputs with the folds it is wanted for."""
         total = sum(len(which) for _, which in needed)
         tested = {name: np.full((total, design.n_batches), np.nan) for name in [*SCORES, *CERTAINTY, "n_rows"]}
         out = cls({}, tested, np.full(total, np.nan), {}, 0, [])
@@ -83,13 +83,13 @@ class Judged:
     ) -> None:
         first = len(self.column)
         fit_S: list[list[float]] = [[] for _ in pending]
-        asked: dict[int, list[int]] = {}
+        columns_of: dict[int, list[int]] = {}
         for c, column in enumerate(pending):
             for k in column.predicted_um:
-                asked.setdefault(k, []).append(c)
+                columns_of.setdefault(k, []).append(c)
             if len(folds[column.fold].test) == 1:
                 self.kept[first + c] = column.predicted_um[folds[column.fold].test[0]]
-        for k, columns in asked.items():
+        for k, columns in columns_of.items():
             y = design.y_um[design.rows(k)]
             tests = [c for c in columns if k in folds[pending[c].fold].test]
             fits = [c for c in columns if pending[c].fitting_S_um is None and k in trained[pending[c].fold]]
@@ -133,7 +133,7 @@ def _columns(
     out = []
     for c, (i, model) in enumerate(zip(which, fitted, strict=True)):
         test = folds[i].test
-        sd_um = dict(zip(test, model.sd_um(design, test), strict=True)) if model.tells_sd else {}
+        sd_um = dict(zip(test, model.sd_um(design, test), strict=True)) if model.has_sd else {}
         fitting = None if own_S_um is None else float(own_S_um[c])
         by_batch = dict(zip(wanted[c], predicted[c], strict=True))
         out.append(_Column(design.inputs, i, by_batch, sd_um, fitting, model.n_parameters()))
@@ -145,7 +145,7 @@ def _stacked(pending: Sequence[_Column], columns: Sequence[int], k: int) -> Arra
 
 
 def score_table(
-    batch_ids: Sequence[str], folds: Sequence[Fold], judged: Judged, columns: NDArray[np.int64], protocol: str
+    batch_ids: Sequence[str], folds: Sequence[Fold], judged: FamilyScores, columns: NDArray[np.int64], protocol: str
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Scores and their summary for C cells, given each cell's column per fold, `columns` (C, F).
 
@@ -153,13 +153,13 @@ def score_table(
         R rows per cell, cell after cell: a row per fold and tested batch, or for train-on-one a row per fold, summed up
         over the batches that it tests; and one row per cell: accuracy S_mean, robustness S_std, the other scores.
     """
-    told = [*SCORES, *CERTAINTY]
+    names = [*SCORES, *CERTAINTY]
     if protocol == "train-on-one":
         fold_names, ids = [f.name for f in folds], ["*"] * len(folds)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing is NaN, and that is what is meant
+            warnings.simplefilter("ignore", RuntimeWarning)  # the mean of an empty slice is NaN, as intended
             # max |e| is the greatest of all, every other score a mean over the tested batches.
-            per_fold = {n: (np.nanmax if n == "max_abs_um" else np.nanmean)(judged.tested[n], axis=1) for n in told}
+            per_fold = {n: (np.nanmax if n == "max_abs_um" else np.nanmean)(judged.tested[n], axis=1) for n in names}
             per_fold["S_std_um"] = np.nanstd(judged.tested["S_um"], axis=1, ddof=1)
             per_fold["n_rows"] = np.nansum(judged.tested["n_rows"], axis=1)
         values = {name: column[columns] for name, column in per_fold.items()}
@@ -170,11 +170,11 @@ def score_table(
         batch_index = np.concatenate([f.test for f in folds])
         fold_names, ids = [folds[i].name for i in fold_index], [batch_ids[k] for k in batch_index]
         picked = columns[:, fold_index]
-        values = {name: judged.tested[name][picked, batch_index] for name in [*told, "n_rows"]}
+        values = {name: judged.tested[name][picked, batch_index] for name in [*names, "n_rows"]}
         fit_S_um = judged.fit_S_um[picked]
         spread = values["S_um"].std(axis=1, ddof=1) if len(fold_index) > 1 else np.full(len(columns), np.nan)
     values["fit_S_um"] = fit_S_um
     rows = {"fold": np.tile(np.array(fold_names, object), len(columns)), "batch_id": np.tile(ids, len(columns))}
-    means = {n: (values[n].max if n == "max_abs_um" else values[n].mean)(axis=1) for n in [*told[1:], "fit_S_um"]}
+    means = {n: (values[n].max if n == "max_abs_um" else values[n].mean)(axis=1) for n in [*names[1:], "fit_S_um"]}
     summary = {"S_mean_um": values["S_um"].mean(axis=1), "S_std_um": spread, **means, "n_batches": len(fold_names)}
     return pd.DataFrame({**rows, **{n: v.ravel() for n, v in values.items()}}), pd.DataFrame(summary)

@@ -1,4 +1,4 @@
-"""Linear families from per-batch sums: every fold, and every inner fold, is a pooling of the same few moments.
+"""Base classes of linear families, fitted from pooled per-batch moments.
 
 Rows are read once, for the moments. A fold's covariance is a sum over its batches, so 30 folds cost 30 small
 matrices, and a choice by leave-batch-out inside them 435 more (leaving out i and k is one fit, whichever is outer).
@@ -20,6 +20,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.metrics import SIDE_OF_90
+from models.solvers.batches import fold_masks
 from models.solvers.kernels import unit_scale
 from models.solvers.pooled_sums import AT_ONCE, Blocks, Pool, inner_sets, leave_block_out
 
@@ -77,7 +78,7 @@ def _left_out_um(
     for k in range(design.n_batches):
         here = np.flatnonzero(left == k)
         rows = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-        rows = rows[:: -(-len(rows) // _MOST_ROWS) or 1]  # neighbours tell the same, and a fold must not cost rows
+        rows = rows[:: -(-len(rows) // _MOST_ROWS) or 1]  # neighbours are redundant, and a fold must not cost rows
         out[rows[:, None], outer[here]] = design.y_um[rows, None] - design.x[rows] @ coef[here].T - constant[here]
     return out
 
@@ -165,9 +166,6 @@ class Linear(Family):
     (or the design knows no units), and divided by their training std where another unit is among them.
     """
 
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
-
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold, all at once from the design's moments.
 
@@ -176,12 +174,11 @@ class Linear(Family):
         """
         if not folds:
             return []
+        if not design.inputs:
+            target = design.target or "the error"
+            raise InputError(f"{self.key}: no inputs given for {target}; name at least one channel")
         moments = design.moments
-        masks = np.zeros((len(folds), design.n_batches), bool)
-        for f, fold in enumerate(folds):
-            masks[f, list(fold)] = True
-            _check_rows(self.key, design, fold, int(moments.count[masks[f]].sum()))
-        masks &= moments.count > 0
+        masks = fold_masks(self.key, design, folds, moments.count, _MIN_ROWS)
         scaled = any(unit not in _KELVIN for unit in design.input_units)
         blocks = Blocks.of(moments)
         task = Task(design, masks, blocks, blocks.pool(masks, scaled), scaled)
@@ -242,7 +239,7 @@ class Linear(Family):
 
         NaN throughout where fewer than three batches were learned from.
         """
-        if not self.tells_sd:
+        if not self.has_sd:
             return super().sd_um(design, batches)
         a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
         return [np.sqrt(a + b * mean_square(design.x[design.rows(k)], design)) for k in batches]
@@ -253,11 +250,11 @@ class Linear(Family):
 
     @abstractmethod
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
-        """Coefficients (F, p) per unit of the inputs, and more to remember, each (F,); what is NaN is forgotten."""
+        """Coefficients (F, p) per unit of the inputs, and further quantities to store, each (F,); NaN is dropped."""
 
     def _spread(self, task: Task, path: Callable[[Pool], Array], chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """What `sd_um` needs, for families that tell it."""
-        if not self.tells_sd:
+        """Coefficients for `sd_um`, for families with `has_sd`."""
+        if not self.has_sd:
             return {}
         square = mean_square(task.design.x, task.design)
         a, b = left_out_spread(task.design, square, task.masks, task.scaled, path, chosen)
@@ -293,17 +290,4 @@ class Tuned(Linear):
 
     @abstractmethod
     def _setting(self, pool: Pool, chosen: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """The chosen setting in words of the family, each (S,)."""
-
-
-def _check_rows(key: str, design: Design, fold: Sequence[int], n_rows: int) -> None:
-    names = [design.batch_ids[k] for k in fold]
-    where = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    if not design.inputs:
-        raise InputError(f"{key}: no inputs given for {design.target or 'the error'}; name at least one channel")
-    if n_rows < _MIN_ROWS:
-        raise InputError(
-            f"{key}: batches {where or '(none)'} have {n_rows} usable rows (target {design.target!r} and all "
-            f"{len(design.inputs)} inputs recorded and not masked), expected at least {_MIN_ROWS}; add batches, "
-            "or drop the inputs that are missing"
-        )
+        """The chosen setting as the family's quantities, each (S,)."""

@@ -1,4 +1,4 @@
-"""LS-SVM regression with an RBF kernel and a linear part, tuned by exact leave-batch-out."""
+"""Family: least-squares support vector machine with RBF and linear kernel, tuned by exact leave-batch-out."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class LSSVM(KernelExpansion):
     """Least-squares support vector regression: `[[0, 1ᵀ], [1, Ω + I/γ]] [b; α] = [0; y]`.
 
     `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `10 u_i·u_j/p` with `linear`: an RBF alone falls back to b outside the
-    trained seasons, the linear part goes on. u are the p inputs divided by a fixed scale per unit (`SCALES`: 10 K,
+    trained seasons, the linear part extrapolates. u are the p inputs divided by a fixed scale per unit (`SCALES`: 10 K,
     10 K/h, 1000 rpm, …), the same for every fold, so all folds share one kernel; σ is in those scales. The model is
     linear in y, so scaling y would change nothing.
 
     γ and σ are those of least mean RMS over the training batches (contiguous quarters of one or two), each left out
-    once. `tuning` looks for them on the grid `gammas` × `sigmas` (`closed_form`), or between the grid's ends by a
+    once. `tuning` searches them on the grid `gammas` × `sigmas` (`closed_form`), or between the grid's ends by a
     `particle_swarm` over (log σ, log γ) of a seed, fold by fold: the same fitness, slower. Batches are decimated
-    evenly, all to at most `max_rows` over the number of batches in the design (at least 8 each); `fitted` tells the
+    evenly, all to at most `max_rows` over the number of batches in the design (at least 8 each); `fitted` has the
     rows kept.
 
     Source: J. Suykens et al., Least squares support vector machines (2002); left-out residuals from the
@@ -42,7 +42,7 @@ class LSSVM(KernelExpansion):
     """
 
     key = "lssvm"
-    words = "least-squares support vector machine, RBF and linear kernel"
+    summary = "least-squares support vector machine, RBF and linear kernel"
     source = "Suykens et al. 2002"
     effort = "quick"
     rank = 60
@@ -62,9 +62,6 @@ class LSSVM(KernelExpansion):
         self.tuning, self.seed = tuning, int(seed)
         self.linear, self.max_rows = bool(linear), int(max_rows)
         self.sigmas, self.gammas = [float(s) for s in sigmas], [float(g) for g in gammas]
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """Folds that leave out one batch share one inverse per (γ, σ); the others are stacked where alike in size.

@@ -1,4 +1,4 @@
-"""How a prediction is judged, for many models at once.
+"""Scores of predictions, for many models at once.
 
 All on one batch's usable rows, recorded y and prediction p (µm), e = y − p:
 S = sqrt(Σ e² / (n − 1)), the residual standard deviation of the year-round PCR study; max |e|; bias = mean e;
@@ -49,7 +49,7 @@ def batch_scores(y_um: Array, predicted_um: Array) -> dict[str, Array]:
 
 
 def coverage(y_um: Array, predicted_um: Array, sd_um: Array) -> dict[str, Array]:
-    """How sure C models say they are on one batch, and how right they are in that.
+    """Coverage and mean of the stated standard deviations of C models on one batch.
 
     Args:
         y_um: recorded error (n,). predicted_um, sd_um: predictions and their stated standard deviations (n, C).

@@ -14,15 +14,15 @@ from models.linear import DIGITS_LEFT, EPS, Linear, Pool, Task
 class MLR(Linear):
     """Ordinary least squares with intercept; of equally good solutions the one of least norm.
 
-    `condition` tells how far the coefficients can be trusted: with head sensors 10²–10⁴ is usual.
+    `condition` bounds the accuracy of the coefficients: with head sensors 10²–10⁴ is usual.
     Where the covariance cannot carry the answer (near-deficient inputs) the fit goes back to the rows.
     """
 
     key = "mlr"
-    words = "multiple linear regression: least squares on all chosen inputs"
+    summary = "multiple linear regression: least squares on all chosen inputs"
     source = "Legendre (1805); minimum norm by singular values: Golub and Kahan (1965)"
     effort = "quick"
-    tells_sd = True
+    has_sd = True
     rank = 10
 
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
@@ -37,7 +37,7 @@ class MLR(Linear):
 
 
 def _from_sums(pool: Pool) -> tuple[Array, Array]:
-    """Coefficients (S, p) and eigenvalues (S, p) of the correlation; what is lost in rounding tells nothing."""
+    """Coefficients (S, p) and eigenvalues (S, p) of the correlation; eigenvalues below rounding are dropped."""
     correlation, spread = pool.correlation()
     values, vectors = np.linalg.eigh(correlation)
     with np.errstate(divide="ignore", invalid="ignore"):

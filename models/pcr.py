@@ -1,4 +1,4 @@
-"""Principal component regression: components by contribution, or by leave-batch-out."""
+"""Families: principal component regression, components chosen by contribution or by leave-batch-out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PCR(Linear):
     """
 
     key = "pcr"
-    words = "principal component regression, components to 95 % cumulative contribution"
+    summary = "principal component regression, components to 95 % cumulative contribution"
     source = "Massy (1965); year-round study of a Vcenter-55 machining centre: covariance, 95 %, 4 points"
     effort = "quick"
     rank = 11
@@ -42,11 +42,11 @@ class PCR(Linear):
 class PCRByLeaveBatchOut(Tuned):
     """The same with the number of components chosen by leave-batch-out inside the training batches.
 
-    A component of small variance can be the column's bending gradient: the 95 % rule discards it, this one asks.
+    A component of small variance, such as a bending gradient, can matter: the 95 % rule discards it.
     """
 
     key = "pcr_lbo"
-    words = "principal component regression, number of components by leave-batch-out inside the training batches"
+    summary = "principal component regression, number of components by leave-batch-out inside the training batches"
     source = "Massy (1965); choice by prediction error: Mertens, Fearn and Thompson (1995)"
     effort = "quick"
     rank = 13

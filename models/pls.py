@@ -1,4 +1,4 @@
-"""Partial least squares, its number of components chosen by leave-batch-out."""
+"""Family: partial least squares, number of components chosen by leave-batch-out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PLS(Tuned):
     """
 
     key = "pls"
-    words = "partial least squares, number of components by leave-batch-out inside the training batches"
+    summary = "partial least squares, number of components by leave-batch-out inside the training batches"
     source = "Wold, Martens and Wold (1983); from cross-products: de Jong and ter Braak (1994)"
     effort = "quick"
     rank = 14

@@ -16,13 +16,13 @@ from models.protocols import PromotionRule
 from models.result import GridResult
 
 BASELINES = ("zero", "mean_curve")
-_EXACT_UP_TO = 16  # batches: 2^16 sign patterns are counted out, above that 2^16 of them are drawn
+_SIGN_PATTERNS = 2**16  # of up to 16 batches all are counted, of more so many are drawn
 _INTERVAL = 0.90
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The cell that the rule picked. `caution` says why it is not to be trusted: a baseline won, no set of points was
+    """The cell that the rule picked. `caution` is why it is not to be trusted: a baseline won, no set of points was
     stable, or the search itself explains the score; empty where it is."""
 
     protocol: str
@@ -36,7 +36,7 @@ class Choice:
     tsp_stability: float
     n_batches: int
     caution: str
-    words: str
+    summary: str
     nested_S_mean_um: float = float("nan")  # every batch predicted by the cell that the other batches chose
     nested_S_std_um: float = float("nan")
 
@@ -51,7 +51,7 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """The cell in words."""
+        """The cell as text."""
         return _cell_words(self.family, self.n_tsp, self.selector)
 
 
@@ -160,7 +160,7 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
     """The rule's choice (or the cell picked by hand) with what choosing itself costs: the nested score.
 
     Where the nested score is no better than the best baseline, the choice is not to be trusted: on these batches the
-    search cannot tell a good model from a lucky one.
+    search cannot distinguish a good model from a lucky one.
 
     Raises:
         InputError: as `choose` and `pick`.
@@ -170,7 +170,7 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
     if nested.empty or cell:
         return choice
     mean, std = float(nested["S_um"].mean()), float(nested["S_um"].std())
-    words = f"{choice.words}; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
+    words = f"{choice.summary}; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
     cells = result.cells[(result.cells["protocol"] == rule.protocol) & result.cells["family"].isin(BASELINES)]
     caution = choice.caution
     if not caution and len(cells) and rule.score != "max_abs":
@@ -183,7 +183,7 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
                 f"by {rule.score} {beaten_by}"
             )
             words += f", {beaten_by}: do not trust"
-    return replace(choice, caution=caution, words=words, nested_S_mean_um=mean, nested_S_std_um=std)
+    return replace(choice, caution=caution, summary=words, nested_S_mean_um=mean, nested_S_std_um=std)
 
 
 def left_out(result: GridResult, protocol: str, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
@@ -200,7 +200,7 @@ def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
     """Every batch judged by the cell that the other batches would have chosen: batch_id, cell, S_um.
 
     The best of many cells has been chosen for its left-out score, which flatters it (Varma & Simon 2006,
-    BMC Bioinformatics 7:91). Here batch k has no say in the choice that predicts it. Empty for train-on-one, where a
+    BMC Bioinformatics 7:91). Here batch k is not used in the choice that predicts it. Empty for train-on-one, where a
     score belongs to the batch trained on, and for two batches, where the other one alone has no spread.
     """
     columns = ["batch_id", "cell", "S_um"]
@@ -261,14 +261,18 @@ def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) ->
 def sign_flip_p(difference: NDArray[np.float64]) -> float:
     """One-sided p of mean(difference) > 0 when every sign is a coin toss; (n,) -> p. Ties count against."""
     d = np.asarray(difference, float)
-    n = len(d)
-    if n <= _EXACT_UP_TO:
-        signs = 1.0 - 2.0 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
-    else:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(2**_EXACT_UP_TO, n))
-        signs[0] = 1.0  # the observed pattern belongs to the draw (Phipson & Smyth 2010)
-    sums = signs @ d
-    return float(np.mean(sums >= d.sum() - 1e-9 * np.abs(d).sum()))
+    if len(d) < 2:
+        return 0.5 if d.sum() > 0 else 1.0
+    size = np.abs(d).sum() or 1.0
+
+    def total(flipped: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        """Rounded, so that equal sums of different rounding errors are ties."""
+        return np.round(flipped.sum(axis=axis) / size, 9)
+
+    found = stats.permutation_test(
+        (d,), total, permutation_type="samples", alternative="greater", n_resamples=_SIGN_PATTERNS, rng=0
+    )
+    return float(found.pvalue)
 
 
 def _simplest(table: pd.DataFrame) -> pd.Series:
@@ -297,7 +301,7 @@ def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], caution: str)
         tsp_stability=float(row["tsp_stability"]),
         n_batches=int(row["n_batches"]),
         caution=caution,
-        words="; ".join([words, *notes]),
+        summary="; ".join([words, *notes]),
     )
 
 

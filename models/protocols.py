@@ -1,4 +1,4 @@
-"""How batches are divided into training and test. Batches are the independent samples, never rows."""
+"""Protocols that divide batches into training and test sets, and the promotion rule. Rows are never split."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.batch import Batch
 from data.errors import InputError, closest
+from features.rises import first_finite
 
 _SEASON_BOUNDS_DEGC = (10.0, 18.0, 25.0)
 
@@ -36,7 +37,7 @@ def train_on_one(batches: Sequence[Batch]) -> list[Fold]:
 
 
 def leave_season_out(batches: Sequence[Batch]) -> list[Fold]:
-    """One fold per season, told by the start ambient: below 10, 10–18, 18–25, above 25 °C."""
+    """One fold per season, defined by the start ambient: below 10, 10–18, 18–25, above 25 °C."""
     return _leave_group_out([season(b) for b in batches])
 
 
@@ -68,12 +69,7 @@ def folds_of(protocol: str, batches: Sequence[Batch]) -> list[Fold]:
 def start_ambient_degC(batch: Batch) -> float:
     """Ambient at the start; without an ambient channel the median of the temperatures' first samples."""
     names = batch.names("ambient") or batch.names("temperature")
-    firsts = []
-    for name in names:
-        values = batch.masked(name)
-        ok = np.isfinite(values)
-        if ok.any():
-            firsts.append(float(values[np.argmax(ok)]))
+    firsts = [first for name in names if np.isfinite(first := first_finite(batch.masked(name)))]
     return float(np.median(firsts)) if firsts else float("nan")
 
 

@@ -1,4 +1,4 @@
-"""Random forest: trees grown on bootstraps of whole batches, so that what is out of the bag is a batch."""
+"""Family: random forest on bootstraps of whole batches, so that out-of-bag samples are batches."""
 
 from __future__ import annotations
 
@@ -21,22 +21,21 @@ _PARTS_OF_ONE = 12  # of one or two batches: a tree that lacks a quarter of its 
 class RandomForest(Family):
     """The mean of `n_trees` regression trees, each grown on a bootstrap of the training batches.
 
-    Rows of one batch are near copies of each other: a bootstrap of rows would hold nearly every batch, and what is
-    out of the bag would be known all the same. Fewer than 3 batches are cut into twelfths. At a split a tree looks at
-    a third of the inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each, or 480
-    together. `sd_um`: variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag
-    residuals.
+    Rows of one batch are near copies of each other: a bootstrap of rows would hold nearly every batch, and what is out
+    of the bag would be known all the same. Fewer than 3 batches are cut into twelfths. A split considers a third of the
+    inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each, or 480 together. `sd_um`:
+    variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag residuals.
 
-    A forest repeats what it has seen: beyond the trained temperatures it stays constant.
+    A forest does not extrapolate: beyond the trained temperatures it stays constant.
 
     Source: L. Breiman, Random forests, Machine Learning 45 (2001); its trees are scikit-learn's.
     """
 
     key = "random_forest"
-    words = "random forest on bootstraps of whole batches"
+    summary = "random forest on bootstraps of whole batches"
     source = "Breiman 2001"
     closed_form = False
-    tells_sd = True
+    has_sd = True
     rank = 75
 
     def __init__(self, n_trees: int = 24, leaf: int = 3, max_rows: int = 16, seed: int = 0) -> None:
@@ -69,18 +68,18 @@ class RandomForest(Family):
 
     def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing."""
-        return [mean for mean, _ in self._told(design, batches)]
+        return [mean for mean, _ in self._moments(design, batches)]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value."""
         constant, factor = self.fitted["variance_um2"], self.fitted["factor"]
-        return [np.sqrt(constant + factor * variance) for _, variance in self._told(design, batches)]
+        return [np.sqrt(constant + factor * variance) for _, variance in self._moments(design, batches)]
 
     def n_parameters(self) -> int:
         """A threshold per split and a value per leaf."""
         return int(np.size(self.fitted["feature"])) if self.fitted else 0
 
-    def _told(self, design: Design, batches: Sequence[int]) -> list[tuple[Array, Array]]:
+    def _moments(self, design: Design, batches: Sequence[int]) -> list[tuple[Array, Array]]:
         """Mean and variance over the trees on the rows of each batch."""
         trees, out = Trees.from_plain(self.fitted), []
         for k in batches:

@@ -1,4 +1,4 @@
-"""LSTM: long short-term memory along whole batches."""
+"""Families: LSTM and GRU nets along whole batches."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class LSTM(RecurrentNet):
     """
 
     key = "lstm"
-    words = "long short-term memory net along whole batches, behind a linear part with memory"
+    summary = "long short-term memory net along whole batches, behind a linear part with memory"
     source = "Hochreiter and Schmidhuber 1997"
     gates, candidate = 4, 0
 
@@ -142,7 +142,7 @@ class GRU(RecurrentNet):
     """
 
     key = "gru"
-    words = "gated recurrent units along whole batches, behind a linear part with memory"
+    summary = "gated recurrent units along whole batches, behind a linear part with memory"
     source = "Cho et al. 2014"
     gates, candidate = 3, 2
 

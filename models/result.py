@@ -1,4 +1,4 @@
-"""What the grid hands on: one tidy table of scores, one row per cell, and the left-out predictions."""
+"""Result of a grid: tables of scores, cells and left-out predictions, saved as Parquet files."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class GridResult:
       one float32 column per "selector|family|n_tsp" with the left-out prediction in µm.
     - `findings`: batch_id, check, channel, start_s, end_s, words, masks, overruled.
     - `distances`: how far left-out batches were from the training of the chosen cell, and its S there, see
-      `models.trust`; empty where nobody chose.
+      `models.trust`; empty without a chosen cell.
     - `excluded`: channel, reason: channels that no cell may use.
-    - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: what is known to go wrong with
+    - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: known weaknesses of
       each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty
       in older files.
     """

@@ -1,4 +1,4 @@
-"""Ridge regression, its penalty chosen by leave-batch-out."""
+"""Family: ridge regression, penalty chosen by leave-batch-out."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Ridge(Tuned):
     """
 
     key = "ridge"
-    words = "ridge regression, penalty by leave-batch-out inside the training batches"
+    summary = "ridge regression, penalty by leave-batch-out inside the training batches"
     source = "Hoerl and Kennard (1970), eq. 2.1"
     effort = "quick"
-    tells_sd = True
+    has_sd = True
     rank = 12
 
     def __init__(self, least: float = 1e-6, most: float = 1e2, n_penalties: int = 25) -> None:

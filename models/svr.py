@@ -1,4 +1,4 @@
-"""Support vector regression with an RBF kernel."""
+"""Family: support vector regression with an RBF kernel."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class SVR(KernelExpansion):
     the trained seasons the kernel dies out and the model falls back to its bias. Batches are decimated evenly, to at
     most `max_rows` together. σ from `sigmas`, C from `costs` over the number of rows, and then ε (in standard
     deviations of the error) from `epsilons`, whose first stands until then: least mean RMS over left-out groups of
-    whole training batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` tells
-    rows, setting and score, and holds the support rows: a trained model predicts without scikit-learn.
+    whole training batches (every third; contiguous quarters of one or two batches), on half the rows. `fitted` has
+    rows, setting and score, and the support rows: a trained model predicts without scikit-learn.
 
     Source: V. Vapnik, The nature of statistical learning theory (1995), ch. 6; C.-C. Chang and C.-J. Lin, LIBSVM: a
     library for support vector machines (2011).
     """
 
     key = "svr"
-    words = "support vector regression, RBF kernel"
+    summary = "support vector regression, RBF kernel"
     source = "Vapnik 1995; Chang and Lin 2011"
     rank = 62
     linear = False

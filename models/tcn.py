@@ -1,4 +1,4 @@
-"""TCN: dilated causal convolutions along whole batches."""
+"""Family: temporal convolutional net (TCN) along whole batches."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class TCN(SequenceNet):
     """Temporal convolutional net of `hidden` channels behind a linear part with memory; see `SequenceNet`.
 
     `z_0 = W x`; `z_{l+1}(t) = tanh(N_l z_l(t) + P_l z_l(t − 2^l) + b_l) − tanh(b_l)`, l = 0 … 3: kernels of two taps,
-    dilations 1, 2, 4, 8, so that a state sees 16 steps (5 h 20 min at the default spacing). All layers are read out.
-    Before the start everything is 0 and stays so. At the start of the training N = P = ½: layer l is a moving mean
+    dilations 1, 2, 4, 8, so that a state depends on 16 steps (5 h 20 min at the default spacing). All layers are read
+    out. Before the start everything is 0 and stays so. At the start of the training N = P = ½: layer l is a moving mean
     over 2^l steps.
 
     Source: A. van den Oord et al., WaveNet (2016); S. Bai, J. Kolter and V. Koltun (2018).
     """
 
     key = "tcn"
-    words = "temporal convolutional net along whole batches, behind a linear part with memory"
+    summary = "temporal convolutional net along whole batches, behind a linear part with memory"
     source = "Bai, Kolter and Koltun 2018"
     weights = ("input", "now", "past", "bias")
 

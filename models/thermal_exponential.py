@@ -15,7 +15,7 @@ from features.rises import hold_last
 from models.base import Family, Plain
 from models.solvers.batches import padded, steps_s, too_few_rows, unpadded
 
-EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it stays where one speed tells nothing
+EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where there is one speed
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
 _LEAST_RATIO = 2.0  # of two time constants: closer ones give huge amplitudes of opposite sign
 _MOST_STEPS = 12
@@ -36,7 +36,7 @@ class ThermalExponential(Family):
     """
 
     key = "thermal_exponential"
-    words = "exponential warm-up driven by spindle speed or time alone"
+    summary = "exponential warm-up driven by spindle speed or time alone"
     source = "Newton's law of cooling; Golub and Pereyra 1973"
     effort = "quick"
     uses_inputs = False
@@ -46,9 +46,6 @@ class ThermalExponential(Family):
     def __init__(self, lags: int = 2) -> None:
         super().__init__()
         self.lags = int(lags)
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """A grid over (m, τ) whose sums all folds share, then τ refined fold by fold.
@@ -150,7 +147,7 @@ class _Sums:
             fine = apart & allowed[None, :] & (det > 1e-9 * power[:, :, None] * power[:, None, :])
             two = np.where(fine, two / det, 0.0)
         gain = two.max(axis=(1, 2)) if lags > 1 else one.max(axis=1)
-        # A tie within rounding goes to the first exponent: a single speed cannot tell them apart.
+        # A tie within rounding goes to the first exponent: a single speed does not distinguish them.
         m = int(np.argmax(gain >= gain.max() * (1.0 - 1e-9)))
         alone = _TAU_GRID_S[[int(one[m].argmax())]]
         if lags < 2 or two[m].max() <= one[m].max():

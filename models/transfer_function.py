@@ -1,4 +1,4 @@
-"""Transfer function: the error as a sum of first-order responses to temperatures, drivers and the start's state."""
+"""Family: transfer function, a sum of first-order responses to temperatures, drivers and the start state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.linear import left_out_spread, mean_square
-from models.solvers.batches import too_few_rows
+from models.solvers.batches import fold_masks
 from models.solvers.poles import (
     TAUS_S,
     Candidate,
@@ -45,8 +45,8 @@ class TransferFunction(Family):
 
     In every fold leave-batch-out over its training batches chooses on a grid from 2 min to 12 h the poles that all
     inputs start from, whether gaps and drivers take part, and the ridge on the gains. Then each input's poles move by
-    themselves. With fewer than three training batches nothing tells a lag from chance: only direct terms of the
-    sensors are fitted. What some batch of the design lacks takes no part.
+    themselves. With fewer than three training batches only direct terms of the sensors are fitted. What some batch of
+    the design lacks takes no part.
 
     `fitted`: per input kind, name and exponent, direct_um (µm per unit), gain_um and tau_s (inputs, poles).
 
@@ -55,12 +55,12 @@ class TransferFunction(Family):
     """
 
     key = "transfer_function"
-    words = "first-order responses to the sensors and to what is not settled at the start"
+    summary = "first-order responses to the sensors and to what is not settled at the start"
     source = "Ljung 1999, eq. 4.25; Golub and Pereyra 1973"
     effort = "usual"
     closed_form = False
     rowwise = False
-    tells_sd = True
+    has_sd = True
     rank = 30
 
     def __init__(self, poles: int = 2, gaps: bool = True, drivers: bool = False) -> None:
@@ -68,9 +68,6 @@ class TransferFunction(Family):
         if poles not in (0, 1, 2):
             raise InputError(f"family {self.key}: poles is {poles!r}, expected 0, 1 or 2; choose one of them")
         self.poles, self.gaps, self.drivers = int(poles), bool(gaps), bool(drivers)
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """All folds from the sums of one dictionary of responses.
@@ -84,12 +81,7 @@ class TransferFunction(Family):
                 f"{_MOST_INPUTS}; let a selector choose"
             )
         counts = np.bincount(design.group[design.usable], minlength=design.n_batches)
-        masks = np.zeros((len(folds), design.n_batches), bool)
-        for f, fold in enumerate(folds):
-            masks[f, list(fold)] = True
-            if counts[masks[f]].sum() < _FEWEST_ROWS:
-                raise too_few_rows(self.key, design, fold, int(counts[masks[f]].sum()), _FEWEST_ROWS)
-        masks &= counts > 0
+        masks = fold_masks(self.key, design, folds, counts, _FEWEST_ROWS)
         drivers = drivers_of(design) if self.drivers else []
         gaps = gaps_of(design) if self.gaps else []
         dictionary = Dictionary(design, (*(Source("input", i) for i in design.inputs), *drivers, *gaps))
@@ -169,7 +161,7 @@ class TransferFunction(Family):
     def _spread(
         self, dictionary: Dictionary, masks: Mask, candidate: Candidate, penalty: Array
     ) -> list[dict[str, float]]:
-        """What `sd_um` needs, from left-out residuals with the poles where the candidate has them."""
+        """Coefficients for `sd_um`, from left-out residuals with the poles where the candidate has them."""
         names = map(str, dictionary.places(candidate.sources(dictionary), candidate.poles))
         tried, chosen = np.unique(penalty, return_inverse=True)
         square = mean_square(dictionary.design.x, dictionary.design)

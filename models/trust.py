@@ -1,4 +1,4 @@
-"""How a model's error rises with the distance from where it was trained, measured on batches that it never saw."""
+"""Region of the training data, and the growth of a model's error with the distance from it on left-out batches."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Region:
 
     `ranges`: least and greatest value of every input (K), start temperature of its channel (`name@start`, degC) and
     driver (its unit). `directions` (p, p): the principal directions of the temperature inputs about `centre` (p,),
-    with the least and greatest score `low`, `high` (p,) in K: they know how the points stand to each other, so a
-    sensor that was moved or replaced is far outside though every single value was seen before.
+    with the least and greatest score `low`, `high` (p,) in K. They capture the pattern of the points: a moved or
+    replaced sensor is far outside even if each single value is within its range.
     """
 
     ranges: Mapping[str, tuple[float, float]]
@@ -72,7 +72,7 @@ class Region:
         """For every quantity of a batch how far each row (n,) is outside, in trained widths (at least 5 K, 1000 rpm
         or 1000 mm/min); 0 inside, 1 as far outside as the region is wide. NaN where the quantity is missing.
 
-        Quantities that the batch lacks (a driver not recorded) are not judged.
+        Quantities that the batch lacks (a driver not recorded) are skipped.
         """
         out = {}
         for name, (low, high) in self.ranges.items():
@@ -127,7 +127,7 @@ def _excess(values: Array, low: Array | float, high: Array | float) -> Array:
 
 COLUMNS = ["cell", "protocol", "fold", "batch_id", "distance", "farthest", "S_um"]
 EDGES = (0.05, 0.25, 0.5, 1.0, 2.0, np.inf)  # upper ends of the bands, in trained widths
-_LEAST_PAIRS = 3  # left-out batches that a band needs before it says anything
+_LEAST_PAIRS = 3  # left-out batches that a band needs to be stated
 _FAR = ("leave-season-out", "leave-speed-out")
 
 
@@ -163,9 +163,9 @@ def error_against_distance(crossing: Crossing, selector: str, family: str, n_tsp
 class Rise:
     """How many times larger S is in bands of distance than on the same batches predicted by their neighbours.
 
-    inside_um: the median S by leave-batch-out. Per band the upper edge (B,) in widths, the number of predicted
-    batches, the median and the 90 % quantile of the factor S / S by leave-batch-out: the same batch near and far, so
-    batches of large errors do not pass for distant ones. From seasons and speeds left out, that is from models that
+    inside_um: the median S by leave-batch-out. Per band the upper edge (B,) in widths, the number of predicted batches,
+    the median and the 90 % quantile of the factor S / S by leave-batch-out: the same batch near and far, so that
+    batches of large errors do not count as distant ones. From seasons and speeds left out, that is from models that
     learned from many batches; bands with fewer than 3 predictions are not among them.
     """
 
@@ -200,15 +200,15 @@ class Rise:
     def expected_um(self, distance: Array) -> Array:
         """S (n,) to be expected at a distance: the median by leave-batch-out times the band's factor, at least 1 and
         never falling with the distance. NaN in bands that were not measured."""
-        told = np.full(len(EDGES) + 1, np.nan)
+        factor = np.full(len(EDGES) + 1, np.nan)
         if self.edge:
-            told[np.searchsorted(EDGES, self.edge)] = np.maximum.accumulate(np.maximum(self.factor, 1.0))
-        told[0] = 1.0
+            factor[np.searchsorted(EDGES, self.edge)] = np.maximum.accumulate(np.maximum(self.factor, 1.0))
+        factor[0] = 1.0
         band = np.searchsorted(EDGES, distance, side="left")
-        return np.asarray(self.inside_um * np.where(np.isfinite(distance), told[band], np.nan))
+        return np.asarray(self.inside_um * np.where(np.isfinite(distance), factor[band], np.nan))
 
     def as_plain(self) -> dict[str, Any]:
-        """Numbers and lists; the last band has no upper edge and says "beyond"."""
+        """Numbers and lists; the upper edge of the last band is "beyond"."""
         return {"inside_um": self.inside_um, "edge": [e if np.isfinite(e) else "beyond" for e in self.edge],
                 "count": list(self.count), "factor": list(self.factor), "high": list(self.high)}  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The physics twin as a family: the machine file's network, calibrated on the training batches, run from drivers."""
+"""Family: thermal network of the machine file, calibrated on the training batches and run from the drivers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from models.solvers.twin_folds import Calibrated, Calibrations, TwinRun
 from twin.compile import compile_network
 from twin.network import Network
 
-_FEW = 3  # training sets from which on a common beginning pays
+_FEW = 3  # training sets from which on a common start saves time
 
 
 class Twin(Family):
@@ -36,7 +36,7 @@ class Twin(Family):
     """
 
     key = "twin"
-    words = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
+    summary = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
     source = "machine file; Mayr et al. (2012), CIRP Annals 61(2), sec. 4; MAP least squares, Tarantola (2005), ch. 3"
     effort: ClassVar[Effort] = "usual"
     uses_inputs = False
@@ -52,9 +52,6 @@ class Twin(Family):
         if not every_s > 0:
             raise InputError(f"family {self.key}: every_s is {every_s!r}, expected seconds above 0")
         self.every_s, self.channels, self.start = float(every_s), tuple(channels), start
-
-    def fit_design(self, design: Design, train: Sequence[int]) -> Self:
-        return self.fit_folds(design, [train])[0]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold; several begin at one fit on all of them, which does not change where they end.
@@ -115,7 +112,7 @@ class Twin(Family):
         driven_by += [name for s in network.surroundings for name in s.first]
         return {"machine": machine, "driven_by": list(dict.fromkeys(driven_by)),
                 "parameters": [p.name for p in network.parameters], "values": c.values, "start_K": c.start_K,
-                "start_cov_K2": c.start_cov_K2, "words": c.words}  # fmt: skip
+                "start_cov_K2": c.start_cov_K2, "words": c.message}  # fmt: skip
 
     def _usual_K(self) -> Array:
         start = np.asarray(self.fitted["start_K"], float)

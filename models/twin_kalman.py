@@ -1,4 +1,4 @@
-"""The twin beside the machine: it assimilates the sensors that a control has."""
+"""Family: calibrated twin with a Kalman filter on the selected sensors."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _CHOSEN_ON = 6  # training batches that the noise of the heat is chosen on
 class TwinKalman(Twin):
     """The twin of `models.twin`, corrected row by row by those selected inputs that are its sensors.
 
-    They are read as temperatures, not as rises; an input that is no sensor of the twin says nothing here, and without
-    any the twin runs free. A row knows the readings up to it. The start's scatter is that of the training batches;
+    They are read as temperatures, not as rises; an input that is no sensor of the twin is ignored, and without
+    any the twin runs free. A row uses the readings up to it. The start's scatter is that of the training batches;
     each heat has a factor of its own in every batch (standard deviation `heat_spread`); the white noise of the bodies'
     heat is the one of `HEAT_W` of least mean S on up to six of the training batches. `fitted` adds heat_W.
     """
 
     key = "twin_kalman"
-    words = "physics twin that assimilates the sensors by a Kalman filter"
+    summary = "physics twin that assimilates the sensors by a Kalman filter"
     source = "Kalman (1960); Gelb (1974), sec. 6.1, linearised about the simulation"
     uses_inputs = True
     closed_form = False

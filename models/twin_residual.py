@@ -1,4 +1,4 @@
-"""The twin and what the sensors add to it: a regression of its residual on the temperatures that it did not expect."""
+"""Family: calibrated twin plus a regression of its residual on deviations of the measured temperatures."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class TwinResidual(Twin):
     """
 
     key = "twin_residual"
-    words = "physics twin plus a regression of its residual on the sensors"
-    source = "Kennedy and O'Hagan (2001), eq. 4, a discrepancy beside a calibrated model; Hoerl and Kennard (1970)"
+    summary = "physics twin plus a regression of its residual on the sensors"
+    source = "Kennedy and O'Hagan (2001), eq. 4, a discrepancy added to a calibrated model; Hoerl and Kennard (1970)"
     effort = "usual"
     uses_inputs = True
     closed_form = False
@@ -106,7 +106,7 @@ class TwinResidual(Twin):
         return np.column_stack(out)
 
     def _left_out(self, design: Design, fold: Sequence[int]) -> Design:
-        """The design with the twin's honest residuals as target and what the inputs say beyond it, in the fold."""
+        """The design with the twin's left-out residuals as target and the inputs less its readings, in the fold."""
         work = self._calibrations(design)
         y, seen = np.full(len(design.y_um), np.nan), np.full((len(design.y_um), len(work.network.readings)), np.nan)
         at = [e.channel for e in work.network.errors].index(design.target)

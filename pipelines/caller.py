@@ -1,4 +1,4 @@
-"""How the steps of a job are run: as plain calls here, as tasks of a flow in `pipelines.flows`."""
+"""How the steps of a job run: as plain calls here, as tasks of a flow in `pipelines.flows`."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from threadpoolctl import threadpool_limits
 T = TypeVar("T")
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
-Done = Callable[[str, int, int], None]
-LANES = max(2, os.cpu_count() or 1)  # steps under way at once: no fewer than `workers_for` gives processes
+Say = Callable[[str], None]  # one line of progress
+Done = Callable[[str, int, int], None]  # step, finished, of how many
+LANES = max(2, os.cpu_count() or 1)  # concurrent steps: no fewer than the processes of `workers_for`
 RETRIES = 2  # for steps that touch a share or a store, where a second try can succeed
 
 
 class Caller(Protocol):
-    """How steps are run."""
+    """How steps run."""
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
         """`work` on every item, results in the items' order; an exception of any of them is raised."""
 
 
 class DirectCaller:
-    """Steps as plain calls, some at a time."""
+    """Steps as plain calls, up to `LANES` at a time."""
 
     def __init__(self, done: Done | None = None) -> None:
         self.done = done
@@ -42,14 +43,14 @@ class DirectCaller:
 
 
 class Future(Protocol[R_co]):
-    """What has been submitted, to a thread pool or to Prefect."""
+    """A submitted step, in a thread pool or in Prefect."""
 
     def result(self) -> R_co:
-        """Waits for it; raises what it raised."""
+        """Wait for the step; raises what it raised."""
 
 
 def gather(step: str, futures: Sequence[Future[R]], done: Done | None) -> list[R]:
-    """Results in the order of submission, telling how many of how many have come."""
+    """Results in the order of submission; `done` hears of each."""
     results: list[R] = []
     for future in futures:
         results.append(future.result())

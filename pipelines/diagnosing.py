@@ -1,15 +1,20 @@
-"""`thermodrift diagnose`: recordings and a machine file into findings, a report, a new machine file, the next run."""
+"""The diagnosis as a job: recordings and a machine file into findings, a report, a new machine file, the next run.
+
+A training whose twin predicts new batches worse than before is followed by one (`diagnose_if_grown`)."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
@@ -19,19 +24,23 @@ from data.machine import Machine, load_machine
 from diagnosis.export.machine_file import diagnosed_text, drafted_text
 from diagnosis.findings.schema import Findings, as_json
 from diagnosis.result import Diagnosis
-from pipelines.caller import RETRIES, Caller, DirectCaller, Done
+from models import FAMILIES
+from models.promotion import left_out, score_um
+from models.protocols import PromotionRule
+from models.result import GridResult
+from pipelines import tracking
+from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
 from pipelines.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
 from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
 
-Say = Callable[[str], None]
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
 FILES = (REPORT, PLAN, MACHINE, FINDINGS)  # the last one says that the others are complete
 
 
 class Diagnose(Protocol):
-    """What does the work: `diagnosis.diagnose.diagnose`, or a toy in its place."""
+    """The signature of `diagnosis.diagnose.diagnose`, and of a stand-in for it."""
 
     def __call__(
         self,
@@ -62,7 +71,7 @@ class DiagnosisRequest:
 class DiagnosisOutcome:
     """A diagnosis, the files in the folder `out` by name, and the run that tracks it.
 
-    `trouble`: why there is no new machine file though something was found; empty where all went well.
+    `trouble`: why there is no new machine file though something was found, else empty.
     """
 
     diagnosis: Diagnosis
@@ -73,7 +82,7 @@ class DiagnosisOutcome:
     trouble: str = ""
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """``diagnosed: explained (floor_sink at bed), var/diagnoses/…``."""
         f = self.diagnosis.findings
         found = ", ".join(f"{x.mechanism} at {x.where.name}" for x in f.findings)
@@ -81,7 +90,7 @@ class DiagnosisOutcome:
 
 
 def dated_folder(name: str) -> Path:
-    """Where a diagnosis goes that nobody gave a folder: `home()`/diagnoses/NAME-DATE-TIME."""
+    """The default folder of a diagnosis: `home()`/diagnoses/NAME-DATE-TIME."""
     return home() / "diagnoses" / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
@@ -95,11 +104,10 @@ def diagnose_file(
 ) -> DiagnosisOutcome:
     """Diagnose a machine on recordings, write OUT and track it as a run.
 
-    Everything that can be wrong with files and options is looked at before the work starts. OUT changes only once the
-    work is done.
+    Files and options are checked before the work starts. OUT changes only once the work is done.
 
     Args:
-        caller: how the steps are run; here and now by default.
+        caller: how the steps run; as plain calls by default.
         work: another diagnosis than the library's.
 
     Raises:
@@ -144,7 +152,7 @@ def check_diagnosis(request: DiagnosisRequest) -> tuple[Machine, str]:
 
 
 def write_diagnosis(d: Diagnosis, out: Path, text: str, report: bool = True) -> tuple[dict[str, Path], str]:
-    """Fill OUT, all files or none; gives them by name, and why the machine file is missing where it should be there.
+    """Fill OUT, all files or none; returns them by name, and why the machine file is missing where one is due.
 
     Args:
         text: of the machine file that was diagnosed.
@@ -157,7 +165,7 @@ def write_diagnosis(d: Diagnosis, out: Path, text: str, report: bool = True) -> 
     machine_file, trouble = None, ""
     try:
         machine_file = new_machine_file(d, text, f"machine file {out / MACHINE}", datetime.now().astimezone())
-    except (InputError, WorkError) as error:  # the findings are worth having all the same
+    except (InputError, WorkError) as error:  # the findings are written all the same
         trouble = str(error)
     with staged(out, FILES) as scratch:
         (scratch / FINDINGS).write_text(as_json(_naming_plan(d)), encoding="utf-8")
@@ -186,15 +194,15 @@ def new_machine_file(d: Diagnosis, text: str, where: str, when: datetime) -> str
     if not (d.added or d.values):
         return text
     rms = {k: v for k, v in f.fit.left_out_rms.after.items() if v is not None}
-    words = f"diagnosis: {f.verdict.replace('_', ' ')}"
+    remarks = f"diagnosis: {f.verdict.replace('_', ' ')}"
     if rms:
-        words += f"; left_out_rms: over all rows of {f.fit.batches} left-out batches"
-    origin = Origin(f.batches, when.isoformat(timespec="seconds"), d.simulated, rms, words)
+        remarks += f"; left_out_rms: over all rows of {f.fit.batches} left-out batches"
+    origin = Origin(f.batches, when.isoformat(timespec="seconds"), d.simulated, rms, remarks)
     return diagnosed_text(text, where, d.values, d.intervals, d.added, d.notes, origin)
 
 
 def _naming_plan(d: Diagnosis) -> Findings:
-    """The findings, whose next run names the plan that lies beside them."""
+    """The findings, whose next run names the plan file next to them."""
     run = d.findings.next_experiment
     if run is None:
         return d.findings
@@ -207,7 +215,7 @@ def _diagnosed(
 ) -> Diagnosis:
     last = ""
 
-    def told(step: str, n: int, of: int) -> None:
+    def progress(step: str, n: int, of: int) -> None:
         nonlocal last
         if of and done is not None:
             done(step, n, of)
@@ -217,11 +225,11 @@ def _diagnosed(
 
     work = work or library_diagnosis()
     cache = home() / "diagnosis_cache"
-    return work(machine, batches, seed=seed, processes=os.cpu_count() or 1, cache=cache, progress=told)
+    return work(machine, batches, seed=seed, processes=os.cpu_count() or 1, cache=cache, progress=progress)
 
 
 def library_diagnosis() -> Diagnose:
-    """The product's own diagnosis; imported late, because it takes a while."""
+    """The library's diagnosis; imported here because its import takes seconds."""
     from diagnosis.diagnose import diagnose
 
     return diagnose
@@ -235,11 +243,9 @@ def _track(
     say: Say,
     files: Mapping[str, Path],
 ) -> str:
-    from pipelines.diagnosis_tracking import log_diagnosis
-
     params = {"machine_file": request.machine_file.name, "seed": request.seed}
     try:
-        return log_diagnosis(d, batches, files, settings, params=params, say=say)
+        return tracking.log_diagnosis(d, batches, files, settings, params=params, say=say)
     except WorkError as error:
         raise WorkError(f"{error}; the diagnosis is written to {request.out}, and not tracked") from None
 
@@ -256,3 +262,120 @@ def _check_same_machine(path: Path, machine: str) -> None:
         raise InputError(f"{path}: is there and is no findings file of a diagnosis; give another --out")
     if before["machine"] != machine:
         raise InputError(f"{path}: is a diagnosis of {before['machine']}, not of {machine}; give another --out")
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A twin family's left-out S of a channel: its mean in the last training, and now, on `n_new` new batches.
+
+    Where no batch is new (`n_new` 0) it is the mean over all of them.
+    """
+
+    target: str
+    family: str
+    before_um: float
+    after_um: float
+    n_new: int
+
+    @property
+    def share(self) -> float:
+        """0.25 for a quarter more."""
+        return self.after_um / self.before_um - 1 if self.before_um > 0 else math.nan
+
+    @property
+    def summary(self) -> str:
+        where = f"{self.n_new} new batch{'' if self.n_new == 1 else 'es'}" if self.n_new else "the same batches"
+        return (
+            f"{self.target}: left-out S of the family {self.family} is {self.after_um:.2f} µm on {where}, was "
+            f"{self.before_um:.2f} µm ({100 * self.share:+.0f} %)"
+        )
+
+
+def greatest_growth(now: Mapping[str, GridResult], settings: Settings, ids: Mapping[str, str]) -> Growth | None:
+    """The twin family and channel whose left-out error grew most since the last training; None without one before.
+
+    A family that learns from the residual or the sensors hides what the physics lacks, so each counts for itself.
+
+    Args:
+        now: results by channel, just trained.
+        ids: their trainings, which are tracked already and are not the last ones.
+
+    Raises:
+        WorkError: the store does not answer.
+    """
+    found: list[Growth] = []
+    for result in now.values():
+        families = [f for f in result.cells["family"].unique() if f in FAMILIES and FAMILIES[f].needs_twin]
+        last = _last_result(result, settings, ids) if families else None
+        if last is not None:
+            found += [g for f in families if (g := growth(last, result, f, settings.promotion)) is not None]
+    return max((g for g in found if math.isfinite(g.share)), key=lambda g: g.share, default=None)
+
+
+def growth(before: GridResult, after: GridResult, family: str, rule: PromotionRule) -> Growth | None:
+    """Of a family's best cells in two trainings; None where one of them has none with a finite score.
+
+    New batches count by id and content, since the mean over all dilutes what a season has brought.
+    """
+    old, new = (_left_out_of(result, family, rule) for result in (before, after))
+    if old is None or new is None:
+        return None
+    known = set(before.batches["digest"].astype(str))
+    fresh = [s for digest, s in new if digest not in known]
+    scores = fresh or [s for _, s in new]
+    return Growth(after.target, family, float(np.mean([s for _, s in old])), float(np.mean(scores)), len(fresh))
+
+
+def diagnose_if_grown(
+    machine_file: Path,
+    now: Mapping[str, GridResult],
+    ids: Mapping[str, str],
+    settings: Settings,
+    say: Say = lambda text: None,
+    work: Diagnose | None = None,
+) -> tuple[DiagnosisOutcome | None, str]:
+    """Diagnose on all batches of the lake where the error has grown by more than the settings allow.
+
+    Returns the outcome and a summary, empty where nothing was to be done. A diagnosis that fails does not affect the
+    training that it follows; the summary states why. It is written to `dated_folder`.
+    """
+    limit = settings.diagnose.when_error_grows_by
+    if limit is None:
+        return None, ""
+    try:
+        grown = greatest_growth(now, settings, ids)
+        if grown is None or grown.share <= limit:
+            return None, ""
+        say(f"diagnose: {grown.summary}")
+        machine = next(iter(now.values())).machine
+        request = DiagnosisRequest(machine_file, dated_folder(machine))
+        outcome = diagnose_file(request, settings, say, work=work)
+    except (InputError, WorkError) as error:
+        return None, f"not diagnosed: {error}"
+    except Exception as error:
+        return None, f"not diagnosed: {type(error).__name__}: {error}"
+    return outcome, f"{grown.summary}; {outcome.summary}"
+
+
+def _last_result(result: GridResult, settings: Settings, ids: Mapping[str, str]) -> GridResult | None:
+    past = tracking.trainings(result.machine, result.target, settings)
+    past = past[~past["training_id"].isin(list(ids.values()))]
+    if past.empty:
+        return None
+    try:
+        return tracking.load_training(str(past.iloc[0]["training_id"]), settings).result
+    except InputError:  # its tables are gone
+        return None
+
+
+def _left_out_of(result: GridResult, family: str, rule: PromotionRule) -> list[tuple[str, float]] | None:
+    """Digest and left-out S of every batch, by the family's best cell."""
+    cells = result.cells[(result.cells["protocol"] == rule.protocol) & (result.cells["family"] == family)]
+    cells = cells.assign(score_um=score_um(cells, rule))
+    cells = cells[np.isfinite(cells["score_um"])]
+    if cells.empty:
+        return None
+    best = cells.nsmallest(1, "score_um").iloc[0]
+    table = left_out(result, rule.protocol, str(best["selector"]), family, int(best["n_tsp"]))
+    rows = [(str(d), float(s)) for d, s in zip(table["digest"], table["S_um"], strict=True) if np.isfinite(s)]
+    return rows or None

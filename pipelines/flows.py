@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
-from zoneinfo import available_timezones
+from zoneinfo import ZoneInfo, available_timezones
 
+from cronsim import CronSim, CronSimError
 from prefect import flow, task
 from prefect import settings as prefect_settings
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.schedules import CronSchedule
 from prefect.server.api.server import SubprocessASGIServer
-from prefect.server.schemas.schedules import CronSchedule as ScheduleDates
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.types.entrypoint import EntrypointType
 from threadpoolctl import threadpool_limits
 
 from data.errors import InputError, WorkError
-from pipelines.caller import LANES, Done, gather
+from pipelines.caller import LANES, Done, Say, gather
 from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
-from pipelines.request import TrainRequest
 from pipelines.settings import Settings, load
-from pipelines.training import TrainOutcome, train
+from pipelines.training import TrainOutcome, TrainRequest, train
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -62,7 +60,7 @@ class PrefectCaller:
 
 
 def _can_succeed(task: Any, run: Any, state: Any) -> bool:
-    """Whether another try may help: what the user gave does not get better by waiting."""
+    """Whether another try may help: input that cannot be used does not improve by waiting."""
     try:
         state.result()
     except InputError:
@@ -75,7 +73,8 @@ def _can_succeed(task: Any, run: Any, state: Any) -> bool:
 def start_server() -> threading.Thread | None:
     """Start Prefect's temporary server in the background, so that it comes up while other work goes on.
 
-    None where PREFECT_API_URL names a running one. The flow finds the same server again.
+    None where PREFECT_API_URL names a running one. The flow finds the same server again. Prefect starts this server
+    by itself as well, but only when the flow begins, and has no public way to start it earlier or to stop it.
     """
     if prefect_settings.PREFECT_API_URL.value():
         return None
@@ -87,7 +86,7 @@ def start_server() -> threading.Thread | None:
 def train_in_flow(
     request: TrainRequest,
     settings: Settings,
-    say: Callable[[str], None] = lambda text: None,
+    say: Say = lambda text: None,
     done: Done | None = None,
     server: threading.Thread | None = None,
 ) -> TrainOutcome:
@@ -100,38 +99,38 @@ def train_in_flow(
 
     if server is not None:
         server.join()
-    _one_line_of_trouble()
+    _quiet_prefect()
     return training()
 
 
 @flow(name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
 def retrain(machine_file: str, recordings: list[str]) -> str:
-    """Ingest what arrived since the last time and train if there is anything new; returns what was done, in words.
+    """Ingest what arrived since the last time and train if there is anything new; returns a summary.
 
-    What stops it is printed in one line, and the run counts as failed.
+    An error is printed in one line, and the run counts as failed.
     """
-    _one_line_of_trouble()
+    _quiet_prefect()
     request = TrainRequest(Path(machine_file), tuple(Path(r) for r in recordings), only_if_new=True)
     try:
         outcome = train(request, load(), PrefectCaller())
     except (InputError, WorkError) as error:
         print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {error}", flush=True)
         raise
-    words = outcome.stopped or "; ".join(p.words for p in outcome.promotions.values())
+    summary = outcome.stopped or "; ".join(p.summary for p in outcome.promotions.values())
     quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
-    words += f" (files in quarantine: {quarantined})" if quarantined else ""
-    words += f"; {outcome.diagnosis_words}" if outcome.diagnosis_words else ""
-    print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {words}", flush=True)
-    return words
+    summary += f" (files in quarantine: {quarantined})" if quarantined else ""
+    summary += f"; {outcome.diagnosis_summary}" if outcome.diagnosis_summary else ""
+    print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {summary}", flush=True)
+    return summary
 
 
 @flow(name="thermodrift-diagnose", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
 def diagnose(machine_file: str, recordings: list[str], out: str = "") -> str:
-    """`pipelines.diagnosing.diagnose_file` as a flow, in a folder of its own day where no `out` is given; in words.
+    """`pipelines.diagnosing.diagnose_file` as a flow, in a dated folder where no `out` is given; returns a summary.
 
-    What stops it is printed in one line, and the run counts as failed.
+    An error is printed in one line, and the run counts as failed.
     """
-    _one_line_of_trouble()
+    _quiet_prefect()
     file = Path(machine_file)
     folder = Path(out) if out else dated_folder(file.stem)
     request = DiagnosisRequest(file, folder, tuple(Path(r) for r in recordings), overwrite=True)
@@ -141,54 +140,55 @@ def diagnose(machine_file: str, recordings: list[str], out: str = "") -> str:
         print(f"{datetime.now():%Y-%m-%d %H:%M} not diagnosed: {error}", flush=True)
         raise
     machine = outcome.diagnosis.findings.machine
-    print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {outcome.words}", flush=True)
-    return outcome.words
+    print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {outcome.summary}", flush=True)
+    return outcome.summary
 
 
 def serve_schedule(
     machine_file: Path,
     recordings: Sequence[Path],
     cron: str,
-    say: Callable[[str], None] = lambda text: None,
+    say: Say = lambda text: None,
     rounds: int | None = None,
 ) -> None:
-    """Retrain on a cron schedule in local time until interrupted (or for `rounds`): recordings dropped in are learned.
+    """Retrain on a cron schedule in local time until interrupted (or for `rounds`).
 
     Where PREFECT_API_URL names a server, a deployment is served whose runs that server schedules. Without one this
     process waits by itself and starts Prefect's temporary server for each run, because such a server schedules
-    nothing. What goes wrong in one run is said, and the next one comes all the same.
+    nothing. An error in one run is printed; the next one follows all the same.
 
     Raises:
         InputError: `cron` is no cron expression.
     """
+    zone = ZoneInfo(local_timezone())
     try:
-        schedule = CronSchedule(cron=cron, timezone=local_timezone())
-    except ValueError:
+        schedule = CronSchedule(cron=cron, timezone=zone.key)
+        CronSim(cron, datetime.now(zone))
+    except (ValueError, CronSimError):
         raise InputError(
             f"--cron: got {cron!r}, expected five fields (minute hour day month weekday), such as '0 5 * * 1' for "
             "Mondays at 5:00"
         ) from None
     parameters = {"machine_file": str(machine_file.resolve()), "recordings": [str(r.resolve()) for r in recordings]}
     if prefect_settings.PREFECT_API_URL.value():
-        say(f"retraining of {machine_file.stem} at '{cron}' ({schedule.timezone}); Ctrl-C ends it")
+        say(f"retraining of {machine_file.stem} at '{cron}' ({zone.key}); Ctrl-C ends it")
         retrain.serve(
             name=f"retrain-{machine_file.stem}",
             schedule=schedule,
             parameters=parameters,
             limit=1,
             print_starting_message=False,
-            entrypoint_type=EntrypointType.MODULE_PATH,  # a file path would be one relative to where we stand
+            entrypoint_type=EntrypointType.MODULE_PATH,  # a file path would be relative to the working directory
         )
         return
-    dates = ScheduleDates(cron=schedule.cron, timezone=schedule.timezone)
     while rounds is None or rounds > 0:
-        (due,) = asyncio.run(dates.get_dates(1, start=datetime.now(UTC) + timedelta(seconds=1)))
+        due = next(CronSim(cron, datetime.now(zone)))  # from now on: a run may last past the next date
         say(f"retraining of {machine_file.stem} next at {due:%Y-%m-%d %H:%M %Z}; Ctrl-C ends it")
         _wait_until(due)
         try:
             retrain(**parameters)
         except (InputError, WorkError):
-            pass  # told by the flow
+            pass  # the flow has printed it
         except Exception as error:
             print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {type(error).__name__}: {error}", flush=True)
         finally:
@@ -203,13 +203,13 @@ def _wait_until(due: datetime) -> None:
 
 
 def local_timezone() -> str:
-    """The IANA name of the local time zone, UTC where the system does not tell."""
+    """The IANA name of the local time zone, UTC where the system does not state it."""
     named = os.environ.get("TZ", "").lstrip(":")
     linked = Path("/etc/localtime").resolve().as_posix().partition("zoneinfo/")[2]
     return next((z for z in (named, linked) if z in available_timezones()), "UTC")
 
 
-def _one_line_of_trouble() -> None:
-    """What goes wrong is told once, by the command, in one line; Prefect would log it with a traceback."""
+def _quiet_prefect() -> None:
+    """The command prints an error once, in one line; Prefect would log it with a traceback."""
     for name in ("prefect.flow_runs", "prefect.task_runs"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -45,8 +45,8 @@ class StoredModel:
     def channels(self) -> tuple[str, ...]:
         """The channels that a recording must have: those of the inputs, and what drives it as `fitted` names it."""
         drivers = self.machine.names("driver", "ambient", "temperature", "position")
-        words = (w for v in self.family.fitted.values() for w in (v if isinstance(v, list) else [v]))
-        named = [w for w in words if isinstance(w, str) and w in drivers]
+        texts = (w for v in self.family.fitted.values() for w in (v if isinstance(v, list) else [v]))
+        named = [w for w in texts if isinstance(w, str) and w in drivers]
         needed: dict[str, None] = {}
         for name in self.family.inputs:
             channel, _, kind = name.partition("@")
@@ -63,17 +63,17 @@ class StoredModel:
         """
         absent = [c for c in self.channels() if c not in batch.table or not np.isfinite(batch.values(c)).any()]
         if absent:
-            words = ", ".join(f"{c!r} (column {self._column(c)!r})" for c in absent)
+            needed = ", ".join(f"{c!r} (column {self._column(c)!r})" for c in absent)
             have = [c for c in batch.names("temperature", "ambient", "driver") if c in batch.table]
             raise InputError(
-                f"{batch.source or 'batch'} {batch.batch_id}: the model of {self.machine.machine} needs {words}, "
+                f"{batch.source or 'batch'} {batch.batch_id}: the model of {self.machine.machine} needs {needed}, "
                 f"which the recording does not have; it has {', '.join(have) or 'no input at all'}; "
                 "give a recording with every input, or a model with fewer"
             )
         return self.family.predict(batch)
 
     def outside(self, batch: Batch) -> list[str]:
-        """For every row, which inputs, drivers or start temperatures lie beyond what training saw, joined by ", "."""
+        """Per row the inputs, drivers or start temperatures outside the trained region, joined by ", "."""
         out = [""] * batch.n_rows
         for name, hit in self.region.outside(batch, self.family.inputs).items():
             for i in np.flatnonzero(hit):
@@ -81,11 +81,11 @@ class StoredModel:
         return out
 
     def distance(self, batch: Batch) -> Array:
-        """How far each row (n,) lies outside the trained region, in trained widths; 0 inside."""
+        """Distance of each row (n,) from the trained region, in trained widths; 0 inside."""
         return self.region.distance(watched(batch, self.family.inputs))
 
     def expected_S_um(self, distance: Array) -> Array:
-        """S (n,) that batches so far away were left with, µm; NaN where nobody measured it."""
+        """Expected S (n,) at these distances, µm; NaN where it was not measured."""
         return np.full(len(distance), np.nan) if self.rise is None else self.rise.expected_um(distance)
 
     def _column(self, channel: str) -> str | int:
@@ -174,7 +174,7 @@ def predict_frame(model: StoredModel, table: pd.DataFrame) -> pd.DataFrame:
     for batch_id, rows in groups:
         batch = frame_to_batch(model, table.iloc[rows], batch_id)
         predicted[rows] = model.predict(batch)
-        outside[rows] = [bool(words) for words in model.outside(batch)]
+        outside[rows] = [bool(names) for names in model.outside(batch)]
     return pd.DataFrame({"predicted_um": predicted, "outside_region": outside}, index=table.index)
 
 

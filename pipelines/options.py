@@ -1,8 +1,9 @@
-"""Options that several commands share, and lists of names as they are given on the command line."""
+"""Options that several commands share, and checks of what the command line gives."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from data.errors import InputError, closest
 
 MachineFile = Annotated[Path, typer.Option("--machine", help="machine file (.yml)")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of tables")]
+Workers = Annotated[int | None, typer.Option(help="processes; default: one per core")]
 
 
 def split(given: str) -> tuple[str, ...]:
@@ -31,3 +33,20 @@ def names(given: str, allowed: Iterable[str], kind: str) -> tuple[str, ...]:
         if n not in known:
             raise InputError(f"unknown {kind} {n!r}: {closest(n, known)}")
     return chosen or known
+
+
+def check_suffix(what: str, path: Path, allowed: Sequence[str]) -> None:
+    """Raises InputError where a file's suffix is none of `allowed`."""
+    if path.suffix not in allowed:
+        raise InputError(f"{what} {path}: got suffix {path.suffix!r}, expected {' or '.join(allowed)}")
+
+
+def processes(workers: int | None) -> int:
+    """The number of processes; one per core by default.
+
+    Raises:
+        InputError: fewer than one.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers: got {workers}, expected 1 or more")
+    return workers or os.cpu_count() or 1

@@ -1,6 +1,6 @@
 """The stored model as MLflow serves it: time_s and input channels in, predicted_um and outside_region out.
 
-MLflow keeps this file beside the model's plain data and runs it at load, so that nothing is pickled.
+MLflow keeps this file next to the model's plain data and runs it at load, so that nothing is pickled.
 """
 
 from __future__ import annotations

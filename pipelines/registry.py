@@ -1,21 +1,28 @@
-"""The registry side of promotion: versions, the aliases champion and challenger, roll-back and the state of things."""
+"""The model registry: versions in MLflow, promotion, the aliases champion and challenger, roll-back, and its status."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, Literal
 
+import mlflow
 import pandas as pd
 import yaml
 from filelock import FileLock
 from mlflow.entities.model_registry import ModelVersion
 from mlflow.exceptions import MlflowException
+from mlflow.models import ModelSignature
 from mlflow.protos.databricks_pb2 import RESOURCE_DOES_NOT_EXIST, ErrorCode
 from mlflow.tracking import MlflowClient
+from mlflow.types import ColSpec, Schema
 
 from data.batch import Batch
 from data.errors import InputError, closest
@@ -25,21 +32,20 @@ from models.metrics import residual_std_um
 from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
 from models.trust import Region, Rise
-from pipelines import model_store
-from pipelines.model_log import local_folder, log_version
+from pipelines import model_store, pyfunc_model
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
-CHAMPION, CHALLENGER = "champion", "challenger"
+_MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 Outcome = Literal["champion", "challenger", "unchanged"]
 
 
 @dataclass(frozen=True)
 class Promotion:
-    """What became of a training's best cell. `version` holds its model; `champion_version` runs on the machine now.
+    """The outcome for a training's best cell. `version` holds its model; `champion_version` is the champion now.
 
-    `against` is the version that it was compared with, `obstacle` why that could not be done; `caution` and the nested
-    score are the choice's (see `promotion.Choice`).
+    `against` is the version that it was compared with, `obstacle` the reason why no comparison was possible; `caution`
+    and the nested score are the choice's (see `promotion.Choice`).
     """
 
     outcome: Outcome
@@ -48,7 +54,7 @@ class Promotion:
     champion_version: int
     cell: str
     caution: str
-    words: str
+    summary: str
     comparison: Comparison | None = None
     against: int | None = None
     obstacle: str = ""
@@ -65,106 +71,144 @@ class Promotion:
         return f"models:/{self.name}/{self.version}"
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        kept = asdict(self)
+        return {**kept, "words": kept.pop("summary")}
 
 
-def promote(
-    result: GridResult,
-    choice: Choice,
-    family: Family,
-    machine_yaml: str,
-    training_id: str,
-    settings: Settings,
-    region: Region,
-    batches: Sequence[Batch] = (),
-    *,
-    force: bool = False,
-) -> Promotion:
+@dataclass(frozen=True)
+class Newcomer:
+    """A chosen cell, refitted on all batches of its training.
+
+    Args:
+        machine_yaml: text of the machine file; it is stored with the model.
+        region: where the model was trained.
+        batches: the training's batches; with them the champion is also compared on those that it has not seen.
+    """
+
+    result: GridResult
+    choice: Choice
+    family: Family
+    machine_yaml: str
+    training_id: str
+    region: Region
+    batches: Sequence[Batch] = ()
+
+    @property
+    def fingerprint(self) -> str:
+        """Same batches (id and content), same cell, same meaning of the machine file: same fingerprint."""
+        table, choice = self.result.batches, self.choice
+        seen = sorted((str(b), str(d)) for b, d in zip(table["batch_id"], table["digest"], strict=True))
+        cell = [choice.protocol, choice.cell, list(choice.inputs)]
+        content = json.dumps([seen, *cell, yaml.safe_load(self.machine_yaml)], sort_keys=True, default=str)
+        return hashlib.sha256(content.encode()).hexdigest()
+
+
+def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promotion:
     """Register the refitted model of the chosen cell and decide whether it becomes the champion.
 
     The newcomer replaces a champion only if `promotion.compare_paired` finds it better on the same batches: the
-    left-out S of both on the batches that both trainings share, and, where `batches` are given, the champion's own
-    prediction on batches that it has not seen against the newcomer's left-out one. The same data, cell and machine
-    file again make no new version.
+    left-out S of both on the batches that both trainings share, and, where `Newcomer.batches` are given, the
+    champion's own prediction on batches that it has not seen against the newcomer's left-out one. The same data, cell
+    and machine file again make no new version.
 
     Args:
-        family: the cell refitted on all batches.
-        machine_yaml: text of the machine file; it travels with the model.
-        region: where it was trained.
-        batches: the training's batches (optional).
         force: make it the champion whatever the comparison says; the reason says so.
 
     Raises:
         WorkError: the store does not answer.
     """
-    name = settings.model(result.machine, result.target)
-    fingerprint = _fingerprint(result, choice, machine_yaml)
-    (settings.home / "locks").mkdir(parents=True, exist_ok=True)
+    name = settings.model(new.result.machine, new.result.target)
     client = open_store(settings)
-    with FileLock(settings.home / "locks" / f"{name}.lock"), store_errors(settings):
+    with _locked(name, settings):
         champion = _by_alias(client, name, CHAMPION)
+        fingerprint = new.fingerprint
         same = [v for v in _versions(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags]
         if same and (champion is not None or force):
-            version = same[0].version
-            words = f"{name}: same batches, cell and machine file as version {version}; nothing new registered"
-            if force and (champion is None or champion.version != version):
-                if champion is not None:
-                    client.set_model_version_tag(name, version, "replaces", champion.version)
-                _crown(client, name, version, champion)
-                words += f"; version {version} is champion by force"
-            stays = version if champion is None or force else champion.version
-            done = Promotion("unchanged", name, int(version), int(stays), choice.cell, choice.caution, words,
-                             nested_S_mean_um=choice.nested_S_mean_um,
-                             nested_S_std_um=choice.nested_S_std_um)  # fmt: skip
-            record_promotion(client, training_id, done.as_dict())
-            return done
-        comparison, obstacle, why = None, "", "first model of this machine and channel"
-        if champion is not None:
-            comparison, obstacle, why = _against(champion, result, choice, settings, batches)
-        replaces = champion is None or force or (comparison is not None and comparison.better)
-        if force and champion is not None:
-            why = f"by force; {why}"
-        info = {
-            "training_id": training_id, "cell": choice.cell, "n_batches": len(result.batches),
-            "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.words,
-            "trained_at": pd.Timestamp.now("UTC").isoformat(timespec="seconds"), "trusted": choice.trusted,
-            "caution": choice.caution,
-        }  # fmt: skip
-        tags = {k: _text(v) for k, v in info.items() if k != "choice"} | {
-            "fingerprint": fingerprint, "machine": result.machine, "target": result.target, "reason": why,
-            "selector": choice.selector, "family": choice.family, "n_tsp": str(choice.n_tsp),
-            "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
-            **({"replaces": champion.version} if champion is not None and replaces else {}),
-        }  # fmt: skip
-        rise = Rise.of_cell(result.distances, choice.cell)
-        new = log_version(client, name, family, machine_yaml, region, rise, info, tags, training_id)
-        client.update_model_version(name, new, ("SIMULATED. " if result.simulated else "") + choice.words)
-        client.set_registered_model_tag(name, "simulated", _text(result.simulated))
-        if replaces:
-            _crown(client, name, new, champion)
-            outcome: Outcome = "champion"
+            done = _keep(client, same[0], champion, new.choice, force)
         else:
-            client.set_registered_model_alias(name, CHALLENGER, new)
-            outcome = "challenger"
-        client.set_model_version_tag(name, new, "outcome", outcome)  # last: what lacks it was interrupted
-        stays = new if replaces or champion is None else champion.version
-        words = f"{name} version {new} is {outcome}: {why}; {choice.words}"
-        against = int(champion.version) if champion is not None else None
-        done = Promotion(outcome, name, int(new), int(stays), choice.cell, choice.caution, words, comparison, against,
-                         obstacle, force, choice.nested_S_mean_um, choice.nested_S_std_um)  # fmt: skip
-        record_promotion(client, training_id, done.as_dict())
+            done = _register(client, name, champion, new, settings, force)
+        record_promotion(client, new.training_id, done.as_dict())
         return done
 
 
+def _keep(
+    client: MlflowClient, same: ModelVersion, champion: ModelVersion | None, choice: Choice, force: bool
+) -> Promotion:
+    """No new version: one of the same fingerprint exists; by force it becomes the champion."""
+    name, version = same.name, same.version
+    summary = f"{name}: same batches, cell and machine file as version {version}; nothing new registered"
+    if force and (champion is None or champion.version != version):
+        if champion is not None:
+            client.set_model_version_tag(name, version, "replaces", champion.version)
+        _crown(client, name, version, champion)
+        summary += f"; version {version} is champion by force"
+    stays = version if champion is None or force else champion.version
+    return Promotion(
+        "unchanged", name, int(version), int(stays), choice.cell, choice.caution, summary,
+        nested_S_mean_um=choice.nested_S_mean_um, nested_S_std_um=choice.nested_S_std_um,
+    )  # fmt: skip
+
+
+def _register(
+    client: MlflowClient, name: str, champion: ModelVersion | None, new: Newcomer, settings: Settings, force: bool
+) -> Promotion:
+    """A new version, compared with the champion, as champion or challenger."""
+    choice = new.choice
+    comparison, obstacle, why = None, "", "first model of this machine and channel"
+    if champion is not None:
+        comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
+        why = f"by force; {why}" if force else why
+    replaces = champion is None or force or (comparison is not None and comparison.better)
+    outcome: Outcome = "champion" if replaces else "challenger"
+    info = _info(new)
+    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | {"reason": why}
+    if champion is not None and replaces:
+        tags["replaces"] = champion.version
+    version = _log_version(client, name, new, info, tags)
+    simulated = new.result.simulated
+    client.update_model_version(name, version, ("SIMULATED. " if simulated else "") + choice.summary)
+    client.set_registered_model_tag(name, "simulated", _text(simulated))
+    if replaces:
+        _crown(client, name, version, champion)
+    else:
+        client.set_registered_model_alias(name, CHALLENGER, version)
+    client.set_model_version_tag(name, version, "outcome", outcome)  # last: what lacks it was interrupted
+    return Promotion(
+        outcome, name, int(version), int(version if replaces or champion is None else champion.version), choice.cell,
+        choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
+        None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
+        choice.nested_S_std_um,
+    )  # fmt: skip
+
+
+def _info(new: Newcomer) -> dict[str, Any]:
+    """What is stored with the model."""
+    choice, result = new.choice, new.result
+    return {
+        "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
+        "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary, "trained_at": _now(),
+        "trusted": choice.trusted, "caution": choice.caution,
+    }  # fmt: skip
+
+
+def _tags(new: Newcomer) -> dict[str, str]:
+    """Tags of the version beyond those of `_info`."""
+    choice, result = new.choice, new.result
+    return {
+        "fingerprint": new.fingerprint, "machine": result.machine, "target": result.target,
+        "selector": choice.selector, "family": choice.family, "n_tsp": str(choice.n_tsp),
+        "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
+    }  # fmt: skip
+
+
 def rollback(name: str, settings: Settings) -> Promotion:
-    """Give the alias champion back to the version that the present champion replaced.
+    """Make the version that the present champion replaced the champion again.
 
     Raises:
         InputError: unknown model, no champion, or nothing that it replaced.
     """
     client = open_store(settings)
-    (settings.home / "locks").mkdir(parents=True, exist_ok=True)
-    with FileLock(settings.home / "locks" / f"{name}.lock"), store_errors(settings):
+    with _locked(name, settings):
         present = find_version(client, name, CHAMPION)
         previous = present.tags.get("replaces")
         if not previous:
@@ -174,9 +218,9 @@ def rollback(name: str, settings: Settings) -> Promotion:
         client.set_model_version_tag(name, present.version, "was_champion_until", _now())
         client.set_model_version_tag(name, present.version, "rolled_back", "true")
         client.delete_model_version_tag(name, back.version, "was_champion_until")
-    words = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
+    summary = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
     return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
-                     back.tags.get("caution", ""), words)  # fmt: skip
+                     back.tags.get("caution", ""), summary)  # fmt: skip
 
 
 def status(settings: Settings) -> pd.DataFrame:
@@ -224,10 +268,17 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     return versions[which]
 
 
+def local_folder(uri: str, settings: Settings) -> str:
+    """The local folder of a model's files; downloaded if the store is remote."""
+    open_store(settings)
+    with store_errors(settings):
+        return str(mlflow.artifacts.download_artifacts(artifact_uri=uri, tracking_uri=settings.store_uri))
+
+
 def _against(
     champion: ModelVersion, result: GridResult, choice: Choice, settings: Settings, batches: Sequence[Batch]
 ) -> tuple[Comparison | None, str, str]:
-    """The paired comparison with a champion, what stood in its way (None, why), and the reason in words."""
+    """The paired comparison with a champion (None with the obstacle), and the reason as a sentence."""
     tags = champion.tags
     try:
         then = load_training(tags.get("training_id", ""), settings).result
@@ -260,20 +311,21 @@ def _score_unseen(
     return pd.DataFrame(rows, columns=["batch_id", "digest", "S_um"])
 
 
+@contextmanager
+def _locked(name: str, settings: Settings) -> Iterator[None]:
+    """One process at a time changes a model's versions and aliases."""
+    folder = settings.home / "locks"
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / f"{name}.lock"), store_errors(settings):
+        yield
+
+
 def _crown(client: MlflowClient, name: str, new: str, previous: ModelVersion | None) -> None:
     client.set_registered_model_alias(name, CHAMPION, new)
     if previous is not None:
         client.set_model_version_tag(name, previous.version, "was_champion_until", _now())
     if CHALLENGER in client.get_registered_model(name).aliases:  # it lost to an older champion
         client.delete_registered_model_alias(name, CHALLENGER)
-
-
-def _fingerprint(result: GridResult, choice: Choice, machine_yaml: str) -> str:
-    """Same batches (id and content), same cell, same meaning of the machine file: same fingerprint."""
-    seen = sorted((str(b), str(d)) for b, d in zip(result.batches["batch_id"], result.batches["digest"], strict=True))
-    content = json.dumps([seen, choice.protocol, choice.cell, list(choice.inputs), yaml.safe_load(machine_yaml)],
-                         sort_keys=True, default=str)  # fmt: skip
-    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _versions(client: MlflowClient, name: str) -> list[ModelVersion]:
@@ -297,3 +349,60 @@ def _now() -> str:
 
 def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _log_version(client: MlflowClient, name: str, new: Newcomer, info: dict[str, Any], tags: dict[str, str]) -> str:
+    """Log the model below its training's run and make a registered version of it; returns its number.
+
+    Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
+    """
+    rise = Rise.of_cell(new.result.distances, new.choice.cell)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        model_store.save(folder, new.family, new.machine_yaml, new.region, info, rise)
+        stored = model_store.load(folder)
+        channels = stored.channels()
+        drivers = [d for d in stored.machine.names("driver") if d not in channels]
+        signature = ModelSignature(
+            inputs=Schema([
+                ColSpec("double", "time_s"), *(ColSpec("double", c) for c in channels),
+                *(ColSpec("double", d, required=False) for d in drivers), ColSpec("string", "batch_id", required=False),
+            ]),
+            outputs=Schema([ColSpec("double", "predicted_um"), ColSpec("boolean", "outside_region")]),
+        )  # fmt: skip
+        with mlflow.start_run(run_id=new.training_id):
+            logged = mlflow.pyfunc.log_model(
+                name="model",
+                python_model=str(Path(pyfunc_model.__file__).resolve()),
+                artifacts={f: str(folder / f) for f in model_store.FILES},
+                signature=signature,
+                input_example=_example(stored, [*channels, *drivers]),
+                pip_requirements=_requirements(new.family),
+            )
+    try:
+        client.create_registered_model(name, tags={"machine": tags["machine"], "target": tags["target"]})
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
+    made = client.create_model_version(
+        name, logged.model_uri, run_id=new.training_id, tags=tags, model_id=logged.model_id
+    )
+    return str(made.version)
+
+
+def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.DataFrame:
+    """Three rows in the middle of each channel's plausible range."""
+    step_s = stored.machine.recording.step_s
+    columns: dict[str, list[float]] = {"time_s": [0.0, step_s, 2 * step_s]}
+    for c in channels:
+        low, high = stored.machine.channels[c].range or (20.0, 20.0)
+        columns[c] = [0.5 * (low + high)] * 3
+    return pd.DataFrame(columns)
+
+
+def _requirements(family: Family) -> list[str]:
+    torch = ("torch",) if hasattr(sys.modules[type(family).__module__], "torch") else ()
+    return [f"{p}=={installed(p).partition('+')[0]}" for p in (*_MODEL_PACKAGES, *torch)]
+
+
+CHAMPION, CHALLENGER = "champion", "challenger"

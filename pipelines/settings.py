@@ -1,4 +1,8 @@
-"""`mlflow.yml`: store, names and rules; and the folder that everything is written to."""
+"""`mlflow.yml`: store, names and rules; and the home folder, which everything is written to.
+
+Both are looked for in the working directory, never in the installation: `var/` is the home unless THERMODRIFT_HOME
+names another folder; without an `mlflow.yml` the defaults below hold.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ from data.yaml_file import load_yaml
 from models.protocols import PromotionRule
 from pipelines import TELEMETRY_OFF
 
-PROJECT_ROOT = Path(__file__).resolve().parent.parent
+FILE = "mlflow.yml"
 _prefect_home_set_here = ""
 
 
@@ -93,31 +97,30 @@ class Settings:
 
 
 def home() -> Path:
-    """The folder that everything is written to: THERMODRIFT_HOME, else var/ in the project; absolute."""
-    given = os.environ.get("THERMODRIFT_HOME", "").strip()
-    return Path(given).expanduser().resolve() if given else PROJECT_ROOT / "var"
+    """The folder that everything is written to: THERMODRIFT_HOME, else var/ in the working directory; absolute."""
+    return Path(os.environ.get("THERMODRIFT_HOME", "").strip() or "var").expanduser().resolve()
 
 
 def configure_environment() -> None:
     """Telemetry of mlflow and prefect off and PREFECT_HOME below `home()`; call it before prefect is imported.
 
-    A PREFECT_HOME that the user set stays. Logs are quietened when `pipelines` is imported.
+    A PREFECT_HOME that the user set stays. Log levels are set when `pipelines` is imported.
     """
     global _prefect_home_set_here
     os.environ.update(TELEMETRY_OFF)
     if os.environ.get("PREFECT_HOME", "") in ("", _prefect_home_set_here):
         _prefect_home_set_here = os.environ["PREFECT_HOME"] = str(home() / "prefect")
-    # Prefect makes its folder but not the one above it, and its server then dies without a word.
+    # Prefect makes its folder but not the one above it; its server then stops without a message.
     Path(os.environ["PREFECT_HOME"]).expanduser().mkdir(parents=True, exist_ok=True)
 
 
 def load(path: Path | str | None = None) -> Settings:
-    """Read and check a settings file; without a path the project's `mlflow.yml`, or the defaults if it has none.
+    """Read and check a settings file; without a path the working directory's `mlflow.yml`, or the defaults.
 
     Raises:
         InputError: file missing, not YAML, an unknown key (with the closest), a wrong value; one line each.
     """
-    where = Path(path) if path is not None else PROJECT_ROOT / "mlflow.yml"
+    where = Path(path or FILE)
     parsed = _File() if path is None and not where.exists() else load_yaml(where, _File, "settings file")
     base = home()
     store = parsed.tracking.store.format(home=base.as_posix())

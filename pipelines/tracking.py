@@ -1,16 +1,22 @@
-"""Trainings in MLflow: an experiment per machine and error channel, a parent run per training, a run per model.
+"""Trainings and diagnoses in MLflow.
 
-The parent run keeps the whole `GridResult` as Parquet, so that a report is made from tracked runs alone.
+A training: an experiment per machine and error channel, a parent run, a child run per model. The parent run keeps the
+whole `GridResult` as Parquet, so that a report is made from tracked runs alone. A diagnosis: one run in the machine's
+experiment "diagnosis", with every file of OUT as an artifact.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import platform
+import re
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +27,14 @@ from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run,
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
 
+from data.batch import Batch
 from data.errors import InputError, WorkError
+from diagnosis.result import Diagnosis
 from models import FAMILIES
 from models.promotion import choose, score_um
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
+from pipelines.caller import Say
 from pipelines.settings import Settings, load
 
 _DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
@@ -69,7 +78,7 @@ def log_values(
     params: Mapping[str, str],
     tags: Mapping[str, str] | None = None,
 ) -> None:
-    """In one call, or in few where there are many metrics."""
+    """Log in one call, or in a few where there are many metrics."""
     for first in range(0, len(metrics) or 1, _METRICS_AT_ONCE):
         chunk = list(metrics[first : first + _METRICS_AT_ONCE])
         own = [Param(k, v) for k, v in params.items()] if not first else []
@@ -94,12 +103,12 @@ def finished_runs(client: MlflowClient, kind: str) -> list[Run]:
 
 
 def started(run: Run) -> pd.Timestamp:
-    """When, UTC."""
+    """The start time, UTC."""
     return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
 
 
 def yes_or_no(value: bool) -> str:
-    """As tags hold it."""
+    """A flag as tags hold it."""
     return "true" if value else "false"
 
 
@@ -111,12 +120,8 @@ _GRID = "grid"
 _OPENING = threading.Lock()  # MLflow's own lock on a first migration holds between processes only
 
 
-def _silent(_: str) -> None:
-    pass
-
-
-def open_store(settings: Settings, say: Callable[[str], None] = _silent) -> MlflowClient:
-    """A client of the tracking store; makes the SQLite file at the first use, which takes seconds and is said.
+def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient:
+    """A client of the tracking store; the first use makes the SQLite file, which takes seconds and is reported.
 
     Threads may call it at once.
 
@@ -127,7 +132,7 @@ def open_store(settings: Settings, say: Callable[[str], None] = _silent) -> Mlfl
     with _OPENING, store_errors(settings):
         if file is not None and not file.exists():
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
-        # A logged model's files are looked up in the process-wide store, whatever store is asked for.
+        # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)
         mlflow.set_registry_uri(settings.store_uri)
         client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
@@ -137,7 +142,7 @@ def open_store(settings: Settings, say: Callable[[str], None] = _silent) -> Mlfl
 
 @contextmanager
 def store_errors(settings: Settings) -> Iterator[None]:
-    """Turns MLflow's trouble into one line."""
+    """Turn MLflow's errors into one line."""
     try:
         yield
     except MlflowException as error:
@@ -153,9 +158,9 @@ def log_training(
     *,
     figures: dict[str, bytes] | None = None,
     params: dict[str, Any] | None = None,
-    say: Callable[[str], None] = _silent,
+    say: Say = lambda text: None,
 ) -> str:
-    """Track one training and give back its id (the parent run's).
+    """Track one training; returns its id (the parent run's).
 
     Parent run: the tables as Parquet under grid/, figures (file name -> bytes) under figures/, the lake's batches as
     dataset inputs. One child run per selector × family: metrics ``leave_batch_out/S_mean_um`` and so on with n_tsp
@@ -169,18 +174,19 @@ def log_training(
         experiment = experiment_id(client, settings, result.machine, result.target, result.simulated)
         common = {"simulated": yes_or_no(result.simulated), "machine": result.machine, "target": result.target}
         name = f"{result.machine} {result.target} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
-        parent = client.create_run(experiment, tags={**common, "kind": "training"}, run_name=name).info.run_id
+        run = client.create_run(experiment, tags={**common, "kind": "training"}, run_name=name)
+        parent = str(run.info.run_id)
         status = "FAILED"
         try:
             _log_parent(client, parent, result, settings.promotion, params or {})
             _log_files(client, parent, result, figures or {})
             client.log_inputs(parent, datasets=dataset_inputs(result.batches))
-            for (selector, family), cells in result.cells.groupby(["selector", "family"], sort=False):
-                _log_cell(client, experiment, parent, common, str(selector), str(family), cells, result, settings)
+            for _, cells in result.cells.groupby(["selector", "family"], sort=False):
+                _log_cells(client, run, {**common, "kind": "cell"}, cells, result, settings.promotion)
             status = "FINISHED"
         finally:
             client.set_terminated(parent, status)
-    return str(parent)
+    return parent
 
 
 def trainings(machine: str | None = None, target: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
@@ -232,7 +238,7 @@ def load_training(training_id: str, settings: Settings) -> Training:
 
 
 def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str, Any]) -> None:
-    """Keep on the training what became of it."""
+    """Keep the outcome of the promotion on the training."""
     client.set_tag(training_id, "promotion", json.dumps(promotion, ensure_ascii=False))
 
 
@@ -268,17 +274,16 @@ def _log_files(client: MlflowClient, run_id: str, result: GridResult, figures: d
         client.log_artifacts(run_id, scratch)
 
 
-def _log_cell(
+def _log_cells(
     client: MlflowClient,
-    experiment: str,
-    parent: str,
-    common: dict[str, str],
-    selector: str,
-    family: str,
+    parent: Run,
+    tags: dict[str, str],
     cells: pd.DataFrame,
     result: GridResult,
-    settings: Settings,
+    rule: PromotionRule,
 ) -> None:
+    """A child run for all cells of one selector and family."""
+    selector, family = (str(cells[c].iloc[0]) for c in ("selector", "family"))
     now = int(time.time() * 1000)
     metrics: list[Metric] = []
     for row in cells.to_dict("records"):
@@ -288,8 +293,8 @@ def _log_cell(
                 metrics.append(Metric(f"{prefix}/{name}", float(row[name]), now, int(row["n_tsp"])))
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
-    judged = cells[cells["protocol"] == settings.promotion.protocol]
-    judged = judged.assign(score_um=score_um(judged, settings.promotion))
+    judged = cells[cells["protocol"] == rule.protocol]
+    judged = judged.assign(score_um=score_um(judged, rule))
     judged = judged[np.isfinite(judged["score_um"])]
     if len(judged):
         best = judged.loc[judged["score_um"].idxmin()]
@@ -303,8 +308,8 @@ def _log_cell(
         key = f"{str(best['protocol']).replace('-', '_')}/fold_S_um"
         per_fold = picked.groupby("fold", sort=False)["S_um"].mean()
         metrics += [Metric(key, float(v), now, i) for i, v in enumerate(per_fold) if np.isfinite(v)]
-    tags = {**common, "kind": "cell", "mlflow.parentRunId": parent, "selector": selector, "family": family}
-    run_id = client.create_run(experiment, tags=tags, run_name=f"{selector} × {family}").info.run_id
+    tags = {**tags, "mlflow.parentRunId": parent.info.run_id, "selector": selector, "family": family}
+    run_id = client.create_run(parent.info.experiment_id, tags=tags, run_name=f"{selector} × {family}").info.run_id
     log_values(client, run_id, metrics, params)
     client.set_terminated(run_id)
 
@@ -324,4 +329,136 @@ def _training_row(run: Run) -> dict[str, Any]:
         "simulated": tags.get("simulated") == "true",
         "promotion": promotion.get("outcome", ""),
         "model": version,
+    }
+
+
+DIAGNOSIS = "diagnosis"  # in an experiment's name, in the place of the error channel
+DIAGNOSIS_COLUMNS = (
+    "run_id",
+    "machine",
+    "started",
+    "n_batches",
+    "verdict",
+    "mechanism",
+    "where",
+    "probability",
+    "simulated",
+)
+_VERSIONS = ("thermodrift", "numpy", "scipy", "pandas", "mlflow")
+_MAX_CHARACTERS = 5000  # characters of a parameter or tag; the store takes 6000
+
+
+def log_diagnosis(
+    d: Diagnosis,
+    batches: Sequence[Batch],
+    files: Mapping[str, Path],
+    settings: Settings,
+    *,
+    params: Mapping[str, Any] | None = None,
+    say: Say = lambda text: None,
+) -> str:
+    """Track one diagnosis; returns the run's id.
+
+    Metrics: ``left_out_rms_before/z_um``, ``left_out_rms_after/z_um`` and ``noise_floor/z_um`` by channel, findings,
+    probability (of the first one), batches, left_out_batches, left_out_batches_improved, seconds. Tags: verdict,
+    mechanism, where, simulated, drafted. The batches are dataset inputs, `files` (name -> path) artifacts.
+
+    Raises:
+        WorkError: the store does not answer.
+    """
+    f = d.findings
+    client = open_store(settings, say)
+    with store_errors(settings):
+        experiment = experiment_id(client, settings, f.machine, DIAGNOSIS, d.simulated)
+        tags = {"machine": f.machine, "target": DIAGNOSIS, "kind": "diagnosis", "simulated": yes_or_no(d.simulated)}
+        name = f"{f.machine} {DIAGNOSIS} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
+        run_id = str(client.create_run(experiment, tags=tags, run_name=name).info.run_id)
+        status = "FAILED"
+        try:
+            now = int(time.time() * 1000)
+            metrics = [Metric(k, v, now, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v)]
+            shown = {k: str(v)[:_MAX_CHARACTERS] for k, v in {**_diagnosis_params(d), **(params or {})}.items()}
+            log_values(client, run_id, metrics, shown, {k: v[:_MAX_CHARACTERS] for k, v in _diagnosis_tags(d).items()})
+            client.log_inputs(run_id, datasets=dataset_inputs(_batch_table(batches), DIAGNOSIS))
+            for path in files.values():
+                client.log_artifact(run_id, str(path))
+            status = "FINISHED"
+        finally:
+            client.set_terminated(run_id, status)
+    return run_id
+
+
+def diagnoses(machine: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
+    """Finished diagnoses, newest first, columns `COLUMNS`; mechanism and where of the first finding, else empty.
+
+    Raises:
+        WorkError: the store does not answer.
+    """
+    settings = settings or load()
+    client = open_store(settings)
+    with store_errors(settings):
+        runs = finished_runs(client, "diagnosis")
+    table = pd.DataFrame([_diagnosis_row(r) for r in runs], columns=list(DIAGNOSIS_COLUMNS))
+    if machine is not None:
+        table = table[table["machine"] == machine]
+    return table.reset_index(drop=True)
+
+
+def _diagnosis_metrics(d: Diagnosis) -> dict[str, float]:
+    f = d.findings
+    rms = f.fit.left_out_rms
+    groups = {"left_out_rms_before": rms.before, "left_out_rms_after": rms.after, "noise_floor": rms.noise_floor}
+    values: dict[str, float] = {
+        f"{group}/{_metric_name(key)}": value
+        for group, by_channel in groups.items()
+        for key, value in by_channel.items()
+        if value is not None
+    }
+    values |= {"findings": len(f.findings), "batches": len(f.batches)}
+    values |= {"left_out_batches": f.fit.batches, "left_out_batches_improved": f.fit.batches_improved}
+    if f.seconds is not None:
+        values["seconds"] = f.seconds
+    if f.findings:
+        values["probability"] = f.findings[0].probability
+    return {k: float(v) for k, v in values.items()}
+
+
+def _diagnosis_params(d: Diagnosis) -> dict[str, Any]:
+    versions = {f"version.{name}": version(name) for name in _VERSIONS}
+    batches = {"machine": d.findings.machine, "batches": ", ".join(d.findings.batches)}
+    return {**batches, "version.python": platform.python_version(), **versions}
+
+
+def _diagnosis_tags(d: Diagnosis) -> dict[str, str]:
+    first = d.findings.findings[0] if d.findings.findings else None
+    return {
+        "verdict": d.findings.verdict,
+        "mechanism": first.mechanism if first else "",
+        "where": f"{first.where.kind} {first.where.name}" if first else "",
+        "drafted": yes_or_no(d.drafted),
+    }
+
+
+def _batch_table(batches: Sequence[Batch]) -> pd.DataFrame:
+    rows = [(b.batch_id, b.digest, b.version, b.source, b.n_rows) for b in batches]
+    return pd.DataFrame(rows, columns=["batch_id", "digest", "version", "source", "n_rows"])
+
+
+def _metric_name(key: str) -> str:
+    """A name with only characters that the store takes."""
+    return re.sub(r"[^\w\-. /:]", "_", key)
+
+
+def _diagnosis_row(run: Run) -> dict[str, Any]:
+    tags, metrics = run.data.tags, run.data.metrics
+    return {
+        "run_id": run.info.run_id,
+        "machine": tags["machine"],
+        "started": started(run),
+        "n_batches": int(metrics.get("batches", 0)),
+        "verdict": tags.get("verdict", ""),
+        "mechanism": tags.get("mechanism", ""),
+        "where": tags.get("where", ""),
+        "probability": metrics.get("probability", float("nan")),
+        "simulated": tags.get("simulated") == "true",
     }

@@ -1,12 +1,11 @@
 """The yearly job as one list of steps: ingest → features → grid → track → promote → report, and a diagnosis if need be.
 
-The steps are plain functions; a `pipelines.caller.Caller` decides how they run: here and now, or as tasks of a flow.
-"""
+The steps are plain functions; a `pipelines.caller.Caller` decides how they run: here and now, or as tasks of a flow."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -15,9 +14,8 @@ from pathlib import Path
 
 from data.batch import Batch
 from data.checks import check_machine
-from data.errors import InputError
+from data.errors import InputError, closest
 from data.ingest import IngestReport, ingest
-from data.lake import Lake
 from data.machine import Machine, load_machine
 from models import FAMILIES, promotion
 from models.crossing import Crossing, Plan, prepare, refit, with_target
@@ -25,20 +23,73 @@ from models.grid import Workers, assemble, jobs_of, workers_for
 from models.result import GridResult
 from models.trust import Region
 from pipelines import registry, tracking
-from pipelines.caller import RETRIES, Caller
-from pipelines.diagnosing import DiagnosisOutcome
-from pipelines.diagnosis_trigger import diagnose_if_grown
-from pipelines.request import TrainRequest, check_request
+from pipelines.caller import RETRIES, Caller, Say
+from pipelines.checkpoint import Checkpoint
+from pipelines.diagnosing import DiagnosisOutcome, diagnose_if_grown
+from pipelines.options import check_suffix
+from pipelines.recordings import home_lake, load_batches
 from pipelines.settings import Settings, home
-from pipelines.unfinished import Unfinished
 from reports.comparison import figure_pngs, write_report
 
-Say = Callable[[str], None]
+REPORT_SUFFIXES = (".html", ".md")
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train. `recordings` empty: what the lake holds. `targets` empty: every error channel."""
+
+    machine_file: Path
+    recordings: tuple[Path, ...] = ()
+    targets: tuple[str, ...] = ()
+    plan: Plan = field(default_factory=Plan)
+    report: Path | None = None
+    promote: bool = True
+    only_if_new: bool = False  # stop where the last training saw the same batches
+    workers: int = 0  # processes of the grid; 0: as many as make it faster
+
+
+def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, tuple[str, ...]]:
+    """The machine and the error channels to learn.
+
+    Raises:
+        InputError: a machine file that cannot be used, an unknown channel, recordings that do not exist, a report of
+            an unknown kind, a family that the machine cannot have, or a promotion rule that the chosen protocols do
+            not serve.
+    """
+    machine = load_machine(request.machine_file)
+    targets = _targets(request.targets, machine)
+    missing = [str(p) for p in request.recordings if not p.exists()]
+    if missing:
+        raise InputError(f"recordings {', '.join(missing)}: no such file or folder; give existing ones")
+    if request.report is not None:
+        check_suffix("report", request.report, REPORT_SUFFIXES)
+    rule = settings.promotion.protocol
+    if request.promote and rule not in request.plan.protocols:
+        raise InputError(
+            f"protocols: got {', '.join(request.plan.protocols)}, but promotion judges by {rule}; add it, or train "
+            "without promotion (--no-promote)"
+        )
+    if request.plan.families:
+        request.plan.suited(machine, [machine.channel(t) for t in targets])
+    return machine, targets
+
+
+def _targets(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
+    allowed = machine.names("error")
+    if not allowed:
+        raise InputError(
+            f"machine {machine.machine}: no channel has role: error, so there is nothing to learn; give the "
+            "displacement that role in the machine file"
+        )
+    for t in wanted:
+        if t not in allowed:
+            raise InputError(f"machine {machine.machine}: no error channel {t!r}; {closest(t, allowed)}")
+    return tuple(dict.fromkeys(wanted)) or allowed
 
 
 @dataclass
 class TrainOutcome:
-    """What came of it, for the command line and for tests."""
+    """The results by channel, and where they are tracked, registered and reported."""
 
     machine: str
     simulated: bool
@@ -49,7 +100,7 @@ class TrainOutcome:
     promotions: dict[str, registry.Promotion] = field(default_factory=dict)
     report: Path | None = None
     diagnosis: DiagnosisOutcome | None = None
-    diagnosis_words: str = ""  # why there was a diagnosis, and what it says; empty where none was called for
+    diagnosis_summary: str = ""  # why a diagnosis followed, and its verdict; else empty
     seconds: dict[str, float] = field(default_factory=dict)
     stopped: str = ""  # why nothing was trained
 
@@ -64,7 +115,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     clock = _Clock(outcome.seconds)
-    lake = Lake(home() / "lake")
+    lake = home_lake()
     if request.recordings:
         say(f"ingest {', '.join(p.name for p in request.recordings)}")
         work = partial(ingest, machine=machine, lake=lake)
@@ -81,9 +132,9 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs, unfinished = jobs_of(plan, targets), Unfinished(home() / "unfinished", crossings)
+    jobs, checkpoint = jobs_of(plan, targets), Checkpoint(home() / "unfinished", crossings)
     with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
-        done = dict(zip(jobs, caller.map("grid", unfinished.crossed(workers.cross), jobs), strict=True))
+        done = dict(zip(jobs, caller.map("grid", checkpoint.crossed(workers.cross), jobs), strict=True))
         for t in targets:
             outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
         clock("grid")
@@ -98,7 +149,7 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     say("track")
     track = partial(_track, outcome.results, plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
-    unfinished.forget()
+    checkpoint.remove()
     clock("track")
     if request.promote:
         say("promote")
@@ -114,18 +165,9 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
         diagnose = partial(
             diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
         )
-        outcome.diagnosis, outcome.diagnosis_words = caller.map("diagnose", diagnose, [outcome.results])[0]
+        outcome.diagnosis, outcome.diagnosis_summary = caller.map("diagnose", diagnose, [outcome.results])[0]
         clock("diagnose")
     return outcome
-
-
-def load_batches(lake: Lake, machine: Machine) -> list[Batch]:
-    """A machine's batches from the lake, with the checks that need several batches and the user's overrules.
-
-    Raises:
-        InputError: the lake has no batch of the machine.
-    """
-    return check_machine(lake.load_all(machine.machine), machine)
 
 
 def promote_tracked(
@@ -140,7 +182,7 @@ def promote_tracked(
     machine = load_machine(machine_file)
     if machine.machine != result.machine:
         raise InputError(f"training {training_id} is of {result.machine}, the machine file of {machine.machine}")
-    lake = Lake(home() / "lake")
+    lake = home_lake()
     batches = []
     for batch_id, digest in result.batches[["batch_id", "digest"]].astype(str).to_numpy():
         held = {v.digest: v.version for v in lake.versions(machine.machine, batch_id)}
@@ -152,19 +194,20 @@ def promote_tracked(
     family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target, machine)
     text = machine_file.read_text(encoding="utf-8")
     region = Region.of(batches, family.inputs)
-    return registry.promote(result, choice, family, text, training_id, settings, region, batches, force=force)
+    new = registry.Newcomer(result, choice, family, text, training_id, region, batches)
+    return registry.promote(new, settings, force=force)
 
 
 @contextmanager
 def _naming_quarantine(ingested: IngestReport | None) -> Iterator[None]:
-    """Where too little is left to train on, say what was just turned away."""
+    """Add the files in quarantine to the error that too few batches are left to train on."""
     try:
         yield
     except InputError as error:
-        turned_away = ingested.quarantined if ingested else []
-        if not turned_away:
+        refused = ingested.quarantined if ingested else []
+        if not refused:
             raise
-        raise InputError(f"{error}; files in quarantine: {len(turned_away)}, first {turned_away[0].reason}") from None
+        raise InputError(f"{error}; files in quarantine: {len(refused)}, first {refused[0].reason}") from None
 
 
 class _Clock:
@@ -191,8 +234,8 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
 
 def _track(results: dict[str, GridResult], plan: Plan, settings: Settings, say: Say, target: str) -> str:
     result = results[target]
-    words = {k: v if isinstance(v, str) else ", ".join(map(str, v or ("all",))) for k, v in asdict(plan).items()}
-    return tracking.log_training(result, settings, figures=figure_pngs(result), params=words, say=say)
+    params = {k: v if isinstance(v, str) else ", ".join(map(str, v or ("all",))) for k, v in asdict(plan).items()}
+    return tracking.log_training(result, settings, figures=figure_pngs(result), params=params, say=say)
 
 
 def _promote(
@@ -200,16 +243,10 @@ def _promote(
 ) -> registry.Promotion:
     choice, crossing = outcome.choices[target], crossings[target]
     family = refit(crossing, choice.selector, choice.family, choice.n_tsp)
-    return registry.promote(
-        outcome.results[target],
-        choice,
-        family,
-        machine_file.read_text(encoding="utf-8"),
-        outcome.training_ids[target],
-        settings,
-        Region.of(crossing.batches, family.inputs),
-        crossing.batches,
-    )
+    text, region = machine_file.read_text(encoding="utf-8"), Region.of(crossing.batches, family.inputs)
+    training_id = outcome.training_ids[target]
+    new = registry.Newcomer(outcome.results[target], choice, family, text, training_id, region, crossing.batches)
+    return registry.promote(new, settings)
 
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:

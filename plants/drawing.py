@@ -14,11 +14,7 @@ from plants.runs import STANDING_S, Block, Run
 from plants.structure import AIR, FEATURES, Layout, Part, Plant, Sensor, Source, Structure
 
 PLANTS = Registry(
-    "plant",
-    {
-        "elements": "plants.elements.layout:draw_layout",
-        "volumes": "plants.volumes.layout:draw_layout",
-    },
+    "plant", {"elements": "plants.elements.layout:draw_layout", "volumes": "plants.volumes.layout:draw_layout"}
 )
 
 CHANCE = {
@@ -36,7 +32,7 @@ SELDOM_SENSED = ("saddle", "table", "screw")
 def draw_plant(
     seed: int, has: frozenset[str], lacks: frozenset[str], kind: str = "volumes", spread: float = 1.0, finer: int = 1
 ) -> Plant:
-    """The plant of a seed; `has` and `lacks` overrule what the seed says about `FEATURES`, `kind` is of `PLANTS`.
+    """The plant of a seed; `has` and `lacks` overrule what the seed draws of `FEATURES`, `kind` is of `PLANTS`.
 
     `spread` makes the ranges wider from which sizes, masses, joints, films and losses are drawn; `finer` cuts every
     cell so many times along each axis, and the machine stays the same.
@@ -57,9 +53,8 @@ def plant_of(layout: Layout, seed: int, features: frozenset[str], spread: float 
     sources = _sources(layout.structure, rng, spread)
     if "motor_loss" not in features:
         del sources["motor_loss"]
-    return Plant(
-        layout.structure, rated_rpm, sources, layout.growths, _sensors(layout.structure, seed), features
-    )  # fmt: skip
+    sensors = _sensors(layout.structure, seed)
+    return Plant(layout.structure, rated_rpm, sources, layout.growths, sensors, features)
 
 
 def _sources(s: Structure, rng: np.random.Generator, spread: float) -> dict[str, Source]:

@@ -10,7 +10,6 @@ import numpy as np
 from scipy import sparse
 
 from data.arrays import Array
-from data.registry import Registry
 from plants.effects.base import Effect
 from plants.options import stream
 from plants.runs import Now
@@ -39,7 +38,7 @@ class Everyday(Effect):
         return True
 
     def stated(self) -> Stated | None:
-        """What the machine file says of it beside the constants of links and exposures."""
+        """What the machine file states of it in addition to the constants of links and exposures."""
         return None
 
 
@@ -59,8 +58,7 @@ class Films(Everyday):
 
     key = "films"
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         s = plant.structure
         self.air = s.air_cell
         self.to_air, self.to_room = s.air_W_per_K[:, None], s.room_W_per_K[:, None].copy()
@@ -117,8 +115,7 @@ class Joints(Everyday):
         """Contacts between single cells: finite volumes have them."""
         return isinstance(plant.structure, Volumes)
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         s = plant.structure
         assert isinstance(s, Volumes)
         casting = np.full(s.size, len(s.cells))
@@ -141,9 +138,8 @@ class Joints(Everyday):
         self.when_assembled_K = np.where(bearing, 0.0, ASSEMBLED_DEGC)[:, None]
         self.gap = rng.uniform(*THROUGH_GAP, (len(pairs), 1))
         share = rng.random(len(pairs))
-        self.per_K = np.where(bearing, *(low + share * (high - low) for low, high in (TIGHTENS_PER_K, CLAMPS_PER_K)))[
-            :, None
-        ]
+        tightens, clamps = (low + share * (high - low) for low, high in (TIGHTENS_PER_K, CLAMPS_PER_K))
+        self.per_K = np.where(bearing, tightens, clamps)[:, None]
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
         factor = contact_factor(self.warmer @ cells_degC - self.when_assembled_K, self.gap, self.per_K)
@@ -173,8 +169,7 @@ class Nut(Everyday):
     def fits(cls, plant: Plant) -> bool:
         return "screw" in plant.structure.castings and "feed" in plant.features
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.moment_Nm = float(rng.uniform(*MOMENT_NM)) * size
         self.stroke, self.travel = float(rng.uniform(*STROKE)), float(rng.uniform(*TRAVEL))
         reach = self.stroke / 2 + self.travel
@@ -206,17 +201,9 @@ class Nut(Everyday):
         heat_W[self.cells] += self.power_W(now) * (self.spread @ self.shares(now))
 
 
-EVERYDAY = Registry(
-    "everyday physics",
-    {
-        "films": "plants.everyday:Films",
-        "joints": "plants.everyday:Joints",
-        "nut": "plants.everyday:Nut",
-    },
-)
+EVERYDAY: tuple[type[Everyday], ...] = (Films, Joints, Nut)
 
 
 def everyday(plant: Plant, seed: int) -> list[Everyday]:
     """Everything of `EVERYDAY` that this plant has, its strength drawn from the case's seed."""
-    kinds = [EVERYDAY[key] for key in EVERYDAY]
-    return [kind(plant, 1.0, stream(seed, f"everyday {kind.key}")) for kind in kinds if kind.fits(plant)]
+    return [kind(plant, 1.0, stream(seed, f"everyday {kind.key}")) for kind in EVERYDAY if kind.fits(plant)]

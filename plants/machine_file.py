@@ -11,7 +11,7 @@ from data.machine import Machine
 from plants.effects.base import Effect
 from plants.everyday import Everyday, Stated
 from plants.options import Options, stream
-from plants.recorded import ERROR_STEP_UM, ERRORS, GAP_STEPS
+from plants.simulation import ERROR_STEP_UM, ERRORS, GAP_STEPS
 from plants.structure import Plant, Source, exposures_W_per_K, gains_um_per_K, links_W_per_K
 
 RPM_NMM_W = 1.047e-4
@@ -40,8 +40,8 @@ class _Pen:
 
     def gain(self, value: float) -> dict[str, Any]:
         """A signed gain from a drawing's lengths."""
-        told = self.guess(value, self.options.mass_error)
-        return {"value": f"{told:.4g} um/K", "spread": f"{0.2 * abs(told) + 0.02:.3g} um/K"}
+        stated = self.guess(value, self.options.mass_error)
+        return {"value": f"{stated:.4g} um/K", "spread": f"{0.2 * abs(stated) + 0.02:.3g} um/K"}
 
 
 def machine_file(

@@ -1,4 +1,4 @@
-"""What may be asked of a case beside its seed and its effect."""
+"""Options of a case other than its seed and its effect, and the random streams of a seed."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A run plan (YAML, as a diagnosis proposes it) read as a run of a plant: stages, air, what comes before, a sensor.
 
-Written apart from the twin's own reader; it knows what proposals write: stages with durations and drivers, repeats,
+Independent of the twin's own reader; it knows what proposals write: stages with durations and drivers, repeats,
 air as a temperature or as [hours, degC] points. Comments say what a shop does before the run.
 """
 
@@ -21,10 +21,9 @@ from data.errors import InputError, closest
 from data.machine import Machine
 from data.units import conversion
 from plants.options import stream
-from plants.physics import simulated
 from plants.plant import Posed, posed, with_amounts
-from plants.recorded import gridded, written
 from plants.runs import Block, Run, earlier
+from plants.simulation import gridded, simulated, written
 from plants.structure import Plant, Sensor
 
 Points = tuple[Array, Array]  # s, degC: straight lines between them
@@ -42,7 +41,7 @@ _SENSOR = re.compile(r"^#\s*Put one more temperature sensor at (\S+) before\.\s*
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedRun(Run):
-    """A run in air that goes in straight lines, beside its ripple; `wall` is None where the plan says nothing."""
+    """A run in air that goes in straight lines with a ripple; `wall` is None where the plan does not state it."""
 
     room: Points
     wall: Points | None
@@ -118,8 +117,8 @@ def _latest(blocks: Sequence[Block]) -> tuple[Block, ...]:
 
 def _before(text: str, drivers: Sequence[str], where: str) -> Iterator[tuple[float, dict[str, float]]]:
     """Stages of the comment "Begin after 24 h at rest, then 4 h spindle_rpm 8000."; without it a day at rest."""
-    said = _BEFORE.search(text)
-    for part in (said[1] if said else f"{RESTED_H:g} h at rest").split(", then "):
+    begin = _BEFORE.search(text)
+    for part in (begin[1] if begin else f"{RESTED_H:g} h at rest").split(", then "):
         hours, _, rest = part.partition(" h ")
         values = dict.fromkeys(drivers, 0.0)
         for piece in () if rest == "at rest" else re.split(r", and |, | and ", rest):
@@ -191,9 +190,7 @@ class Executed:
     table: pd.DataFrame
 
 
-def execute(
-    seed: int, sizes: Mapping[str, float], plan_text: str, plant: str = "volumes", **options: Any
-) -> Executed:  # fmt: skip
+def execute(seed: int, sizes: Mapping[str, float], plan_text: str, plant: str = "volumes", **given: Any) -> Executed:
     """Runs a plan on the plant that `draw` simulates for the same arguments, on the day after the case's last run.
 
     Effects, everyday physics, instruments and noise are the case's own. The shop does what the plan's comments say
@@ -203,18 +200,18 @@ def execute(
     Raises:
         InputError: as `draw` and `read_plan`.
     """
-    at = posed(seed, sizes, plant, **options)
-    asked = at.options
+    at = posed(seed, sizes, plant, **given)
+    options = at.options
     plan = read_plan(plan_text, at.machine.names("driver"))
     rng = stream(seed, f"executed {plan.name}")
-    friction = 1.0 + asked.friction_scatter * float(rng.uniform(-1.0, 1.0))
-    run = earlier(plan.run(at.runs[-1].start + pd.Timedelta(days=1), friction), asked.early_s)
+    friction = 1.0 + options.friction_scatter * float(rng.uniform(-1.0, 1.0))
+    run = earlier(plan.run(at.runs[-1].start + pd.Timedelta(days=1), friction), options.early_s)
     ready = _with_sensor(at, plan.sensor, rng) if plan.sensor else at
     shown, channels = with_amounts(ready.plant, at.effects), ready.machine.batch_channels()
-    course = simulated(shown, [run], [*at.effects, *at.everyday], asked.solver_s, plan.before_h)
+    course = simulated(shown, [run], [*at.effects, *at.everyday], options.solver_s, plan.before_h)
     noise = int(rng.integers(2**62))
-    (table,) = written(shown, [run], course, at.effects, noise, channels, asked)
-    return Executed(ready.machine, gridded(at.machine.machine, run, table, channels, asked), table)
+    (table,) = written(shown, course, at.effects, noise, channels, options)
+    return Executed(ready.machine, gridded(at.machine.machine, run, table, channels, options), table)
 
 
 def _with_sensor(at: Posed, body: str, rng: np.random.Generator) -> Posed:

@@ -1,10 +1,11 @@
-"""A case: a plant drawn from a seed, its recordings, the machine file of it, and what the file leaves out."""
+"""A case: a plant drawn from a seed, its recordings, its machine file, and the answer key of what the file omits."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,9 +25,8 @@ from plants.effects.base import Answer, Effect
 from plants.everyday import Everyday, everyday
 from plants.machine_file import machine_file
 from plants.options import Options, stream
-from plants.physics import LEAD_S, Course, simulated
-from plants.recorded import gridded, written
 from plants.runs import Run, earlier, moments, plan_runs
+from plants.simulation import LEAD_S, Course, gridded, simulated, written
 from plants.structure import AIR, FEATURES, Plant
 
 AT_WORK = 0.1  # of the largest heat in any run
@@ -98,8 +98,8 @@ class Posed:
 
 
 def draw(
-    seed: int, effect: str | None = None, size: float = 1.0, batches: int = 12, step_s: float = 300.0,
-    *, plant: str = "volumes", sizes: Mapping[str, float] | None = None, **options: Any,
+    seed: int, effect: str | None = None, size: float = 1.0, *, plant: str = "volumes",
+    sizes: Mapping[str, float] | None = None, **options: Any,
 ) -> Case:  # fmt: skip
     """A case; the same arguments give the same one, to the last digit.
 
@@ -111,40 +111,36 @@ def draw(
     """
     _check("size", size, size >= 0, "0 or more")
     own = {key: size for key in (effect.split("+") if effect else ())} if sizes is None else dict(sizes)
-    at = posed(seed, own, plant, **{"batches": batches, "step_s": step_s, **options})
+    at = posed(seed, own, plant, **options)
     shown, name, channels = with_amounts(at.plant, at.effects), at.machine.machine, at.machine.batch_channels()
     course = simulated(shown, at.runs, [*at.effects, *at.everyday], at.options.solver_s, at.options.before_h)
-    tables = written(shown, at.runs, course, at.effects, seed, channels, at.options)
+    tables = written(shown, course, at.effects, seed, channels, at.options)
     read = [gridded(name, run, table, channels, at.options) for run, table in zip(at.runs, tables, strict=True)]
     by_batch = {run.batch_id: table for run, table in zip(at.runs, tables, strict=True)}
     return Case(at.machine, read, truth_of(at, course), by_batch)
 
 
-def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **options: Any) -> Posed:
+def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **given: Any) -> Posed:
     """What `draw` simulates: the plant of a kind with effects of these sizes, its runs and its machine file.
 
     Raises:
         InputError: as `draw`.
     """
-    asked = _checked(seed, sizes, options)
+    options = _checked(seed, sizes, given)
     kinds = {key: EFFECTS[key] for key in sizes}
-    drawn = draw_plant(seed, *_features(kinds, sizes, asked), plant, asked.spread)
+    drawn = draw_plant(seed, *_features(kinds, sizes, options), plant, options.spread)
     effects = [kind(drawn, sizes[key], stream(seed, f"effect {key}")) for key, kind in kinds.items()]
-    daily = everyday(drawn, seed) if asked.everyday else []
-    machine = machine_file(drawn, effects, asked.name or f"plant_{seed:04d}", seed, asked, daily)
-    runs = plan_runs(
-        seed, asked.batches, asked.hours, asked.step_s, drawn.rated_rpm, asked.friction_scatter,
-        (asked.coldest_degC, asked.warmest_degC), (asked.earliest_h, asked.latest_h), asked.idle,
-    )  # fmt: skip
-    runs = HABITS[asked.habit](runs, drawn.rated_rpm)
-    return Posed(seed, drawn, effects, daily, [earlier(run, asked.early_s) for run in runs], machine, asked)
+    daily = everyday(drawn, seed) if options.everyday else []
+    machine = machine_file(drawn, effects, options.name or f"plant_{seed:04d}", seed, options, daily)
+    runs = HABITS[options.habit](plan_runs(seed, options, drawn.rated_rpm), drawn.rated_rpm)
+    return Posed(seed, drawn, effects, daily, [earlier(run, options.early_s) for run in runs], machine, options)
 
 
 def _features(
-    kinds: Mapping[str, type[Effect]], sizes: Mapping[str, float], asked: Options
+    kinds: Mapping[str, type[Effect]], sizes: Mapping[str, float], options: Options
 ) -> tuple[frozenset[str], frozenset[str]]:
     """Features that the plant must have and must not."""
-    has, lacks = set(asked.has), set(asked.lacks)
+    has, lacks = set(options.has), set(options.lacks)
     for key, kind in kinds.items():
         if sizes[key] == 0 and kind.withholds:
             lacks.add(kind.withholds)  # nothing of it in the plant and nothing in the file
@@ -158,10 +154,7 @@ def with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
     """The plant with withheld features as strong as their effects say."""
 
     def amount(feature: str) -> float:
-        out = 1.0
-        for effect in effects:
-            out *= effect.amount(feature)
-        return out
+        return prod(effect.amount(feature) for effect in effects)
 
     sources = {k: replace(s, amount=amount(k)) for k, s in plant.sources.items()}
     growths = tuple(g.scaled(amount(g.name)) for g in plant.growths)
@@ -180,7 +173,7 @@ def truth_of(at: Posed, course: Course) -> dict[str, Any]:
         "parameters": {},
         "words": "",
     }
-    first = terms[0] if terms else nothing
+    first: Mapping[str, Any] = terms[0] if terms else nothing
     return {
         "simulated": True, "effect": "+".join(t["effect"] for t in terms) or None,
         "size": first["size"] if terms else 0.0, **{k: first[k] for k in nothing},
@@ -246,8 +239,8 @@ def _check(what: str, got: float, fits: bool, expected: str) -> None:
 def write_case(case: Case, folder: Path, key_folder: Path | None = None) -> tuple[Path, Path, Path]:
     """Writes `machine.yml` and `recordings/*.csv` below `folder`, `truth.json` into `key_folder`.
 
-    Returns the machine file, the recordings' folder and the key. `key_folder` is by default beside `folder`, with
-    `_key` added to its name; it must not lie inside, where whoever is asked could find it.
+    Returns the machine file, the recordings' folder and the key. `key_folder` is by default next to `folder`, with
+    `_key` added to its name; it must not lie inside, where whoever answers could find it.
 
     Raises:
         InputError: the key would lie in the case's folder, or a folder cannot be written.

@@ -1,9 +1,9 @@
-"""A case of real recordings: what a diagnosis sees, and the answer key beside it."""
+"""A case of real recordings: what a diagnosis sees, and its answer key."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -42,30 +42,49 @@ class RealCase:
         }
 
 
-def term(
-    effect: str, mechanism: str | None, where: Place, *, parameters: Mapping[str, tuple[float, str]] | None = None,
-    also: Iterable[Place] = (), neighbours: Iterable[str] = (), words: str = "", size: float = 1.0,
-    active: str | list[Window] = "always", driver: str | None = None, same_as: Iterable[tuple[str, Place]] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """One true term of an answer key."""
-    return {
-        "effect": effect, "mechanism": mechanism, "where": _place(where), "also": [_place(p) for p in also],
-        "neighbours": list(neighbours),
-        "parameters": {k: {"value": float(v), "unit": u} for k, (v, u) in (parameters or {}).items()},
-        "words": words, "size": float(size), "limit_share": None, "decoy": False, "active": active, "driver": driver,
-        "same_as": [{"mechanism": m, "where": _place(p)} for m, p in same_as],
-    }  # fmt: skip
+@dataclass(frozen=True)
+class Term:
+    """One true term of an answer key; `mechanism` None: no listed one.
+
+    `also` are places that mean the same, `neighbours` bodies that touch the place, `parameters` values with units,
+    `active` the windows in which it acts, `same_as` what the recordings cannot distinguish from it.
+    """
+
+    effect: str
+    mechanism: str | None
+    where: Place
+    parameters: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    also: Sequence[Place] = ()
+    neighbours: Sequence[str] = ()
+    words: str = ""
+    size: float = 1.0
+    active: str | list[Window] = "always"
+    driver: str | None = None
+    same_as: Sequence[tuple[str, Place]] = ()
+
+    def plain(self) -> dict[str, Any]:
+        """As the answer key states it."""
+        return {
+            "effect": self.effect, "mechanism": self.mechanism, "where": _place(self.where),
+            "also": [_place(p) for p in self.also], "neighbours": list(self.neighbours),
+            "parameters": {k: {"value": float(v), "unit": u} for k, (v, u) in self.parameters.items()},
+            "words": self.words, "size": float(self.size), "limit_share": None, "decoy": False,
+            "active": self.active, "driver": self.driver,
+            "same_as": [{"mechanism": m, "where": _place(p)} for m, p in self.same_as],
+        }  # fmt: skip
 
 
 def answer(
-    name: str, plant: str, kind: str, machine: Machine, seed: int, terms: list[dict[str, Any]], words: str,
-    **more: Any,
-) -> dict[str, Any]:  # fmt: skip
-    """The answer key. Case and suite are for the caller to set; `more` is what this kind of plant adds."""
+    redraw: Mapping[str, Any], kind: str, machine: Machine, terms: Sequence[Term], words: str, **more: Any
+) -> dict[str, Any]:
+    """The answer key. `redraw` are plant, name and seed, which give the case again; the caller sets case and suite.
+
+    `more` is what this kind of plant adds.
+    """
     return {
-        "schema": SCHEMA, "case": name, "kind": kind, "plant": plant, "suite": "development",
-        "simulated": machine.simulated, "words": words, "machine": machine.machine, "seed": seed, "terms": terms,
-        "idle_channels": [], "options": {}, "redraw": {"plant": plant, "name": name, "seed": seed}, **more,
+        "schema": SCHEMA, "case": redraw["name"], "kind": kind, "plant": redraw["plant"], "suite": "development",
+        "simulated": machine.simulated, "words": words, "machine": machine.machine, "seed": redraw["seed"],
+        "terms": [t.plain() for t in terms], "idle_channels": [], "options": {}, "redraw": dict(redraw), **more,
     }  # fmt: skip
 
 
@@ -87,8 +106,7 @@ def linked(twin: Mapping[str, Any], body: str) -> list[str]:
 
 
 def _place(place: Place) -> dict[str, str]:
-    kind, name = place
-    return {"kind": kind, "name": name}
+    return dict(zip(("kind", "name"), place, strict=True))
 
 
 MACHINES = Path(__file__).parents[1] / "machines"
@@ -99,7 +117,7 @@ CLOCK = "%Y%m%d_%H%M"
 class Origin:
     """Where the recordings of a machine lie below the data folder and what a case takes of them.
 
-    A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver tells of. `known`
+    A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver records. `known`
     is added to the machine file, by dotted path below `twin`; a * stands for every part of that name's place.
     """
 
@@ -154,11 +172,11 @@ def recorded(machine: str, data: Path, seed: int, step_s: float | None = None) -
     ]
     names = [f"run_{k:02d}" if t is None else f"{t:{CLOCK}}" for k, t in enumerate(starts, 1)]
     channels = {n: _column(c) for n, c in given.channels.items()}
-    told = dict(zip((b.batch_id for b in chosen), names, strict=True))
+    renamed = dict(zip((b.batch_id for b in chosen), names, strict=True))
     overrule = [
-        rule.model_copy(update={"batch": told.get(rule.batch, rule.batch)})
+        rule.model_copy(update={"batch": renamed.get(rule.batch, rule.batch)})
         for rule in given.overrule
-        if rule.batch == "*" or rule.batch in told
+        if rule.batch == "*" or rule.batch in renamed
     ]
     recording = Recording(
         files=["*.csv"],
@@ -171,8 +189,8 @@ def recorded(machine: str, data: Path, seed: int, step_s: float | None = None) -
         *keys, last = path.split(".")
         for part in parts_at(twin, keys):
             part[last] = value
-    told_anew = {"recording": recording, "channels": channels, "ignore": [], "overrule": overrule, "twin": twin}
-    plain = given.model_copy(update=told_anew)
+    update = {"recording": recording, "channels": channels, "ignore": [], "overrule": overrule, "twin": twin}
+    plain = given.model_copy(update=update)
     own = plain.batch_channels()
     return plain, [_plain(b, name, t, own) for b, name, t in zip(chosen, names, starts, strict=True)]
 

@@ -1,4 +1,4 @@
-"""What a shop does with the machine: protocols of speed, feed and coolant, seasons, the hours before a batch."""
+"""Runs of a machine in a shop: protocols of speed, feed and coolant, seasons, the hours before a batch."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ import numpy as np
 import pandas as pd
 
 from data.arrays import Array
-from plants.options import stream
+from plants.options import Options, stream
 
-SEASON_DEGC = (12.0, 28.0)  # means of the room
-STARTS_H = (6.5, 14.0)  # of the day
 GROUND_MEAN_DEGC, GROUND_FOLLOWS = 18.0, 0.5
 STANDING_S = 300.0
-Course = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -84,20 +81,12 @@ def held(blocks: tuple[Block, ...], time_s: Array) -> Array:
     return values[np.searchsorted(starts, np.asarray(time_s) + 1e-6, side="right")]
 
 
-def plan_runs(
-    seed: int,
-    batches: int,
-    hours: float,
-    row_s: float,
-    rated_rpm: float,
-    friction_scatter: float,
-    season_degC: tuple[float, float] = SEASON_DEGC,
-    starts_h: tuple[float, float] = STARTS_H,
-    idle: Sequence[str] = (),
-) -> list[Run]:
-    """The batches of a case, by date. Drivers change on rows of the recording, every `row_s`."""
+def plan_runs(seed: int, options: Options, rated_rpm: float) -> list[Run]:
+    """The batches of a case, by date. Drivers change on rows of the recording, every `options.step_s`."""
     rng = stream(seed, "runs")
-    switches = {name: stream(seed, f"idle {name}") for name in idle}
+    switches = {name: stream(seed, f"idle {name}") for name in options.idle}
+    batches, end_s, row_s = options.batches, options.hours * 3600.0, options.step_s
+    season_degC = options.coldest_degC, options.warmest_degC
     levels = rng.permutation(np.linspace(*season_degC, batches))
     kinds = rng.permutation(np.arange(batches) % len(PROTOCOLS))
     days = rng.choice(60, batches, replace=False)
@@ -105,17 +94,17 @@ def plan_runs(
     taken: set[pd.Timestamp] = set()
     for k in range(batches):
         mean_degC = float(levels[k] + rng.uniform(-0.6, 0.6))
-        minute = int(rng.integers(round(60 * starts_h[0]), round(60 * starts_h[1])))
+        minute = int(rng.integers(round(60 * options.earliest_h), round(60 * options.latest_h)))
         start = _season_day(mean_degC, season_degC, int(days[k])) + pd.Timedelta(minutes=minute)
         while start.normalize() in taken:  # one batch a day
             start += pd.Timedelta(days=1)
         taken.add(start.normalize())
         run = Run(
             start=start,
-            hours=hours,
-            speed=(*_shift_before(rng, rated_rpm), *PROTOCOLS[kinds[k]](rng, hours * 3600.0, rated_rpm)),
-            feed=_strokes(rng, hours * 3600.0, lambda: float(rng.integers(4, 17)) * 500.0, idle=0.35),
-            coolant=_strokes(rng, hours * 3600.0, lambda: 1.0, idle=0.35),
+            hours=options.hours,
+            speed=(*_shift_before(rng, rated_rpm), *PROTOCOLS[kinds[k]](rng, end_s, rated_rpm)),
+            feed=_strokes(rng, end_s, lambda: float(rng.integers(4, 17)) * 500.0, idle=0.35),
+            coolant=_strokes(rng, end_s, lambda: 1.0, idle=0.35),
             room_mean_degC=mean_degC,
             day_K=float(rng.uniform(0.5, 3.0)),
             warmest_h=float(rng.uniform(14.0, 17.0)),
@@ -123,11 +112,8 @@ def plan_runs(
             ripple_s=(float(rng.uniform(1500, 4000)), float(rng.uniform(600, 1500))),
             wall_K=float(0.35 * (mean_degC - 22.0) + rng.uniform(-2.5, 1.5)),
             slow_K=float(rng.uniform(-2.0, 3.0)),
-            friction=float(1.0 + friction_scatter * rng.uniform(-1.0, 1.0)),
-            idle={
-                name: _on_rows(_strokes(dice, hours * 3600.0, lambda: 1.0, idle=0.35), row_s)
-                for name, dice in switches.items()
-            },
+            friction=float(1.0 + options.friction_scatter * rng.uniform(-1.0, 1.0)),
+            idle={n: _on_rows(_strokes(dice, end_s, lambda: 1.0, idle=0.35), row_s) for n, dice in switches.items()},
         )
         speed, feed, coolant = (_on_rows(blocks, row_s) for blocks in (run.speed, run.feed, run.coolant))
         runs.append(replace(run, speed=speed, feed=feed, coolant=coolant))
@@ -181,9 +167,8 @@ def _cool_down(rng: np.random.Generator, end_s: float, rated_rpm: float) -> tupl
 def _steps(rng: np.random.Generator, end_s: float, rated_rpm: float) -> tuple[Block, ...]:
     edges = np.cumsum(rng.uniform(1200.0, 4500.0, 20))
     speeds = [_speed(rng, rated_rpm) * (rng.random() > 0.2) for _ in range(21)]
-    return tuple(
-        Block(t, v) for t, v in zip([STANDING_S, *edges + STANDING_S], speeds, strict=True) if t < end_s
-    )  # fmt: skip
+    starts = [STANDING_S, *edges + STANDING_S]
+    return tuple(Block(t, v) for t, v in zip(starts, speeds, strict=True) if t < end_s)
 
 
 def _staircase(rng: np.random.Generator, end_s: float, rated_rpm: float) -> tuple[Block, ...]:
@@ -227,8 +212,7 @@ class Now:
 
     def driver(self, channel: str) -> Array:
         """A driver by the name of its channel."""
-        shown = {"spindle_rpm": self.speed_rpm, "feed": self.feed_mm_per_min, "coolant": self.coolant}
-        return shown[channel]
+        return {"spindle_rpm": self.speed_rpm, "feed": self.feed_mm_per_min, "coolant": self.coolant}[channel]
 
 
 def moments(runs: Sequence[Run], step_from_s: Array, at_s: Array) -> list[Now]:
@@ -237,9 +221,5 @@ def moments(runs: Sequence[Run], step_from_s: Array, at_s: Array) -> list[Now]:
     room, wall = (np.stack([getattr(r, f"{n}_degC")(at_s) for r in runs], 1) for n in ("room", "wall"))
     ground = np.array([r.ground_degC() for r in runs])
     clock = (np.array([r.clock_h for r in runs]) + at_s[:, None] / 3600.0) % 24.0
-    return [
-        Now(
-            float(t), drivers["speed"][k], drivers["feed"][k], drivers["coolant"][k], room[k], wall[k], ground, clock[k]
-        )
-        for k, t in enumerate(at_s)
-    ]
+    rows = zip(at_s, drivers["speed"], drivers["feed"], drivers["coolant"], room, wall, clock, strict=True)
+    return [Now(float(t), n, f, c, r, w, ground, h) for t, n, f, c, r, w, h in rows]

@@ -90,7 +90,7 @@ class Structure(ABC):
     room_W_per_K: Array
     air_cell: int | None = None
 
-    stages: ClassVar[tuple[float, ...]]  # shares of a step at which `integrate` asks for the heat
+    stages: ClassVar[tuple[float, ...]]  # shares of a step at which `integrate` evaluates the heat
 
     @property
     def size(self) -> int:

@@ -1,8 +1,9 @@
-"""Words, digits and colours of the report."""
+"""Labels, digits, units and colours that all reports share."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from html import escape
 
 from models import FAMILIES
@@ -22,6 +23,8 @@ _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc
               "main_factor_bp": "main factor BP", "mrmr": "mRMR", "elastic_net_path": "elastic net",
               "vif_pruning": "VIF pruning", "kmedoids": "k-medoids", "exhaustive": "all subsets"}  # fmt: skip
 _SHOUTED = {"mlr", "pls", "bp"}
+_UNITS = {"1": "", "um": "µm", "um/K": "µm/K", "um/m": "µm/m", "um/m/K": "µm/m/K", "degC": "°C", "m**2": "m²",
+          "mm**2/s": "mm²/s", "W/m**2/K": "W/m²/K"}  # fmt: skip
 
 
 def family_label(key: str) -> str:
@@ -35,7 +38,7 @@ def selector_label(key: str) -> str:
 
 
 def cell_label(selector: str, family: str, n_tsp: int) -> str:
-    """A cell in words: ``ridge on 4 points by FCGC``."""
+    """A cell's label: ``ridge on 4 points by FCGC``."""
     if not n_tsp:
         return family_label(family)
     if selector == "none":
@@ -48,6 +51,21 @@ def family_style(key: str) -> tuple[str, str]:
     keys = list(FAMILIES)
     i = keys.index(key) if key in keys else len(keys)
     return _PALETTE[i % len(_PALETTE)], _SYMBOLS[(i + i // len(_PALETTE)) % len(_SYMBOLS)]
+
+
+def tex_escaped(name: str) -> str:
+    """A name that matplotlib reads as text, not as mathematics."""
+    return name.replace("$", r"\$")
+
+
+def unit_label(unit: str) -> str:
+    """A unit as people write it: ``µm`` of ``um``; none of ``1``."""
+    return _UNITS.get(unit, unit)
+
+
+def three_digits(value: float) -> str:
+    """Three significant digits, without a power of ten up to a million."""
+    return (f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
 
 
 def plain(text: str) -> str:
@@ -88,7 +106,7 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %" if math.isfinite(share) else NOTHING
 
 
-def p_words(p: float) -> str:
+def p_label(p: float) -> str:
     """A p-value with honest digits."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
 
@@ -110,7 +128,7 @@ def _clock(time_s: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d}"
 
 
-def listed(names: list[str], most: int = 12) -> str:
+def listed(names: Sequence[str], most: int = 12, last: str = "and") -> str:
     """``a, b and c``; a long list is cut and counted."""
-    shown = names if len(names) <= most else [*names[:most], f"{len(names) - most} more"]
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""
+    shown = list(names) if len(names) <= most else [*names[:most], f"{len(names) - most} more"]
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} {last} {shown[-1]}" if shown else ""

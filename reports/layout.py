@@ -1,4 +1,4 @@
-"""What a page is made of: tables, strips of dots and figures, without a word of HTML or Markdown."""
+"""What a page is made of: tables, strips of dots and figures, independent of HTML and Markdown."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Strip:
     dots: tuple[float, ...]
     mean: float
     beyond: int
-    words: str
+    label: str
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,11 @@ class Row:
 
     cells: tuple[str | Strip, ...]
     mark: str = ""
+
+    @classmethod
+    def of(cls, *cells: str | Strip, mark: str = "") -> Row:
+        """From the cells one by one."""
+        return cls(cells, mark)
 
 
 @dataclass(frozen=True)

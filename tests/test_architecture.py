@@ -22,7 +22,10 @@ ALLOWED: Mapping[str, set[str]] = {
     "reports": {"data", "features", "models", "twin", "diagnosis"},
     "evidence": {"data", "features", "models", "twin", "diagnosis", "plants", "reports"},
     "pipelines": {"data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence"},
-}
+    "thermodrift": {
+        "data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence", "pipelines",
+    },
+}  # fmt: skip
 ORCHESTRATION = {"prefect", "mlflow", "typer"}
 PLANTS_MAY_USE = {"data", "plants", "numpy", "scipy", "pandas", "yaml", "skfem"}
 IMPORT_ALL = """

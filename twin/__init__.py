@@ -1,1 +1,1 @@
-"""The twin: a machine tool simulated from one file, calibrated to its recordings."""
+"""Thermal network of a machine tool: simulation, calibration and views."""

@@ -1,4 +1,4 @@
-"""From a machine file's twin part to a `Network`: places become weights over cells, values become parameters."""
+"""Compilation of a machine file's twin part into a `Network`."""
 
 from __future__ import annotations
 

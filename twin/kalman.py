@@ -1,7 +1,7 @@
-"""The twin beside the machine: readings correct the simulated state row by row, from the past alone.
+"""Kalman filter on a twin: readings correct the simulated state row by row, causally.
 
 A Kalman filter (Kalman 1960) on deviations from the free-running simulation, linearised there (Gelb 1974, sec. 6.1):
-what a law makes of temperature counts to first order in the deviation. Beside the cells the state holds a factor on
+laws enter to first order in the deviation. In addition to the cells the state holds a factor on
 each heat, constant through a batch, what each sensor that lags shows, and the deviation at the start that errors,
 which are shown less their first value, remember.
 """
@@ -28,7 +28,7 @@ _HOUR_S = 3600.0
 
 @dataclass(frozen=True)
 class Doubt:
-    """How far the network itself may be wrong.
+    """Uncertainty of the network.
 
     start_K2 (N, N): covariance of the start temperatures, K². heat_spread: standard deviation of each heat's own
     factor from batch to batch. heat_W: white noise of the heat into every body, as the standard deviation in W of its
@@ -73,12 +73,7 @@ class _Linear:
 
 
 def filtered(
-    network: Network,
-    values: Array,
-    inputs: Inputs,
-    readings: Array,
-    doubt: Doubt,
-    start_degC: Array | None = None,
+    network: Network, values: Array, inputs: Inputs, readings: Array, doubt: Doubt, start_degC: Array | None = None
 ) -> Filtered:
     """Temperatures and errors of B batches at parameter values (n,), corrected by readings (B, K, n_sensors), degC.
 
@@ -92,8 +87,8 @@ def filtered(
     if start_degC is None:
         start_degC = start_of(network, values, inputs, settled=True)
     solved = solved_balance(network, values[None], inputs, start_degC[None], TOLERANCE_K)
-    rows = rows_of(solved, inputs.every, 1)
-    nominal = simulation_of(solved, *shown(rows, network)[:2], TOLERANCE_K, inputs.every, 1)
+    rows = rows_of(solved, 1)
+    nominal = simulation_of(solved, *shown(rows, network)[:2], TOLERANCE_K, 1)
     used = np.flatnonzero(np.isfinite(readings).any(axis=(0, 1)))
     linear = _linearised(solved, rows, nominal, used, doubt)
     return _run(network, linear, nominal, readings, nominal.valid)
@@ -234,7 +229,7 @@ def _lags_s(network: Network, values: Array, used: NDArray[np.int64]) -> dict[in
             elif law.mechanism.along_time:
                 raise InputError(
                     f"machine {network.machine}: sensor {network.readings[j].channel!r} has {law.name}, "
-                    f"which remembers more than one lag ({law.mechanism.words}); filter without this sensor"
+                    f"which remembers more than one lag ({law.mechanism.summary}); filter without this sensor"
                 )
     return out
 

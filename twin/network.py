@@ -28,7 +28,7 @@ class Law:
     """A mechanism at work: parameter numbers by name, driver channels and ports by the law's own names for them.
 
     One `asleep` stands at values without effect: it costs a simulation nothing, and derivatives by its parameters are
-    what it would do. So a diagnosis looks at every candidate in one pass.
+    what it would do. A diagnosis thus screens all candidates in one pass.
     """
 
     name: str

@@ -12,17 +12,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from data.arrays import Array
+from data.units import pint_name, unit_registry
 
 Scale = Literal["log", "linear", "logit"]
-
-
-@lru_cache(maxsize=1)
-def unit_registry() -> Any:
-    """The one pint registry; made at the first use, which takes a third of a second."""
-    import pint
-
-    registry: Any = pint.UnitRegistry(cache_folder=None)
-    return registry
 
 
 @lru_cache(maxsize=4096)
@@ -43,10 +35,11 @@ def convert(text: str | float, unit: str) -> float:
     given = given.strip()
     if not given or given == unit:
         return value
-    if "degC" in (unit, given) or "degF" in (unit, given):
-        return _temperature(value, given, unit, text)
+    temperature = unit == "degC" and given in ("degF", "K")  # a difference of two is in K
+    if {"degC", "degF"} & {unit, given} and not temperature:
+        raise ValueError(f"unit {given!r} cannot be read as {unit!r}; write e.g. '1 {unit}'")
     try:
-        return float(unit_registry().Quantity(value, _spelt(given)).to(_spelt(unit)).magnitude)
+        return float(unit_registry().Quantity(value, pint_name(given)).to(pint_name(unit)).magnitude)
     except Exception as error:  # pint has no common base for its many parsing errors
         raise ValueError(
             f"unit {given!r} cannot be read as {unit!r} ({_first_line(error)}); write e.g. '1 {unit}'"
@@ -57,21 +50,8 @@ def convert(text: str | float, unit: str) -> float:
 def same_dimension(one: str, other: str) -> bool:
     """Whether two units measure the same kind of thing; rpm counts as 1/s, % as a number."""
     registry = unit_registry()
-    dimension = [registry.Unit(_spelt("K" if u == "degC" else u)).dimensionality for u in (one, other)]
+    dimension = [registry.Unit(pint_name("K" if u == "degC" else u)).dimensionality for u in (one, other)]
     return bool(dimension[0] == dimension[1])
-
-
-def _spelt(unit: str) -> str:
-    """pint's spelling: '1' and '%' have no name of their own there."""
-    return {"1": "dimensionless", "%": "percent", "": "dimensionless"}.get(unit, unit)
-
-
-def _temperature(value: float, given: str, unit: str, text: str) -> float:
-    """Temperatures, not differences: 20 degC, 68 degF or 293.15 K."""
-    to_degC = {"degC": lambda v: v, "degF": lambda v: (v - 32.0) / 1.8, "K": lambda v: v - 273.15}
-    if unit != "degC" or given not in to_degC:
-        raise ValueError(f"unit {given!r} cannot be read as {unit!r}; write e.g. '1 {unit}'")
-    return float(to_degC[given](value))
 
 
 def _finite(value: float, text: object, unit: str) -> float:

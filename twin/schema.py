@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from data.errors import InputError
-from data.machine import Machine
+from data.machine import Machine, Section
 from data.yaml_file import parse_part
 from twin.quantity import Value
 
@@ -17,11 +17,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Place = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*(@[0-9.]+(,[0-9.]+)?)?$")]  # a body, or a point in it
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Material(_Part):
+class Material(Section):
     """What a body is made of; built-in ones (steel, cast_iron, aluminium, …) are in `twin.schema`."""
 
     specific_heat: Value  # J/kg/K
@@ -29,7 +25,7 @@ class Material(_Part):
     expansion: Value  # um/m/K
 
 
-class Body(_Part):
+class Body(Section):
     """A part that stores heat: one lump, a bar of N cells along its length, or a plate of N × M cells.
 
     Capacity by itself or as mass × the material's specific heat. Bars and plates conduct inside by their material and
@@ -49,7 +45,7 @@ class Body(_Part):
     words: str = ""
 
 
-class Link(_Part):
+class Link(Section):
     """Heat conduction between two places: a conductance, a joint (area × coefficient) or a bar (k A / L)."""
 
     between: tuple[Place, Place]
@@ -66,7 +62,7 @@ class Link(_Part):
         return _conductance_alone(raw)
 
 
-class Exposure(_Part):
+class Exposure(Section):
     """Heat exchange of a place (or, without @, of a whole body evenly) with a surrounding."""
 
     of: Place
@@ -82,7 +78,7 @@ class Exposure(_Part):
         return _conductance_alone(raw)
 
 
-class Surrounding(_Part):
+class Surrounding(Section):
     """A temperature that the machine does not change: a recorded channel, a constant, or a batch's first readings.
 
     With all of `value`, `first` and `follow` it is value + follow (first − value): ground that follows the season
@@ -109,13 +105,12 @@ class Surrounding(_Part):
         return self
 
 
-class MechanismPart(_Part):
+class MechanismPart(Section):
     """One mechanism at work: its law (a key of `twin.mechanisms`), where, driven by what, with which parameters.
 
     `at` names the places that the law's temperatures come from, by port (a list is their mean) or, for a law with one
-    port, just the place.
-    `into` spreads heat over places as shares; one of them may be "rest". `acts_on` names the links, exposures, heat
-    mechanisms, sensors, errors or surroundings that the law changes.
+    port, just the place. `into` spreads heat over places as shares; one of them may be "rest". `acts_on` names the
+    links, exposures, heat mechanisms, sensors, errors or surroundings that the law changes.
     """
 
     law: str
@@ -127,7 +122,7 @@ class MechanismPart(_Part):
     words: str = ""
 
 
-class Sensor(_Part):
+class Sensor(Section):
     """A temperature channel of the recordings: where it sits and how it measures; the key is the channel."""
 
     at: Place
@@ -139,7 +134,7 @@ class Sensor(_Part):
     words: str = ""
 
 
-class ChainLink(_Part):
+class ChainLink(Section):
     """One expanding length of an error chain: sign × expansion × length × rise, or `gain` × rise."""
 
     body: Place
@@ -150,7 +145,7 @@ class ChainLink(_Part):
     words: str = ""
 
 
-class Tilt(_Part):
+class Tilt(Section):
     """Bending: angle = expansion × height × (hot − cold) / depth, the error is angle × lever; or `gain` alone."""
 
     hot: Place
@@ -164,8 +159,8 @@ class Tilt(_Part):
     words: str = ""
 
 
-class ErrorChain(_Part):
-    """An error channel as a signed chain; the key is the channel. Plus closes the gap, or as `words` say.
+class ErrorChain(Section):
+    """An error channel as a signed chain; the key is the channel. Plus closes the gap, unless `words` state otherwise.
 
     A closed chain of lengths gives no error when everything warms alike and expands alike; `uniform_length` (m) is
     what its signed lengths add up to (0 for a closed one). Chains with gains alone are not checked.
@@ -178,7 +173,7 @@ class ErrorChain(_Part):
     words: str = ""
 
 
-class Calibrated(_Part):
+class Calibrated(Section):
     """Where the values come from, written by `thermodrift calibrate`."""
 
     batches: tuple[str, ...]
@@ -188,7 +183,7 @@ class Calibrated(_Part):
     words: str = ""
 
 
-class TwinPart(_Part):
+class TwinPart(Section):
     """The whole twin part."""
 
     materials: Mapping[Name, Material] = {}
@@ -199,13 +194,13 @@ class TwinPart(_Part):
     mechanisms: Mapping[Name, MechanismPart] = {}
     sensors: Mapping[str, Sensor] = {}
     errors: Mapping[str, ErrorChain] = {}
-    initial_spread: str | float = "1 K"  # prior sd of a body's start temperature about what the first readings say
+    initial_spread: str | float = "1 K"  # prior sd of a body's start temperature about the first readings
     calibrated: Calibrated | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _ends_from_keys(cls, raw: Any) -> Any:
-        """`shaft-front: 14 W/K` says its two ends by its key."""
+        """`shaft-front: 14 W/K` gives its two ends by its key."""
         if not isinstance(raw, dict):
             return raw
         raw = dict(raw)
@@ -216,7 +211,7 @@ class TwinPart(_Part):
 
 
 def _conductance_alone(raw: Any) -> Any:
-    """{'value': …, 'spread': …} or "14 W/K" beside the ends means the conductance."""
+    """{'value': …, 'spread': …} or "14 W/K" next to the ends is the conductance."""
     if not isinstance(raw, dict) or "value" not in raw:
         return raw
     value = {k: raw[k] for k in Value.model_fields if k in raw}
@@ -230,7 +225,7 @@ def _with_ends(key: Any, given: Any, ends: tuple[str, ...]) -> Any:
         return given
     parts = tuple(str(key).split("-"))
     if len(parts) != 2:
-        return given  # the missing key is told by the model
+        return given  # the model reports the missing key
     return {**({ends[0]: parts} if len(ends) == 1 else dict(zip(ends, parts, strict=True))), **given}
 
 

@@ -1,7 +1,7 @@
-"""Checks that find faults in recordings: a registry, one file per check, and the three entries below.
+"""Checks for faults in recordings: the registry and the functions that run it.
 
-A check runs over what the checks before it left unmasked; the order of the registry is the order of the
-checks. Thresholds come from resolution, noise and physics, never from one machine's history.
+Checks run in the order of the registry, each on what the earlier ones left unmasked. Thresholds come from resolution,
+noise and physics, never from one machine's history.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def check_batch(batch: Batch, machine: Machine) -> tuple[Finding, ...]:
 
 
 def check_machine(batches: Sequence[Batch], machine: Machine) -> list[Batch]:
-    """Add what only the batches together can show, then the user's word; safe to repeat.
+    """Add what only the batches together can show, then the machine file's overrules; idempotent.
 
     Returns the batches in the given order with findings of `check_batch` kept, those of several batches added, and
     `machine.overrule` applied: matching findings get its reason, `mask: true` adds a mask of its own.
@@ -81,7 +81,7 @@ def usable_channels(
 
 
 def _shortage(batch: Batch, name: str) -> str:
-    """What is wrong with a channel in one batch, in words; empty when it is usable."""
+    """Why a channel of one batch is not usable; empty when it is."""
     if name not in batch.table.columns or not np.isfinite(batch.values(name)).any():
         return f"missing in {batch.batch_id}"
     lacking = float(np.mean(~np.isfinite(batch.masked(name))))
@@ -99,7 +99,7 @@ def _own(batch: Batch) -> tuple[Finding, ...]:
 
 
 def overruled(batch: Batch, rules: Sequence[Overrule]) -> Batch:
-    """The batch with the user's word: findings that a rule matches get its reason, `mask: true` adds one."""
+    """The batch with the overrules applied: matching findings get the reason, `mask: true` adds a mask."""
     findings = list(batch.findings)
     for rule in rules:
         if not fnmatchcase(batch.batch_id, rule.batch):

@@ -1,4 +1,4 @@
-"""A sensor whose start level stands far off its neighbours in some batches and not in the others."""
+"""Checks that compare batches: offset sensors, swapped sensors, errors that the temperatures do not explain."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import THERMAL, Array, Check, in_time, smallest_step
+from data.checks.base import THERMAL, Array, Check, in_time, row_medians, smallest_step
 from data.machine import Machine
 
 _BATCHES = 5
@@ -25,7 +25,7 @@ class Offset(Check):
     """
 
     key = "offset"
-    words = "start level far off the neighbours, unlike in other batches"
+    summary = "start level far off the neighbours, unlike in other batches"
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         names = batches[0].names(*THERMAL) if batches else ()
@@ -43,13 +43,13 @@ class Offset(Check):
             spread = 1.4826 * np.nanmedian(np.abs(centred), axis=0)
             near = np.argsort(spread, kind="stable")[:_NEIGHBOURS]
             limit = max(_FLOOR_K, _SIGMAS * float(np.median(spread[near])))
-            off = np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in centred[:, near]])
+            off = row_medians(centred[:, near])
             for k in np.flatnonzero(np.abs(np.nan_to_num(off)) > limit):
-                words = (
-                    f"{name} starts {off[k]:+.1f} K off where it stands beside its neighbours in the other batches "
+                message = (
+                    f"{name} starts {off[k]:+.1f} K off its level relative to its neighbours in the other batches "
                     f"(they repeat within {float(np.median(spread[near])):.2f} K)"
                 )
-                found.setdefault(int(k), []).append(self.finding(name, words))
+                found.setdefault(int(k), []).append(self.finding(name, message))
         return found
 
 
@@ -75,7 +75,7 @@ class Swapped(Check):
     """
 
     key = "swapped"
-    words = "two sensors have changed places"
+    summary = "two sensors have changed places"
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         names = list(batches[0].names(*THERMAL)) if batches else []
@@ -90,7 +90,7 @@ class Swapped(Check):
         floor = np.array([0.3] + [0.04] * len(_AT))
         spread = np.maximum(spread, floor)
         for k in range(len(batches)):
-            # fit[i, j]: how badly channel i looks like channel j
+            # fit[i, j]: rms deviation of channel i from the fingerprint of channel j
             z = (prints[k][:, None, :] - centre[None]) / spread[None]
             fit = np.sqrt(np.mean(np.minimum(np.abs(z), 30.0) ** 2, axis=2))
             bad = [i for i in range(len(names)) if np.isfinite(fit[i, i]) and fit[i, i] > _MISFIT]
@@ -98,11 +98,11 @@ class Swapped(Check):
                 for j in bad[a + 1 :]:
                     if fit[i, j] < _FIT and fit[j, i] < _FIT:
                         for this, other in ((i, j), (j, i)):
-                            words = (
+                            message = (
                                 f"{names[this]} behaves as {names[other]} does in the other batches and the other way "
                                 "round: their plugs or columns have changed places"
                             )
-                            found.setdefault(k, []).append(self.finding(names[this], words))
+                            found.setdefault(k, []).append(self.finding(names[this], message))
         return found
 
 
@@ -136,12 +136,12 @@ _FLOOR_UM = 20.0  # friction that scatters by 15 % moves 80 µm by 12 from batch
 
 
 class Unexplained(Check):
-    """Ridge on the rises of all sound temperatures, each batch predicted by the others. A batch is told when
-    its residual exceeds the median over batches by 6 robust sigma, three times the median itself, and 20 µm.
+    """Ridge on the rises of all sound temperatures, each batch predicted by the others. A batch is reported when its
+    residual exceeds the median over batches by 6 robust sigma, three times the median itself, and 20 µm.
     """
 
     key = "unexplained"
-    words = "the temperatures explain this batch's error far worse than the others'"
+    summary = "the temperatures explain this batch's error far worse than the others'"
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         if len(batches) < _BATCHES_TO_COMPARE:
@@ -169,12 +169,12 @@ class Unexplained(Check):
                 if not left[worst] > max(centre + _UNEXPLAINED_SIGMAS * spread, _TIMES * centre, _FLOOR_UM):
                     break
                 odd.append(worst)
-                words = (
+                message = (
                     f"{target}: a ridge model of the other batches leaves {left[worst]:.0f} µm here and "
                     f"{centre:.0f} µm in the median batch. No sensor explains it; look at the probe and its fixture. "
                     "Not masked: to leave it out of training, overrule with mask: true"
                 )
-                found.setdefault(worst, []).append(self.finding(target, words, masks=False))
+                found.setdefault(worst, []).append(self.finding(target, message, masks=False))
         return found
 
 

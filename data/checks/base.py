@@ -1,8 +1,8 @@
-"""What every check shares: its interface, noise and step estimates, stretches, driver changes.
+"""Base class of the checks, and what they share: noise and step estimates, intervals of rows, driver changes.
 
-A check is one class in one file plus one line in the registry. `batch` looks at one recording, `across`
-at all batches of a machine; either may stay as it is here. Both return findings and change nothing.
-A check sees the batch with the masks of the checks before it, so one fault is told once.
+A check is one class plus one line in the registry. `batch` examines one recording, `across` all batches of a machine;
+a subclass overrides one or both. Both return findings and change nothing. A check sees the batch with the masks of the
+checks before it, so that each fault is reported once.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _EXCHANGES = {3: _MEDIAN_7, 4: _MEDIAN_9}
 
 
 class Signals:
-    """Masked values (p, n) of a batch's channels, one row a channel, with their extremes, steps and rests."""
+    """Masked values (p, n) of a batch's channels, one row per channel, with cached extremes and steps."""
 
     def __init__(self, batch: Batch) -> None:
         self._row = {n: i for i, n in enumerate(n for n in batch.channels if n in batch.table.columns)}
@@ -61,7 +61,7 @@ class Signals:
         return float(self._largest_step[self._row[name]])
 
     def rests(self, name: str, rows: int) -> bool:
-        """False if the channel surely never holds one value for `rows` rows."""
+        """False if the channel certainly never repeats one value over `rows` rows."""
         if rows not in self._rest:
             self._rest[rows] = _any_run(self._still, rows - 1)
         return bool(self._rest[rows][self._row[name]])
@@ -118,7 +118,7 @@ def signals(batch: Batch) -> Signals:
 
 
 def excess(values: Array, half: int = 4) -> Array:
-    """Step into each row less the median step of the rows around it, shape (n,); row 0 is 0, NaN beside holes."""
+    """Step into each row less the median step of the rows around it, shape (n,); row 0 is 0, NaN next to holes."""
     steps = np.diff(values, prepend=values[:1])
     steps[:1] = 0.0
     return steps - rolling_median(steps, half)
@@ -164,10 +164,10 @@ SETTLE_S = 600.0  # after a start, stop or speed change the machine may move as 
 
 
 class Check:
-    """One kind of fault: `key` names it in findings, `words` says it in a line."""
+    """One kind of fault: `key` names it in findings, `summary` describes it in a line."""
 
     key: ClassVar[str] = ""
-    words: ClassVar[str] = ""
+    summary: ClassVar[str] = ""
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         """Findings in one recording."""
@@ -180,12 +180,12 @@ class Check:
     def finding(
         self,
         channel: str | None,
-        words: str,
+        message: str,
         start_s: float | None = None,
         end_s: float | None = None,
         masks: bool = True,
     ) -> Finding:
-        return Finding(self.key, channel, words, start_s, end_s, masks)
+        return Finding(self.key, channel, message, start_s, end_s, masks)
 
 
 def in_time(batch: Batch, *roles: str) -> tuple[str, ...]:
@@ -243,6 +243,11 @@ def widened(found: Finding, batch: Batch, thin: Batch) -> Finding:
     )
 
 
+def row_medians(values: Array) -> Array:
+    """Median of the finite values of each row (n, m), (n,); NaN where there is none."""
+    return np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in values])
+
+
 def smallest_step(batch: Batch, name: str) -> float:
     """The stated resolution, else 0."""
     return batch.channels[name].resolution or 0.0
@@ -266,7 +271,7 @@ def load_changes(batch: Batch) -> Bools:
 
 
 def standing(batch: Batch) -> Bools:
-    """Rows where the spindle stands or nobody says that it runs; shape (n,)."""
+    """Rows where the spindle stands or its speed is unknown; shape (n,)."""
     spindle = [n for n in batch.names("driver") if batch.channels[n].unit == "rpm"] or list(batch.names("driver"))
     runs = np.zeros(batch.n_rows, bool)
     for name in spindle:
@@ -276,12 +281,12 @@ def standing(batch: Batch) -> Bools:
 
 
 def clock(seconds: float) -> str:
-    """Time from the batch's start for people: ``5 h 29 min``."""
+    """Time from the batch's start as text: ``5 h 29 min``."""
     minutes = round(seconds / 60.0)
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
 
 
-def span_words(batch: Batch, first: int, last: int) -> str:
+def span_text(batch: Batch, first: int, last: int) -> str:
     """``from 5 h 01 min to 6 h 00 min`` of rows first..last."""
     t = batch.time_s
     return f"from {clock(t[first])} to {clock(t[last])}"

@@ -1,4 +1,4 @@
-"""A temperature that takes no part: constant through a batch in which the others move."""
+"""Checks for repeated values: dead temperature sensors, frozen channels, error channels that are held."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from data.checks.base import (
     Check,
     constant_runs,
     in_time,
+    row_medians,
     signals,
     smallest_step,
-    span_words,
+    span_text,
     standing,
 )
 from data.checks.steps import JumpNoReturn, Spike
@@ -31,14 +32,16 @@ _STEADY = 4.0
 
 
 class Dead(Check):
-    """Alone: wholly constant while the median of the others moves by 3 K and 30 of its resolution steps.
+    """A temperature that takes no part in the warming.
 
-    Against its own history: it moves by less than a tenth of what the three others with the steadiest ratio to it
+    Within one batch: constant while the median of the others moves by 3 K and 30 of its resolution steps.
+
+    Against other batches: it moves by less than a tenth of what the three others with the steadiest ratio to it
     let expect, where that ratio is steady (four times its scatter below 1).
     """
 
     key = "dead"
-    words = "takes no part in the machine's warming"
+    summary = "takes no part in the machine's warming"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         moved = {n: self._moved_K(batch, n) for n in batch.names(*THERMAL)}
@@ -50,8 +53,8 @@ class Dead(Check):
             usual = float(np.median(others))
             if usual >= max(_FLOOR_K, _STEPS * smallest_step(batch, name)):
                 level = batch.values(name)[np.isfinite(batch.values(name))][0]
-                words = f"{name} stays at {level:.5g} degC all through while the others move by {usual:.1f} K"
-                found.append(self.finding(name, words))
+                message = f"{name} stays at {level:.5g} degC all through while the others move by {usual:.1f} K"
+                found.append(self.finding(name, message))
         return found
 
     @staticmethod
@@ -80,22 +83,18 @@ class Dead(Check):
             near = np.argsort(scatter, kind="stable")[:_NEIGHBOURS]
             if _STEADY * float(np.median(scatter[near])) > 1.0:
                 continue
-            expected = _median_of_rows(usual[near] * rest[:, near])
+            expected = row_medians(usual[near] * rest[:, near])
             least = max(_FLOOR_K, _STEPS * smallest_step(batches[0], name))
             for k, batch in enumerate(batches):
                 if any(f.check == self.key and f.channel == name for f in batch.findings):
                     continue
                 if expected[k] > least and moved[k, j] < 0.1 * expected[k]:
-                    words = (
+                    message = (
                         f"{name} moves by {moved[k, j]:.1f} K where its neighbours let expect {expected[k]:.1f} K from "
                         "the other batches"
                     )
-                    found.setdefault(k, []).append(self.finding(name, words))
+                    found.setdefault(k, []).append(self.finding(name, message))
         return found
-
-
-def _median_of_rows(values: Array) -> Array:
-    return np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in values])
 
 
 def _range_K(values: Array) -> float:
@@ -115,17 +114,16 @@ _SIGMAS = 6.0
 
 
 class Frozen(Check):
-    """Two ways to tell.
+    """Constant far longer than its noise and the other channels allow; either of two criteria is enough.
 
-    Noise above the resolution (75 % of the samples differ from the one before, or half of them and often by
-    more than one step of the display) makes so many equal samples
-    impossible: chance below 1e-9 and three times the longest other run. Or the other temperatures, fitted
-    outside the stretch, and the channel's own slope at the stretch's ends both say that it moves in it by
-    15 resolution steps, by 1 K or 5 µm, and by six sigma of that fit.
+    Noise above the resolution (75 % of the samples differ from the one before, or half of them and often by more than
+    one step of the display) makes so many equal samples impossible: chance below 1e-9 and three times the longest other
+    run. Or the other temperatures, fitted outside the interval, and the channel's own slope at its ends both predict a
+    movement of at least 15 resolution steps, 1 K or 5 µm, and six sigma of that fit.
     """
 
     key = "frozen"
-    words = "constant far longer than noise and the other channels allow"
+    summary = "constant far longer than noise and the other channels allow"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
@@ -147,10 +145,10 @@ class Frozen(Check):
                 )
                 if reason:
                     claimed.append((a, b))
-                    words = (
-                        f"{name} stays at {v[a]:.5g} {batch.channels[name].unit} {span_words(batch, a, b)}: {reason}"
+                    message = (
+                        f"{name} stays at {v[a]:.5g} {batch.channels[name].unit} {span_text(batch, a, b)}: {reason}"
                     )
-                    found.append(self.finding(name, words, float(batch.time_s[a + 1]), float(batch.time_s[b])))
+                    found.append(self.finding(name, message, float(batch.time_s[a + 1]), float(batch.time_s[b])))
         return found
 
     def _no_flicker(self, batch: Batch, name: str, v: Array, a: int, b: int, longest_other: int) -> str:
@@ -201,11 +199,11 @@ class Frozen(Check):
         least = max(least, _SIGMAS * sigma)
         if moved < least or own < least:
             return ""
-        return f"the other temperatures say that it moves by {moved:.1f} {'K' if unit == 'degC' else unit} in this time"
+        return f"the other temperatures predict a change of {moved:.1f} {'K' if unit == 'degC' else unit} in this time"
 
 
 class _Witnesses:
-    """Who may speak for the other channels: a sensor that jumps or spikes may not. Asked only where it matters."""
+    """Channels that jump or spike, which must not serve as inputs; found only when needed."""
 
     def __init__(self, batch: Batch, machine: Machine) -> None:
         self._batch, self._machine = batch, machine
@@ -249,7 +247,7 @@ class ErrorHeld(Check):
     """
 
     key = "error_held"
-    words = "error channels held while the spindle stands"
+    summary = "error channels held while the spindle stands"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)
@@ -263,7 +261,7 @@ class ErrorHeld(Check):
         together[0] = True
         for name in names:
             v = seen.values(name)
-            # a channel already masked here has no say
+            # a channel already masked here does not count
             change = np.abs(np.diff(v))
             together[1:] |= np.isfinite(change) & ~(change <= EQUAL * np.maximum(1.0, np.abs(v[1:])))
         code = np.cumsum(together).astype(float)
@@ -273,18 +271,20 @@ class ErrorHeld(Check):
         held = [(a, b) for a, b in runs if self._is_held(batch, names, code, a, b, runs, still)]
         found = []
         for a, b in held:
-            state = "while the spindle stands" if still[a + 1 : b].mean() > 0.5 else "though the spindle is said to run"
+            state = (
+                "while the spindle stands" if still[a + 1 : b].mean() > 0.5 else "although the spindle speed is above 0"
+            )
             for name in names:
                 there = np.flatnonzero(np.isfinite(seen.values(name)[a : b + 1]))
                 if len(there) < 2:
                     continue
                 last = a + int(there[-1])
                 moved = _temperature_change(batch, a, last)
-                words = (
+                message = (
                     f"{name} repeats {batch.values(name)[a]:.1f} {batch.channels[name].unit} "
-                    f"{span_words(batch, a, last)} {state}, while temperatures change by up to {moved:.1f} K"
+                    f"{span_text(batch, a, last)} {state}, while temperatures change by up to {moved:.1f} K"
                 )
-                found.append(self.finding(name, words, float(batch.time_s[a + 1]), float(batch.time_s[last])))
+                found.append(self.finding(name, message, float(batch.time_s[a + 1]), float(batch.time_s[last])))
         return found
 
     def _is_held(

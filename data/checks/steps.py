@@ -1,4 +1,4 @@
-"""Single samples far off their neighbours."""
+"""Checks of single steps: spikes, and jumps that do not return."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class Spike(Check):
     """
 
     key = "spike"
-    words = "single samples far off their neighbours"
+    summary = "single samples far off their neighbours"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)
         names = in_time(batch, "temperature", "ambient", "error")
-        # who stands off the rows around by the floor got there in three steps at most
+        # a deviation of the floor from the rows around takes at most three steps
         names = tuple(n for n in names if seen.largest_step(n) * _HALF > _FLOOR[batch.channels[n].role])
         loaded = load_changes(batch) if names else np.zeros(0, bool)
         found = []
@@ -62,11 +62,11 @@ class Spike(Check):
             rows = [r for r in hit if self._single(r, set(hit)) and self._comes_back(v, r, off[r])]
             for r in rows:
                 unit = "K" if channel.unit == "degC" else channel.unit
-                words = (
+                message = (
                     f"{name} reads {v[r]:.5g} {channel.unit} at {clock(batch.time_s[r])}, {off[r]:.1f} {unit} off the "
                     "samples around it"
                 )
-                found.append(self.finding(name, words, float(batch.time_s[r]), float(batch.time_s[r])))
+                found.append(self.finding(name, message, float(batch.time_s[r]), float(batch.time_s[r])))
         return found
 
     @staticmethod
@@ -96,18 +96,18 @@ _MOST = 0.6
 class JumpNoReturn(Check):
     """A step beyond noise, resolution and the channel's own liveliness, away from driver changes and not
     shared by others; or a temperature that rises faster than noise and 1 kW into 7.5 kJ/K explain. Masked from the
-    first odd step to the batch's end, or to the step that brings it back. A fast recording is looked at row by row and
+    first odd step to the batch's end, or to the step that brings it back. A fast recording is checked row by row and
     over 10 s, where a step spread over seconds shows.
     """
 
     key = "jump_no_return"
-    words = "a step of one channel that noise, load and neighbours do not explain"
+    summary = "a step of one channel that noise, load and neighbours do not explain"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = self._at(batch)
         if thin := thinned(batch):
-            told = {f.channel for f in found}
-            found += [widened(f, batch, thin) for f in self._at(thin) if f.channel not in told]
+            reported = {f.channel for f in found}
+            found += [widened(f, batch, thin) for f in self._at(thin) if f.channel not in reported]
         return found
 
     def _at(self, batch: Batch) -> list[Finding]:
@@ -136,7 +136,7 @@ class JumpNoReturn(Check):
                 alone |= self._too_fast(batch, name, seen) & (shared < max(2, _MOST * len(same)))
             row = self._staying(seen.values(name), steps[name], alone)
             if row is not None:
-                found.append(self._told(batch, name, row, seen))
+                found.append(self._finding_at(batch, name, row, seen))
         return found
 
     def _limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
@@ -173,7 +173,7 @@ class JumpNoReturn(Check):
                 return int(row)
         return None
 
-    def _told(self, batch: Batch, name: str, row: int, seen: Signals) -> Finding:
+    def _finding_at(self, batch: Batch, name: str, row: int, seen: Signals) -> Finding:
         channel, t, e = batch.channels[name], batch.time_s, seen.excess(name)
         unit = "K" if channel.unit == "degC" else channel.unit
         v = seen.values(name)
@@ -188,12 +188,12 @@ class JumpNoReturn(Check):
         back = np.flatnonzero((np.sign(e) == -np.sign(size)) & (np.abs(e) > 0.6 * abs(size)))
         back = back[back > row + 1]
         end = int(back[0]) - 1 if len(back) else None
-        words = (
+        message = (
             f"{name} steps by {size:+.1f} {unit} at {clock(t[row])}, which noise ({small / 8:.2g} {unit}), load and "
             "the other channels do not explain, and "
         )
-        words += "does not return" if end is None else f"comes back at {clock(t[end])}"
-        return self.finding(name, words, float(t[first]), None if end is None else float(t[end]))
+        message += "does not return" if end is None else f"comes back at {clock(t[end])}"
+        return self.finding(name, message, float(t[first]), None if end is None else float(t[end]))
 
 
 def _floor(batch: Batch, name: str) -> float:
@@ -201,7 +201,7 @@ def _floor(batch: Batch, name: str) -> float:
 
 
 def _near(flags: Bools) -> Bools:
-    """True also one row beside: resampling can move a step by one."""
+    """True also in the neighbouring rows: resampling can move a step by one."""
     out = flags.copy()
     out[1:] |= flags[:-1]
     out[:-1] |= flags[1:]

@@ -1,22 +1,11 @@
-"""What the reader had to repair in the recording's clock, told as findings that mask nothing."""
+"""Checks of the time axis: repaired clock, gaps, interrupted recordings."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from data.batch import Batch, Finding
-from data.checks.base import (
-    THERMAL,
-    Check,
-    clock,
-    in_time,
-    signals,
-    span_words,
-    step_limit,
-    stretches,
-    thinned,
-    widened,
-)
+from data.checks.base import THERMAL, Check, clock, in_time, signals, span_text, step_limit, stretches, thinned, widened
 from data.machine import Machine
 
 _REPAIRS = {
@@ -30,19 +19,19 @@ _REPAIRS = {
 
 class Clock(Check):
     key = "clock"
-    words = "the recording's clock was repaired"
+    summary = "the recording's clock was repaired"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         return [
-            self.finding(None, f"clock: {batch.repairs[kind]} {words}", masks=False)
-            for kind, words in _REPAIRS.items()
+            self.finding(None, f"clock: {batch.repairs[kind]} {repair}", masks=False)
+            for kind, repair in _REPAIRS.items()
             if batch.repairs.get(kind)
         ]
 
 
 class Gap(Check):
     key = "gap"
-    words = "nothing recorded"
+    summary = "nothing recorded"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         names = [n for n in in_time(batch, "temperature", "ambient", "error") if n in batch.table.columns]
@@ -52,19 +41,19 @@ class Gap(Check):
             return []
         empty = {n: ~np.isfinite(batch.values(n)) for n in names}
         everywhere = np.logical_and.reduce(list(empty.values()))
-        found = [self._told(batch, None, a, b) for a, b in stretches(everywhere)]
+        found = [self._gap(batch, None, a, b) for a, b in stretches(everywhere)]
         for name in names:
             if empty[name].all() and not everywhere.all():
                 found.append(self.finding(name, f"{name} was not recorded", masks=False))
                 continue
-            found += [self._told(batch, name, a, b) for a, b in stretches(empty[name] & ~everywhere)]
+            found += [self._gap(batch, name, a, b) for a, b in stretches(empty[name] & ~everywhere)]
         return found
 
-    def _told(self, batch: Batch, name: str | None, a: int, b: int) -> Finding:
+    def _gap(self, batch: Batch, name: str | None, a: int, b: int) -> Finding:
         minutes = (b - a + 1) * batch.step_s / 60.0
         who = f"{name} has no values" if name else "no channel has values"
-        words = f"{who} {span_words(batch, a, b)} ({minutes:.3g} min)"
-        return self.finding(name, words, float(batch.time_s[a]), float(batch.time_s[b]), masks=False)
+        message = f"{who} {span_text(batch, a, b)} ({minutes:.3g} min)"
+        return self.finding(name, message, float(batch.time_s[a]), float(batch.time_s[b]), masks=False)
 
 
 _SHARE = 0.6
@@ -76,7 +65,7 @@ class Interruption(Check):
     """Most temperatures step in one row. What the error channels show afterwards hangs on an unknown zero."""
 
     key = "interruption"
-    words = "recording interrupted: all temperatures jump together"
+    summary = "recording interrupted: all temperatures jump together"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = self._at(batch)
@@ -117,11 +106,11 @@ class Interruption(Check):
         moved = size[:, rows[0]][jumped[:, rows[0]]]
         start = float(batch.time_s[max(row - 1, 0)])
         low, high = np.min(np.abs(moved)), np.max(np.abs(moved))
-        words = (
+        message = (
             f"{len(moved)} of {len(names)} temperatures jump together at {clock(start)}, by {low:.1f} to {high:.1f} K "
             f"within {2 * batch.step_s:.0f} s: the recording was interrupted"
         )
         return [
-            self.finding(name, f"{words}; {name} after it cannot be tied to the zero at the start", start)
+            self.finding(name, f"{message}; {name} after it cannot be tied to the zero at the start", start)
             for name in batch.names("error")
         ]

@@ -1,4 +1,4 @@
-"""Samples outside the plausible range of the machine file."""
+"""Checks of level and scale: plausible range, full scale of an instrument, wrong unit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from data.checks.base import (
     constant_runs,
     signals,
     smallest_step,
-    span_words,
+    span_text,
     step_limit,
     stretches,
 )
@@ -22,7 +22,7 @@ from data.machine import Machine
 
 class OutOfRange(Check):
     key = "out_of_range"
-    words = "outside the plausible range of the machine file"
+    summary = "outside the plausible range of the machine file"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
@@ -41,7 +41,7 @@ class OutOfRange(Check):
                 found.append(
                     self.finding(
                         name,
-                        f"{name} reads {worst:.5g} {channel.unit} {span_words(batch, a, b)}, outside "
+                        f"{name} reads {worst:.5g} {channel.unit} {span_text(batch, a, b)}, outside "
                         f"{channel.low:g} to {channel.high:g}",
                         float(batch.time_s[a]),
                         float(batch.time_s[b]),
@@ -61,7 +61,7 @@ class Saturated(Check):
     """
 
     key = "saturated"
-    words = "pinned at a full-scale value"
+    summary = "pinned at a full-scale value"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = []
@@ -88,7 +88,7 @@ class Saturated(Check):
                         self.finding(
                             name,
                             f"{name} jumps by {arrived:.1f} {channel.unit} at {clock(batch.time_s[a])} to its "
-                            f"full scale {rail:g} {channel.unit} and stays there {span_words(batch, a, b)}",
+                            f"full scale {rail:g} {channel.unit} and stays there {span_text(batch, a, b)}",
                             float(batch.time_s[a]),
                             float(batch.time_s[b]),
                         )
@@ -124,7 +124,7 @@ _TINY_UM = 0.5  # a machine that warms by 3 K moves by more than this
 
 class WrongUnit(Check):
     key = "wrong_unit"
-    words = "level or scale fits another unit"
+    summary = "level or scale fits another unit"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         starts = {n: _start(batch.values(n)) for n in batch.names(*THERMAL) if batch.channels[n].unit == "degC"}
@@ -135,9 +135,11 @@ class WrongUnit(Check):
         found = []
         for name, start in starts.items():
             if name in kelvin:
-                found.append(self._told(batch, name, f"starts at {start:.1f}", "K", start - 273.15, "degC"))
+                found.append(self._unit_finding(batch, name, f"starts at {start:.1f}", "K", start - 273.15, "degC"))
             elif self._fahrenheit(start, usual):
-                found.append(self._told(batch, name, f"starts at {start:.1f}", "degF", (start - 32) / 1.8, "degC"))
+                found.append(
+                    self._unit_finding(batch, name, f"starts at {start:.1f}", "degF", (start - 32) / 1.8, "degC")
+                )
         return found + self._millimetres(batch, list(starts))
 
     def _fahrenheit(self, start: float, usual: float) -> bool:
@@ -161,15 +163,15 @@ class WrongUnit(Check):
             steps = np.abs(np.diff(v))
             fine = (batch.channels[name].resolution or np.inf) / 10.0
             if 0 < np.ptp(v) < _TINY_UM and (steps[steps > 0].min() < fine):
-                words = f"moves by only {np.ptp(v):.3g} while the temperatures move by {warmed:.1f} K"
-                found.append(self._told(batch, name, words, "mm", float(np.ptp(v)) * 1000.0, "um in all"))
+                observed = f"moves by only {np.ptp(v):.3g} while the temperatures move by {warmed:.1f} K"
+                found.append(self._unit_finding(batch, name, observed, "mm", float(np.ptp(v)) * 1000.0, "um in all"))
         return found
 
-    def _told(self, batch: Batch, name: str, seen: str, unit: str, value: float, canonical: str) -> Finding:
+    def _unit_finding(self, batch: Batch, name: str, observed: str, unit: str, value: float, canonical: str) -> Finding:
         expected = batch.channels[name].unit
         return self.finding(
             name,
-            f"{name} {seen}, which is no plausible {expected} but as {unit} gives {value:.1f} {canonical}: "
+            f"{name} {observed}, which is no plausible {expected} but as {unit} gives {value:.1f} {canonical}: "
             f"set unit_in_file: {unit} for this channel",
         )
 

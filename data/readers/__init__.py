@@ -1,4 +1,4 @@
-"""The file formats, one line each: a new one is a class in a new file plus a line here."""
+"""Registry of file readers. A new format is a class in a new file plus a line here."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ def reader_for(path: Path) -> Reader:
     """The reader of a file by its suffix (case does not matter).
 
     Raises:
-        InputError: unknown suffix.
+        InputError: unsupported file extension.
     """
     suffix = path.suffix.lower().removeprefix(".")
     key = _OTHER_SUFFIXES.get(suffix, suffix)
     if key not in READERS:
         allowed = ", ".join(f".{s}" for s in [*READERS, *_OTHER_SUFFIXES])
-        raise InputError(f"{path.name}: unknown suffix {path.suffix!r}; expected one of {allowed}; export it as CSV")
+        raise InputError(
+            f"{path.name}: unsupported file extension {path.suffix!r}; expected one of {allowed}; export it as CSV"
+        )
     reader: Reader = READERS[key]()
     return reader
 

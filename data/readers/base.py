@@ -1,4 +1,4 @@
-"""What a reader is: it opens a file and hands out its sheets, each with its first rows and a stream of blocks.
+"""Base classes of the file readers: a reader opens a file and yields its sheets.
 
 To add a format, write one class in a new file and a line in `data/readers/__init__.py`:
 
@@ -7,9 +7,9 @@ To add a format, write one class in a new file and a line in `data/readers/__ini
         def open(self, path, hints):
             yield [OdsSheet(...), ...]
 
-A sheet knows nothing of machines: it gives `head`, the first rows as cells, in which `data.readers.header`
-looks for the header, and `blocks(first_row, positions, text)`, the data rows below, column by column.
-Everything that is wrong with the file itself is an InputError in one line.
+A sheet is independent of the machine file. `head` holds the first rows as cells, in which `data.readers.header` finds
+the header; `blocks(first_row, positions, text)` yields the data rows below it, column by column. A damaged file is an
+InputError.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-HEAD_ROWS = 1000  # a header further down is not looked for in formats that are slow to scan
+HEAD_ROWS = 1000  # the header is searched in these rows only, in formats that are slow to scan
 
 
 @dataclass(frozen=True)
 class Block:
     """Consecutive data rows. `columns`: position -> Arrow array of numbers, text or timestamps, all of one length.
 
-    `ragged_rows` counts rows of this stretch that could not be told apart into columns; they are in no array.
+    `ragged_rows` counts rows that could not be split into columns; they are in no array.
     """
 
     columns: dict[int, Any]
@@ -41,8 +41,8 @@ class Sheet(ABC):
     name: str = ""
     head: Sequence[Sequence[Any]] = ()  # first rows, cells as text or as Python values
     decimal: str = "."  # decimal mark of numbers in text cells
-    share_read: float = 1.0  # of the file, by the blocks given out so far: foretells how many rows will come
-    words: str = ""  # how the text is written, for people: "semicolon, decimal comma, cp1252"
+    share_read: float = 1.0  # share of the file in the blocks so far: predicts the number of rows
+    summary: str = ""  # how the text is encoded: "semicolon, decimal comma, cp1252"
 
     @abstractmethod
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:

@@ -1,4 +1,4 @@
-"""Cells to numbers and times: Arrow columns as the readers give them, to float64 arrays."""
+"""Parsing of cells: Arrow columns of numbers, text and time stamps to float64 arrays."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def stamp_formats(samples: Sequence[str]) -> list[str]:
     fits = [p for p in patterns if _parse(cells.iloc[:3], p).notna().any() and _parse(cells, p).notna().sum() >= need]
     fits = [p for p in fits if _parse(cells, p).dropna().is_monotonic_increasing] or fits
     starts: dict[Any, str] = {}
-    for pattern in fits:  # patterns that say the same count once
+    for pattern in fits:  # equivalent patterns count once
         starts.setdefault(_parse(cells, pattern).dropna().iloc[0], pattern)
     return list(starts.values())
 
@@ -144,7 +144,7 @@ def stamp_format(samples: Sequence[str], where: str) -> str:
     """The one pattern that fits; "ISO8601" where there are no samples.
 
     Raises:
-        InputError: none fits, or day and month cannot be told apart.
+        InputError: none fits, or day and month are ambiguous.
     """
     if not any(s.strip() for s in samples):
         return _ISO

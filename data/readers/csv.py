@@ -1,4 +1,4 @@
-"""CSV in all its spellings. pyarrow parses the bulk; only blocks that it rejects take the tolerant way."""
+"""CSV reader: detects encoding, separator and decimal mark; blocks that pyarrow rejects are read as text."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class CsvSheet(Sheet):
         self._quoted = '"' in text
         names = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar"}
         mark = "point" if self.decimal == "." else "comma"
-        self.words = f"{names[self.separator]} separated, decimal {mark}, {self.encoding}"
+        self.summary = f"{names[self.separator]} separated, decimal {mark}, {self.encoding}"
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         widths = Counter(len(row) for row in self.head[first_row : first_row + 200] if row)
@@ -221,9 +221,7 @@ class CsvSheet(Sheet):
                 pa.BufferReader(lines),
                 read_options=pc.ReadOptions(column_names=names),
                 parse_options=pc.ParseOptions(
-                    delimiter=self.separator,
-                    quote_char='"' if self._quoted else False,
-                    invalid_row_handler=skip,
+                    delimiter=self.separator, quote_char='"' if self._quoted else False, invalid_row_handler=skip
                 ),
                 convert_options=pc.ConvertOptions(
                     column_types=types,
@@ -269,7 +267,7 @@ class CsvReader(Reader):
 
 
 def read_text_table(path: Path) -> list[dict[str, str]]:
-    """A small table of text, first row the header: one dict a row. For tables beside recordings, up to 1 MB."""
+    """A small table of text, first row the header: one dict per row. For tables next to recordings, up to 1 MB."""
     head = CsvSheet(path, ()).head
     rows = [[cell.strip() for cell in row] for row in head if row]
     if not rows:

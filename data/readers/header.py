@@ -1,4 +1,4 @@
-"""Where a sheet's data begin and which of its columns is which channel."""
+"""Layout of a sheet: header, units row, first data row, and the column of each channel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class NotThisTable(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """First data row, position of time and of each channel found, and what was left aside.
+    """First data row, position of time and of each channel found, and counts of what was skipped.
 
     `sweeps`: error channel -> (key in `positions`, position along its axis) where each position has a column.
     """
@@ -114,7 +114,8 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
             f"{where}: no error channel; got {got}, expected column {_some([str(wanted[n]) for n in errors])};"
             " correct column: of the error channels"
         )
-    known = set(positions.values()) | {at} | {p for c in machine.ignore if (p := position(_plain(c))) is not None}
+    ignored = (position(int(c) if c.isdigit() else c) for c in machine.ignore)
+    known = {*positions.values(), at, *(p for p in ignored if p is not None)}
     named = sum(bool(str(c or "").strip()) for c in header) if header else width
     first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
     counts = {
@@ -124,10 +125,6 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         "missing_channels": len(wanted) - len(got_channels),
     }
     return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps)
-
-
-def _plain(column: str) -> str | int:
-    return int(column) if column.isdigit() else column
 
 
 def _some(names: Sequence[str], n: int = 3) -> str:

@@ -1,4 +1,4 @@
-"""Parquet files."""
+"""Parquet reader."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BLOCK_ROWS = 1 << 18
 class ParquetSheet(Sheet):
     """One Parquet file; row 0 of `head` are the column names."""
 
-    words = "parquet"
+    summary = "parquet"
 
     def __init__(self, path: Path, file: Any) -> None:
         self._path = path
@@ -50,8 +50,8 @@ class ParquetSheet(Sheet):
 
 
 def _damaged(path: Path, error: BaseException) -> InputError:
-    words = (str(error).splitlines() or [""])[0]
-    return InputError(f"{path.name}: not a readable Parquet file ({words}); write or copy it again")
+    reason = (str(error).splitlines() or [""])[0]
+    return InputError(f"{path.name}: not a readable Parquet file ({reason}); write or copy it again")
 
 
 class ParquetReader(Reader):

@@ -1,4 +1,4 @@
-"""XLSX workbooks, sheet by sheet, read as a stream."""
+"""XLSX reader: streams the sheets of a workbook."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class XlsxSheet(Sheet):
         self._worksheet = worksheet
         worksheet.reset_dimensions()
         self.head = [list(row) for row in itertools.islice(self._rows(1), HEAD_ROWS)]
-        self.words = f"sheet {self.name!r}"
+        self.summary = f"sheet {self.name!r}"
 
     def _rows(self, first_row: int) -> Iterator[Sequence[Any]]:
         try:
@@ -74,9 +74,9 @@ def _stamp(cell: Any) -> Any:
 
 
 def _damaged(path: Path, error: BaseException) -> InputError:
-    words = (str(error).splitlines() or [""])[0]
+    reason = (str(error).splitlines() or [""])[0]
     return InputError(
-        f"{path.name}: damaged or truncated XLSX ({type(error).__name__}: {words});"
+        f"{path.name}: damaged or truncated XLSX ({type(error).__name__}: {reason});"
         " expected a workbook that Excel opens; save or copy it again"
     )
 
@@ -87,12 +87,14 @@ class XlsxReader(Reader):
     @contextmanager
     def open(self, path: Path, hints: Sequence[str]) -> Iterator[list[Sheet]]:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # openpyxl speaks of styles and extensions that do not matter here
+            warnings.simplefilter("ignore")  # openpyxl warns of styles and extensions, which do not matter here
             try:
                 book = openpyxl.load_workbook(path, read_only=True, data_only=True)
             except _DAMAGE as error:
                 raise _damaged(path, error) from None
             try:
+                if not book.worksheets:
+                    raise InputError(f"{path.name}: the workbook has no worksheet; save or copy it again")
                 yield [XlsxSheet(path, worksheet) for worksheet in book.worksheets]
             finally:
                 book.close()

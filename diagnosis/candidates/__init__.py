@@ -1,1 +1,1 @@
-"""What may be missing and where: mechanisms at places, and the rivals that need no new physics."""
+"""What may be missing and where: mechanisms at places, and the alternatives that need no new physics."""

@@ -1,8 +1,8 @@
-"""The rival "the network is too coarse here": a piece of its own around a sensor, with or without a neighbour's heat.
+"""Alternatives that need no new physics: a finer network near a sensor, a wrong value, a value that varies.
 
-A sensor in a big casting sees what is near it first. A local node of part of the casting's capacity behind a free
-conductance is the least refinement that can lag, and lead where a neighbour's heat enters through it; a far one lets
-the sensor's body answer at once and settle slowly.
+A sensor in a big casting sees what is near it first. A local node with a part of the casting's capacity behind a free
+conductance is the smallest refinement that can lag, and lead where a neighbour's heat enters through it; a far node
+lets the sensor's body respond at once and settle slowly.
 """
 
 from __future__ import annotations
@@ -15,23 +15,30 @@ import numpy as np
 from pydantic import BaseModel
 
 from diagnosis.candidates.library import ends_of, linked
-from diagnosis.contracts import FAR, NEAR, Candidate, Change, Fitted, Kind, Where, pieces_of
+from diagnosis.contracts import (
+    FAR_SUFFIX,
+    NEAR_SUFFIX,
+    Candidate,
+    CandidateKind,
+    Change,
+    Fitted,
+    Kind,
+    Where,
+    pieces_of,
+)
+from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
 from twin.network import Network
 from twin.quantity import Parameter, Value
 from twin.schema import Body, Link, MechanismPart
 
-SHARE = 0.15  # of the body's capacity
-STIFF = 3.0  # times all that leaves the body per kelvin: how well a piece conducts to the rest, to begin with
-SPREAD = 1.0  # of the logarithm of both
-SHORTCUTS = 1  # from one neighbour to another, the best conducting two
-HEATS = 1  # into a body that may enter half of it, one that was found first
-HALVES = 0.5  # times all that leaves the body per kelvin: how well they conduct to each other, to begin with
-THROUGH = 1  # links of a body that heat may enter a piece through, the best conducting
-FAR_SHARE = 0.4  # of the body's capacity that is added behind a conductance
 
-
-def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, worse: float = 9.0) -> list[Candidate]:
+def coarse_candidates(
+    fitted: Fitted,
+    mean_squares: np.ndarray,
+    most: int = POLICY.coarse_sensors,
+    worse: float = POLICY.coarse_min_mean_square,
+) -> list[Candidate]:
     """Refinements at the sensors whose left-out mean square (in units of the given noise's) is `worse` and largest,
     and where a heat that was found enters: a sensor near it sees more of it than its body's mean."""
     part = fitted.part
@@ -50,9 +57,9 @@ def coarse_candidates(fitted: Fitted, mean_squares: np.ndarray, most: int = 2, w
 
 
 def found_since(fitted: Fitted) -> list[str]:
-    """The mechanisms that the machine file has not got."""
+    """The mechanisms that the machine file lacks."""
     if not fitted.machine.twin:
-        return []  # it states nothing: all is drafted
+        return []  # drafted: the machine file states nothing
     known = fitted.machine.twin.get("mechanisms") or {}
     return [name for name in fitted.part.mechanisms if name not in known]
 
@@ -75,7 +82,7 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
     part, network = fitted.part, fitted.problem.network
     sensor = part.sensors[channel]
     body = sensor.at.partition("@")[0]
-    near = f"{channel}{NEAR}"
+    near = f"{channel}{NEAR_SUFFIX}"
     if near in part.bodies or part.bodies[body].shape != "lump":
         return
     cell = int(network.bodies[body][0])
@@ -83,43 +90,45 @@ def _of_sensor(fitted: Fitted, channel: str) -> Iterator[Candidate]:
     leaves = float(network.conductance_W_per_K(fitted.values)[cell, cell])
     own = partial(_piece, part.bodies[body], body, f"the sensor {channel}")
     piece = {
-        **own(near, "near", SHARE * capacity, STIFF * leaves),
+        **own(near, "near", POLICY.near_piece_capacity_share * capacity, POLICY.near_piece_conductance_factor * leaves),
         f"sensors.{channel}": sensor.model_copy(update={"at": near}),
     }
     where = Where("sensor", channel)
     yield from _shortcuts(fitted, body, channel, where, leaves)
-    far = f"{channel}{FAR}"
+    far = f"{channel}{FAR_SUFFIX}"
     if far not in part.bodies:
         yield Candidate(
-            "coarse_network",
+            CandidateKind.COARSE_NETWORK.value,
             where,
             f"coarse_network_{channel}_far",
             f"a piece of the {body} far from {channel}",
-            parts=own(far, "far from", FAR_SHARE * capacity, leaves),
+            parts=own(far, "far from", POLICY.far_piece_capacity_share * capacity, leaves),
         )
-    words = f"a piece of the {body} of its own around {channel}"
-    yield Candidate("coarse_network", where, f"coarse_network_{channel}", words, parts=piece)
+    label = f"a piece of the {body} of its own around {channel}"
+    yield Candidate(CandidateKind.COARSE_NETWORK.value, where, f"coarse_network_{channel}", label, parts=piece)
     ranked = sorted(part.links, key=lambda k: -_conductance(fitted, k))  # heat comes through the best ones
-    for key in [k for k in ranked if body in ends_of(part.links[k])][:THROUGH]:
+    for key in [k for k in ranked if body in ends_of(part.links[k])][: POLICY.coarse_entry_links]:
         link = part.links[key]
         ends = ends_of(link)
         moved = tuple(near if end == body else place for end, place in zip(ends, link.between, strict=True))
         other = ends[1 - ends.index(body)]
         yield Candidate(
-            "coarse_network",
+            CandidateKind.COARSE_NETWORK.value,
             where,
             f"coarse_network_{channel}_{other}",
-            f"{words}, through which the heat of {other} enters",
+            f"{label}, through which the heat of {other} enters",
             parts={**piece, f"links.{key}": link.model_copy(update={"between": moved})},
         )
-    for key in [k for k in (*found_since(fitted), *part.mechanisms) if body in _into(part.mechanisms[k])][:HEATS]:
+    for key in [k for k in (*found_since(fitted), *part.mechanisms) if body in _into(part.mechanisms[k])][
+        : POLICY.coarse_heats
+    ]:
         given, half = part.mechanisms[key], f"{body}@0.25"
-        cut = Value(value=f"{HALVES * leaves:.4g} W/K", spread=SPREAD)
+        cut = Value(value=f"{POLICY.half_body_conductance_factor * leaves:.4g} W/K", spread=POLICY.coarse_log_sd)
         yield Candidate(
-            "coarse_network",
+            CandidateKind.COARSE_NETWORK.value,
             where,
             f"coarse_network_{channel}_{key}",
-            f"a half of the {body} with {channel}, which {MECHANISMS[given.law].words} enters",
+            f"a half of the {body} with {channel}, which {MECHANISMS[given.law].summary} enters",
             parts={
                 f"bodies.{body}": part.bodies[body].model_copy(update={"shape": "bar", "cells": 2, "conductance": cut}),
                 f"sensors.{channel}": sensor.model_copy(update={"at": half}),
@@ -134,12 +143,12 @@ def _piece(
     """A body of its own, `where` ("near") the sensor, and its link to the rest."""
     return {
         f"bodies.{name}": Body(
-            capacity=Value(value=f"{capacity_J_per_K:.4g} J/K", spread=SPREAD),
+            capacity=Value(value=f"{capacity_J_per_K:.4g} J/K", spread=POLICY.coarse_log_sd),
             material=whole.material,
             words=f"{whole.words or body}, {where} {sensor}",
         ),
         f"links.{name}-{body}": Link(
-            between=(name, body), conductance=Value(value=f"{conductance_W_per_K:.4g} W/K", spread=SPREAD)
+            between=(name, body), conductance=Value(value=f"{conductance_W_per_K:.4g} W/K", spread=POLICY.coarse_log_sd)
         ),
     }
 
@@ -149,17 +158,20 @@ def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: fl
     best = _nearest(fitted, body)
     across = [(one, body, other) for one, other in combinations(best, 2)]
     through = [(one, best[0], body) for one in _nearest(fitted, best[0]) if one != body] if best else []
-    for one, between, other in (*across[:SHORTCUTS], *through[:SHORTCUTS]):
+    for one, between, other in (*across[: POLICY.coarse_shortcuts], *through[: POLICY.coarse_shortcuts]):
         if other in linked(fitted.part, one):
             continue
         yield Candidate(
-            "coarse_network",
+            CandidateKind.COARSE_NETWORK.value,
             where,
             f"coarse_network_{channel}_{one}_{other}",
             f"heat that crosses the {between} from {one} to {other}",
             parts={
                 f"links.{one}-{other}": Link(
-                    between=(one, other), conductance=Value(value=f"{0.1 * leaves:.4g} W/K", spread=1.5 * SPREAD)
+                    between=(one, other),
+                    conductance=Value(
+                        value=f"{POLICY.shortcut_conductance_factor * leaves:.4g} W/K", spread=POLICY.shortcut_log_sd
+                    ),
                 )
             },
         )
@@ -181,12 +193,11 @@ def _conductance(fitted: Fitted, key: str) -> float:
     return next((float(e.conductance(fitted.values)) for e in network.edges if e.name == key), 0.0)
 
 
-PER_BATCH = 0.2  # of the logarithm, from run to run
-DOUBTED = {"capacity", "mass", "conductance", "coefficient", "lag", "bonding", "follow"}
+DOUBTED_PARAMETERS = {"capacity", "mass", "conductance", "coefficient", "lag", "bonding", "follow"}
 
 
-def rivals(network: Network) -> list[Candidate]:
-    """Every fixed value that a recording could prove wrong, and every heat whose size may differ from run to run."""
+def alternatives(network: Network) -> list[Candidate]:
+    """Every fixed value that recordings could contradict, and every heat whose size may differ from run to run."""
     amplitudes = heat_amplitudes(network)
     out = []
     for j, p in enumerate(network.parameters):
@@ -194,17 +205,22 @@ def rivals(network: Network) -> list[Candidate]:
         if place is None:
             continue
         last = p.name.rsplit(".", 1)[-1]
-        if not p.free and p.value > 0 and p.scale != "linear" and (last in DOUBTED or j in amplitudes):
-            out.append(_rival("wrong_parameter", place, p, Change(p, spread=SPREAD)))
+        if not p.free and p.value > 0 and p.scale != "linear" and (last in DOUBTED_PARAMETERS or j in amplitudes):
+            out.append(_alternative(CandidateKind.WRONG_PARAMETER, place, p, Change(p, spread=POLICY.coarse_log_sd)))
         if j in amplitudes and p.scale != "linear" and p.value > 0 and p.per_batch == 0:
-            out.append(_rival("varies_between_runs", place, p, Change(p, per_batch=PER_BATCH)))
+            out.append(
+                _alternative(
+                    CandidateKind.VARIES_BETWEEN_RUNS, place, p, Change(p, per_batch=POLICY.doubted_run_to_run_log_sd)
+                )
+            )
     return out
 
 
-def _rival(key: str, where: Where, p: Parameter, change: Change) -> Candidate:
-    words = {"wrong_parameter": "another value", "varies_between_runs": "a value that differs from run to run"}[key]
-    name = f"{key}_{p.name}".replace(".", "_").replace("-", "_").replace("@", "_")
-    return Candidate(key, where, name, f"{words}: {p.name}", change=change)
+def _alternative(kind: CandidateKind, where: Where, p: Parameter, change: Change) -> Candidate:
+    doubts = kind is CandidateKind.WRONG_PARAMETER
+    label = "another value" if doubts else "a value that differs from run to run"
+    name = f"{kind}_{p.name}".replace(".", "_").replace("-", "_").replace("@", "_")
+    return Candidate(kind.value, where, name, f"{label}: {p.name}", change=change)
 
 
 def heat_amplitudes(network: Network) -> set[int]:

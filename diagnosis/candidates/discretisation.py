@@ -1,9 +1,9 @@
-"""What a lumped network gets wrong by itself, and every fit may therefore do: it is no news.
+"""Discretisation errors of a lumped network, which every fit may take up as slack.
 
-A sensor in a casting stands in a gradient that a lump does not have, and is late, or early where it is near the heat; a
-length of an error's chain spans part of its body, nearer to one neighbour than the body's mean, and bodies beside the
-chain tilt it a little; a film that is stated as a constant follows its temperature difference; a heat is not the same
-in every run to the last per cent. Without slack the difference passes for physics.
+A sensor in a casting sits in a gradient that a lump does not have: it lags, or leads where it is near the heat. A
+length of an error chain spans a part of its body, and bodies outside the chain tilt it a little. A film that is stated
+as a constant follows its temperature difference. No heat is exactly the same in every run. Without slack these errors
+would pass for physics.
 """
 
 from __future__ import annotations
@@ -13,49 +13,50 @@ from collections.abc import Sequence
 import numpy as np
 
 from diagnosis.candidates.alternatives import heat_amplitudes
-from diagnosis.contracts import Candidate, Fitted
+from diagnosis.contracts import Candidate, CandidateKind, Fitted
+from diagnosis.policy import POLICY
 
-LOOSE = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
-PLACE = 0.1  # sd of the share of a neighbour's lead that a sensor sees
-SPAN = 0.15  # the same of a length of an error's chain
-NOSE = 0.5  # and of one in a small body, whose ends are as far apart as its neighbours are
-BESIDE = 0.1  # sd of what a body outside an error's chain adds to it, of the chain's largest
-SMALL = 0.03  # of the machine's capacity: what is smaller carries no bending that an error shows
-LAG_S, LAG = 240.0, 1.5  # sd of a lag where the file states none; of the logarithm of one that it holds fixed
-FILM = 0.2  # sd of a natural film's area in m2 for each W/K that the file states as a constant: about all of it
-RUN = 0.05  # sd of the logarithm of a heat, and of an exposure, from run to run
-SKEW = 0.1  # of the rows' step: a row is the mean about its time, which blurs a corner to both sides
+SLACK_MECHANISMS = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
 
 
 def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
-    """By name of a candidate the prior sd of its amplitude, for those that every fit has."""
+    """Prior sd of the amplitude, by candidate, of those that every fit has as slack."""
     out = {}
     gains, small, films = _chain_gains(fitted), _small(fitted), _films(fitted)
     for c in proposed:
         if c.mechanism == "sensor_place":
-            out[c.name] = PLACE
+            out[c.name] = POLICY.sensor_place_sd
         elif c.mechanism == "time_skew":
-            out[c.name] = LAG_S if c.where.kind == "sensor" else SKEW * fitted.step_s
+            out[c.name] = (
+                POLICY.sensor_lag_sd_s if c.where.kind == "sensor" else POLICY.time_skew_sd_rows * fitted.step_s
+            )
         elif c.mechanism == "natural_convection":
-            if (stated := films.get((c.where.name, _air(c)), 0.0)) > 0:
-                out[c.name] = FILM * stated
+            assert c.part is not None and isinstance(c.part.at, dict)
+            if (stated := films.get((c.where.name, str(c.part.at["air"])), 0.0)) > 0:
+                out[c.name] = POLICY.film_area_sd * stated
         elif c.mechanism == "sensor_lag":
-            out[c.name] = LAG_S
-        elif c.mechanism == "wrong_parameter" and c.change is not None and c.change.parameter.name.endswith(".lag"):
-            out[c.name] = LAG
+            out[c.name] = POLICY.sensor_lag_sd_s
+        elif (
+            c.kind is CandidateKind.WRONG_PARAMETER
+            and c.change is not None
+            and c.change.parameter.name.endswith(".lag")
+        ):
+            out[c.name] = POLICY.held_lag_log_sd
         elif c.mechanism == "column_bending":
             sides = _sides(c)
-            share = NOSE if sides & small else SPAN
+            share = POLICY.small_body_span_sd if sides & small else POLICY.chain_span_sd
             out[c.name] = share * max(abs(gains.get((c.where.name, side), 0.0)) for side in sides)
         elif c.mechanism == "spindle_growth":
             (body,) = _sides(c)
             if (c.where.name, body) not in gains:
-                out[c.name] = BESIDE * max((abs(g) for (e, _), g in gains.items() if e == c.where.name), default=0.0)
+                out[c.name] = POLICY.outside_body_sd * max(
+                    (abs(g) for (e, _), g in gains.items() if e == c.where.name), default=0.0
+                )
     return {name: sd for name, sd in out.items() if sd > 0}
 
 
-def no_news(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
-    """Those that any size is a lumped network's own fault of: never reported as found."""
+def never_reported(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
+    """Names of the candidates that a lumped network explains at any size; they are never reported."""
     small = _small(fitted)
     return {
         c.name
@@ -67,9 +68,9 @@ def no_news(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
 
 
 def from_run_to_run(fitted: Fitted) -> dict[int, float]:
-    """By number of a fit's unknown the sd, in its coordinate, that every batch may have of its own about it.
+    """Prior sd, in the fitting coordinate, by which an unknown may differ from batch to batch, by its number.
 
-    Of what the machine file states: what was found since is claimed to be the same in every run.
+    Only heats and films that the machine file states may differ: an effect is claimed to be the same in every run.
     """
     network = fitted.problem.network
     stated = (fitted.machine.twin or {}).get("mechanisms", fitted.part.mechanisms)
@@ -79,7 +80,7 @@ def from_run_to_run(fitted: Fitted) -> dict[int, float]:
         p = network.parameters[network.index(u.name)]
         film = u.name.startswith("exposures.") and u.name.endswith((".conductance", ".coefficient"))
         if p.scale == "log" and p.per_batch == 0 and (film or u.name in heats):
-            out[k] = RUN
+            out[k] = POLICY.run_to_run_log_sd
     return out
 
 
@@ -88,13 +89,8 @@ def _sides(c: Candidate) -> set[str]:
     return set(c.part.at.values())
 
 
-def _air(c: Candidate) -> str:
-    assert c.part is not None and isinstance(c.part.at, dict)
-    return str(c.part.at["air"])
-
-
 def _films(fitted: Fitted) -> dict[tuple[str, str], float]:
-    """By body and surrounding the conductance that the fit has between them, W/K.
+    """Conductance in W/K by body and surrounding, as fitted.
 
     What a body gives to an enclosure's air counts as given to what that air exchanges with.
     """
@@ -112,15 +108,15 @@ def _films(fitted: Fitted) -> dict[tuple[str, str], float]:
 
 
 def _small(fitted: Fitted) -> set[str]:
-    """Bodies too small to bend what the tool hangs on."""
+    """Bodies whose capacity is too small to bend the structure that carries the tool."""
     network = fitted.problem.network
     every = network.capacity_J_per_K(fitted.values)
     own = {name: float(every[cells].sum()) for name, cells in network.bodies.items()}
-    return {name for name, capacity in own.items() if capacity < SMALL * sum(own.values())}
+    return {name for name, capacity in own.items() if capacity < POLICY.small_body_capacity_share * sum(own.values())}
 
 
 def _chain_gains(fitted: Fitted) -> dict[tuple[str, str], float]:
-    """By error and body what a kelvin of the body adds, tilts left aside; in the error's unit."""
+    """Displacement per kelvin, in the error's unit, by error and body; tilts are left out."""
     network = fitted.problem.network
     out: dict[tuple[str, str], float] = {}
     for e in network.errors:

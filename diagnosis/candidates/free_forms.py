@@ -1,7 +1,7 @@
-"""What no mechanism lists, at every place: each driver, power, product and temperature as a candidate of its own.
+"""Terms of no listed mechanism at every place: each driver, power, product and temperature as a candidate.
 
-A term is one parameter of `free_flux` or `free_shift`. As candidates they are screened and refitted as listed ones are:
-how far a network is bent by what it lacks, and what its bodies do then, is seen by the refit alone.
+A term is one parameter of `free_flux` or `free_shift`. Terms are screened and refitted as listed mechanisms are, since
+only a refit shows how far a fit without them is bent.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import numpy as np
 from data.batch import Batch
 from data.machine import Machine
 from diagnosis.candidates.library import own_bodies
-from diagnosis.contracts import Candidate, Where
+from diagnosis.contracts import Candidate, CandidateKind, Where
 from diagnosis.findings.report_data import as_given, few, listed, with_unit
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.free_form import REFERENCE_DEGC
 from twin.schema import MechanismPart, TwinPart
 
-OF_BODY = ("per_K", "product")  # parameters that a body's temperature goes with
+BODY_PARAMETERS = ("per_K", "product")  # parameters that a body's temperature goes with
 
 
 @dataclass(frozen=True)
 class Level:
-    """A driver; `top` is its largest size in the recordings, at which terms are told."""
+    """A driver; `top` is its largest size in the recordings, at which terms are stated."""
 
     name: str
     unit: str
@@ -36,11 +36,11 @@ class Level:
 
     @property
     def following(self) -> str:
-        """How something follows it, in words."""
-        return f"while {self.name} is on" if self.switched else f"in proportion to {self.words}"
+        """How an effect follows the driver, as a phrase."""
+        return f"while {self.name} is on" if self.switched else f"in proportion to {self.label}"
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         return f"{self.name} (at {with_unit(as_given(self.top), self.unit)})"
 
 
@@ -59,7 +59,7 @@ class Form:
         return self.where.kind == "node"
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         """The term as an expression: ``spindle_rpm (T_head - 20)``."""
         names = [d.name for d in (self.level, self.other) if d is not None]
         if self.role in ("square", "square_cross"):
@@ -69,7 +69,7 @@ class Form:
             names.append(f"({rise})" if self.heat and names else rise)
         return " ".join(names) or "1"
 
-    def told(self, value: float) -> str:
+    def phrase(self, value: float) -> str:
         """``60 W into column while coolant is on``, ``−2 µm of z per K of bed's rise``; `value` of the parameter."""
         value *= self.top
         size = with_unit(few(abs(value), 2), "W" if self.heat else "um")
@@ -85,7 +85,7 @@ class Form:
             yield f"per K of {above}" + ("," if one else "")
         if one is None:
             return
-        yield f"with the square of {one.words}" if self.role in ("square", "square_cross") else one.following
+        yield f"with the square of {one.label}" if self.role in ("square", "square_cross") else one.following
         if other is not None:
             alike = one.switched == other.switched and self.role == "cross"
             yield f"{'and ' if alike else ''}{other.following}"
@@ -108,10 +108,10 @@ class Form:
 
 
 def candidate_of(forms: Sequence[Form], body: str = "") -> Candidate:
-    """One instance that states these terms; `body` stands where none of them looks at one."""
+    """One instance that states these terms; `body` is taken where none of them has one."""
     first = forms[0]
     body = next((f.body for f in forms if f.body), first.where.name if first.heat else body)
-    law = "free_flux" if first.heat else "free_shift"
+    law = (CandidateKind.FREE_FLUX if first.heat else CandidateKind.FREE_SHIFT).value
     level, other = (next((d.name for f in forms if (d := getattr(f, r))), None) for r in ("level", "other"))
     roles = [f.role for f in forms]
     also = [n for n in ("" if first.heat else body, *roles, level, other) if n]
@@ -119,7 +119,7 @@ def candidate_of(forms: Sequence[Form], body: str = "") -> Candidate:
         mechanism=law,
         where=first.where,
         name=re.sub(r"\W", "_", "_".join([law, first.where.name, *also])),
-        words=f"{MECHANISMS[law].words}: {first.where.name} ({listed([f.words for f in forms])})",
+        label=f"{MECHANISMS[law].summary}: {first.where.name} ({listed([f.label for f in forms])})",
         part=MechanismPart(
             law=law,
             at={"body": body},
@@ -181,6 +181,6 @@ def levels(batches: Sequence[Batch]) -> Iterator[Level]:
             yield Level(name, channel.unit, float(np.abs(values).max()), len(np.unique(values[values != 0])) == 1)
 
 
-def told(forms: Sequence[Form], values: Mapping[str, float]) -> str:
+def phrases(forms: Sequence[Form], values: Mapping[str, float]) -> str:
     """One phrase: how much, where, following what; `values` by parameter."""
-    return listed([f.told(values[f.role]) for f in forms])
+    return listed([f.phrase(values[f.role]) for f in forms])

@@ -94,8 +94,8 @@ def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
         for k, value in enumerate(values):  # a number in its name: what its fit comes to is another value
             given = {**c.part.parameters, name: Value(value=f"{value:g} {unit}")}
             part = c.part.model_copy(update={"parameters": given})
-            words = f"{c.words}, {name} begun at {value:g} {unit}"
-            yield replace(c, name=f"{c.name}_{k + 2}", words=words, part=part, variant_of=c.name)
+            label = f"{c.label}, {name} begun at {value:g} {unit}"
+            yield replace(c, name=f"{c.name}_{k + 2}", label=label, part=part, variant_of=c.name)
 
 
 def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:
@@ -107,7 +107,7 @@ def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, 
 
 def _words(mechanism: type[Mechanism], site: Site, also: Sequence[str]) -> str:
     with_ = f" ({', '.join(also)})" if also else ""
-    return f"{mechanism.words}: {site.name}{with_}"
+    return f"{mechanism.summary}: {site.name}{with_}"
 
 
 def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[Site]:
@@ -171,8 +171,10 @@ def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Sit
         places = [place for _, place in chosen]
         if len(set(places)) < len(places):
             continue
-        if mechanism.far_apart and _near(part, places):
-            continue
+        if mechanism.far_apart:
+            one, other = linked(part, places[0]), linked(part, places[-1])
+            if places[-1] in one or set(one) & set(other):  # linked, or with a common neighbour
+                continue
         if two_sides:
             if frozenset(places) in seen or places[1] not in linked(part, places[0]):
                 continue
@@ -201,12 +203,6 @@ def own_bodies(part: TwinPart) -> list[str]:
     """The machine's bodies: physics at a piece that a finer network invented would be the network's, not hers."""
     pieces = pieces_of(part)
     return [name for name in part.bodies if name not in pieces]
-
-
-def _near(part: TwinPart, places: Sequence[str]) -> bool:
-    """Whether two bodies are linked or have a common neighbour."""
-    one, other = set(linked(part, places[0])), set(linked(part, places[-1]))
-    return bool(one & other) or places[-1] in one
 
 
 def _own_links(part: TwinPart) -> dict[str, Link]:

@@ -18,9 +18,10 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.drafting.first_guess import HELD_W, Driven, driven
-from diagnosis.drafting.groups import LEAST_PARTS, Rises, Rows, rows_of
-from diagnosis.drafting.part import HELD_J_PER_K, Sketch, moved, part_of, sketch, with_values
+from diagnosis.drafting.first_guess import Driven, driven
+from diagnosis.drafting.groups import Rises, Rows, rows_of
+from diagnosis.drafting.part import Sketch, moved, part_of, sketch, with_values
+from diagnosis.policy import POLICY
 from twin.calibration.estimate import free_running_rms
 from twin.calibration.fit_problem import Noise
 from twin.calibration.least_squares import State, descend, x_of
@@ -28,12 +29,6 @@ from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.network import Network
 from twin.schema import TwinPart
-
-FOLDS = 4
-MISFIT = 0.1  # of a channel's movement: what a drafted network leaves; it weighs the channel's rows
-ALIKE = 10.0  # rows of a smooth misfit that count as one: at full weight priors would say nothing
-ITERATIONS, FOLD_ITERATIONS = 30, 10
-TOLERANCE = 1e-3  # of the cost per row
 
 
 @dataclass(frozen=True)
@@ -82,11 +77,11 @@ def scored(network: Network, batches: Sequence[Batch], moved: Mapping[str, float
     soft = replace(network, readings=readings, errors=errors)
     problem = CalibrationProblem.of(soft, batches, every_s=min(b.step_s for b in batches))
     nuisance = [np.zeros(q) for q in problem.nuisance_sizes]
-    done = _fit(problem, np.zeros(len(problem.unknowns)), nuisance, ITERATIONS)
+    done = _fit(problem, np.zeros(len(problem.unknowns)), nuisance, POLICY.draft_steps)
     count = len(batches)
     left_out, zero = np.full((2, count, len(problem.channels)), np.nan)
-    for fold in range(min(FOLDS, count)):
-        out = list(range(fold, count, FOLDS))
+    for fold in range(min(POLICY.draft_folds, count)):
+        out = list(range(fold, count, POLICY.draft_folds))
         part = problem.only(out)
         for b, m, rms in zip(out, part.measured, free_running_rms(part, _without(problem, done, out)), strict=True):
             for c, value in rms.items():
@@ -98,20 +93,20 @@ def scored(network: Network, batches: Sequence[Batch], moved: Mapping[str, float
 
 
 def _soft(noise: float, moved: float) -> float:
-    return float(np.hypot(noise, MISFIT * moved))
+    return float(np.hypot(noise, POLICY.draft_misfit_share * moved))
 
 
 def _fit(problem: CalibrationProblem, z: Array, nuisance: list[Array], iterations: int) -> State:
     channels = len(problem.channels)
-    start = State.at(problem, z, nuisance, Noise(np.ones(channels), np.full(channels, ALIKE)))
-    return descend(problem, start, iterations, TOLERANCE * start.rows)
+    start = State.at(problem, z, nuisance, Noise(np.ones(channels), np.full(channels, POLICY.draft_rows_per_value)))
+    return descend(problem, start, iterations, POLICY.draft_tolerance * start.rows)
 
 
 def _without(problem: CalibrationProblem, done: State, out: Sequence[int]) -> Array:
     """All parameter values (n,) of the fit without some parts; begun at the fit with them, which saves steps."""
     kept = [b for b in range(len(done.nuisance)) if b not in out]
     if kept:
-        done = _fit(problem.only(kept), done.z, [done.nuisance[b] for b in kept], FOLD_ITERATIONS)
+        done = _fit(problem.only(kept), done.z, [done.nuisance[b] for b in kept], POLICY.draft_fold_steps)
     return _values(problem, done)
 
 
@@ -119,8 +114,6 @@ def _values(problem: CalibrationProblem, state: State) -> Array:
     return problem.values_at(x_of(problem.unknowns, state.z))
 
 
-LEAST_GAIN = 0.03  # relative fall of what is left, for a body or a set of links more
-PATIENCE = 2  # counts of bodies that may fail to be better before the search ends
 SCORE_COLUMNS = ("bodies", "links", "free", "share_left", "worse", "worse_sd", "chosen")
 LEFT_OUT_COLUMNS = ("channel", "unit", "left_out", "zero", "noise")
 
@@ -136,7 +129,7 @@ class Drafted:
     """
 
     part: TwinPart
-    words: tuple[str, ...]
+    remarks: tuple[str, ...]
     scores: pd.DataFrame
     left_out: pd.DataFrame
 
@@ -152,7 +145,7 @@ def drafted_part(
     machine: Machine,
     batches: Sequence[Batch],
     progress: Callable[[str, int, int], None] | None = None,
-    max_bodies: int = 8,
+    max_bodies: int = POLICY.draft_max_bodies,
 ) -> Drafted:
     """The simplest network of at most `max_bodies` bodies that the recordings support.
 
@@ -167,7 +160,7 @@ def drafted_part(
     rows = rows_of(machine, batches)
     rises, movement = Rises.of(rows), moved(rows)
     heats, unheard = driven(machine, rows.tops)
-    most = min(max_bodies, len(rows.temperatures)) if len(rows.batches) >= LEAST_PARTS else 1
+    most = min(max_bodies, len(rows.temperatures)) if len(rows.batches) >= POLICY.draft_min_parts else 1
 
     def tried(count: int, extra_links: bool = False) -> _Tried:
         if progress:
@@ -187,7 +180,7 @@ def drafted_part(
                 chosen = meshed
     return Drafted(
         with_values(chosen.part, chosen.scored.network, chosen.scored.values),
-        (*_words(rows, chosen, heats), *unheard, *rows.words),
+        (*_words(rows, chosen, heats), *unheard, *rows.remarks),
         _scores(every, chosen),
         _left_out(chosen.scored),
     )
@@ -201,11 +194,11 @@ def _tried_in_turn(tried: Callable[[int], _Tried], most: int) -> list[_Tried]:
         one = _or_none(lambda count=count: tried(count))  # type: ignore[misc]
         if one is not None and len(one.sketch.groups) == count:
             every.append(one)
-        if one is not None and one.scored.share_left < (1 - LEAST_GAIN) * best:
+        if one is not None and one.scored.share_left < (1 - POLICY.draft_min_fall) * best:
             best, failed = one.scored.share_left, 0
         else:
             failed += 1
-        if failed == PATIENCE:
+        if failed == POLICY.draft_patience:
             break
     return every
 
@@ -221,31 +214,36 @@ def _or_none(work: Callable[[], _Tried]) -> _Tried | None:
 def _as_good(one: Scored, best: Scored) -> bool:
     """Whether the other is not better by more than its standard error and the least gain."""
     gain, error = best.better_than(one)
-    return gain <= max(error, -np.log(1 - LEAST_GAIN))
+    return gain <= max(error, -np.log(1 - POLICY.draft_min_fall))
 
 
 def _words(rows: Rows, chosen: _Tried, heats: Sequence[Driven]) -> tuple[str, ...]:
     drawn = chosen.sketch
     bodies = _counted(len(drawn.groups), "body", "bodies")
     parts = _counted(len(rows.batches), *(("block", "blocks") if rows.blocks else ("batch", "batches")))
-    tested = "in recordings that it was not fitted to" if len(rows.batches) >= LEAST_PARTS else "that it was fitted to"
+    tested = (
+        "in recordings that it was not fitted to"
+        if len(rows.batches) >= POLICY.draft_min_parts
+        else "that it was fitted to"
+    )
     left = (
         f"the machine file has no twin part: {bodies} drafted from {parts}, named after sensors "
         f"({', '.join(drawn.names)}); it leaves {100 * chosen.scored.share_left:.0f} % of the movement {tested}"
     )
     if drawn.held is not None:
         heat = drawn.heats[drawn.held]
-        scale = f"temperatures determine ratios alone: {heat.name} is held at {HELD_W:g} W at {heat.top:g} {heat.unit}"
+        held = f"{POLICY.draft_held_heat_W:g} W at {heat.top:g} {heat.unit}"
+        scale = f"temperatures determine ratios alone: {heat.name} is held at {held}"
     else:
         why = "no recorded driver heats it" if not drawn.heats else "no heat could be held"
-        scale = f"{why}: the capacity of {drawn.names[0]} is held at {HELD_J_PER_K / 1e3:g} kJ/K"
-    words = [left, f"{scale}, and every other W, W/K and J/K is relative to that"]
+        scale = f"{why}: the capacity of {drawn.names[0]} is held at {POLICY.draft_held_capacity_J_per_K / 1e3:g} kJ/K"
+    remarks = [left, f"{scale}, and every other W, W/K and J/K is relative to that"]
     cold = [h.driver for h in heats if h not in drawn.heats]
-    words += [f"driver {d} warms no body, so that the draft has no heat of it" for d in cold]
+    remarks += [f"driver {d} warms no body, so that the draft has no heat of it" for d in cold]
     if not rows.rooms:
-        words.append("no ambient was recorded: the room is taken from first readings")
-    words += [f"ambient {r} is not used: a draft has one room, {rows.rooms[0]}" for r in rows.rooms[1:]]
-    return tuple(words)
+        remarks.append("no ambient was recorded: the room is taken from first readings")
+    remarks += [f"ambient {r} is not used: a draft has one room, {rows.rooms[0]}" for r in rows.rooms[1:]]
+    return tuple(remarks)
 
 
 def _counted(count: int, one: str, several: str) -> str:

@@ -17,9 +17,7 @@ from scipy.optimize import nnls
 
 from data.arrays import Array
 from data.machine import Machine
-
-LONGEST, SHORTEST = 20.0, 3.0  # time constants: in durations of a part, and in rows
-SOFT = 0.3  # weight of "all capacities alike" against what a link says of two
+from diagnosis.policy import POLICY
 
 
 @dataclass(frozen=True)
@@ -70,12 +68,12 @@ def guess(balance: Balance, links: Sequence[tuple[int, int]]) -> Guess:
         heating[k] = solved[len(near) + 1 :]
     duration_s = float(np.median([balance.time_s[at[-1]] for at in balance.parts]))
     step_s = duration_s / max(1.0, float(np.median([len(at) for at in balance.parts])) - 1.0)
-    low, high = 1.0 / (LONGEST * duration_s), 1.0 / (SHORTEST * step_s)
+    low, high = 1.0 / (POLICY.draft_max_time_constant * duration_s), 1.0 / (POLICY.draft_min_time_constant * step_s)
     capacity = _capacities(rate, links)
     link = np.zeros(len(links))
     for n, (a, b) in enumerate(links):
-        told = [r * c for r, c in ((rate[a, b], capacity[a]), (rate[b, a], capacity[b])) if r > 0]
-        link[n] = np.exp(np.mean(np.log(told))) if told else 0.0
+        known = [r * c for r, c in ((rate[a, b], capacity[a]), (rate[b, a], capacity[b])) if r > 0]
+        link[n] = np.exp(np.mean(np.log(known))) if known else 0.0
         link[n] = np.clip(link[n], low * min(capacity[a], capacity[b]), high * min(capacity[a], capacity[b]))
     heat = heating * capacity[:, None]
     return Guess(capacity, link, np.clip(to_room, low, high) * capacity, heat)
@@ -84,7 +82,7 @@ def guess(balance: Balance, links: Sequence[tuple[int, int]]) -> Guess:
 def _rates(balance: Balance, k: int, near: Sequence[int]) -> Array:
     """Rates of body k: to each neighbour and the room 1/s, then heating by each driver K/s; none below 0.
 
-    Sensors' offsets make a ramp in either direction, which is fitted beside them and forgotten.
+    Sensors' offsets make a ramp in either direction, which is fitted with them and discarded.
     """
     blocks, aims = [], []
     for at in balance.parts:
@@ -120,19 +118,14 @@ def _held(values: Array, time_s: Array) -> Array:
 def _capacities(rate: Array, links: Sequence[tuple[int, int]]) -> Array:
     """Capacities (K,), geometric mean 1: a conductance is the same from both ends, so C_a rate_ab = C_b rate_ba."""
     count = len(rate)
-    rows, aims = [SOFT * np.eye(count)[k] for k in range(count)], [0.0] * count
+    rows, aims = [POLICY.draft_equal_capacity_weight * np.eye(count)[k] for k in range(count)], [0.0] * count
     for a, b in links:
         if rate[a, b] > 0 and rate[b, a] > 0:
             rows.append(np.eye(count)[a] - np.eye(count)[b])
-            aims.append(float(np.clip(np.log(rate[b, a] / rate[a, b]), -4.0, 4.0)))
+            most = POLICY.draft_max_log_capacity_ratio
+            aims.append(float(np.clip(np.log(rate[b, a] / rate[a, b]), -most, most)))
     log = np.linalg.lstsq(np.array(rows), np.array(aims), rcond=None)[0]
     return np.asarray(np.exp(log - log.mean()))
-
-
-HELD_W = 300.0  # the one heat that is held: some kilowatts of spindle lose a few hundred watts at their highest speed
-SPREAD = 1.0  # of a heat's logarithm
-EXPONENT, EXPONENT_SPREAD = 1.5, 0.3  # friction and windage grow with speed as n^1 to n^2.5
-GUIDE_FRICTION = 0.1
 
 
 @dataclass(frozen=True)
@@ -161,24 +154,29 @@ class Driven:
 
         def free(value: float, unit: str) -> Any:
             text = f"{value:.4g} {unit}"
-            return text if held else {"value": text, "spread": SPREAD}
+            return text if held else {"value": text, "spread": POLICY.draft_heat_log_sd}
 
         top = f"{self.top:.6g}"
         if self.law == "belt_loss":
-            exponent = {"value": EXPONENT, "spread": EXPONENT_SPREAD}
+            exponent = {"value": POLICY.draft_speed_exponent, "spread": POLICY.draft_speed_exponent_sd}
             return {"power": free(heat_W, "W"), "exponent": exponent, "rated": f"{top} rpm"}
         if self.law == "guide_friction":
-            load_N = float(np.clip(heat_W / (GUIDE_FRICTION * self.top / 60e3), 2.0, 9e5))
-            return {"friction": GUIDE_FRICTION, "load": free(load_N, "N")}
+            load_N = float(np.clip(heat_W / (POLICY.draft_guide_friction * self.top / 60e3), 2.0, 9e5))
+            return {"friction": POLICY.draft_guide_friction, "load": free(load_N, "N")}
         if self.law == "ohmic_heat":
             return {"resistance": free(heat_W / self.top**2, "ohm")}
         if self.law == "cutting_heat":
-            return {"share": {"value": float(f"{np.clip(heat_W / self.top, 0.01, 0.9):.3g}"), "spread": SPREAD}}
+            return {
+                "share": {
+                    "value": float(f"{np.clip(heat_W / self.top, 0.01, 0.9):.3g}"),
+                    "spread": POLICY.draft_heat_log_sd,
+                }
+            }
         return {"gain": free(heat_W / self.top, "W")}
 
 
 LAWS: Mapping[str, tuple[str, float]] = {
-    "rpm": ("belt_loss", EXPONENT),
+    "rpm": ("belt_loss", POLICY.draft_speed_exponent),
     "mm/min": ("guide_friction", 1.0),
     "A": ("ohmic_heat", 2.0),
     "W": ("cutting_heat", 1.0),
@@ -188,15 +186,15 @@ LAWS: Mapping[str, tuple[str, float]] = {
 
 
 def driven(machine: Machine, tops: Mapping[str, float]) -> tuple[list[Driven], list[str]]:
-    """The drivers that some law takes, and words on those that none does."""
-    out, words = [], []
+    """The drivers that some law takes, and remarks on those that none does."""
+    out, remarks = [], []
     for driver, name in zip(tops, plain_names([f"heat_of_{d}" for d in tops]), strict=True):
         unit = machine.channels[driver].unit
         if unit in LAWS:
             out.append(Driven(name, driver, unit, *LAWS[unit], tops[driver]))
         else:
-            words.append(f"driver {driver} is in {unit}, which no drafted heat grows with: it warms nothing there")
-    return out, words
+            remarks.append(f"driver {driver} is in {unit}, which no drafted heat grows with: it warms nothing there")
+    return out, remarks
 
 
 def plain_names(channels: Sequence[str], taken: Sequence[str] = ()) -> tuple[str, ...]:

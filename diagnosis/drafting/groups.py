@@ -18,17 +18,10 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
+from diagnosis.policy import POLICY
 from twin.simulation.inputs import MAX_GAP_S
 
-MOST_BATCHES = 12
-LEAST_PARTS = 4  # batches, or blocks of them, so that some can be left out
-ROWS = 48  # of a batch: a body that answers within a fiftieth of a run is not what a draft is about
-LONGEST_STEP_S = 600.0
-LEAST_ROWS = 6
-MOVES_K = 0.3  # an ambient that moves less within runs and between them drives nothing
-LEAST_NOISE = {"degC": 0.01, "um": 0.1}
-DIFFERENCES, MEDIAN_OF_NORMAL = (1, 2, 3, 4), 0.6745
-LEAST_SHARE = 1e-3  # of a channel's largest change, where its unit states no least noise
+DIFFERENCE_ORDERS, NORMAL_MEDIAN = (1, 2, 3, 4), 0.6745
 
 
 @dataclass(frozen=True)
@@ -36,7 +29,7 @@ class Rows:
     """Thinned batches and what of the machine can be used in them; `blocks`: cut from fewer than four batches.
 
     `rooms` are ambient channels with values; `tops` the drivers that ever move, with their largest size; `noise` is
-    the sd (K or the channel's unit) of every temperature and error. `words` say what was left out and why.
+    the sd (K or the channel's unit) of every temperature and error. `remarks` say what was left out and why.
     """
 
     batches: tuple[Batch, ...]
@@ -46,7 +39,7 @@ class Rows:
     rooms: tuple[str, ...]
     tops: Mapping[str, float]
     noise: Mapping[str, float]
-    words: tuple[str, ...]
+    remarks: tuple[str, ...]
 
 
 def rows_of(machine: Machine, batches: Sequence[Batch]) -> Rows:
@@ -59,43 +52,45 @@ def rows_of(machine: Machine, batches: Sequence[Batch]) -> Rows:
     if not batches:
         raise InputError(f"{where}: got no batch; give one or more recordings")
     batches = sorted(batches, key=lambda b: b.batch_id)  # folds must not depend on the order of files
-    words: list[str] = []
+    remarks: list[str] = []
+    share = POLICY.draft_min_channel_share
     used = {
-        role: _usable(machine, batches, role, at_least, words)
-        for role, at_least in (("temperature", 0.0), ("error", 0.0), ("ambient", 0.5), ("driver", 0.5))
+        role: _usable(machine, batches, role, at_least, remarks)
+        for role, at_least in (("temperature", 0.0), ("error", 0.0), ("ambient", share), ("driver", share))
     }
     if not used["temperature"]:
         raise InputError(f"{where}: no temperature channel has a value; record one, or give it role: temperature")
     tops = {n: float(max(np.nanmax(np.abs(_values(b, n)), initial=0.0) for b in batches)) for n in used["driver"]}
-    words += [f"driver {n} is never other than 0: left out" for n, top in tops.items() if top == 0]
+    remarks += [f"driver {n} is never other than 0: left out" for n, top in tops.items() if top == 0]
     tops = {n: top for n, top in tops.items() if top > 0}
     if not tops and not any(_moves(batches, n) for n in used["ambient"]):
         raise InputError(
-            f"{where}: no driver is ever other than 0 and no ambient moves by {MOVES_K:g} K: nothing warms it; "
-            "record what the machine did (speed, feed) or the room, and give it role: driver or ambient"
+            f"{where}: no driver is ever other than 0 and no ambient moves by {POLICY.ambient_min_range_K:g} K: "
+            "nothing warms it; record what the machine did (speed, feed) or the room, and give it role: driver or "
+            "ambient"
         )
-    whole = [b for b in batches if _whole(b, [*tops, *used["ambient"][:1]], words)]
+    whole = [b for b in batches if _whole(b, [*tops, *used["ambient"][:1]], remarks)]
     if not whole:
         raise InputError(
             f"{where}: in every batch a driver or the ambient has no value for more than {MAX_GAP_S:g} s; "
             "mend the recordings, or overrule the masks"
         )
-    at = np.unique(np.linspace(0, len(whole) - 1, min(MOST_BATCHES, len(whole))).round().astype(int))
-    parts, blocks = _parts([whole[k] for k in at.tolist()], words)
-    step_s = min(LONGEST_STEP_S, float(np.median([b.time_s[-1] for b in parts])) / ROWS)
+    at = np.unique(np.linspace(0, len(whole) - 1, min(POLICY.draft_max_batches, len(whole))).round().astype(int))
+    parts, blocks = _parts([whole[k] for k in at.tolist()], remarks)
+    step_s = min(POLICY.draft_max_step_s, float(np.median([b.time_s[-1] for b in parts])) / POLICY.draft_rows_per_batch)
     thin = tuple(_thinned(b, step_s) for b in parts)
-    told = {r: tuple(n for n in used[r] if any(_numbers(b, n) for b in thin)) for r in ("temperature", "error")}
-    if not told["temperature"]:
+    recorded = {r: tuple(n for n in used[r] if any(_numbers(b, n) for b in thin)) for r in ("temperature", "error")}
+    if not recorded["temperature"]:
         raise InputError(f"{where}: no temperature has a value in the batches that can be simulated; mend the others")
-    noise = {n: _noise(machine, batches, n, tops) for n in (*told["temperature"], *told["error"])}
-    return Rows(thin, blocks, told["temperature"], told["error"], used["ambient"], tops, noise, tuple(words))
+    noise = {n: _noise(machine, batches, n, tops) for n in (*recorded["temperature"], *recorded["error"])}
+    return Rows(thin, blocks, recorded["temperature"], recorded["error"], used["ambient"], tops, noise, tuple(remarks))
 
 
 def _values(batch: Batch, channel: str) -> Array:
     return batch.masked(channel) if channel in batch.table.columns else np.full(batch.n_rows, np.nan)
 
 
-def _usable(machine: Machine, batches: Sequence[Batch], role: str, share: float, words: list[str]) -> tuple[str, ...]:
+def _usable(machine: Machine, batches: Sequence[Batch], role: str, share: float, remarks: list[str]) -> tuple[str, ...]:
     """Channels of a role with values in more than a share of the batches."""
     out = []
     for name, channel in machine.channels.items():
@@ -104,7 +99,7 @@ def _usable(machine: Machine, batches: Sequence[Batch], role: str, share: float,
             if count and count >= share * len(batches):
                 out.append(name)
             else:
-                words.append(f"{role} {name} has values in {count} of {len(batches)} batches: left out")
+                remarks.append(f"{role} {name} has values in {count} of {len(batches)} batches: left out")
     return tuple(out)
 
 
@@ -114,34 +109,34 @@ def _numbers(batch: Batch, channel: str) -> int:
 
 def _moves(batches: Sequence[Batch], channel: str) -> bool:
     values = np.concatenate([_values(b, channel) for b in batches])
-    low, high = np.nanquantile(values, [0.02, 0.98])
-    return bool(high - low > MOVES_K)
+    low, high = np.nanquantile(values, [POLICY.ambient_range_tail, 1.0 - POLICY.ambient_range_tail])
+    return bool(high - low > POLICY.ambient_min_range_K)
 
 
-def _whole(batch: Batch, needed: Sequence[str], words: list[str]) -> bool:
+def _whole(batch: Batch, needed: Sequence[str], remarks: list[str]) -> bool:
     """Can the batch be simulated: rows enough, and no long hole in what drives it?"""
-    if batch.n_rows < LEAST_ROWS:
-        words.append(f"batch {batch.batch_id} has {batch.n_rows} rows: left out of the draft")
+    if batch.n_rows < POLICY.draft_min_rows:
+        remarks.append(f"batch {batch.batch_id} has {batch.n_rows} rows: left out of the draft")
         return False
     for name in needed:
         good = np.flatnonzero(np.isfinite(_values(batch, name)))
         edges = np.concatenate([[0], good, [batch.n_rows - 1]])
         if not len(good) or np.diff(edges).max() * batch.step_s > MAX_GAP_S + batch.step_s:
-            words.append(f"batch {batch.batch_id} has holes in {name}: left out of the draft")
+            remarks.append(f"batch {batch.batch_id} has holes in {name}: left out of the draft")
             return False
     return True
 
 
-def _parts(batches: Sequence[Batch], words: list[str]) -> tuple[list[Batch], bool]:
+def _parts(batches: Sequence[Batch], remarks: list[str]) -> tuple[list[Batch], bool]:
     """The batches, or blocks of them where they are fewer than four."""
-    if len(batches) >= LEAST_PARTS:
+    if len(batches) >= POLICY.draft_min_parts:
         return list(batches), False
-    each = -(-LEAST_PARTS // len(batches))
-    if min(b.n_rows for b in batches) // each < LEAST_ROWS:
-        words.append("the recordings are too short to leave any out: one body alone is drafted")
+    each = -(-POLICY.draft_min_parts // len(batches))
+    if min(b.n_rows for b in batches) // each < POLICY.draft_min_rows:
+        remarks.append("the recordings are too short to leave any out: one body alone is drafted")
         return list(batches), False
     few = f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"
-    words.append(f"{few} alone: cut into {each} blocks each, and blocks were left out instead of batches")
+    remarks.append(f"{few} alone: cut into {each} blocks each, and blocks were left out instead of batches")
     return [block for b in batches for block in _cut(b, each)], True
 
 
@@ -184,14 +179,14 @@ def _noise(machine: Machine, batches: Sequence[Batch], name: str, drivers: Mappi
     channel = machine.channels[name]
     if channel.resolution is not None:
         return channel.resolution / math.sqrt(12.0)
-    every: dict[int, list[Array]] = {order: [] for order in DIFFERENCES}
+    every: dict[int, list[Array]] = {order: [] for order in DIFFERENCE_ORDERS}
     steps: list[Array] = []
     largest = 0.0
     for b in batches:
         values, still = _values(b, name), np.ones(b.n_rows, bool)
         for d in drivers:
             still &= _values(b, d) == 0
-        if still.sum() < 2 * LEAST_ROWS:
+        if still.sum() < 2 * POLICY.draft_min_rows:
             still[:] = True
         for order, found in every.items():
             difference = np.abs(np.diff(values, order)[still[order:]])
@@ -199,19 +194,15 @@ def _noise(machine: Machine, batches: Sequence[Batch], name: str, drivers: Mappi
         steps.append(np.abs(np.diff(values[np.isfinite(values)])))
         largest = max(largest, float(np.ptp(values[np.isfinite(values)])) if np.isfinite(values).any() else 0.0)
     spread = min(
-        float(np.median(np.concatenate(found))) / (MEDIAN_OF_NORMAL * math.sqrt(math.comb(2 * order, order)))
+        float(np.median(np.concatenate(found))) / (NORMAL_MEDIAN * math.sqrt(math.comb(2 * order, order)))
         if sum(map(len, found))
         else 0.0
         for order, found in every.items()
     )
     step = np.concatenate(steps)
     step = step[step > 1e-9 * largest]
-    least = LEAST_NOISE.get(channel.unit, LEAST_SHARE * largest)
+    least = dict(POLICY.draft_min_noise).get(channel.unit, POLICY.draft_min_noise_share * largest)
     return float(max(least, spread, step.min() / math.sqrt(12.0) if len(step) else 0.0)) or 1.0
-
-
-SMALL = 0.1  # of the median channel's rise: what is smaller is not told apart by shape
-AT_START = 3  # batches from which on first readings tell a sensor's offset
 
 
 @dataclass(frozen=True)
@@ -261,7 +252,7 @@ class Rises:
     @cached_property
     def distance(self) -> Array:
         """How far two sensors are from reading one body, (S, S): rms difference of their rises over their size."""
-        small = SMALL * float(np.median(self.size_K))
+        small = POLICY.draft_small_rise_share * float(np.median(self.size_K))
         scale = np.sqrt(np.outer(self.size_K, self.size_K) + small**2 + np.outer(self.noise_K, self.noise_K))
         apart = np.sqrt(_mean((self.rise_K[:, :, None] - self.rise_K[:, None, :]) ** 2)) / scale
         never_together = 2.0 * float(np.nanmax(apart, initial=1.0))
@@ -284,7 +275,7 @@ class Rises:
         """By how much each sensor of a group starts above the group's mean, median over parts; 0 of too few."""
         first = self.first_degC[:, group]
         apart = first - _mean(first, axis=1)[:, None]
-        if len(first) < AT_START:
+        if len(first) < POLICY.draft_min_offset_batches:
             return np.zeros(len(group))
         return np.nan_to_num(_median(apart))
 

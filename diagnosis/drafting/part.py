@@ -11,21 +11,11 @@ import numpy as np
 from data.arrays import Array
 from data.machine import Machine
 from diagnosis.contracts import with_value
-from diagnosis.drafting.first_guess import HELD_W, Balance, Driven, Guess, guess, plain_names
+from diagnosis.drafting.first_guess import Balance, Driven, Guess, guess, plain_names
 from diagnosis.drafting.groups import Rises, Rows, between, tree_of
+from diagnosis.policy import POLICY
 from twin.network import Network
 from twin.schema import TwinPart
-
-WIDE = 1.0  # prior sd of a capacity's or conductance's logarithm: a factor of 2.7
-SHARES = (1e-3, 0.999)  # a fitted share at its end would be no share
-OUTLETS = 2  # bodies that a heat goes into, at most
-LEAST_SHARE = 0.02  # of a driver's heat into a body
-CHAIN = (2, 4)  # bodies in an error's chain
-CHAIN_GAIN = 0.05  # least relative fall of an error's rms for one body more
-HELD_J_PER_K = 10e3  # where nothing heats, a capacity is held instead
-GAIN_SPREAD_UM_PER_K = 10.0
-START_SPREAD = "0.5 K"
-OFFSET_SPREAD = "0.5 K"  # of a sensor, beside what first readings tell
 
 
 @dataclass(frozen=True)
@@ -60,7 +50,11 @@ def sketch(rows: Rows, rises: Rises, heats: Sequence[Driven], count: int, extra_
     warm = [k for k in range(len(heats)) if found.heat_W[:, k].sum() > 0]
     scalable = [k for k in warm if heats[k].scalable]
     held = max(scalable, key=lambda k: float(found.heat_W[:, k].sum() * heat[:, k].mean()), default=None)
-    size = float(found.heat_W[:, held].sum()) / HELD_W if held is not None else found.capacity_J_per_K[0] / HELD_J_PER_K
+    size = (
+        float(found.heat_W[:, held].sum()) / POLICY.draft_held_heat_W
+        if held is not None
+        else found.capacity_J_per_K[0] / POLICY.draft_held_capacity_J_per_K
+    )
     found = replace(found.scaled(1.0 / size), heat_W=found.heat_W[:, warm] / size)
     return Sketch(
         groups=tuple(tuple(g) for g in groups),
@@ -78,12 +72,13 @@ def part_of(machine: Machine, rows: Rows, rises: Rises, drawn: Sketch) -> TwinPa
     """The twin part that a sketch means, every value with a wide prior but the one that fixes the scale."""
     name, found = drawn.names, drawn.guess
     bodies: dict[str, Any] = {}
+    held_J_per_K = POLICY.draft_held_capacity_J_per_K
     for k, group in enumerate(drawn.groups):
         held = drawn.held is None and k == 0
         bodies[name[k]] = {
-            "capacity": f"{HELD_J_PER_K:g} J/K" if held else _free(found.capacity_J_per_K[k], "J/K"),
+            "capacity": f"{held_J_per_K:g} J/K" if held else _free(found.capacity_J_per_K[k], "J/K"),
             "words": "drafted: where " + ", ".join(rises.names[s] for s in group) + (" sit" if group[1:] else " sits")
-            + (f"; held at {HELD_J_PER_K / 1e3:g} kJ/K, all J/K and W/K are relative to it" if held else ""),
+            + (f"; held at {held_J_per_K / 1e3:g} kJ/K, all J/K and W/K are relative to it" if held else ""),
         }  # fmt: skip
     raw = {
         "surroundings": {"room": _surrounding(rows, rises)},
@@ -95,7 +90,7 @@ def part_of(machine: Machine, rows: Rows, rises: Rises, drawn: Sketch) -> TwinPa
         "mechanisms": {h.name: _heat(drawn, k) for k, h in enumerate(drawn.heats)},
         "sensors": dict(sorted(_sensors(machine, rows, rises, drawn), key=lambda s: rises.names.index(s[0]))),
         "errors": {e: _error(machine, rows, rises, drawn, e) for e in rows.errors},
-        "initial_spread": START_SPREAD,
+        "initial_spread": f"{POLICY.draft_start_sd_K:g} K",
     }
     return TwinPart.model_validate(raw)
 
@@ -104,13 +99,13 @@ def with_values(part: TwinPart, network: Network, values: Array) -> TwinPart:
     """The part with its network's free parameters at values (n,), which become the centres of their priors."""
     for k in network.free.tolist():
         p = network.parameters[k]
-        value = float(np.clip(values[k], *SHARES)) if p.scale == "logit" else float(values[k])
+        value = float(np.clip(values[k], *POLICY.draft_share_bounds)) if p.scale == "logit" else float(values[k])
         part = with_value(part, p, value=f"{value:.4g} {p.unit}" if p.unit != "1" else float(f"{value:.4g}"))
     return part
 
 
 def _free(value: float, unit: str) -> dict[str, Any]:
-    return {"value": f"{value:.3g} {unit}", "spread": WIDE}
+    return {"value": f"{value:.3g} {unit}", "spread": POLICY.draft_log_sd}
 
 
 def _second(apart: Array, links: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -151,8 +146,8 @@ def _surrounding(rows: Rows, rises: Rises) -> dict[str, Any]:
 
 def _outlets(heat_W: Array) -> tuple[tuple[int, float], ...]:
     """The bodies that a heat goes into with their shares, the largest first."""
-    order = np.argsort(-heat_W, kind="stable")[:OUTLETS]
-    kept = [k for k in order.tolist() if heat_W[k] > LEAST_SHARE * heat_W.sum()]
+    order = np.argsort(-heat_W, kind="stable")[: POLICY.draft_heat_outlets]
+    kept = [k for k in order.tolist() if heat_W[k] > POLICY.draft_min_outlet_share * heat_W.sum()]
     total = float(heat_W[kept].sum())
     return tuple((k, float(heat_W[k]) / total) for k in kept)
 
@@ -161,19 +156,24 @@ def _heat(drawn: Sketch, k: int) -> dict[str, Any]:
     given, outlets = drawn.heats[k], drawn.into[k]
     names = [drawn.names[b] for b, _ in outlets]
     held = k == drawn.held
-    heat_W = HELD_W if held else max(float(drawn.guess.heat_W[:, k].sum()), 1e-3 * HELD_W)
+    heat_W = (
+        POLICY.draft_held_heat_W
+        if held
+        else max(float(drawn.guess.heat_W[:, k].sum()), POLICY.draft_min_heat_share * POLICY.draft_held_heat_W)
+    )
     shares: dict[str, Any] = {
-        n: {"value": float(f"{np.clip(share, 0.03, 0.9):.3g}"), "spread": WIDE}
+        n: {"value": float(f"{np.clip(share, *POLICY.draft_start_share_bounds):.3g}"), "spread": POLICY.draft_log_sd}
         for n, (_, share) in zip(names[1:], outlets[1:], strict=True)
     }
-    told = f"drafted: what grows with {given.driver} and warms {', '.join(names)}"
-    scale = f"; held at {HELD_W:g} W at {given.top:g} {given.unit}: all other W, W/K and J/K are relative to it"
+    summary = f"drafted: what grows with {given.driver} and warms {', '.join(names)}"
+    top = f"{POLICY.draft_held_heat_W:g} W at {given.top:g} {given.unit}"
+    scale = f"; held at {top}: all other W, W/K and J/K are relative to it"
     raw = {
         "law": given.law,
         "drivers": given.driver,
         "into": {names[0]: "rest", **shares} if shares else names[0],
         "parameters": given.parameters(heat_W, held),
-        "words": told + (scale if held else ""),
+        "words": summary + (scale if held else ""),
     }
     return raw | ({"at": {"body": names[0]}} if given.law == "ohmic_heat" else {})
 
@@ -182,13 +182,13 @@ def _sensors(machine: Machine, rows: Rows, rises: Rises, drawn: Sketch) -> Itera
     for name, group in zip(drawn.names, drawn.groups, strict=True):
         for s, offset_K in zip(group, rises.offsets_K(group), strict=True):
             channel = rises.names[s]
-            offset = {"value": f"{offset_K:.2f} K", "spread": OFFSET_SPREAD}
+            offset = {"value": f"{offset_K:.2f} K", "spread": f"{POLICY.draft_offset_sd_K:g} K"}
             yield channel, {"at": name, "offset": offset, **_noise(machine, rows, channel, "K")}
 
 
 def _error(machine: Machine, rows: Rows, rises: Rises, drawn: Sketch, channel: str) -> dict[str, Any]:
     unit = machine.channels[channel].unit
-    spread = GAIN_SPREAD_UM_PER_K
+    spread = POLICY.draft_gain_sd_um_per_K
     if unit != "um":
         largest = max(float(np.nanmax(np.abs(_moved(b.values(channel))), initial=0.0)) for b in rows.batches)
         spread = 3.0 * largest / max(float(np.nanmax(np.abs(rises.rise_K))), 1e-3) or 1.0
@@ -212,11 +212,11 @@ def _chain(channel: str, rows: Rows, rises: Rises, body_degC: Array) -> tuple[in
     error, rise_K = error[good], rise_K[good]
     chosen: list[int] = []
     left = float(np.linalg.norm(error))
-    while len(chosen) < min(CHAIN[1], rise_K.shape[1]):
+    while len(chosen) < min(POLICY.draft_chain_bodies[1], rise_K.shape[1]):
         rest = [k for k in range(rise_K.shape[1]) if k not in chosen]
         tried = {k: _left(rise_K[:, [*chosen, k]], error) for k in rest}
         best = min(rest, key=lambda k: tried[k])
-        if len(chosen) >= CHAIN[0] and tried[best] > (1 - CHAIN_GAIN) * left:
+        if len(chosen) >= POLICY.draft_chain_bodies[0] and tried[best] > (1 - POLICY.draft_chain_min_fall) * left:
             break
         chosen.append(best)
         left = tried[best]

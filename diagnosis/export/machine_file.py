@@ -10,25 +10,14 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel
 
 from data.errors import InputError, WorkError, closest
 from data.machine import Machine, parse_machine
-from diagnosis.contracts import PLACES, Fitted, with_parts, with_value
-from diagnosis.export.yaml_text import (
-    DIGITS,
-    entry_at,
-    flow,
-    is_flow,
-    part_plain,
-    plain,
-    steps_of,
-    tidied,
-    with_comment,
-    with_entry,
-)
-from twin.calibration.calibrated_file import Origin, Update, with_calibrated, with_values
+from data.yaml_edit import YamlText
+from diagnosis.contracts import PART_GROUPS, Fitted, with_parts, with_value
+from diagnosis.export.yaml_text import DIGITS, part_plain, plain, tidied
+from twin.calibration.calibrated_file import Origin, Update, held_steps, kept, put_values, with_calibrated
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
 from twin.network import Network
@@ -70,17 +59,18 @@ def diagnosed_text(
     network = compile_network(machine, where, part)
     own = own_paths(machine, part)
     updates = _updates(values, {i.name: i for i in intervals}, network, own, where)
-    new = text
+    document = YamlText(text)
     filled, rest = _filled(parts, updates)
     for path, given in filled.items():
-        new = _with_part(new, path, given, old)
+        _put_part(document, path, given, old)
     for path in rest:
-        new = _with_default(new, path, network, own)
-    new = with_values(new, rest, where)
+        _put_default(document, path, network, own)
+    put_values(document, rest, where)
     for path, note in notes.items():
-        new = with_comment(new, ["twin", *_held_steps(new, path)], note)
+        document.comment(_held_steps(document, path), note)
+    new = str(document)
     if origin is not None:
-        new = _with_origin(new, origin)
+        new = with_calibrated(new, origin.rows)
     _check(new, machine, part, network, updates, own, where)
     return new
 
@@ -96,7 +86,9 @@ def drafted_text(text: str, part: TwinPart, where: str, note: str = "") -> str:
     if machine.twin is not None:
         raise InputError(f"{where}: has a twin part already; nothing is drafted over it")
     part = tidied_part(part)
-    new = with_entry(text.rstrip("\n") + "\n", [], "twin", part_plain(part), note, blocks=2)
+    document = YamlText(text)
+    document.set([], "twin", part_plain(part), note, blocks=2)
+    new = str(document)
     network = compile_network(machine, where, part)
     _check(new, machine, part, network, {}, {}, where)
     return new
@@ -129,7 +121,7 @@ def _updates(
             raise WorkError(f"{where}: {given} has no finite value and interval; nothing was written")
         path = own.get(name, name)
         update = Update(names[name], float(value), (interval.low, interval.high))
-        if path in out and _kept(out[path].value) != _kept(update.value):
+        if path in out and kept(out[path].value) != kept(update.value):
             raise WorkError(
                 f"{where}: {path} is one value in the file and was fitted as {out[path].value:g} and {value:g}; "
                 "give each place a mechanism of its own; nothing was written"
@@ -158,60 +150,41 @@ def _filled(
             rest[path] = update
             continue
         unit = update.parameter.unit
-        both = (_kept(update.value), _kept(update.parameter.prior_value))
+        both = (kept(update.value), kept(update.parameter.prior_value))
         value, prior = (v if unit == "1" else f"{v:.{DIGITS}g} {unit}" for v in both)
-        fitted = {"value": value, "prior": prior, "interval90": tuple(_kept(v) for v in update.interval90)}
+        fitted = {"value": value, "prior": prior, "interval90": tuple(kept(v) for v in update.interval90)}
         held = (given.parameters.get(below[0]) or Value(value=0.0)).model_copy(update=fitted)
         filled[f"{group}.{name}"] = given.model_copy(update={"parameters": {**given.parameters, below[0]: held}})
     return filled, rest
 
 
-def _with_part(text: str, path: str, given: BaseModel, old: TwinPart) -> str:
+def _put_part(document: YamlText, path: str, given: BaseModel, old: TwinPart) -> None:
     """A new part whole; of a changed one only the keys that changed, so that its other comments stay."""
     group, name = path.split(".", 1)
-    before, new = getattr(old, group).get(name), plain(given, name)
-    if before is None or type(before) is not type(given):
-        return with_entry(text, ["twin", group], name, new, order=GROUPS)
-    fields = type(given).model_fields
-    changed = [k for k in fields if getattr(before, k) != getattr(given, k)]
-    whole = plain(given)
-    if not isinstance(plain(before, name), dict) or not set(changed) <= set(whole):
-        return with_entry(text, ["twin", group], name, new, order=GROUPS)
-    for key in changed:
-        text = with_entry(text, ["twin", group, name], key, whole[key])
-    return text
+    before, whole = getattr(old, group).get(name), plain(given)
+    if type(before) is type(given) and isinstance(plain(before, name), dict):
+        changed = [k for k in type(given).model_fields if getattr(before, k) != getattr(given, k)]
+        if set(changed) <= set(whole):
+            for key in changed:
+                document.set(["twin", group, name], key, whole[key])
+            return
+    document.set(["twin", group], name, plain(given, name), order=GROUPS)
 
 
-def _with_default(text: str, path: str, network: Network, own: Mapping[str, str]) -> str:
+def _put_default(document: YamlText, path: str, network: Network, own: Mapping[str, str]) -> None:
     """A mechanism's value that stood nowhere but in its class is written out, so that it can be changed."""
-    steps = path.split(".")
-    if steps[0] != "mechanisms" or len(steps) != 3 or _held_steps(text, path) != steps[:2]:
-        return text
+    steps = ["twin", *path.split(".")]
+    if steps[1] != "mechanisms" or len(steps) != 4 or _held_steps(document, path) != steps[:3]:
+        return
     name = next((n for n, at in own.items() if at == path), path)
     p = network.parameters[network.index(name)]
     value: Any = f"{p.value:.{DIGITS}g} {p.unit}" if p.unit != "1" else p.value
-    return with_entry(text, ["twin", *steps[:2], "parameters"], steps[2], value)
+    document.set([*steps[:3], "parameters"], steps[3], value)
 
 
-def _held_steps(text: str, path: str) -> list[str]:
-    """The keys below `twin` that lead as far towards a path as the text goes; a bare name is a mechanism's."""
-    return steps_of(text, path if "." in path else f"mechanisms.{path}")
-
-
-def _with_origin(text: str, origin: Origin) -> str:
-    rows: dict[str, Any] = {"batches": list(origin.batches), "when": origin.when, "simulated": origin.simulated}
-    if origin.left_out_rms:
-        rows["left_out_rms"] = {k: float(f"{v:.3g}") for k, v in origin.left_out_rms.items()}
-    if origin.words:
-        rows["words"] = origin.words
-    entry = entry_at(yaml.compose(text, Loader=yaml.SafeLoader), ["twin"])
-    if entry is not None and (entry.inside or is_flow(entry.value)):
-        return with_entry(text, ["twin"], "calibrated", rows)
-    return with_calibrated(text, "".join(f"{k}: {flow(v)}\n" for k, v in rows.items()))
-
-
-def _kept(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
+def _held_steps(document: YamlText, path: str) -> list[str]:
+    """The keys that lead as far towards a path as the text goes; a bare name is a mechanism's."""
+    return held_steps(document, path if "." in path else f"mechanisms.{path}")[0]
 
 
 def _check(
@@ -233,11 +206,11 @@ def _check(
         raise WorkError(f"{where}: the new file reads back as another network; nothing was written")
     for new, old in zip(again.parameters, network.parameters, strict=True):
         update = updates.get(own.get(old.name, old.name))
-        value = old.value if update is None else _kept(update.value)
-        told = (new.value, new.low, new.high, new.spread)
+        value = old.value if update is None else kept(update.value)
+        stated = (new.value, new.low, new.high, new.spread)
         if not math.isclose(new.prior_value, old.prior_value, rel_tol=PRIOR_SAME, abs_tol=1e-300) and update:
-            told, value = (new.prior_value, *told[1:]), old.prior_value
-        for got, meant in zip(told, (value, old.low, old.high, old.spread), strict=True):
+            stated, value = (new.prior_value, *stated[1:]), old.prior_value
+        for got, meant in zip(stated, (value, old.low, old.high, old.spread), strict=True):
             if not (math.isclose(got, meant, rel_tol=SAME, abs_tol=1e-300) or (math.isnan(got) and math.isnan(meant))):
                 raise WorkError(f"{where}: {new.name} reads back as {got:g} instead of {meant:g}; nothing was written")
 
@@ -273,7 +246,7 @@ def deviations(fitted: Fitted) -> dict[str, float]:
 def changed_parts(before: TwinPart, after: TwinPart) -> Mapping[str, BaseModel]:
     """By path ("mechanisms.floor_sink_bed") what `after` states that `before` does not, or states otherwise."""
     out = {}
-    for group in PLACES:
+    for group in PART_GROUPS:
         old = getattr(before, group)
         for name, given in getattr(after, group).items():
             if name not in old or old[name] != given:

@@ -1,8 +1,9 @@
-"""From the search to findings: what was found where, when, how large, how sure, and what would tell ties apart."""
+"""From the search to findings: place, time, size and probability of each effect, the residual, and the verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -10,14 +11,14 @@ import pandas as pd
 from data.arrays import Array
 from diagnosis.contracts import Candidate, Fitted
 from diagnosis.export.machine_file import deviations
-from diagnosis.findings.report_data import Estimate, Found, Other, Rms, beside_words, place_words
+from diagnosis.findings.report_data import Estimate, Found, Other, Rms, context_label, place_label
 from diagnosis.findings.schema import Verdict
+from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.screen import alone
 from diagnosis.screening.unseen import unseen
 from diagnosis.search.acceptance import trust
 from diagnosis.search.decision import Round
-from diagnosis.search.null import AS_IT_IS
-from diagnosis.search.probability import Explanation, explanations, most_sure, told
+from diagnosis.search.probability import Explanation, explanations, probability_cap, reported
 from diagnosis.search.search import Search
 from twin.calibration.identifiability import Interval
 from twin.compiling.cells import several
@@ -27,17 +28,14 @@ from twin.quantity import Spec
 from twin.schema import MechanismPart, TwinPart
 from twin.simulation import Simulation, simulate
 
-AT_WORK = 0.1  # of the largest watts
-ALWAYS = 0.95  # of the time
-
 Windows = tuple[tuple[str, float, float], ...]
 
 
 def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
-    """The regime ("spindle_rpm > 0", "always", "at times") and windows (batch, start s, end s), none where always.
+    """The regime of an effect ("spindle_rpm > 0", "always", "at times") and its windows (batch, start s, end s).
 
-    By what the law itself says, else while its drivers run, those of the heat that it multiplies included, else by the
-    watts that it makes.
+    The law's own statement decides, else its drivers and those of the heat that it multiplies, else its watts. An
+    effect that is always at work has no windows.
     """
     if c.part is None:
         return "always", ()
@@ -53,13 +51,13 @@ def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
 
 
 def _by_watts(fitted: Fitted, name: str) -> tuple[str, Windows]:
-    """The same by a heat's size, where it is above a share of its largest; always, where it is none."""
+    """`activity` of a heat: where its watts exceed a share of their largest. What is no heat is always at work."""
     if not any(h.law.name == name for h in fitted.problem.network.heats):
         return "always", ()
     run = _simulated(fitted, fitted.values)
     watts = np.abs(run.heat_W[name][0])
-    on_rows = (watts > AT_WORK * watts[run.valid].max(initial=0.0)) & run.valid
-    if on_rows[run.valid].mean() > ALWAYS:
+    on_rows = (watts > POLICY.active_min_share * watts[run.valid].max(initial=0.0)) & run.valid
+    if on_rows[run.valid].mean() > POLICY.always_min_share:
         return "always", ()
     on = {b: on_rows[k, run.valid[k]] for k, b in enumerate(run.batch_ids)}
     times = {b: run.time_s[k, run.valid[k]] for k, b in enumerate(run.batch_ids)}
@@ -67,7 +65,7 @@ def _by_watts(fitted: Fitted, name: str) -> tuple[str, Windows]:
 
 
 def usual_size(fitted: Fitted, c: Candidate) -> float:
-    """Root mean square of a heat's watts, or of what a displacement adds to its error, where it is not next to none."""
+    """Root mean square of a heat's watts, or of a displacement in its error's unit, over rows where it is at work."""
     run = _simulated(fitted, fitted.values)
     if c.where.kind == "node":
         series = run.heat_W[c.name][0]
@@ -79,18 +77,17 @@ def usual_size(fitted: Fitted, c: Candidate) -> float:
         series = (run.errors - _simulated(fitted, without).errors)[0, ..., column]
     series = np.abs(series[run.valid])
     series = series[np.isfinite(series)]
-    at_work = series[series > AT_WORK * series.max(initial=0.0)]
+    at_work = series[series > POLICY.active_min_share * series.max(initial=0.0)]
     return float(np.sqrt(np.mean(at_work**2))) if len(at_work) else 0.0
 
 
 def _simulated(fitted: Fitted, values: Array) -> Simulation:
     problem, nuisance = fitted.problem, fitted.state.nuisance
-    start, offset = problem.own(nuisance)
-    return simulate(problem.network, values, problem.own_heat(nuisance), start, keep_cells=True, offsets_K=offset)
+    return simulate(problem.network, values, *problem.own(nuisance), keep_cells=True)
 
 
 def _stated(fitted: Fitted, c: Candidate) -> Windows | None:
-    """The windows of a law that says itself when it works."""
+    """The windows of a law that states itself when it works."""
     if c.mechanism not in MECHANISMS:
         return None
     law, network = MECHANISMS[c.mechanism], fitted.problem.network
@@ -101,7 +98,7 @@ def _stated(fitted: Fitted, c: Candidate) -> Windows | None:
         at_work = law().at_work(View(time_s=b.time_s), own)
         if at_work is None:
             return None
-        on[b.batch_id] = at_work >= 0.5
+        on[b.batch_id] = at_work >= POLICY.active_min_level
     return _windows(on, {b.batch_id: b.time_s for b in fitted.batches})
 
 
@@ -124,19 +121,6 @@ def _windows(on: Mapping[str, np.ndarray], time_s: Mapping[str, np.ndarray]) -> 
     return tuple(out)
 
 
-STRUCTURE = 0.025  # of what a channel moves: left-out errors of a network of castings are told in units of it
-# Of these and of what refined networks leave, beyond which something is left, whatever it is: 267 opened cases of a
-# proof that lacked nothing visible, of 8 to 13 runs, left 1.5 units in the median, 2.8 in 95 of 100 and 5.1 at most.
-# Units of the noise would test the sensors: all 19 cases that once left too many of those had the finest resolution.
-# Few runs prove less.
-REST, REST_OF_FEW, FEW = 6.0, 4.0, 6
-# Of an amplitude, how far off a lumped network is beside all that its fit and the structural null know of: with it 207
-# of 231 intervals told in two opened proofs would have held the true amplitude, with 0.35 they were 192.
-LUMPED = 0.5
-UNSEEN = 1.0 - 1e-9  # of a prior's spread: a parameter that does nothing at this place (no draught blows at a room)
-SURE = 0.7  # below it the best explanation does not stand by itself
-
-
 def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
     """Root mean squares over all left-out rows by channel, errors first."""
     errors = {e.channel for e in fitted.problem.network.errors}
@@ -157,66 +141,85 @@ def rms_of(table: pd.DataFrame, fitted: Fitted) -> tuple[Rms, ...]:
 def found_of(
     search: Search, done: Round, part: TwinPart, intervals: Mapping[str, Interval], rms: Sequence[Rms], separates: str
 ) -> Found:
-    """One accepted round as a finding; `intervals` of the final fit's parameters by network name, `rms` of the left-out
-    batches before and after this effect."""
-    every, nothing, unlisted = explanations(done)
-    best = next(e for e in every if done.best is not None and e.tried is done.best)
-    c = best.tried.candidate
-    same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
-    rest = [e for e in every if e not in same]
-    final = search.final
-    trusted = trust(best.tried, len(final.batches))
-    parameters, was = parameters_told(final, c, intervals, done.scatter)
+    """One accepted round as a finding.
+
+    Args:
+        intervals: of the final fit's parameters, by network name.
+        rms: of batches left out, before and after this effect.
+        separates: the run that would tell it from its alternatives.
+    """
+    best, final = done.best, search.final
+    assert best is not None
+    c = best.candidate
+    _, nothing, unlisted = explanations(done)
+    trusted = trust(best, len(final.batches))
+    parameters, was = reported_parameters(final, c, intervals, done.scatter)
     regime, windows = activity(final, c)
-    given = c.part
-    return Found(
-        mechanism=c.mechanism,
-        where=c.where,
-        place=_place_of(c, part),
+    return replace(
+        claimed(done, part, final),
         parameters=parameters,
-        probability=trusted * min(sum(e.probability for e in same), most_sure(final.runs)),
         name=c.name if c.part is not None else "",
-        beside=beside_words(given, c.where, part) if given is not None else "",
-        others=tuple(_other(e, part, trusted) for e in told([best, *rest])),
         regime=regime,
         windows=windows,
         rms=tuple(rms),
         separates=separates,
         caps=caps(final.runs),
         evidence={
-            "gain_nats": best.tried.gain,
+            "gain_nats": best.gain,
             "threshold_nats": float(done.threshold),
-            "batches_improved": best.tried.improved,
+            "batches_improved": best.improved,
             "batches": len(final.batches),
             "sign_test_p": done.sign_p,
-            "absorbed_share": best.tried.scored.absorbed,
+            "absorbed_share": best.scored.absorbed,
             "probability_nothing": 1.0 - trusted * (1.0 - nothing),
             "probability_unlisted": trusted * unlisted,
             "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
-            **unseen(done.before, best.tried.fitted or final),
+            **unseen(done.before, best.fitted or final),
         },
         was=was,
     )
 
 
+def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
+    """The best of a round with its probability and the alternatives; `final` is the fit that it is reported from."""
+    every, _, _ = explanations(done)
+    best = next(e for e in every if e.tried is done.best)
+    c = best.tried.candidate
+    same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
+    rest = [e for e in every if e not in same]
+    trusted = trust(best.tried, len(final.batches))
+    return Found(
+        mechanism=c.mechanism,
+        where=c.where,
+        place=_place_of(c, part),
+        parameters={},
+        probability=trusted * min(sum(e.probability for e in same), probability_cap(final.runs)),
+        context=context_label(c.part, c.where, part) if c.part is not None else "",
+        others=tuple(_other(e, part, trusted) for e in reported([best, *rest])),
+    )
+
+
 def _place_of(c: Candidate, part: TwinPart) -> str:
-    """The place in words; of a heat's size the heat's own."""
+    """The label of the place; of a heat's amplitude that of the heat."""
     if c.change is not None and c.where.name in part.mechanisms:
-        return f"{MECHANISMS[part.mechanisms[c.where.name].law].words} ({c.where.name})"
-    return place_words(c.where, part)
+        return f"{MECHANISMS[part.mechanisms[c.where.name].law].summary} ({c.where.name})"
+    return place_label(c.where, part)
 
 
 def _other(e: Explanation, part: TwinPart, trusted: float) -> Other:
     c = e.tried.candidate
-    beside = beside_words(c.part, c.where, part) if c.part is not None else ""
-    return Other(c.mechanism, c.where, _place_of(c, part), trusted * e.probability, beside, e.alike)
+    context = context_label(c.part, c.where, part) if c.part is not None else ""
+    return Other(c.mechanism, c.where, _place_of(c, part), trusted * e.probability, context, e.alike)
 
 
-def parameters_told(
+def reported_parameters(
     final: Fitted, c: Candidate, intervals: Mapping[str, Interval], scatter: float
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """Fitted values of what was found, in their units, and those that the machine file had; `scatter` of the only
-    amplitude that structure alone makes, in its unit. What does nothing at the candidate's place is not told."""
+    """Fitted values of an effect, in their units, and the machine file's values of those that it corrects.
+
+    `scatter` is by how much structure alone moves the only amplitude, in its unit. A parameter that does nothing at the
+    candidate's place is left out.
+    """
     network = final.problem.network
     if c.change is not None:
         name = c.change.parameter.name
@@ -232,7 +235,11 @@ def parameters_told(
     out: dict[str, Estimate] = {}
     specs = MECHANISMS[c.mechanism].parameters if c.mechanism in MECHANISMS else ()
     places = {s: _network_name(final, c.name, s.name, c.where.name) for s in specs}
-    idle = {s for s, at in places.items() if at and at in intervals and intervals[at].prior_shrinkage > UNSEEN}
+    idle = {
+        s
+        for s, at in places.items()
+        if at and at in intervals and intervals[at].prior_shrinkage > POLICY.idle_prior_share
+    }
     sizes = [s for s in specs if s.name in c.amplitudes and s not in idle]
     for spec, at in places.items():
         if at is None or spec in idle:
@@ -240,7 +247,7 @@ def parameters_told(
         if at in intervals:
             more = scatter if sizes == [spec] else 0.0
             if spec in sizes and not MECHANISMS[c.mechanism].fault:
-                more = float(np.hypot(more, LUMPED * abs(intervals[at].value)))
+                more = float(np.hypot(more, POLICY.lumped_amplitude_sd * abs(intervals[at].value)))
             out[spec.name] = _widened(intervals[at], spec, more)
         else:
             p = network.parameters[network.index(at)]
@@ -249,7 +256,7 @@ def parameters_told(
 
 
 def _widened(i: Interval, spec: Spec, more: float) -> Estimate:
-    """The interval of a parameter, as wide as structure scatters it by `more`."""
+    """The interval of a parameter, widened by `more` in its unit."""
     if not more:
         return Estimate(i.value, i.unit, i.low, i.high)
     if i.low > 0 and i.value > more:
@@ -260,7 +267,7 @@ def _widened(i: Interval, spec: Spec, more: float) -> Estimate:
 
 
 def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> str | None:
-    """Where a mechanism's parameter stands in the network: by its instance, or in what a structural one wrote."""
+    """The network name of a mechanism's parameter, in its instance or in the parts that the mechanism adds."""
     names = [p.name for p in final.problem.network.parameters]
     plain = f"mechanisms.{instance}.{parameter}"
     if plain in names:
@@ -278,36 +285,38 @@ def _network_name(final: Fitted, instance: str, parameter: str, place: str) -> s
 
 
 def caps(n: int) -> tuple[str, ...]:
-    """What keeps a probability from being higher."""
-    return () if n >= FEW else (f"{n} runs only",)
+    """Remarks on what limits a probability."""
+    return () if n >= POLICY.few_runs else (f"{n} runs only",)
 
 
-def remainder(search: Search) -> float:
-    """Left-out errors after all that was found over what structure alone leaves, the median over channels.
+def residual_ratio(search: Search) -> float:
+    """Left-out errors after all that was found over those of structure alone; the median over channels.
 
-    Of rows filtered by their memory: a slow misfit has little that is new in any row (see `slow_remainder`).
+    Rows are filtered by their memory, so that a slow misfit counts little; `slow_residual_ratio` shows that.
     """
     final, null = search.final, search.rounds[-1].null
     left = alone(final, final.memory)
     seen = left.mean_squares(left.left_out())[0]
-    structure = np.median(null.mean_squares[:, AS_IT_IS], axis=0)
+    structure = np.median(null.mean_squares[:, POLICY.null_own_scale], axis=0)
     return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
 
 
-def slow_remainder(rms: Sequence[Rms], fitted: Fitted) -> float:
-    """The same of the rows as they are, noise aside, as a share of what their channel moves, over the share that a
-    network of castings usually leaves; channels that noise alone moves do not count."""
+def slow_residual_ratio(rms: Sequence[Rms], fitted: Fitted) -> float:
+    """Left-out errors of unfiltered rows, less noise, over what a network of castings usually leaves; the median.
+
+    Both are shares of what the channel moves. Channels that noise alone moves do not count.
+    """
     moves = moved_rms(fitted)
     beyond = [
         float(np.sqrt(max(r.after**2 - np.nan_to_num(r.noise) ** 2, 0.0))) / moves[r.channel]
         for r in rms
         if moves.get(r.channel, 0.0) > np.nan_to_num(r.noise)
     ]
-    return float(np.median(beyond or [0.0])) / STRUCTURE
+    return float(np.median(beyond or [0.0])) / POLICY.structure_error_share
 
 
 def moved_rms(fitted: Fitted) -> dict[str, float]:
-    """By channel the root mean square of what its rows differ from their run's first one, in its unit."""
+    """Root mean square of the difference from a run's first row, in the channel's unit, by channel."""
     squares = np.zeros((2, len(fitted.problem.channels)))
     for m in fitted.problem.measured:
         for c in m.usable.tolist():
@@ -318,32 +327,41 @@ def moved_rms(fitted: Fitted) -> dict[str, float]:
     }
 
 
-def verdict_of(found: Sequence[Found], more: bool, rest: float, slow: float, runs: int) -> Verdict:
-    """`more`: what is left over follows something that no listed mechanism is; `rest`: `remainder`, `slow`:
-    `slow_remainder`. Where nothing was found only the rows as they are speak: filtered ones tell the shape of what is
-    left, and castings that are cut too coarsely for one reason or another have every shape."""
+def verdict_of(
+    found: Sequence[Found], more: bool, rest: float, slow: float, runs: int, policy: Policy = POLICY
+) -> Verdict:
+    """The verdict on all effects of listed mechanisms.
+
+    Args:
+        more: whether the residual follows something that no listed mechanism does.
+        rest: `residual_ratio`. It counts only next to a finding, since it judges the shape of a residual, and a coarse
+            network leaves residuals of every shape.
+        slow: `slow_residual_ratio`.
+    """
     if not found:
-        return "unlisted" if more else "undecidable" if slow > most_left(runs) else "consistent"
-    if found[0].probability < SURE and found[0].tied:
+        return "unlisted" if more else "undecidable" if slow > max_residual_ratio(runs, policy) else "consistent"
+    if found[0].probability < POLICY.stands_alone_probability and found[0].tied:
         return "undecidable"
-    return "partly_explained" if more or max(rest, slow) > most_left(runs) else "explained"
+    return "partly_explained" if more or max(rest, slow) > max_residual_ratio(runs, policy) else "explained"
 
 
-def most_left(runs: int) -> float:
-    """How many times what structure leaves so many runs may leave before something is missing for sure."""
-    return REST_OF_FEW if runs < FEW else REST
+def max_residual_ratio(runs: int, policy: Policy = POLICY) -> float:
+    """The ratio of residual to structure above which something is missing, for so many runs."""
+    if not policy.checks_residual:
+        return float("inf")
+    return POLICY.few_runs_residual_max_units if runs < POLICY.few_runs else POLICY.residual_max_units
 
 
-def left_words(rest: float, slow: float, runs: int) -> tuple[str, ...]:
-    """What of `remainder` and `slow_remainder` is beyond what so many runs may leave, in words; the larger first."""
-    bound = most_left(runs)
+def residual_remarks(rest: float, slow: float, runs: int) -> tuple[str, ...]:
+    """Remarks on the residual ratios that exceed the limit for so many runs; the larger first."""
+    bound, unit = max_residual_ratio(runs), 100 * POLICY.structure_error_share
     of_moves = (
-        f"left-out errors are {100 * STRUCTURE * slow:.0f} % of what their channels move (median over channels); up to "
-        f"{100 * STRUCTURE * bound:.0f} % may be the coarse network's"
+        f"left-out errors are {unit * slow:.0f} % of what their channels move (median over channels); up to "
+        f"{unit * bound:.0f} % may be the coarse network's"
     )
     of_memory = (
         f"left-out errors filtered by their memory are {rest:.1f} times what a coarse network makes of them (median "
         f"over channels); up to {bound:.0f} times may be its"
     )
     said = sorted(((slow, of_moves), (rest, of_memory)), reverse=True)
-    return tuple(words for times, words in said if times > bound)
+    return tuple(remark for ratio, remark in said if ratio > bound)

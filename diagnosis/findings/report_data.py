@@ -1,4 +1,4 @@
-"""What a diagnosis hands to those who word it: one effect, where, how large, how sure."""
+"""Data of the report: effects with place, size and probability, and the tables of a diagnosis."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from data.arrays import Array
-from diagnosis.contracts import COLUMNS, Fitted, Where
+from diagnosis.contracts import COLUMNS, CandidateKind, Fitted, Where
 from diagnosis.findings.schema import rms_key
 from diagnosis.fitting.fitted import LeftOutRows
+from diagnosis.policy import POLICY
 from diagnosis.search.decision import Round
 from diagnosis.search.null import Null
 from diagnosis.search.probability import explanations
@@ -86,9 +87,9 @@ def percent(share: float) -> str:
     return "under 1 %" if share < 0.01 else f"{100 * share:.0f} %"
 
 
-def listed(words: Sequence[str], last: str = "and") -> str:
+def listed(items: Sequence[str], last: str = "and") -> str:
     """``a, b and c``."""
-    return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
+    return f"{', '.join(items[:-1])} {last} {items[-1]}" if len(items) > 1 else "".join(items)
 
 
 def _decimals(value: float, digits: int) -> int:
@@ -103,9 +104,6 @@ def _fixed(value: float, decimals: int) -> str:
         return "?"
     text = f"{round(value, decimals):.{max(decimals, 0)}f}"
     return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
-
-
-UNLISTED = ("free_flux", "free_shift", "unlisted")  # what stands in for physics that no listed mechanism describes
 
 
 @dataclass(frozen=True)
@@ -137,7 +135,7 @@ class Other:
     where: Where
     place: str
     probability: float
-    beside: str = ""
+    context: str = ""
     alike: bool = True
 
 
@@ -145,12 +143,15 @@ class Other:
 class Found:
     """One effect that a diagnosis found.
 
-    `mechanism` is a registry key or a rival's, `place` and `beside` come from `place_words` and `beside_words`. For a
-    wrong parameter `parameters` are by path ("exposures.front-air.conductance") and `was` has the file's values; for
-    what varies between runs the one estimate is its sd, as a share where the unit is 1. `size` is what sentences call
-    the effect's size where no parameter is (root mean square watts of a `free_flux`). `separates`: the run that would
-    tell the alternatives apart ("a night switched off"), `caps`: what keeps the probability from being higher ("3 runs
-    only").
+    Attributes:
+        mechanism: a registry key or a `CandidateKind`.
+        place, context: from `place_label` and `context_label`.
+        parameters: by name; of a wrong parameter by path ("exposures.front-air.conductance"). Of a value that varies
+            between runs the one estimate is its sd, as a share where the unit is 1.
+        was: the machine file's values of a wrong parameter.
+        size: the effect's size where no parameter is one (root mean square watts of a `free_flux`).
+        separates: the run that would tell the alternatives apart ("a night switched off").
+        caps: what limits the probability ("3 runs only").
     """
 
     mechanism: str
@@ -159,7 +160,7 @@ class Found:
     parameters: Mapping[str, Estimate]
     probability: float
     name: str = ""
-    beside: str = ""
+    context: str = ""
     others: tuple[Other, ...] = ()
     regime: str = "always"
     windows: tuple[tuple[str, float, float], ...] = ()
@@ -169,6 +170,10 @@ class Found:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     was: Mapping[str, float] = field(default_factory=dict)
     size: Estimate | None = None
+
+    @property
+    def kind(self) -> CandidateKind:
+        return CandidateKind.of(self.mechanism)
 
     @property
     def main(self) -> tuple[str, ...]:
@@ -181,9 +186,10 @@ class Found:
     @property
     def tied(self) -> tuple[Other, ...]:
         """Explanations that these runs cannot tell from it and that are at least half as probable."""
-        if self.probability > 0.9:
+        if self.probability > POLICY.untied_probability:
             return ()
-        return tuple(o for o in self.others if o.alike and o.probability >= self.probability / 2)
+        least = POLICY.tied_min_probability_share * self.probability
+        return tuple(o for o in self.others if o.alike and o.probability >= least)
 
 
 def times_noise(rms: Sequence[Rms]) -> float:
@@ -191,7 +197,7 @@ def times_noise(rms: Sequence[Rms]) -> float:
     return float(np.nanmedian([r.times_noise for r in rms if r.noise > 0] or [0.0]))
 
 
-def place_words(where: Where, part: TwinPart) -> str:
+def place_label(where: Where, part: TwinPart) -> str:
     """``the bed``, ``the shaft and the front bearing housing`` of a link, channels by their name.
 
     A body goes by its `words`, or by its name with blanks for underscores (words with a colon explain, not name).
@@ -204,33 +210,33 @@ def place_words(where: Where, part: TwinPart) -> str:
     return _thing(where.name, part) if where.kind == "node" else where.name
 
 
-def beside_words(given: MechanismPart, where: Where, part: TwinPart) -> str:
-    """What else a mechanism looks at: ``surrounding: the room, speed: spindle_rpm``; nothing for the place itself."""
+def context_label(given: MechanismPart, where: Where, part: TwinPart) -> str:
+    """What else a mechanism depends on: ``surrounding: the room, speed: spindle_rpm``; nothing for the place itself."""
     ports = given.at if isinstance(given.at, Mapping) else {}
     at = {port: listed([_thing(p, part) for p in several(places)]) for port, places in ports.items()}
-    told = [f"{port.replace('_', ' ')}: {place}" for port, place in at.items() if place != place_words(where, part)]
+    parts = [f"{port.replace('_', ' ')}: {place}" for port, place in at.items() if place != place_label(where, part)]
     if isinstance(given.drivers, Mapping):
-        told += [f"{role.replace('_', ' ')}: {channel}" for role, channel in given.drivers.items()]
+        parts += [f"{role.replace('_', ' ')}: {channel}" for role, channel in given.drivers.items()]
     elif given.drivers:
-        told.append(f"driver: {given.drivers}")
+        parts.append(f"driver: {given.drivers}")
     if where.kind != "node" and isinstance(given.at, str):
-        told.insert(0, _thing(given.at, part))
+        parts.insert(0, _thing(given.at, part))
     on = [target for target in several(given.acts_on) if target != where.name]
     if on:
-        told.insert(0, f"{'with' if where.kind == 'sensor' else 'acts on'}: {listed(on)}")
-    return ", ".join(told)
+        parts.insert(0, f"{'with' if where.kind == 'sensor' else 'acts on'}: {listed(on)}")
+    return ", ".join(parts)
 
 
 def _thing(place: str, part: TwinPart) -> str:
     """A body or surrounding with its article; numbered ones (node3) have none."""
     name, _, at = place.partition("@")
     held = part.bodies.get(name) or part.surroundings.get(name)
-    words = held.words if held and held.words and ":" not in held.words else name.replace("_", " ")
-    article = "" if words[-1].isdigit() or words.split()[0].lower() in ("a", "an", "the") else "the "
-    return f"{article}{words}{f' at {at}' if at else ''}"
+    label = held.words if held and held.words and ":" not in held.words else name.replace("_", " ")
+    article = "" if label[-1].isdigit() or label.split()[0].lower() in ("a", "an", "the") else "the "
+    return f"{article}{label}{f' at {at}' if at else ''}"
 
 
-LAGS = 40
+ACF_LAGS = 40
 
 
 def empty_tables() -> dict[str, pd.DataFrame]:
@@ -281,7 +287,7 @@ def acf_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.Dat
 
 
 def _acf(errors: Sequence[Array], fitted: Fitted, channel: int) -> tuple[Array, float]:
-    total, step_s = np.zeros(LAGS), 0.0
+    total, step_s = np.zeros(ACF_LAGS), 0.0
     for k, m in enumerate(fitted.problem.measured):
         at = m.channel == channel
         if at.sum() < 3:
@@ -289,7 +295,7 @@ def _acf(errors: Sequence[Array], fitted: Fitted, channel: int) -> tuple[Array, 
         step_s = m.stride * fitted.batches[k].step_s
         series = np.full(int((m.row[at][-1] - m.row[at][0]) // m.stride) + 1, np.nan)
         series[(m.row[at] - m.row[at][0]) // m.stride] = errors[k][at]
-        sums = lagged_sums(series)[0][:LAGS]
+        sums = lagged_sums(series)[0][:ACF_LAGS]
         total[: len(sums)] += sums
     return (total / total[0] if total[0] > 0 else total), step_s
 
@@ -304,10 +310,11 @@ def candidates_table(rounds: Sequence[Round]) -> pd.DataFrame:
             amplitude, unit = _amplitude(e.tried.scored.amplitudes, c.mechanism)
             gain = e.tried.gain if e.tried.alike is None else e.tried.alike  # as they were compared
             rows.append(
-                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.words, e.tried.cluster, gain,
+                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.label, e.tried.cluster, gain,
                  e.tried.improved, n, s.absorbed, amplitude, unit, e.probability)
             )  # fmt: skip
-    return pd.DataFrame(rows, columns=list(COLUMNS["candidates"]))
+    table = pd.DataFrame(rows, columns=list(COLUMNS["candidates"]))
+    return table.assign(cluster=1 + pd.factorize(table["cluster"])[0])
 
 
 def _amplitude(amplitudes: dict[str, float], mechanism: str) -> tuple[float, str]:
@@ -324,7 +331,7 @@ def _amplitude(amplitudes: dict[str, float], mechanism: str) -> tuple[float, str
 
 def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
     rows = [
-        (k + 1, r.best.candidate.words, r.best.gain, r.threshold, r.best.improved, r.accepted)
+        (k + 1, r.best.candidate.label, r.best.gain, r.threshold, r.best.improved, r.accepted)
         for k, r in enumerate(rounds)
         if r.best is not None
     ]

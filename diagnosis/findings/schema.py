@@ -16,13 +16,13 @@ from diagnosis.contracts import Kind
 
 SCHEMA = "thermodrift.findings/1"
 DIGITS = 4  # significant, of every number but the seconds of a window
-NEARLY_ONE = 0.9999  # a probability below 1 is not written as 1
+LARGEST_PROBABILITY = 0.9999  # a probability below 1 is not written as 1
 
 Verdict = Literal["consistent", "explained", "partly_explained", "unlisted", "undecidable"]
 Number = float | None  # None: not known; nan is written as null
 Share = Annotated[float, Field(ge=0, le=1)]
 
-# The keys of a finding's evidence; others may stand beside them.
+# The keys of a finding's evidence; others may be added.
 EVIDENCE: Mapping[str, str] = {
     "gain_nats": "rise of the log score of the batches left out, in nats",
     "threshold_nats": "gain that structure alone reaches when nothing is missing (99 % quantile)",
@@ -132,7 +132,7 @@ class Refinement(_Part):
 
 
 class Findings(_Part):
-    """The whole file. `statement` says the verdict in words; `remarks` what caps the confidence."""
+    """The whole file. `statement` is the verdict as a sentence; `remarks` say what limits the confidence."""
 
     schema_: Literal["thermodrift.findings/1"] = Field(default="thermodrift.findings/1", alias="schema")
     machine: str
@@ -207,4 +207,4 @@ def _rounded(value: Any, key: str = "") -> Any:
     if key == "windows":
         return round(value, 1)
     rounded = float(f"{value:.{DIGITS}g}")
-    return min(rounded, NEARLY_ONE) if key == "probability" and value < 1 else rounded
+    return min(rounded, LARGEST_PROBABILITY) if key == "probability" and value < 1 else rounded

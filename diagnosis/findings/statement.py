@@ -1,6 +1,6 @@
 """The sentence for the engineer: claim, evidence, advice, caveat, and never more certain than the probability.
 
-Every mechanism is worded from its own `words`, the place and its amplitude, so that a new one needs nothing here.
+Every mechanism is described by its own `summary`, the place and its amplitude, so that a new one needs nothing here.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from diagnosis.contracts import Where
+from diagnosis.contracts import CandidateKind, Where
 from diagnosis.findings.report_data import (
-    UNLISTED,
     Estimate,
     Found,
     Other,
@@ -27,6 +26,7 @@ from diagnosis.findings.report_data import (
     with_unit,
 )
 from diagnosis.findings.schema import Alternative, DetectionLimit, Finding, FoundParameter, Place, Verdict, When
+from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism
 
@@ -38,8 +38,8 @@ _OPERAND_NEXT = rf" +(?=[\w(\[θα°|])(?!{_PROSE}\b)"
 def equation_with_numbers(mechanism: type[Mechanism], values: Mapping[str, float]) -> str:
     """``P = 10.2 W/K · (T_floor - T)``: the parameters' names replaced by their values, in the mechanism's units.
 
-    Three significant digits. A blank that means a product becomes a dot beside a number; what defines a parameter
-    (``gain = ± α · length``) stays; parameters that the equation has under a symbol are told behind it.
+    Three significant digits. A blank that means a product becomes a dot next to a number; what defines a parameter
+    (``gain = ± α · length``) stays; parameters that the equation has under a symbol are appended.
     """
     text, behind = mechanism.equation, []
     for spec in sorted(mechanism.parameters, key=lambda s: -len(s.name)):
@@ -57,15 +57,12 @@ def equation_with_numbers(mechanism: type[Mechanism], values: Mapping[str, float
     text = re.sub(r"(?<=\^)\x00([^\x01]* [^\x01]*)\x01", r"(\1)", text)
     text = re.sub(r"\x00(−[^\x01]*)\x01", r"(\1)", text)
     text = text.replace("\x00", "").replace("\x01", "")
-    told = listed([words for _, words in sorted(behind)])
-    return f"{text}; {told}" if told else text
+    appended = listed([text for _, text in sorted(behind)])
+    return f"{text}; {appended}" if appended else text
 
 
-SURE, LIKELY = 0.9, 0.6  # above: plain; between: most likely; below: perhaps
-FALLS = 0.98  # an error that keeps a larger share than this has not fallen
 _THINGS = {"sensor": "sensor|channel", "error": "channel", "link": "joint|link", "node": "body"}  # what words call it
-NOISE, NOISE_OF_ONE = 2.0, 3.0  # times the given noise, of the median channel and of each: up to it that is noise
-_NAMED = 3  # limits, and alternatives, that a sentence names
+_MAX_NAMED = 3  # limits, and alternatives, that a sentence names
 
 
 def finding_of(found: Found) -> Finding:
@@ -94,43 +91,53 @@ def finding_of(found: Found) -> Finding:
 
 def statement(found: Found) -> str:
     """Claim, evidence, advice and caveat of one effect, as a few short sentences on one line."""
-    claim = claim_words(found)
+    claim = claim_phrase(found)
     fall = falls(found.rms)
     if fall:
         claim += f"; with it {fall}"
         better, of = found.evidence.get("batches_improved"), found.evidence.get("batches")
         claim += f", better in {better} of {of} runs" if better is not None and of else ""
-    return " ".join([f"{claim}.", *_others(found), *_advice(found), *_caveat(found)])
+    return " ".join(
+        [
+            f"{claim}.",
+            *_others(found),
+            *_advice(found),
+            *([f"No surer than that: {listed(found.caps)}."] if found.caps else []),
+        ]
+    )
 
 
-def claim_words(found: Found) -> str:
+def claim_phrase(found: Found) -> str:
     """What is missing, where and how much, without a full stop; the first letter is a capital."""
     if found.tied:
-        # what is claimed may be the less likely: a likelier one that looks alike may fail a bar
-        own = (found.probability, f"{effect_words(found)}{_size(found)} ({percent(found.probability)})")
-        tied = [(o.probability, f"{_other_words(o)} ({percent(o.probability)})") for o in found.tied]
-        said = [words for _, words in sorted([own, *tied], key=lambda s: -s[0])]
-        return f"These runs cannot tell {_number(len(said))} explanations apart: {listed(said, 'or')}"
+        # what is claimed may be the less likely: a likelier one that looks alike may fail a criterion
+        own = (found.probability, f"{effect_phrase(found)}{_size(found)} ({percent(found.probability)})")
+        tied = [(o.probability, f"{_other_phrase(o)} ({percent(o.probability)})") for o in found.tied]
+        said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
+        numbers = {2: "two", 3: "three", 4: "four"}
+        return (
+            f"These runs cannot tell {numbers.get(len(said), str(len(said)))} explanations apart: {listed(said, 'or')}"
+        )
     hedge = _hedge(found.probability)
     sentence = _sentence(found)
     if sentence:
         return _capital(f"{hedge} {sentence}".strip())
-    if found.mechanism in UNLISTED:
-        return _capital(f"{hedge} {effect_words(found)}; no listed mechanism does this".strip())
+    if found.kind.is_unlisted:
+        return _capital(f"{hedge} {effect_phrase(found)}; no listed mechanism does this".strip())
     frame = "in the measurement" if MECHANISMS[found.mechanism].fault else "missing"
-    return f"{_capital(f'{hedge} {frame}'.strip())}: {effect_words(found)}{_size(found)}"
+    return f"{_capital(f'{hedge} {frame}'.strip())}: {effect_phrase(found)}{_size(found)}"
 
 
-def effect_words(found: Found) -> str:
+def effect_phrase(found: Found) -> str:
     """``heat to the floor at the bed``, and when; what has no listed mechanism by its size: ``60 W into the bed``."""
-    if found.mechanism in UNLISTED:
-        return f"{_size(found).removeprefix(', ')} {_inward(found)}{_in_brackets(found.beside)}{_when(found)}"
-    return _noun(found.mechanism, found.where, found.place, found.beside) + _when(found)
+    if found.kind.is_unlisted:
+        return f"{_size(found).removeprefix(', ')} {_inward(found)}{_in_brackets(found.context)}{_when(found)}"
+    return _noun(found.mechanism, found.where, found.place, found.context) + _when(found)
 
 
 def falls(rms: Sequence[Rms], most: int = 2) -> str:
     """How far the errors of the runs left out fall, the greatest fall first; nothing where none does."""
-    fallen = [r for r in rms if r.after < FALLS * r.before]
+    fallen = [r for r in rms if r.after < POLICY.fallen_max_share * r.before]
     fallen = sorted(fallen, key=lambda r: (r.after / r.before, r.channel))[:most]
     said = []
     for k, r in enumerate(fallen):
@@ -150,13 +157,17 @@ def verdict_statement(
     separates: str = "",
     places: Sequence[str] = (),
 ) -> str:
-    """The verdict in words. `limits`, the most telling first, with `places` (`place_words`) of each; `separates` is the
-    run that would tell tied explanations apart."""
+    """The verdict as a sentence.
+
+    Args:
+        limits: detection limits, the most informative first, with the `places` (`place_label`) of each.
+        separates: the run that would tell tied explanations apart.
+    """
     # of several effects each says by itself how sure it is, and what may be in its place
     doubts = [_doubt(f) if len(found) > 1 else "" for f in found]
     said = listed(
         [
-            effect_words(f) + ("" if f.mechanism in UNLISTED else _size(f)) + doubt
+            effect_phrase(f) + ("" if f.kind.is_unlisted else _size(f)) + doubt
             for f, doubt in zip(found, doubts, strict=True)
         ]
     )
@@ -166,17 +177,17 @@ def verdict_statement(
         return _consistent(rms, limits, places)
     if verdict == "undecidable":
         tied = found and found[0].tied
-        words = "Something is missing." if tied else "Something is missing, and these runs cannot tell what."
-        words += f" {claim_words(found[0])}." if found else ""
-        return words + (f" {_capital(separates)} would tell." if separates else "")
+        text = "Something is missing." if tied else "Something is missing, and these runs cannot tell what."
+        text += f" {claim_phrase(found[0])}." if found else ""
+        return text + (f" {_capital(separates)} would tell." if separates else "")
     if verdict == "unlisted":
-        words = "No listed mechanism explains the difference"
-        return f"{words}: {said}{f'; with it {fall}' if fall else ''}."
+        text = "No listed mechanism explains the difference"
+        return f"{text}: {said}{f'; with it {fall}' if fall else ''}."
     if verdict == "partly_explained":
-        words = _capital(f"{hedge} part of the difference is {said}".strip())
-        return f"{words}{f'; with it {fall}' if fall else ''}. Something else is still missing."
-    words = _capital(f"{hedge} the difference is {said}".strip())
-    return f"{words}{f'; with it {fall}' if fall else ''}. Nothing else is missing that these runs could show."
+        text = _capital(f"{hedge} part of the difference is {said}".strip())
+        return f"{text}{f'; with it {fall}' if fall else ''}. Something else is still missing."
+    text = _capital(f"{hedge} the difference is {said}".strip())
+    return f"{text}{f'; with it {fall}' if fall else ''}. Nothing else is missing that these runs could show."
 
 
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
@@ -184,41 +195,47 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
             + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
     times, worst = times_noise(rms), max(rms, key=lambda r: np.nan_to_num(r.times_noise), default=None)
     most = worst.times_noise if worst is not None else 0.0
-    of_one = f" and {few(most)} times in {worst.channel}" if worst is not None and most > NOISE_OF_ONE else ""
-    words = "Nothing is missing: the remaining error is the noise" if times <= NOISE and not of_one else (
-        f"Nothing is missing that these runs could show: the remaining error, {few(times)} times the noise in the "
-        f"median channel{of_one}, is what a network this coarse leaves"
-    )  # fmt: skip
-    words += f" ({', '.join(left)})" if left else ""
+    of_one = (
+        f" and {few(most)} times in {worst.channel}"
+        if worst is not None and most > POLICY.channel_noise_max_ratio
+        else ""
+    )
+    text = "Nothing is missing: the remaining error is the noise"
+    if times > POLICY.noise_max_ratio or of_one:
+        text = (
+            f"Nothing is missing that these runs could show: the remaining error, {few(times)} times the noise in the "
+            f"median channel{of_one}, is what a network this coarse leaves"
+        )
+    text += f" ({', '.join(left)})" if left else ""
     seen = []
-    for limit, place in zip(limits[:_NAMED], places or [n.where.name for n in limits], strict=False):
+    for limit, place in zip(limits[:_MAX_NAMED], places or [n.where.name for n in limits], strict=False):
         if limit.limit is not None:
             what = _noun(limit.mechanism, Where(limit.where.kind, limit.where.name), place)
             seen.append(f"{what} {with_unit(few(limit.limit), limit.unit)}")
-    more = f" and {len(limits) - _NAMED} more in the table of limits" if len(limits) > _NAMED else ""
+    more = f" and {len(limits) - _MAX_NAMED} more in the table of limits" if len(limits) > _MAX_NAMED else ""
     return (
-        f"{words}. An effect above these limits would have been seen: {', '.join(seen)}{more}." if seen else f"{words}."
+        f"{text}. An effect above these limits would have been seen: {', '.join(seen)}{more}." if seen else f"{text}."
     )
 
 
 def _sentence(found: Found) -> str:
-    """The claim of what is a sentence by itself: rivals, and words such as "sensor that drifts"."""
+    """The claim where it is a sentence by itself: alternatives, and summaries such as "sensor that drifts"."""
     e = next((found.parameters[p] for p in found.main), None)
-    if found.mechanism == "wrong_parameter":
+    if found.kind is CandidateKind.WRONG_PARAMETER:
         said = [_replaced(p, found.was.get(p), found.parameters[p]) for p in found.parameters]
         several = len(said) > 1
         return f"the value{'s' * several} of {listed(said)} in the machine file {'are' if several else 'is'} wrong"
-    if found.mechanism == "coarse_network":
+    if found.kind is CandidateKind.COARSE_NETWORK:
         return f"the network is too coarse at {found.place}"
-    if found.mechanism == "varies_between_runs":
+    if found.kind is CandidateKind.VARIES_BETWEEN_RUNS:
         return f"{found.place} differs from run to run{f' by ±{_share(e)}' if e else ''}"
-    if found.mechanism not in MECHANISMS or found.mechanism in UNLISTED:
+    if found.mechanism not in MECHANISMS or found.kind.is_unlisted:
         return ""
-    thing = re.match(rf"({_THINGS[found.where.kind]}) that (.+)", MECHANISMS[found.mechanism].words)
+    thing = re.match(rf"({_THINGS[found.where.kind]}) that (.+)", MECHANISMS[found.mechanism].summary)
     if not thing:
         return ""
     place = f" between {found.place}" if found.where.kind == "link" else f" {found.place}"
-    return f"the {thing[1]}{place} {thing[2]}{_in_brackets(found.beside)}{_when(found)}{_size(found)}"
+    return f"the {thing[1]}{place} {thing[2]}{_in_brackets(found.context)}{_when(found)}{_size(found)}"
 
 
 def _share(e: Estimate) -> str:
@@ -226,28 +243,28 @@ def _share(e: Estimate) -> str:
     return amount(Estimate(100 * e.value, "%", 100 * e.low, 100 * e.high) if e.unit == "1" else e)
 
 
-def _noun(key: str, where: Where, place: str, beside: str = "") -> str:
-    """``heat to the floor at the bed``, ``constant error of the sensor front``; rivals have words of their own."""
-    rivals = {
-        "wrong_parameter": f"a wrong value in the machine file ({where.name})",
-        "coarse_network": f"a network too coarse at {place}",
-        "varies_between_runs": f"{place} that differs from run to run",
-        "unlisted": f"something of no listed mechanism {_at(where, place)}",
+def _noun(key: str, where: Where, place: str, context: str = "") -> str:
+    """``heat to the floor at the bed``, ``constant error of the sensor front``; alternatives have own phrases."""
+    names = {
+        CandidateKind.WRONG_PARAMETER: f"a wrong value in the machine file ({where.name})",
+        CandidateKind.COARSE_NETWORK: f"a network too coarse at {place}",
+        CandidateKind.VARIES_BETWEEN_RUNS: f"{place} that differs from run to run",
+        CandidateKind.UNLISTED: f"something of no listed mechanism {_at(where, place)}",
     }
     if key not in MECHANISMS:
-        return rivals.get(key, f"{key.replace('_', ' ')} {_at(where, place)}")
-    words, linked = MECHANISMS[key].words, "between " if where.kind == "link" else ""
-    thing = re.search(rf"(^|\ba |\b)({_THINGS[where.kind]})\b", words)
+        return names.get(CandidateKind.of(key), f"{key.replace('_', ' ')} {_at(where, place)}")
+    text, linked = MECHANISMS[key].summary, "between " if where.kind == "link" else ""
+    thing = re.search(rf"(^|\ba |\b)({_THINGS[where.kind]})\b", text)
     if (
         thing
     ):  # "a sensor" and a leading "sensor" become "the sensor front", "bonded sensor" becomes "bonded sensor front"
         the = "the " if thing[1] or thing.start() == 0 else ""
-        named = f"{words[: thing.start()]}{the}{thing[2]} {linked}{place}{words[thing.end() :]}"
+        named = f"{text[: thing.start()]}{the}{thing[2]} {linked}{place}{text[thing.end() :]}"
     elif where.kind == "sensor":
-        named = f"{words}: {place}"
+        named = f"{text}: {place}"
     else:
-        named = f"{words} {_at(where, place)}"
-    return named + _in_brackets(beside)
+        named = f"{text} {_at(where, place)}"
+    return named + _in_brackets(context)
 
 
 def _at(where: Where, place: str) -> str:
@@ -265,7 +282,7 @@ def _size(found: Found) -> str:
     """``, 10 W/K (90 %: 9–12)``; a bare number, or one of several, with its parameter's name."""
     if found.size is not None:
         return f", {amount(found.size)}"
-    if found.mechanism == "varies_between_runs":
+    if found.kind is CandidateKind.VARIES_BETWEEN_RUNS:
         return "".join(f", by ±{_share(found.parameters[p])}" for p in found.main)
     named = len(found.main) > 1 or any(not spelt(found.parameters[p].unit) for p in found.main)
     said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
@@ -278,58 +295,50 @@ def _replaced(path: str, was: float | None, now: Estimate) -> str:
 
 def _others(found: Found) -> list[str]:
     """What would look the same, and the run that would tell; what is less likely is not named."""
-    alike = [o for o in found.others if o.alike and o not in found.tied][:_NAMED]
+    alike = [o for o in found.others if o.alike and o not in found.tied][:_MAX_NAMED]
     if not alike:
         return [f"{_capital(found.separates)} would tell them apart."] if found.tied and found.separates else []
-    said = listed([f"{_other_words(o)} ({percent(o.probability)})" for o in alike])
+    said = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in alike])
     run = f"; {found.separates} would tell them apart" if found.separates else ""
     return [f"{_capital(said)} would look the same in these runs{run}."]
 
 
 def _doubt(found: Found) -> str:
     """`` (41 %; or radiation at the bed, 52 %)``: of one effect among several; nothing where it is sure."""
-    if found.probability > SURE:
+    if found.probability > POLICY.plain_probability:
         return ""
-    tied = [f"{_other_words(o)}, {percent(o.probability)}" for o in found.tied]
-    return f" ({percent(found.probability)}{''.join(f'; or {words}' for words in tied)})"
+    tied = [f"{_other_phrase(o)}, {percent(o.probability)}" for o in found.tied]
+    return f" ({percent(found.probability)}{''.join(f'; or {text}' for text in tied)})"
 
 
-def _other_words(other: Other) -> str:
-    return _noun(other.mechanism, other.where, other.place, other.beside)
+def _other_phrase(other: Other) -> str:
+    return _noun(other.mechanism, other.where, other.place, other.context)
 
 
 def _advice(found: Found) -> list[str]:
     if found.mechanism in MECHANISMS and MECHANISMS[found.mechanism].fault:
         return ["Check it at the machine before the model is changed."]
-    if found.mechanism == "wrong_parameter":
+    if found.kind is CandidateKind.WRONG_PARAMETER:
         return ["Check the value against the drawing or the data sheet."]
     return []
 
 
-def _caveat(found: Found) -> list[str]:
-    return [f"No surer than that: {listed(found.caps)}."] if found.caps else []
-
-
 def _hedge(probability: float) -> str:
-    if probability > SURE:
+    if probability > POLICY.plain_probability:
         return ""
-    return f"{'most likely' if probability >= LIKELY else 'perhaps'} ({percent(probability)})"
+    return f"{'most likely' if probability >= POLICY.likely_probability else 'perhaps'} ({percent(probability)})"
 
 
 def _when(found: Found) -> str:
     return "" if found.regime in ("", "always") else f" (when: {found.regime})"
 
 
-def _in_brackets(beside: str) -> str:
-    return f" ({beside})" if beside else ""
+def _in_brackets(context: str) -> str:
+    return f" ({context})" if context else ""
 
 
 def _place(where: Where) -> Place:
     return Place(kind=where.kind, name=where.name)
-
-
-def _number(n: int) -> str:
-    return {2: "two", 3: "three", 4: "four"}.get(n, str(n))
 
 
 def _capital(text: str) -> str:

@@ -11,11 +11,9 @@ import pandas as pd
 
 from data.batch import Batch
 from data.errors import InputError
+from diagnosis.policy import POLICY
 from twin.network import Network
 from twin.simulation.inputs import inputs_of
-
-ENOUGH = 4
-SHORTEST_ROWS = 24
 
 
 def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
@@ -23,18 +21,18 @@ def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ..
 
     A block starts where its sensors stand: bodies without one start as the network at rest says, within the prior.
     """
-    if len(batches) >= ENOUGH:
+    if len(batches) >= POLICY.min_batches:
         return list(batches), ()
-    each = int(np.ceil(ENOUGH / max(1, len(batches))))
+    each = int(np.ceil(POLICY.min_batches / max(1, len(batches))))
     out: list[Batch] = []
     for batch in batches:
-        n = max(1, min(each, batch.n_rows // SHORTEST_ROWS))
+        n = max(1, min(each, batch.n_rows // POLICY.min_block_rows))
         out += _cut(batch, n)
-    words = (
+    remarks = (
         f"{len(batches)} run{'s' if len(batches) != 1 else ''} only: cut into {len(out)} blocks that are left out in "
-        "turn; blocks of one run share its weather and its state, so no probability above 0.9 is told",
+        "turn; blocks of one run share its weather and its state, so no probability above 0.9 is reported",
     )
-    return out, words
+    return out, remarks
 
 
 def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
@@ -44,7 +42,7 @@ def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Bat
         InputError: fewer than four are left, or fewer than half; the first reason.
     """
     kept: list[Batch] = []
-    words: list[str] = []
+    remarks: list[str] = []
     reasons: list[InputError] = []
     for batch in batches:
         try:
@@ -52,10 +50,10 @@ def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Bat
             kept.append(batch)
         except InputError as error:
             reasons.append(error)
-            words.append(f"left out: {error}")
-    if reasons and len(kept) < max(ENOUGH, len(batches) / 2):
+            remarks.append(f"left out: {error}")
+    if reasons and len(kept) < max(POLICY.min_batches, POLICY.min_usable_share * len(batches)):
         raise reasons[0]
-    return kept, tuple(words)
+    return kept, tuple(remarks)
 
 
 def _cut(batch: Batch, n: int) -> list[Batch]:

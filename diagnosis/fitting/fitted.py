@@ -1,4 +1,4 @@
-"""A twin part at its best fit, and how well it predicts batches left out."""
+"""Fits of a twin part to recordings: the baseline, refits with a changed part, predictions of batches left out."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine
 from diagnosis.contracts import Fitted, pieces_of
-from diagnosis.fitting.regression import Filtered, left_where_own_follow, memory_left, settle_filtered, whitened, whiter
+from diagnosis.fitting.regression import Filtered, Whitened, left_where_own_follow, memory_left, settle_filtered, whiter
+from diagnosis.policy import POLICY
 from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import State, descend, settled, x_of, z_bounds
+from twin.calibration.least_squares import FitOptions, State, descend, settled, x_of, z_bounds
 from twin.calibration.problem import EVERY_S, CalibrationProblem, Nuisances
 from twin.compile import compile_network
 from twin.network import Network
@@ -35,10 +36,11 @@ def on_network(
     free_starts: bool = False,
     pieces: Mapping[str, str] = _NO_PIECES,
 ) -> CalibrationProblem:
-    """The same recordings posed to a network with more bodies, laws or drivers.
+    """The calibration problem of the same recordings with another network (more bodies, laws or drivers).
 
-    A new body starts as the one that it is linked with most strongly; with `free_starts` each batch may say otherwise.
-    `pieces` of a body, {piece: body}, start with it: a piece that started as it liked would be a store of its own.
+    A new body starts at the temperature of the body that it is linked with most strongly; with `free_starts` its start
+    is an unknown of each batch. `pieces`, {piece: body}, start with their body: with a start of its own a piece would
+    be a heat store that no body is.
     """
     inputs = problem.inputs
     if not _drives(inputs, network):
@@ -61,7 +63,7 @@ def on_network(
 
 
 def _drives(inputs: Inputs, network: Network) -> bool:
-    """Whether inputs of another network hold all that drives this one: what was worked out of them serves again."""
+    """Whether the inputs of another network hold all that drives this one, so that they can be used again."""
     recorded = {s.channel for s in network.surroundings if s.channel}
     first = {*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)}
     drivers = set(network.drivers) <= set(inputs.drivers)
@@ -69,7 +71,7 @@ def _drives(inputs: Inputs, network: Network) -> bool:
 
 
 def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
-    """Each batch's own unknowns in the new network's order; what is new stands at its prior's mean, 0."""
+    """Each batch's own unknowns in the new network's order; new ones are at their prior mean, 0."""
     names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
     out = []
     for own in nuisance:
@@ -79,7 +81,7 @@ def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance
 
 
 def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Array:
-    """The parameters that both networks fit at their old place, the others at their priors' mean."""
+    """z (p,) of the new problem: parameters that both problems fit at their old values, others at their prior means."""
     by_name = {u.name: u.prior + u.spread * v for u, v in zip(old.unknowns, z, strict=True)}
     return np.array([(by_name.get(u.name, u.prior) - u.prior) / u.spread for u in new.unknowns])
 
@@ -98,22 +100,19 @@ def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
     return np.asarray(start[:, int(np.argmax(conductance))])
 
 
-REFIT_STEPS, REFIT_TOLERANCE = 1, 0.1  # of a refit: whether a candidate is in the running needs no more
-
-
 def refitted(
     old: Fitted,
     part: TwinPart,
     at: Mapping[str, float] | None = None,
-    steps: int = REFIT_STEPS,
-    tolerance: float = REFIT_TOLERANCE,
+    steps: int = POLICY.refit_steps,
+    tolerance: float = POLICY.refit_tolerance,
 ) -> Fitted:
-    """The same recordings fitted by a changed twin part, from the old fit; `at` gives values where to begin.
+    """The same recordings fitted by a changed twin part, starting from the old fit.
 
-    What is new begins otherwise at its value in the part, which is its prior's centre where that is not stated.
+    `at` gives start values by parameter name; other new parameters start at their value in the part.
 
-    Noise and memory are estimated again before every step; no channel counts as noisier, and no row remembers longer,
-    than in the old fit: none is given up for a start that is still far off.
+    Noise and memory are estimated before every step, and neither exceeds that of the old fit: a start that is still far
+    off must not make a channel count for less.
 
     Raises:
         InputError: the part does not compile; WorkError: it cannot be simulated there.
@@ -146,22 +145,21 @@ def refitted(
 def _counted(
     old: Fitted, problem: CalibrationProblem, state: State, left: list[Array], parameters: float
 ) -> tuple[Filtered, State]:
-    """The state with rows that remember no longer, and channels no noisier, than in the old fit and in what is left."""
+    """The state with memory and noise of the residuals `left`, neither above that of the old fit."""
     filtered = Filtered(problem, whiter(old.memory, memory_left(problem, left)))
     here = filtered.noise_of(left, parameters)
     noise = replace(state.noise, factor=np.minimum(here.factor, state.noise.factor))
     return filtered, State.at(filtered, state.z, state.nuisance, noise)
 
 
-def settle(fitted: Fitted, steps: int = 4, tolerance: float = 0.01, rounds: int = 10) -> Fitted:
-    """The same fit taken on to its optimum, noise and memory estimated until it stands."""
+def settle(
+    fitted: Fitted,
+    steps: int = POLICY.settle_steps,
+    tolerance: float = POLICY.settle_tolerance,
+    rounds: int = POLICY.settle_rounds,
+) -> Fitted:
+    """The fit continued to its optimum, with noise and memory estimated in every round until no parameter moves."""
     return replace(fitted, state=settle_filtered(fitted.problem, fitted.state, steps, tolerance, rounds))
-
-
-BASELINE_TOLERANCE, BASELINE_STEPS = 1e-2, 40
-# Every channel's noise to begin with, and rows that count as one: alike, so that none is given up for others.
-MISFIT, SMOOTH = 3.0, 20.0
-ROWS = 60  # of a usual batch, at least: a run of ten minutes is no less a run than one of six hours
 
 
 def check(machine: Machine, batches: Sequence[Batch]) -> None:
@@ -178,8 +176,9 @@ def baseline(
     progress: Callable[[str, int, int], None] | None = None,
     runs: int = 0,
 ) -> Fitted:
-    """The twin part fitted to all batches, with the noise of every channel as the fit leaves it; `runs` that they
-    come from, where they are blocks of fewer.
+    """The twin part fitted to all batches, with noise and memory of every channel estimated from its residuals.
+
+    `runs` is the number of runs, where batches are blocks of fewer.
 
     Raises:
         InputError: batches of another machine, twice the same, or that cannot be simulated.
@@ -189,22 +188,25 @@ def baseline(
     problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
     steps = 0
 
-    def told(_: str) -> None:
+    def count(_: str) -> None:
         nonlocal steps
         steps += 1
         if progress:
             progress("baseline", steps, 0)
 
     k = len(problem.channels)
-    alike = Noise(np.full(k, MISFIT), np.full(k, SMOOTH))
-    state, _ = settled(problem, tolerance=BASELINE_TOLERANCE, max_iterations=BASELINE_STEPS, progress=told, noise=alike)
+    alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
+    options = FitOptions(max_iterations=POLICY.baseline_steps, tolerance=POLICY.baseline_tolerance)
+    state, _ = settled(problem, options, count, alike)
     return settle(Fitted(machine, part, tuple(batches), problem, state, runs or len(batches)))
 
 
 def spacing_s(batches: Sequence[Batch]) -> float:
-    """Seconds from one row that is looked at to the next."""
-    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # none: told where they are simulated
-    return min(EVERY_S, lengths[len(lengths) // 2] / ROWS) or EVERY_S
+    """Seconds between the rows that are fitted."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches) or [
+        0.0
+    ]  # an empty recording is refused where it is simulated
+    return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
 
 
 RMS_COLUMNS = ("batch", "channel", "unit", "rows", "rms")
@@ -219,12 +221,12 @@ class LeftOutRows:
 
 
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
-    """Every batch predicted by all others."""
+    """Every batch predicted by the fit to all others."""
     problem, state = fitted.problem, fitted.state
     weight = 1.0 / fitted.noise.factor**2
     blocks = list(problem.linearise(fitted.x, state.nuisance))
     rows = [
-        whitened(b, v, state.z, problem.unknowns, (), weight, fitted.memory)
+        Whitened.at(b, v, state.z, problem.unknowns, (), weight, fitted.memory)
         for b, v in zip(blocks, state.nuisance, strict=True)
     ]
     own = [w.jacobian.T @ w.jacobian for w in rows]

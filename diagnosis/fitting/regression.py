@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from data.arrays import Array
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Block, Noise, Problem, Unknown
 from twin.calibration.least_squares import State, descend, x_of
 from twin.calibration.problem import CalibrationProblem
 
-ROWS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after which the memory has decayed to 1/e
-SHARES = (0.1, 0.25, 0.4, 0.6, 0.75, 0.87, 0.94, 0.97, 0.985)
-FEWEST = 20  # rows of a channel that say anything about it
-QUIET = 0.25  # of the given noise's variance: no channel has less; files state noise on the safe side
-WORTH = 4.0  # nats of likelihood below which rows are taken as independent
-SHORT = 110  # rows up to which a filter's matrix is quicker than its recursion; at 73 rows of 150 columns twice
+MEMORY_REACHES_ROWS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # after which the memory has decayed to 1/e
+MEMORY_SHARES = (0.1, 0.25, 0.4, 0.6, 0.75, 0.87, 0.94, 0.97, 0.985)
+MATRIX_FILTER_ROWS = (
+    110  # rows up to which a filter's matrix is quicker than its recursion; at 73 rows of 150 columns twice
+)
 
 Slices = Sequence[tuple[int, slice]]  # every channel's number and rows
 
@@ -61,7 +61,7 @@ class Memory:
             phi, theta, sd = self._filter[channel]
             if phi == 0.0:
                 out[at] = rows[at]
-            elif (n := at.stop - at.start) <= SHORT:
+            elif (n := at.stop - at.start) <= MATRIX_FILTER_ROWS:
                 np.matmul(_matrix(phi, theta, sd)[:n, :n], rows[at], out=out[at])
             else:
                 out[at] = _innovations(phi, theta, sd, rows[at])
@@ -109,11 +109,13 @@ def memory_of(residuals: Sequence[Array], channels: Sequence[NDArray[np.int64]],
     there = np.arange(len(rows))[:, None, None] < lengths
     for b, (left, at) in enumerate(zip(residuals, channels, strict=True)):
         rows[:, :, b].T[there[:, :, b].T] = left[np.argsort(at, kind="stable")]
-    w, rows_to_1_e = np.array([(0.0, 1.0), *product(SHARES, ROWS)]).T
+    w, rows_to_1_e = np.array([(0.0, 1.0), *product(MEMORY_SHARES, MEMORY_REACHES_ROWS)]).T
     keep = np.where(w > 0.0, np.exp(-1.0 / rows_to_1_e), 0.0)
     likely = _likelihoods(rows, there, w, keep)
     best = 1 + np.argmax(likely[1:], axis=0)
-    found = (lengths.sum(axis=1) >= FEWEST) & (likely[best, np.arange(n_channels)] > likely[0] + WORTH)
+    found = (lengths.sum(axis=1) >= POLICY.memory_min_rows) & (
+        likely[best, np.arange(n_channels)] > likely[0] + POLICY.memory_min_gain_nats
+    )
     return Memory(np.where(found, w[best], 0.0), np.where(found, keep[best], 0.0))
 
 
@@ -134,14 +136,14 @@ def _likelihoods(rows: Array, there: NDArray[np.bool_], w: Array, keep: Array) -
             now += (row - phi * rows[t - 1]) / sd
         squares += np.einsum("gkb,gkb,kb->gk", now, now, known)
     mean = squares / np.maximum(n, 1)
-    scale = np.maximum(mean, (QUIET / (1.0 - w))[:, None])
+    scale = np.maximum(mean, (POLICY.min_noise_variance_share / (1.0 - w))[:, None])
     return np.asarray(-0.5 * n * (np.log(scale) + np.log(variance)[:, None] + mean / scale))
 
 
-@lru_cache(maxsize=len(SHARES) * len(ROWS))  # of every memory that `memory_of` may find
+@lru_cache(maxsize=len(MEMORY_SHARES) * len(MEMORY_REACHES_ROWS))  # of every memory that `memory_of` may find
 def _matrix(phi: float, theta: float, sd: float) -> Array:
     """The filter of SHORT rows; what it does to the first n of them is its corner of n rows."""
-    return _innovations(phi, theta, sd, np.eye(SHORT))
+    return _innovations(phi, theta, sd, np.eye(MATRIX_FILTER_ROWS))
 
 
 def _innovations(phi: float, theta: float, sd: float, rows: Array) -> Array:
@@ -159,9 +161,6 @@ def _moving_average(share: Array, keep: Array) -> tuple[Array, Array]:
     b = keep * (1.0 - share)
     theta = 2.0 * b / (a + np.sqrt(np.maximum(a**2 - 4.0 * b**2, 0.0)))
     return theta, np.asarray(np.where(theta > 0, b / np.where(theta > 0, theta, 1.0), a))
-
-
-STANDS = 0.1  # of a prior's standard deviation: a round that moves no parameter further is the last
 
 
 @dataclass(frozen=True)
@@ -199,7 +198,7 @@ class Filtered:
         own = [self._innovations(rows, m.channel) for rows, m in zip(left, self.problem.measured, strict=True)]
         square = square_sums(self.problem, own)
         rows = np.bincount(np.concatenate([m.channel for m in self.problem.measured]), minlength=len(square))
-        left_over = max(1.0 - parameters / max(1.0, rows.sum()), 0.1)
+        left_over = max(1.0 - parameters / max(1.0, rows.sum()), POLICY.min_residual_freedom)
         factor = np.sqrt(square / (np.maximum(rows, 1.0) * left_over))
         return Noise(np.maximum(factor, 1.0), np.ones(len(factor)))
 
@@ -234,12 +233,12 @@ def settle_filtered(problem: CalibrationProblem, state: State, steps: int, toler
         noise = filtered.noise_of(left, state.arrow.effective_parameters())
         before = state.z
         state = descend(filtered, State.at(filtered, before, state.nuisance, noise), steps, tolerance)
-        if np.abs(state.z - before).max(initial=0.0) < STANDS:
+        if np.abs(state.z - before).max(initial=0.0) < POLICY.settle_max_move_sd:
             break
     return state
 
 
-SEEN = 1e-9  # sum of squares below which a direction of the nuisances, of variance 1, shows in no row
+MIN_DIRECTION_SQUARE = 1e-9  # sum of squares below which a direction of the nuisances, of variance 1, shows in no row
 
 
 @dataclass(frozen=True)
@@ -259,6 +258,42 @@ class Whitened:
     mixing: Array
     damping: Array
     memory: Memory | None = None  # of each channel's rows; None: they are independent
+
+    @classmethod
+    def at(
+        cls,
+        block: Block,
+        nuisance: Array,
+        z: Array,
+        unknowns: Sequence[Unknown],
+        columns: Sequence[int],
+        weight: Array,
+        memory: Memory | None = None,
+    ) -> Whitened:
+        """A block at z and its nuisances (q,), the unknowns numbered `columns` taken as amplitudes.
+
+        z (p,) of the other unknowns in their order; `weight` (channels,) of the rows, `memory` of each channel's.
+        """
+        scale = np.sqrt(weight[block.channel])
+        bare = np.zeros((len(scale), 0))
+        none = cls(block.batch_id, scale[:0], bare, bare, block.channel, scale, bare, scale[:0], memory)
+        own = none.of(block.nuisance)
+        square, turn = np.linalg.eigh(own.T @ own)  # what rounding makes of small ones is damped by no more than that
+        kept = square > MIN_DIRECTION_SQUARE
+        mixing, damping = own @ (turn[:, kept] / np.sqrt(square[kept])), 1.0 - 1.0 / np.sqrt(1.0 + square[kept])
+        chosen = np.zeros(len(unknowns), bool)
+        chosen[list(columns)] = True
+        spread = np.array([u.spread for u in unknowns])
+        out = replace(none, mixing=mixing, damping=damping)
+        rows = out.of(
+            np.column_stack(
+                [block.residual + block.nuisance @ nuisance, block.jacobian[:, ~chosen] * spread[~chosen],
+                 block.jacobian[:, list(columns)]]
+            )
+        )  # fmt: skip
+        p = int((~chosen).sum())
+        jacobian = rows[:, 1 : 1 + p]
+        return replace(out, target=rows[:, 0] + jacobian @ z, jacobian=jacobian, columns=rows[:, 1 + p :])
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
@@ -316,33 +351,3 @@ class Whitened:
         if self.memory is None:
             return rows
         return self.memory.restored(self.slices, rows)
-
-
-def whitened(
-    block: Block, nuisance: Array, z: Array, unknowns: Sequence[Unknown], columns: Sequence[int], weight: Array,
-    memory: Memory | None = None,
-) -> Whitened:  # fmt: skip
-    """A block at z and its nuisances (q,), the unknowns numbered `columns` taken as amplitudes.
-
-    z (p,) of the other unknowns in their order; `weight` (channels,) of the rows, `memory` of each channel's.
-    """
-    scale = np.sqrt(weight[block.channel])
-    bare = np.zeros((len(scale), 0))
-    none = Whitened(block.batch_id, scale[:0], bare, bare, block.channel, scale, bare, scale[:0], memory)
-    own = none.of(block.nuisance)
-    square, turn = np.linalg.eigh(own.T @ own)  # what rounding makes of small ones is damped by no more than that
-    kept = square > SEEN
-    mixing, damping = own @ (turn[:, kept] / np.sqrt(square[kept])), 1.0 - 1.0 / np.sqrt(1.0 + square[kept])
-    chosen = np.zeros(len(unknowns), bool)
-    chosen[list(columns)] = True
-    spread = np.array([u.spread for u in unknowns])
-    out = replace(none, mixing=mixing, damping=damping)
-    rows = out.of(
-        np.column_stack(
-            [block.residual + block.nuisance @ nuisance, block.jacobian[:, ~chosen] * spread[~chosen],
-             block.jacobian[:, list(columns)]]
-        )
-    )  # fmt: skip
-    p = int((~chosen).sum())
-    jacobian = rows[:, 1 : 1 + p]
-    return replace(out, target=rows[:, 0] + jacobian @ z, jacobian=jacobian, columns=rows[:, 1 + p :])

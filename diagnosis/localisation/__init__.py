@@ -1,1 +1,1 @@
-"""Where and when: a free smooth series at every place, beside what was found at others."""
+"""Where and when: a free smooth series at every place, given what was found at others."""

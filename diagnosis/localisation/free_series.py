@@ -18,6 +18,7 @@ from scipy.linalg import cholesky
 from data.arrays import Array
 from data.errors import WorkError
 from diagnosis.localisation.linearised import FitRows, ForcedNetwork, Hats, Optimum, on_channels
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Noise
 from twin.calibration.least_squares import SETTLED
 from twin.calibration.problem import CalibrationProblem
@@ -25,13 +26,11 @@ from twin.calibration.problem import CalibrationProblem
 Indices = NDArray[np.int64]
 Kind = Literal["heat", "displacement", "sensor"]
 
-CORRELATION_S = 5400.0
 # Of the best seen mode's signal against its noise, in sd: below the first nothing is seen, above the last all is.
-STRENGTHS = np.geomspace(0.3, 3e4, 9)
-RANGE = float(np.log(STRENGTHS[-1] / STRENGTHS[0]))
-HALVINGS = 3  # of the step between strengths
-CORNER = 1e300
-PEAKED = 5.0  # nats of gain, above which a marginal likelihood is a peak
+SIGNAL_TO_NOISE_GRID = np.geomspace(0.3, 3e4, 9)
+LOG_GRID_RANGE = float(np.log(SIGNAL_TO_NOISE_GRID[-1] / SIGNAL_TO_NOISE_GRID[0]))
+STEP_HALVINGS = 3  # of the step between strengths
+UNUSED_CORNER = 1e300
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Basis:
     def root(self) -> Array:
         """Lower triangular (K, K) of the hats' correlation."""
         gap_s = np.abs(self.hats.knot_s[:, None] - self.hats.knot_s)
-        return np.asarray(cholesky(np.exp(-gap_s / CORRELATION_S), lower=True))
+        return np.asarray(cholesky(np.exp(-gap_s / POLICY.series_correlation_s), lower=True))
 
     @cached_property
     def shown(self) -> Array:
@@ -77,7 +76,7 @@ class Amplitudes:
 
 @dataclass(frozen=True)
 class FreeSeries:
-    """A basis beside parameters, of `information` (p, p) and `pull` (p,), in modes that are a batch's independent hats.
+    """A basis with the parameters, of `information` (p, p) and `pull` (p,), in modes: a batch's independent hats.
 
     `modes` (B, P, K, K) lead from modes to the values shown at the hats, of unit prior variance times sigma²;
     `strength` (B, P, K) is their squared signal to noise per sigma²; `by_z` (B, P, K, p) and `along` (B, P, K) what
@@ -111,7 +110,7 @@ class FreeSeries:
 
     @cached_property
     def _shared(self) -> Array:
-        """Information with the pull beside it (p + 1, p + 1)."""
+        """Information with the pull as last row and column, (p + 1, p + 1)."""
         return np.block([[self.information, self.pull[:, None]], [self.pull, np.zeros(1)]])
 
     def gains(self, sigma: Array, places: Indices | slice = slice(None)) -> Array:
@@ -127,7 +126,7 @@ class FreeSeries:
     def _tried(self) -> tuple[Array, Array]:
         """Sigmas and gains (strengths, P) all over the range of sigma; 0 where a place is not seen at all."""
         best = self.strength.max(axis=(0, 2))
-        sigma = STRENGTHS[:, None] / np.sqrt(np.where(best > 0, best, np.inf))
+        sigma = SIGNAL_TO_NOISE_GRID[:, None] / np.sqrt(np.where(best > 0, best, np.inf))
         return sigma, np.stack([self.gains(s) for s in sigma])
 
     def promising(self, margin: float, without: Sequence[int] = ()) -> Indices:
@@ -141,8 +140,8 @@ class FreeSeries:
         sigma, gain = (a[:, places] for a in self._tried)
         at, each = gain.argmax(axis=0), np.arange(len(places))
         best, top = sigma[at, each], gain[at, each]
-        step = float(np.log(STRENGTHS[1] / STRENGTHS[0]))
-        for _ in range(HALVINGS):
+        step = float(np.log(SIGNAL_TO_NOISE_GRID[1] / SIGNAL_TO_NOISE_GRID[0]))
+        for _ in range(STEP_HALVINGS):
             step /= 2
             around = np.stack([best * np.exp(-step), best, best * np.exp(step)])
             three = np.stack([self.gains(around[0], places), top, self.gains(around[2], places)])
@@ -155,9 +154,11 @@ class FreeSeries:
         there = self.gains(vertex, places)
         best, top = np.where(there > top, vertex, best), np.maximum(there, top)
         width = np.sqrt(2 * np.pi / np.where(hump, -bend, 1e-9))
-        peak = top + np.log(np.minimum(width / RANGE, 1.0))
+        peak = top + np.log(np.minimum(width / LOG_GRID_RANGE, 1.0))
         average = np.logaddexp.reduce(gain, axis=0) - np.log(len(gain))
-        return Amplitudes(np.where(top > 0, best, 0.0), np.maximum(top, 0.0), np.where(top > PEAKED, peak, average))
+        return Amplitudes(
+            np.where(top > 0, best, 0.0), np.maximum(top, 0.0), np.where(top > POLICY.peaked_gain_nats, peak, average)
+        )
 
     @cached_property
     def best(self) -> Amplitudes:
@@ -211,18 +212,12 @@ class Posterior:
 
 
 def _log(shared: Array) -> Array:
-    """``(bᵀ A⁻¹ b - log det A) / 2`` of an information A with its pull b beside it (..., p + 1, p + 1)."""
+    """``(bᵀ A⁻¹ b - log det A) / 2`` of an information A with its pull b as last row and column (..., p + 1, p + 1)."""
     shared = shared.copy()
-    shared[..., -1, -1] = CORNER  # whatever stands there, the row before it becomes the half-solved pull
+    shared[..., -1, -1] = UNUSED_CORNER  # whatever stands there, the row before it becomes the half-solved pull
     root = np.linalg.cholesky(shared)
     log_root = np.log(np.diagonal(root, 0, -2, -1)[..., :-1]).sum(axis=-1)
     return np.asarray(0.5 * (root[..., -1, :-1] ** 2).sum(axis=-1) - log_root)
-
-
-SEEN = 5.0  # nats of evidence beyond the number of places: odds of 150 to 1
-NOISE_ROUNDS = 5
-MARGIN = 200.0  # nats that a rough amplitude may cost a place
-REMAINS = 0.01  # of the first place's evidence: less may be what hats and linearisation leave of a strong effect
 
 
 @dataclass(frozen=True)
@@ -278,7 +273,7 @@ class PlaceSearch:
         return np.asarray(np.linalg.solve(np.linalg.cholesky(np.eye(inner.shape[-1]) + inner), seen))
 
     def series(self, held: Sequence[Held] = ()) -> tuple[FreeSeries, ...]:
-        """A free series at every place of each basis, beside what is held."""
+        """A free series at every place of each basis, given what is held."""
         key = tuple(sorted(held, key=lambda h: h.at))
         if key not in self._known:
             self._known[key] = tuple(self._series(key))
@@ -301,10 +296,10 @@ class PlaceSearch:
         return out
 
     def best(self, held: Sequence[Held]) -> tuple[Held, float]:
-        """The place of most evidence beside what is held, and its evidence in nats."""
+        """The place of most evidence given what is held, and its evidence in nats."""
         found: list[tuple[float, Held]] = []
         for i, series in enumerate(self.series(held)):
-            places = series.promising(MARGIN, [h.place for h in held if h.basis == i])
+            places = series.promising(POLICY.rough_amplitude_margin_nats, [h.place for h in held if h.basis == i])
             got = series.refined(places)
             for place, sigma, evidence in zip(places.tolist(), got.sigma, got.evidence, strict=True):
                 found.append((float(evidence), Held(i, place, float(sigma))))
@@ -313,26 +308,26 @@ class PlaceSearch:
 
     def forward(self, most: int) -> list[Held]:
         """Places taken one after the other while the evidence is beyond chance, each then tried against all others."""
-        needed = SEEN + float(np.log(sum(len(b.places) for b in self.bases)))
+        needed = POLICY.place_min_evidence_nats + float(np.log(sum(len(b.places) for b in self.bases)))
         held: list[Held] = []
         while len(held) < most:
             new, evidence = self.best(held)
             if evidence < needed:
                 break
             held.append(new)
-            needed = max(needed, REMAINS * evidence)
+            needed = max(needed, POLICY.place_min_evidence_share * evidence)
             for k in range(len(held) if len(held) > 1 else 0):
                 held[k], _ = self.best(held[:k] + held[k + 1 :])
         return held
 
     def optimum(self, held: Sequence[Held]) -> Optimum:
-        """Of all unknowns beside what is held, under the noise that is left there.
+        """Of all unknowns given what is held, under the noise that is left there.
 
         Hats miss what is switched between them: under too small a noise the parameters would make up for that.
         """
         series = [self.bases[h.basis].nuisance(h.place, h.sigma) for h in held]
         noise = self.noise
-        for _ in range(NOISE_ROUNDS):
+        for _ in range(POLICY.place_noise_rounds):
             found = self.fitted.optimum(series, noise.weight)
             if found.noise.change(noise) < SETTLED:
                 break
@@ -340,7 +335,7 @@ class PlaceSearch:
         return found
 
     def probabilities(self, held: Sequence[Held] = ()) -> list[Array]:
-        """By basis each place's probability beside what is held; with that of nothing they sum to 1.
+        """By basis each place's probability given what is held; with that of nothing they sum to 1.
 
         Nothing and each kind are as likely beforehand, and within a kind each place.
         """
@@ -349,15 +344,11 @@ class PlaceSearch:
         return [np.asarray(np.exp(e - total)) for e in log]
 
 
-LONGEST_STEP = 3.0  # prior sd: beyond it a linearised model says little
-SAME_STEP = 0.3  # prior sd: parameters that move by less are where they were
-
-
 @dataclass(frozen=True)
 class Point:
     """A network linearised at parameters x (p,) and nuisances by batch, and the search there.
 
-    A calibration that lacks an effect bends its parameters. Beside what is found they move back, without the effect in
+    A calibration that lacks an effect bends its parameters. Given what is found they move back, without the effect in
     the network: its own response then stays what it is, and does not trade its size against capacities.
     """
 
@@ -382,16 +373,16 @@ class Point:
 
     @property
     def settled(self) -> bool:
-        return self.last_step < SAME_STEP
+        return self.last_step < POLICY.linear_step_settled_sd
 
     def moved(self, held: Sequence[Held]) -> Point:
-        """To the optimum beside what is held, with the noise that is left there; with nothing held, the noise alone."""
+        """To the optimum given what is held, with the noise that is left there; with nothing held, the noise alone."""
         optimum = self.search.optimum(held)
         here = replace(self, search=PlaceSearch(self.search.fitted, self.search.bases, optimum.noise), last_step=0.0)
         if not held:
             return here
         step = float(np.abs(optimum.dz).max(initial=0.0))
-        dz = optimum.dz * min(1.0, LONGEST_STEP / max(step, 1e-9))
+        dz = optimum.dz * min(1.0, POLICY.linear_step_max_sd / max(step, 1e-9))
         low, high = np.array([(u.low, u.high) for u in self.problem.unknowns]).T
         x = np.clip(self.x + self.search.fitted.spread * dz, low, high)
         nuisance = [v[:q] for v, q in zip(optimum.nuisance, self.problem.nuisance_sizes, strict=True)]

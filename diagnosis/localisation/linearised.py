@@ -14,12 +14,12 @@ import numpy as np
 from scipy.linalg import blas, cho_solve, cholesky, solve_triangular
 
 from data.arrays import Array
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Block, Noise, estimate
 from twin.calibration.problem import CalibrationProblem
 from twin.simulation.channels import Rows, shown
 from twin.simulation.run import TOLERANCE_K, Solved, rows_of, solved_balance
-from twin.simulation.sensitivity import _Tangents
-from twin.simulation.tangent import Unknown
+from twin.simulation.sensitivity import Unknown, _Tangents
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class FitRows:
     def gram(self, b: int, columns: Sequence[Array], weight: Array, more: Sequence[Array] = ()) -> Array:
         """Batch b's ``Xᵀ (1 + N Nᵀ)⁻¹ X`` (C, C), X being columns (·, n_b), derivatives by z and the residual.
 
-        `more` (n_b, k) are nuisances N(0, 1) beside the batch's own.
+        `more` (n_b, k) are nuisances N(0, 1) in addition to the batch's own.
         """
         rows, own, now, _ = self._scaled(b, weight, more)
         rows = np.vstack([*(c * np.sqrt(weight[self.blocks[b].channel]) for c in columns), rows.T])
@@ -108,9 +108,7 @@ class FitRows:
         return np.asarray(cholesky(np.eye(own.shape[1]) + own.T @ own))
 
 
-MOST_NUMBERS = 6_000_000  # modal heat held at once (50 MB): bodies beyond it are worked out one after the other
-KNOT_S = 1800.0  # heat that changes faster is smoothed by any body's capacity
-MOST_KNOTS = 25  # of one batch: longer batches have them farther apart
+MAX_MODAL_VALUES = 6_000_000  # modal heat held at once (50 MB): bodies beyond it are worked out one after the other
 
 
 @dataclass(frozen=True)
@@ -123,9 +121,9 @@ class Hats:
     knot_s: Array
 
     @classmethod
-    def over(cls, longest_s: float, knot_s: float = KNOT_S) -> Hats:
-        """Hats over a time, `knot_s` apart or as many as `MOST_KNOTS`."""
-        count = int(np.clip(np.ceil(longest_s / knot_s - 1e-9), 1, MOST_KNOTS - 1))
+    def over(cls, longest_s: float, knot_s: float = POLICY.knot_spacing_s) -> Hats:
+        """Hats over a time, `knot_s` apart or as many as `max_knots`."""
+        count = int(np.clip(np.ceil(longest_s / knot_s - 1e-9), 1, POLICY.max_knots - 1))
         return cls(np.linspace(0.0, longest_s, count + 1))
 
     @property
@@ -151,9 +149,8 @@ class ForcedNetwork:
         Raises:
             WorkError: the simulation fails there.
         """
-        start, offset = problem.own(nuisance)
         values = problem.values_at(x)[None]
-        solved = solved_balance(problem.network, values, problem.own_heat(nuisance), start, TOLERANCE_K, 1, offset)
+        solved = solved_balance(problem.network, values, *problem.own(nuisance), TOLERANCE_K)
         return cls(problem, solved)
 
     @cached_property
@@ -167,7 +164,7 @@ class ForcedNetwork:
 
     @cached_property
     def rows(self) -> Rows:
-        return rows_of(self.solved, self.problem.inputs.every, 1)
+        return rows_of(self.solved, 1)
 
     def answers(self, into: Array, series_W: Array) -> Array:
         """Channels (Q, B, K, C) in their units by Q heat series.
@@ -180,7 +177,7 @@ class ForcedNetwork:
             for to, watts in zip(into, series_W, strict=True)
         ]
         cells_degC = self.solved.states.at(np.eye(self.problem.network.n_cells)[None])[0]
-        tangents = _Tangents(self.solved, unknowns, cells_degC, self.problem.inputs.every).at_rows(self.rows)
+        tangents = _Tangents(self.solved, unknowns, cells_degC).at_rows(self.rows)
         _, _, readings, errors = shown(self.rows, self.problem.network, tangents)
         return np.concatenate([readings, errors], axis=-1)
 
@@ -190,7 +187,7 @@ class ForcedNetwork:
         ends = np.stack([inputs.time_s[:, :-1], inputs.time_s[:, 1:]], axis=-1)
         series = np.moveaxis(hats.at(ends), -1, 0)
         n = len(series)
-        together = max(1, MOST_NUMBERS // (series.size * self.problem.network.n_cells))
+        together = max(1, MAX_MODAL_VALUES // (series.size * self.problem.network.n_cells))
         parts: list[list[Array]] = [[] for _ in self.problem.measured]
         for first in range(0, len(self.weights), together):
             into = np.repeat(self.weights[first : first + together], n, axis=0)

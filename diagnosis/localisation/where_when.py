@@ -19,14 +19,14 @@ from data.batch import Batch
 from data.errors import InputError
 from diagnosis.contracts import COLUMNS
 from diagnosis.localisation.free_series import Held, Kind, PlaceSearch, Point, Posterior
-from diagnosis.localisation.linearised import KNOT_S, Hats
+from diagnosis.localisation.linearised import Hats
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Noise
 from twin.calibration.problem import CalibrationProblem
 
-MOST_LEVELS = 4  # of a driver: more distinct values are put into as many bands
-SINCE_MIN = (0, 30, 60, 120, 240, 360, 480, 720, 1440, 100_000)
-CLOCK_H = (0, 6, 10, 14, 18, 22, 24)
-LEAST_SHARE = 0.005  # of all rows: rarer regimes are left out
+MAX_DRIVER_LEVELS = 4  # of a driver: more distinct values are put into as many bands
+SINCE_START_EDGES_MIN = (0, 30, 60, 120, 240, 360, 480, 720, 1440, 100_000)
+CLOCK_EDGES_H = (0, 6, 10, 14, 18, 22, 24)
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,14 @@ def regimes_of(batches: Sequence[Batch]) -> list[Regime]:
         out += _ambient(name, [b.masked(name) for b in batches])
     out += _hours(batches)
     minutes = [b.time_s / 60.0 for b in batches]
-    for low, high in itertools.pairwise(SINCE_MIN):
+    for low, high in itertools.pairwise(SINCE_START_EDGES_MIN):
         out.append(Regime("since_start", _span(low, high), _all(minutes, _between(low, high))))
     rows = sum(b.n_rows for b in batches)
-    return [r for r in out if sum(int(m.sum()) for m in r.mask) > (0 if r.by == "batch" else LEAST_SHARE * rows)]
+    return [
+        r
+        for r in out
+        if sum(int(m.sum()) for m in r.mask) > (0 if r.by == "batch" else POLICY.regime_min_row_share * rows)
+    ]
 
 
 def _names(batches: Sequence[Batch], role: str) -> list[str]:
@@ -93,11 +97,11 @@ def _driver(name: str, series: Sequence[Array], switch: bool) -> Iterator[Regime
     after = [~o & (np.cumsum(o) > 0) for o in on]
     if 0.0 in levels:
         yield Regime("regime", f"{name} = 0 before it ran", tuple(~o & ~a for o, a in zip(on, after, strict=True)))
-    if len(running) <= MOST_LEVELS:
+    if len(running) <= MAX_DRIVER_LEVELS:
         for v in running:
             yield Regime("regime", f"{name} = {v:g}", _all(series, _between(v, np.nextafter(v, np.inf))))
     else:
-        edges = np.quantile(np.concatenate(series)[np.concatenate(on)], np.linspace(0, 1, MOST_LEVELS))
+        edges = np.quantile(np.concatenate(series)[np.concatenate(on)], np.linspace(0, 1, MAX_DRIVER_LEVELS))
         for low, high in itertools.pairwise(edges):
             last = high == edges[-1]
             test = _between(low, np.nextafter(high, np.inf) if last else high)
@@ -123,12 +127,12 @@ def _hours(batches: Sequence[Batch]) -> Iterator[Regime]:
     for b in batches:
         start = np.nan if b.start is None else (b.start - b.start.normalize()).total_seconds() / 3600.0
         clock.append((start + b.time_s / 3600.0) % 24.0)
-    for low, high in itertools.pairwise(CLOCK_H):
+    for low, high in itertools.pairwise(CLOCK_EDGES_H):
         yield Regime("hour", f"{low:02d}–{high:02d} h", _all(clock, _between(low, high)))
 
 
 def _span(low_min: int, high_min: int) -> str:
-    if high_min == SINCE_MIN[-1]:
+    if high_min == SINCE_START_EDGES_MIN[-1]:
         return f"after {low_min // 60} h"
     if high_min <= 60:
         return f"{low_min}–{high_min} min"
@@ -136,7 +140,6 @@ def _span(low_min: int, high_min: int) -> str:
 
 
 RANKING = ("rank", "kind", "place", "gain", "evidence", "probability", "sigma", "unit")
-MOVES = 3  # at most: beyond it places and series hardly change
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,7 @@ class Located:
 
     `ranking` (columns `RANKING`) has every place alone, the likeliest first: `gain` over nothing in nats at its best
     sigma, `evidence` with sigma averaged over; `probability` sums to 1 with that of nothing. `map` is the table of
-    `diagnosis.result`: every place beside what was found at others.
+    `diagnosis.result`: every place given what was found at others.
     """
 
     point: Point
@@ -181,7 +184,7 @@ class Located:
         return _odds(self.point.search, ())
 
     def over_time(self, kind: str, place: str) -> pd.DataFrame:
-        """The free series at a place beside what was found at others; columns of `diagnosis.result`."""
+        """The free series at a place given what was found at others; columns of `diagnosis.result`."""
         i = next(n for n, basis in enumerate(self.point.search.bases) if basis.kind == kind)
         basis = self.point.search.bases[i]
         k = basis.places.index(place)
@@ -202,14 +205,13 @@ def locate(
     nuisance: Sequence[Array],
     batches: Sequence[Batch],
     *,
-    knot_s: float = KNOT_S,
-    most: int = 3,
+    most: int = POLICY.located_places,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Located:
     """Where and when a calibrated network and its recordings differ, at a fit's x (p,) and nuisances.
 
-    `batches` are the problem's, in its order; `most` places are sought one after the other. The noise is the machine
-    file's own where the places found explain all else, and larger where they do not.
+    `batches` are the problem's, in its order; at most `most` places are located, one after the other. The noise is the
+    machine file's own where the places found explain all else, and larger where they do not.
 
     Raises:
         InputError: batches that are not the problem's.
@@ -217,18 +219,18 @@ def locate(
     """
     say = progress or (lambda what, done, of: None)
     _check(problem, batches)
-    hats = Hats.over(float(_ends_s(problem).max()), knot_s)
+    hats = Hats.over(float(_ends_s(problem).max()))
     point = Point.of(problem, x, nuisance, hats, Noise.as_given(len(problem.channels)))
     held = point.search.forward(most)
-    for number in range(MOVES):
-        say("locate", number, MOVES)
+    for number in range(POLICY.linearisations):
+        say("locate", number, POLICY.linearisations)
         point = point.moved(held)
         held = point.search.forward(most)
         if point.settled:
             break
     found = tuple(_found(point.search, held, k) for k in range(len(held)))
     table = _map(point.search, held, regimes_of(batches), [b.time_s for b in batches])
-    say("locate", MOVES, MOVES)
+    say("locate", POLICY.linearisations, POLICY.linearisations)
     return Located(point, tuple(held), found, _ranking(point.search), table)
 
 

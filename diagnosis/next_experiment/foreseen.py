@@ -1,6 +1,6 @@
-"""What rival explanations foresee of runs that nobody has done yet, and how much better the true one would fit them.
+"""What alternative explanations predict of runs that nobody has done yet, and how much better the true one fits them.
 
-T-optimality (Atkinson and Fedorov 1975, Biometrika 62, 57): data of one rival, and the least squares that another
+T-optimality (Atkinson and Fedorov 1975, Biometrika 62, 57): data of one alternative, and the least squares that another
 reaches after it has moved its parameters within what the recordings allow, and the run's own start and offsets.
 """
 
@@ -16,6 +16,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from data.arrays import Array
 from diagnosis.contracts import Fitted
 from diagnosis.next_experiment.menu import Run
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Block
 from twin.calibration.problem import CalibrationProblem, Measured, Nuisances
 from twin.network import Network, Reading
@@ -23,15 +24,12 @@ from twin.simulation import simulate
 from twin.simulation.inputs import Inputs, inputs_of_plan
 from twin.simulation.start import start_of
 
-FINEST = 2  # parts of a row: both sides of a comparison share what the simulation gets wrong
-MARK = "one more sensor at "  # the channel of a sensor that is not there yet
-EXTRA_OFFSET_K = 0.3  # prior sd of its error
-EXTRA_NOISE_K = 0.1  # its noise where no sensor says what is usual
+EXTRA_SENSOR = "one more sensor at "  # the channel of a sensor that is not there yet
 
 
 @dataclass(frozen=True)
 class Foreseen:
-    """How far A rivals are apart in R runs: nats (A, A, R) by which the log likelihood of data of the first falls
+    """How far A alternatives are apart in R runs: nats (A, A, R) by which the log likelihood of data of the first falls
     when the second explains them, both refitted; `with_sensor` (A, A, R, E) with one more sensor at a body of `places`.
     """
 
@@ -40,22 +38,22 @@ class Foreseen:
     places: tuple[str, ...]
 
 
-def foreseen(rivals: Sequence[Fitted], runs: Sequence[Run]) -> Foreseen:
-    """All ordered pairs of rivals in all runs; every rival is linearised once.
+def foreseen(alternatives: Sequence[Fitted], runs: Sequence[Run]) -> Foreseen:
+    """All ordered pairs of alternatives in all runs; every alternative is linearised once.
 
-    What the true rival itself misses, since a hot machine's inner temperatures are not known at the start, is taken
-    off and counts as noise.
+    What the true alternative itself misses, since a hot machine's inner temperatures are not known at the start, counts
+    as noise.
 
     Raises:
-        ValueError: rivals that show different channels.
+        ValueError: alternatives that show different channels.
         InputError, WorkError: a run that cannot be simulated.
     """
-    channels = rivals[0].problem.channels
-    if any(f.problem.channels != channels for f in rivals):
-        raise ValueError("rivals of a next experiment must show the same channels")
-    places = _unsensed(rivals)
-    weight, count = _worst(rivals, len(places))
-    models = [_Model.of(f, runs, places) for f in rivals]
+    channels = alternatives[0].problem.channels
+    if any(f.problem.channels != channels for f in alternatives):
+        raise ValueError("alternatives of a next experiment must show the same channels")
+    places = _unsensed(alternatives)
+    weight, count = _worst(alternatives, len(places))
+    models = [AlternativeModel.of(f, runs, places) for f in alternatives]
     squares = np.zeros((len(models), len(models), len(runs), 1 + len(places)))
     for b, model in enumerate(models):
         foretold = [model.foretold(m.first) if m is not model else model.expected for m in models]
@@ -69,18 +67,20 @@ def foreseen(rivals: Sequence[Fitted], runs: Sequence[Run]) -> Foreseen:
 
 
 @dataclass(frozen=True)
-class _Model:
-    """One rival on R runs, as a problem in which all that is measured is 0: a residual is minus what is foretold, in
-    units of the given noise. `problem` begins every run in the state in which the rival itself says the machine is.
+class AlternativeModel:
+    """One alternative on R runs, as a problem in which all measurements are 0: a residual is minus the prediction, in
+    units of the given noise. `problem` begins every run in the state that it predicts.
     """
 
     fitted: Fitted
     problem: CalibrationProblem
 
     @classmethod
-    def of(cls, fitted: Fitted, runs: Sequence[Run], places: Sequence[str]) -> _Model:
+    def of(cls, fitted: Fitted, runs: Sequence[Run], places: Sequence[str]) -> AlternativeModel:
         network = _with_sensors(fitted.problem.network, places)
-        finer = int(np.clip(round(runs[0].row_s / float(fitted.problem.inputs.dt_s[0, 0])), 1, FINEST))
+        finer = int(
+            np.clip(round(runs[0].row_s / float(fitted.problem.inputs.dt_s[0, 0])), 1, POLICY.prediction_max_refinement)
+        )
         inputs = _side_by_side(fitted, runs).refined(finer)
         state = _before(fitted, runs, finer)
         return cls(
@@ -89,7 +89,7 @@ class _Model:
 
     @cached_property
     def shown(self) -> list[Array]:
-        """Minus what the machine shows, (n_r,) of every run, if this rival is true."""
+        """Minus what the machine shows, (n_r,) of every run, if this alternative is true."""
         return self.problem.residuals(self.fitted.x, self._none)
 
     @cached_property
@@ -103,7 +103,7 @@ class _Model:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """Every run linearised where this rival expects it."""
+        """Every run linearised where this alternative expects it."""
         return list(self._started(self.first).linearise(self.fitted.x, self._none))
 
     @property
@@ -112,7 +112,7 @@ class _Model:
         return [block.residual for block in self.blocks]
 
     def foretold(self, first: Mapping[str, Array]) -> list[Array]:
-        """Minus what this rival expects, (n_r,) of every run, once it has seen the first readings (R,) by channel."""
+        """Minus what this alternative expects, (n_r,) of every run, given the first readings (R,) by channel."""
         return self._started(first).residuals(self.fitted.x, self._none)
 
     def least_squares(self, block: Block, apart: Array, weight: Array, places: int) -> Array:
@@ -132,8 +132,8 @@ class _Model:
         gram, cross, square = _sums(known[there], apart[there])
         out = [_left(gram + prior, cross, square)]
         for rows in extra:
-            offset = EXTRA_OFFSET_K / self.problem.noise[block.channel[rows][0]] * scale[rows]
-            more = _sums(_floating(known[rows], offset), _floating(apart[rows], offset))
+            offset = POLICY.extra_sensor_offset_sd_K / self.problem.noise[block.channel[rows][0]] * scale[rows]
+            more = _sums(with_free_offset(known[rows], offset), with_free_offset(apart[rows], offset))
             out.append(_left(gram + more[0] + prior, cross + more[1], square + more[2]))
         return np.array(out)
 
@@ -180,7 +180,7 @@ def _side_by_side(fitted: Fitted, runs: Sequence[Run]) -> Inputs:
         return np.stack([np.pad(v, (0, size - len(v)), mode="edge") for v in rows])
 
     return Inputs(
-        batch_ids=tuple(r.words for r in runs),
+        batch_ids=tuple(r.label for r in runs),
         time_s=np.repeat(runs[0].row_s * np.arange(longest + 1.0)[None], len(runs), axis=0),
         n_intervals=np.concatenate([i.n_intervals for i in each]),
         drivers={n: padded([i.drivers[n][0] for i in each], longest) for n in each[0].drivers},
@@ -199,37 +199,37 @@ def _rows(network: Network, runs: Sequence[Run]) -> tuple[Measured, ...]:
         row = [np.arange(int(e), run.rows + 1) for e in is_error]
         channel = np.repeat(np.arange(len(is_error)), [len(r) for r in row])
         nothing = np.zeros(len(channel)), np.zeros(len(is_error), np.int64)
-        out.append(Measured(run.words, np.concatenate(row), channel, *nothing, is_error))
+        out.append(Measured(run.label, np.concatenate(row), channel, *nothing, is_error))
     return tuple(out)
 
 
-def _unsensed(rivals: Sequence[Fitted]) -> tuple[str, ...]:
-    """Bodies of all rivals on which no sensor sits."""
-    network = rivals[0].problem.network
+def _unsensed(alternatives: Sequence[Fitted]) -> tuple[str, ...]:
+    """Bodies of all alternatives on which no sensor sits."""
+    network = alternatives[0].problem.network
     seen = np.sum([r.cells for r in network.readings], axis=0) if network.readings else np.zeros(network.n_cells)
     bare = [name for name, cells in network.bodies.items() if not np.any(seen[cells])]
-    return tuple(name for name in bare if all(name in f.problem.network.bodies for f in rivals))
+    return tuple(name for name in bare if all(name in f.problem.network.bodies for f in alternatives))
 
 
 def _with_sensors(network: Network, places: Sequence[str]) -> Network:
     """The network with a sensor on each of these bodies, after those that it has."""
-    noise = float(np.median([r.noise for r in network.readings])) if network.readings else EXTRA_NOISE_K
+    noise = float(np.median([r.noise for r in network.readings])) if network.readings else POLICY.extra_sensor_noise_K
     extra = []
     for place in places:
         cells = np.zeros(network.n_cells)
         cells[network.bodies[place]] = 1.0 / len(network.bodies[place])
-        extra.append(Reading(MARK + place, cells, (), noise))
+        extra.append(Reading(EXTRA_SENSOR + place, cells, (), noise))
     return replace(network, readings=(*network.readings, *extra))
 
 
-def _worst(rivals: Sequence[Fitted], places: int) -> tuple[Array, float]:
-    """The weight of a row of each channel by the rival that knows it worst, 0 where nothing was recorded; new sensors
-    are as good as the usual one. And how many independent values a row of all channels holds."""
-    noises = [f.noise for f in rivals]
-    recorded = rivals[0].rows > 0
+def _worst(alternatives: Sequence[Fitted], places: int) -> tuple[Array, float]:
+    """The weight of a row of each channel by the alternative that knows it worst, and how many independent values a row
+    of all channels holds; 0 where nothing was recorded. New sensors are as good as the usual one."""
+    noises = [f.noise for f in alternatives]
+    recorded = alternatives[0].rows > 0
     weight = np.where(recorded, np.min([n.weight for n in noises], axis=0), 0.0)
     count = np.where(recorded, 1.0 / np.max([n.inflation for n in noises], axis=0), 0.0)
-    sensors = len(rivals[0].problem.network.readings)
+    sensors = len(alternatives[0].problem.network.readings)
     usual = weight[:sensors][recorded[:sensors]]
     extra = np.full(places, float(np.median(usual)) if len(usual) else 1.0)
     return np.insert(weight, np.full(places, sensors), extra), float(count.sum())
@@ -244,7 +244,7 @@ def _left(system: Array, cross: Array, square: Array) -> Array:
     return np.asarray(np.maximum(square - np.einsum("pa,pa->a", cross, cho_solve(cho_factor(system), cross)), 0.0))
 
 
-def _floating(rows: Array, offset: Array) -> Array:
+def with_free_offset(rows: Array, offset: Array) -> Array:
     """Rows (n, …) of unit noise whitened for one more constant unknown, offset (n, 1) per unit of prior N(0, 1)."""
     size = float(np.sum(offset**2))
     if size == 0:

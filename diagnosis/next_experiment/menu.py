@@ -15,15 +15,9 @@ from data.errors import InputError
 from data.machine import Machine
 from data.units import quantity
 from diagnosis.findings.report_data import as_given, with_unit
+from diagnosis.policy import POLICY
 from twin.run_plan import RunPlan
 from twin.run_plan.plan import Stage
-
-SHORT_H = 3.0  # recordings shorter than this, as of a board on a desk, make every run shorter in proportion
-LOW = 0.2  # of the highest speed: where friction hardly warms and convection does
-STAIRS = (0.25, 0.5, 0.75, 1.0)
-STOOD_H, WARM_UP_H = 24.0, 4.0  # before a run, or before a cool-down
-NIGHT_K, HEATING_K = 6.0, 5.0
-MORNING_H, EVENING_H = 7.0, 21.0  # time of day at which runs begin
 
 Points = tuple[tuple[float, float], ...]  # (s, degC), straight lines between them
 
@@ -32,17 +26,17 @@ Points = tuple[tuple[float, float], ...]  # (s, degC), straight lines between th
 class Run:
     """One run: what the machine does in `stages`, after what it did `before`, which is not recorded.
 
-    `words` name it in a sentence: "… would tell them apart". `surroundings` are the recorded channels over time; rows
+    `label` names it in a sentence: "… would tell them apart". `surroundings` are the recorded channels over time; rows
     and changes stand on multiples of `row_s`. `clock_h` is the time of day at which it begins, `settled_degC` where a
     machine without recorded surroundings has stood.
     """
 
-    words: str
+    label: str
     stages: tuple[Stage, ...]
     surroundings: Mapping[str, Points]
     row_s: float
     before: tuple[Stage, ...]
-    clock_h: float = MORNING_H
+    clock_h: float = POLICY.morning_h
     settled_degC: float = 20.0
 
     @property
@@ -63,7 +57,7 @@ class Run:
     def preparation(self) -> Run:
         """What comes before it as a run of its own, the surroundings held where this run finds them."""
         held: dict[str, Points] = {n: ((0.0, T),) for n, T in self.begins.items()}
-        return replace(self, words=f"before {self.words}", stages=self.before, surroundings=held)
+        return replace(self, label=f"before {self.label}", stages=self.before, surroundings=held)
 
     def plan(self, machine: Machine, start: Mapping[str, float] | None = None) -> RunPlan:
         """The run on its rows; `start` has bodies' temperatures, degC, all others begin at `settled_degC`."""
@@ -76,12 +70,12 @@ class Run:
             for name, value in held.items():
                 drivers[name][begin : begin + count] = value
         air = {n: np.interp(time_s, *np.transpose(points)) for n, points in self.surroundings.items()}
-        return RunPlan(self.words, time_s, drivers, air, dict(start or {}), self.settled_degC, self.row_s)
+        return RunPlan(self.label, time_s, drivers, air, dict(start or {}), self.settled_degC, self.row_s)
 
     def text(self, start: Mapping[str, float] | None = None, comments: Sequence[str] = ()) -> str:
         """The run as a run plan file, which reads back as `plan(machine, start)`; `comments` stand above it."""
         given: dict[str, object] = {
-            "name": self.words,
+            "name": self.label,
             "step": f"{self.row_s:g} s",
             "stages": [{**_duration(s.seconds), **_plains(s.drivers)} for s in self.stages],
         }
@@ -154,14 +148,15 @@ class _Shop:
         sensed = [v[0] for n in machine.names("temperature") for b in batches if len(v := _recorded([b], n))]
         order = sorted(room, key=lambda n: n != "room")
         settled = room[order[0]] if order else _half(float(np.median(sensed))) if sensed else 20.0
+        pace = min(1.0, longest_h / POLICY.short_recording_h)
         return cls(
-            machine, row_s, min(1.0, longest_h / SHORT_H), highest, frozenset(switches), rest, room, settled
+            machine, row_s, pace, highest, frozenset(switches), rest, room, settled
         )  # fmt: skip
 
     def turning(self, name: str) -> Iterator[Run]:
         """A step and its cool-down, a staircase, a slow run."""
-        top, low = self.highest[name], float(f"{LOW * self.highest[name]:.2g}")
-        stairs = [float(f"{share * top:.3g}") for share in STAIRS]
+        top, low = self.highest[name], float(f"{POLICY.slow_run_speed_share * self.highest[name]:.2g}")
+        stairs = [float(f"{share * top:.3g}") for share in POLICY.staircase_speed_shares]
         step = [(3.0, {name: top}), (2.0, {name: 0.0})]
         yield self._run(f"{self._span(3)} at {self._level(name, top)} and {self._span(2)} at rest", step)
         climb = [*((1.0, {name: v}) for v in stairs), (1.0, {name: 0.0})]
@@ -170,40 +165,44 @@ class _Shop:
 
     def alone(self, name: str) -> Run:
         said = "the feed" if quantity(self.machine.channels[name].unit) == "feed" else name
-        words = f"{said} alone, {self._span(3)} {self._working(name)} and {self._span(1)} off"
-        return self._run(words, [(3.0, {name: self.highest[name]}), (1.0, {name: 0.0})])
+        label = f"{said} alone, {self._span(3)} {self._working(name)} and {self._span(1)} off"
+        return self._run(label, [(3.0, {name: self.highest[name]}), (1.0, {name: 0.0})])
 
     def cooling(self, name: str) -> Run:
         """From as hot as the machine gets; the warming up is a shift's work and is not recorded."""
         turns = quantity(self.machine.channels[name].unit) == "rotation"
-        work = f"{self._span(WARM_UP_H)} {'' if turns else f'of {name} '}{self._working(name)}"
-        words = f"a cool-down of {self._span(5)} after {work}"
-        return self._run(words, [(5.0, {name: 0.0})], before=[(WARM_UP_H, {name: self.highest[name]})])
+        work = f"{self._span(POLICY.warm_up_h)} {'' if turns else f'of {name} '}{self._working(name)}"
+        label = f"a cool-down of {self._span(5)} after {work}"
+        return self._run(label, [(5.0, {name: 0.0})], before=[(POLICY.warm_up_h, {name: self.highest[name]})])
 
     def around(self) -> Iterator[Run]:
         """The machine at rest and the room moving."""
         if not self.room_degC:
             return
-        night = {n: ((0.0, T), (self._s(8), self._within(n, T - NIGHT_K))) for n, T in self.room_degC.items()}
-        yield self._run("a night switched off", [(8.0, {})], night, clock_h=EVENING_H)
+        night = {
+            n: ((0.0, T), (self._s(8), self._within(n, T - POLICY.night_fall_K))) for n, T in self.room_degC.items()
+        }
+        yield self._run("a night switched off", [(8.0, {})], night, clock_h=POLICY.evening_h)
         on_s, warm_s, end_s = self._s(0.5), self._s(0.5) + self._s(1), self._s(8)
         heated = {}
         for name, cool in self.room_degC.items():
-            warm = self._within(name, cool + HEATING_K)
+            warm = self._within(name, cool + POLICY.hall_heating_K)
             heated[name] = ((0.0, cool), (on_s, cool), (warm_s, warm), (end_s, warm))
-        yield self._run(f"{self._span(8)} at rest in a hall that is heated by {HEATING_K:g} K", [(8.0, {})], heated)
+        yield self._run(
+            f"{self._span(8)} at rest in a hall that is heated by {POLICY.hall_heating_K:g} K", [(8.0, {})], heated
+        )
 
     def _run(
         self,
-        words: str,
+        label: str,
         stages: Sequence[tuple[float, Mapping[str, float]]],
         air: Mapping[str, Points] | None = None,
         before: Sequence[tuple[float, Mapping[str, float]]] = (),
-        clock_h: float = MORNING_H,
+        clock_h: float = POLICY.morning_h,
     ) -> Run:
         room = {n: ((0.0, T),) for n, T in self.room_degC.items()} if air is None else air
-        stages_before = self._stages([(STOOD_H, {}), *before])
-        return Run(words, self._stages(stages), room, self.row_s, stages_before, clock_h, self.settled_degC)
+        stages_before = self._stages([(POLICY.rest_before_run_h, {}), *before])
+        return Run(label, self._stages(stages), room, self.row_s, stages_before, clock_h, self.settled_degC)
 
     def _stages(self, given: Sequence[tuple[float, Mapping[str, float]]]) -> tuple[Stage, ...]:
         held = {n: v for n, v in self.rest.items() if v}

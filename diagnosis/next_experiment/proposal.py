@@ -1,4 +1,4 @@
-"""The next experiment: where recordings leave rival explanations tied, the run that would tell them apart."""
+"""The next experiment: where recordings leave alternative explanations tied, the run that would tell them apart."""
 
 from __future__ import annotations
 
@@ -15,29 +15,27 @@ from diagnosis.contracts import Fitted, Tried
 from diagnosis.findings.report_data import few, listed
 from diagnosis.next_experiment.foreseen import Foreseen, begun, foreseen
 from diagnosis.next_experiment.menu import Run, menu
+from diagnosis.policy import POLICY
 from diagnosis.search.decision import Round
 from diagnosis.search.probability import explanations
 from diagnosis.search.refits import refit
 from diagnosis.search.search import Search
 
-SETTLES = 5.0  # nats: odds of 150 to 1
-TELLS = 1.0  # what is less than odds of 3 to 1 tells nothing
-SENSOR_H = 2.0  # what it takes to put on one more sensor
 COLUMNS = ("run", "hours", "nats", "nats_per_hour", "sensor", "nats_with_sensor", "hardest")
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A run that tells rivals apart: `separates` names them, `words` go before "would tell them apart".
+    """A run that tells alternatives apart: `separates` names them, `label` goes before "would tell them apart".
 
     `nats` is the least, over all ordered pairs, by which the truth is expected to fit better than the other, and
     `tied` the pairs that no run separates. `plan_text` is a run plan file and `sensor` the body that needs one more
-    sensor, if any. Where nothing tells, `words` and `plan_text` are empty and nats are those of the best run.
+    sensor, if any. Where nothing tells, `label` and `plan_text` are empty and nats are those of the best run.
     `table` has the whole menu, columns `COLUMNS`; `hardest` is the pair that the run separates least.
     """
 
     separates: tuple[str, ...]
-    words: str
+    label: str
     hours: float
     nats: float
     nats_per_hour: float
@@ -51,16 +49,16 @@ class Proposal:
         """What is proposed, or that nothing tells and how near the best run comes."""
         if not len(self.table):
             return "No run is known that would tell them apart: no driver is set by the shop and no room is recorded."
-        if not self.words:
+        if not self.label:
             best = self.table.iloc[int(self.table["nats"].argmax())]
             return (
                 f"None of {len(self.table)} runs would tell them apart: the best, {best['run']}, is expected to give "
-                f"{few(self.nats)} nats, and {TELLS:g} is the least that tells."
+                f"{few(self.nats)} nats, and {POLICY.telling_nats:g} is the least that tells."
             )
-        settled = "which settles it" if self.nats >= SETTLES else f"{SETTLES:g} settle it"
+        settled = "which settles it" if self.nats >= POLICY.settling_nats else f"{POLICY.settling_nats:g} settle it"
         left = [f" {a} and {b} would stay tied." for a, b in self.tied]
         return (
-            f"{self.words[0].upper()}{self.words[1:]} would tell {listed(self.separates)} apart: {few(self.hours)} h, "
+            f"{self.label[0].upper()}{self.label[1:]} would tell {listed(self.separates)} apart: {few(self.hours)} h, "
             f"{few(self.nats)} nats expected, {settled}.{''.join(left)}"
         )
 
@@ -75,42 +73,42 @@ class _Option:
 
     @property
     def cost_h(self) -> float:
-        return self.run.hours + (SENSOR_H if self.sensor else 0.0)
+        return self.run.hours + (POLICY.sensor_cost_h if self.sensor else 0.0)
 
 
-def next_experiment(rivals: Mapping[str, Fitted], runs: Sequence[Run] | None = None) -> Proposal:
-    """The run for two or more rivals by name, the likeliest first; `runs` replace the menu.
+def next_experiment(alternatives: Mapping[str, Fitted], runs: Sequence[Run] | None = None) -> Proposal:
+    """The run for two or more alternatives by name, the likeliest first; `runs` replace the menu.
 
     Of runs that settle it the shortest, else the one that tells most per hour. A pair that no run separates does not
-    decide: the others still gain.
+    count.
 
     Raises:
-        ValueError: fewer than two rivals, or rivals that show different channels.
+        ValueError: fewer than two alternatives, or alternatives that show different channels.
         InputError, WorkError: a run that cannot be simulated.
     """
-    if len(rivals) < 2:
-        raise ValueError(f"a next experiment separates two rivals or more, got {len(rivals)}")
-    names, fits = list(rivals), list(rivals.values())
+    if len(alternatives) < 2:
+        raise ValueError(f"a next experiment separates two alternatives or more, got {len(alternatives)}")
+    names, fits = list(alternatives), list(alternatives.values())
     runs = _menu(fits) if runs is None else list(runs)
     if not runs:
         return _nothing([], np.zeros(0, bool), names)
     options = _options(foreseen(fits, runs), runs)
-    told = np.max([o.pairs for o in options], axis=0) >= TELLS
-    if not told.any():
-        return _nothing(options, told, names)
-    settling = [o for o in options if _least(o, told) >= SETTLES]
+    separable = np.max([o.pairs for o in options], axis=0) >= POLICY.telling_nats
+    if not separable.any():
+        return _nothing(options, separable, names)
+    settling = [o for o in options if _least(o, separable) >= POLICY.settling_nats]
     if settling:
-        best = min(settling, key=lambda o: (o.cost_h, -_least(o, told)))
+        best = min(settling, key=lambda o: (o.cost_h, -_least(o, separable)))
     else:
-        best = max(options, key=lambda o: _least(o, told) / o.cost_h)
-    if _least(best, told) < TELLS:  # no run does for all pairs: the one that does for the likeliest
-        told &= np.arange(len(told)) == int(np.argmax(told))
-        best = max(options, key=lambda o: _least(o, told) / o.cost_h)
-    return _proposal(best, options, told, names, fits[0])
+        best = max(options, key=lambda o: _least(o, separable) / o.cost_h)
+    if _least(best, separable) < POLICY.telling_nats:  # no run does for all pairs: the one that does for the likeliest
+        separable &= np.arange(len(separable)) == int(np.argmax(separable))
+        best = max(options, key=lambda o: _least(o, separable) / o.cost_h)
+    return _proposal(best, options, separable, names, fits[0])
 
 
 def _menu(fits: Sequence[Fitted]) -> list[Run]:
-    """The runs for all drivers that some rival answers to, at the spacing of the fit's rows."""
+    """The runs for all drivers that some alternative answers to, at the spacing of the fit's rows."""
     first = fits[0]
     drivers = dict.fromkeys(n for f in fits for n in f.problem.network.drivers)
     spacing = [m.stride * b.step_s for m, b in zip(first.problem.measured, first.batches, strict=True)]
@@ -130,38 +128,40 @@ def _options(seen: Foreseen, runs: Sequence[Run]) -> list[_Option]:
     return out
 
 
-def _least(option: _Option, told: Array) -> float:
-    return float(option.pairs[told].min())
+def _least(option: _Option, separable: Array) -> float:
+    return float(option.pairs[separable].min())
 
 
-def _proposal(best: _Option, options: Sequence[_Option], told: Array, names: Sequence[str], first: Fitted) -> Proposal:
+def _proposal(
+    best: _Option, options: Sequence[_Option], separable: Array, names: Sequence[str], first: Fitted
+) -> Proposal:
     pairs = list(combinations(names, 2))
-    separated = {n for pair, t in zip(pairs, told, strict=True) if t for n in pair}
+    separated = {n for pair, t in zip(pairs, separable, strict=True) if t for n in pair}
     separates = tuple(n for n in names if n in separated)
-    words = best.run.words + (f" with one more sensor at {best.sensor}" if best.sensor else "")
-    nats = _least(best, told)
+    label = best.run.label + (f" with one more sensor at {best.sensor}" if best.sensor else "")
+    nats = _least(best, separable)
     comments = [
         f"Tells apart: {listed(separates)}. Expected: {few(nats)} nats in {few(best.run.hours)} h.",
         f"Begin after {_prepared(best.run)}.",
     ]
     comments += [f"Put one more temperature sensor at {best.sensor} before."] if best.sensor else []
     return Proposal(
-        separates, words, best.run.hours, nats, nats / best.run.hours,
+        separates, label, best.run.hours, nats, nats / best.run.hours,
         best.run.text(_start(best.run, first), comments), best.sensor,
-        tuple(p for p, t in zip(pairs, told, strict=True) if not t), _table(options, told, pairs),
+        tuple(p for p, t in zip(pairs, separable, strict=True) if not t), _table(options, separable, pairs),
     )  # fmt: skip
 
 
-def _nothing(options: Sequence[_Option], told: Array, names: Sequence[str]) -> Proposal:
+def _nothing(options: Sequence[_Option], separable: Array, names: Sequence[str]) -> Proposal:
     """No run separates any pair."""
     pairs = list(combinations(names, 2))
-    table = _table(options, np.ones_like(told), pairs)
+    table = _table(options, np.ones_like(separable), pairs)
     nats = float(table["nats"].max()) if len(table) else 0.0
     return Proposal((), "", 0.0, nats, 0.0, "", None, tuple(pairs), table)
 
 
 def _prepared(run: Run) -> str:
-    """The stages before a run, in words."""
+    """The stages before a run, as a phrase."""
     return ", then ".join(
         f"{s.seconds / 3600:g} h " + (listed([f"{n} {v:g}" for n, v in s.drivers.items() if v]) or "at rest")
         for s in run.before
@@ -174,41 +174,40 @@ def _start(run: Run, fit: Fitted) -> dict[str, float]:
     return {name: round(degC, 1) for name, degC in begun(fit, run).items() if name in known}
 
 
-def _table(options: Sequence[_Option], told: Array, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    shown = [k for k, t in enumerate(told) if t]
+def _table(options: Sequence[_Option], separable: Array, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
+    shown = [k for k, t in enumerate(separable) if t]
     rows = []
     for o in (o for o in options if not o.sensor):
-        more = max((m for m in options if m.sensor and m.run is o.run), key=lambda m: _least(m, told), default=None)
+        more = max(
+            (m for m in options if m.sensor and m.run is o.run), key=lambda m: _least(m, separable), default=None
+        )
         hardest = shown[int(np.argmin(o.pairs[shown]))]
         nats = float(o.pairs[hardest])
         rows.append(
-            (o.run.words, o.run.hours, nats, nats / o.run.hours, more.sensor if more else None,
-             _least(more, told) if more else np.nan, " / ".join(pairs[hardest]))
+            (o.run.label, o.run.hours, nats, nats / o.run.hours, more.sensor if more else None,
+             _least(more, separable) if more else np.nan, " / ".join(pairs[hardest]))
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     return table.sort_values("nats", ascending=False, kind="stable", ignore_index=True)
-
-
-CLEAR = 0.9  # above it nothing needs to be told apart
-RIVAL = 0.05  # probability worth a run
-MOST = 3
 
 
 def settling_run(done: Search, named: Sequence[Round]) -> Proposal | None:
     """For the first finding that is in doubt; None where none is, or nothing could be simulated."""
     for r in named:
         every, _, _ = explanations(r)
-        if not every or every[0].probability > CLEAR:
+        if not every or every[0].probability > POLICY.clear_probability:
             continue
-        rivals: dict[str, Fitted] = {}
-        for e in [e for e in every if e.probability >= RIVAL and e.tried.candidate.change is None][:MOST]:
+        alternatives: dict[str, Fitted] = {}
+        for e in [
+            e for e in every if e.probability >= POLICY.alternative_min_probability and e.tried.candidate.change is None
+        ][: POLICY.separated_alternatives]:
             fitted = e.tried.fitted or _refitted(r, e.tried)
             if fitted is not None:
-                rivals[e.tried.candidate.words] = fitted
-        if len(rivals) < 2:
+                alternatives[e.tried.candidate.label] = fitted
+        if len(alternatives) < 2:
             continue
         try:
-            return next_experiment(rivals)
+            return next_experiment(alternatives)
         except (InputError, WorkError, ValueError):
             return None  # what cannot be simulated cannot be proposed
     return None

@@ -1,6 +1,6 @@
 """How well candidates predict batches left out: every fold of every candidate from one linearisation.
 
-With the nuisances projected out (`whitened`) a fold is a downdate of the normal matrix, and a candidate beside the
+With the nuisances projected out (`Whitened`) a fold is a downdate of the normal matrix, and a candidate with the
 shared parameters a Schur complement (Frisch and Waugh 1933): hundreds of candidates cost a few matrix products.
 The score is the left-out log density with every channel's noise unknown, ``-1/2 sum_c n_c log(MSE_c)``, so that no
 channel's units or misfit decide; rows that repeat each other are filtered first (`diagnosis.fitting.regression`).
@@ -17,11 +17,11 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
-from diagnosis.fitting.regression import QUIET, Whitened
+from diagnosis.fitting.regression import Whitened
+from diagnosis.policy import POLICY
 
 TINY = 1e-300
 Prior = tuple[Array, Array]  # (R, C), (C,): how far columns move parameters back to their prior, and its square
-ROUNDS = 3  # of reweighting in a fold, from the optimum on all batches
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Scores:
-    """C columns one by one beside the parameters: left-out gain in nats, batches that improve, in-sample z, amplitude.
+    """C columns one by one with the parameters: left-out gain in nats, batches that improve, in-sample z, amplitude.
 
     `amplitude` (C,) and its sd are of the whole fit; `absorbed` (C,) the share of a column's square that the shared
     parameters take; `by_batch` (B, C) the fall of each left-out batch's squared residual.
@@ -124,13 +124,23 @@ class Evidence:
             for b, f, t, own in zip(self.batches, self.folds, targets, to, strict=True)
         ]
 
+    def inside(self, targets: Sequence[Array] | None = None) -> list[Array]:
+        """Residuals (n_b, R) of every batch at the parameters of the whole fit."""
+        targets = self.targets if targets is None else targets
+        z = self._parameters(targets)
+        return [t - b.jacobian @ z for b, t in zip(self.batches, targets, strict=True)]
+
+    def residuals(self, targets: Sequence[Array] | None = None, left_out: bool = True) -> list[Array]:
+        """Residuals (n_b, R) of every batch, `left_out` of the fit or inside it."""
+        return self.left_out(targets) if left_out else self.inside(targets)
+
     def mean_squares(self, left: Sequence[Array]) -> Array:
         """Left-out mean squares (R, K) in units of the given noise's variance; nan where a channel has no rows."""
         total = np.sum([self._by_channel(b, e**2) for b, e in zip(self.batches, left, strict=True)], axis=0).T
         return np.asarray(np.where(self.rows > 0, total / np.maximum(self._least, TINY), np.nan))
 
-    def base_score(self, targets: Sequence[Array] | None = None) -> Array:
-        """Log density (R,) of batches left out without any candidate, in nats up to a constant.
+    def base_score(self, targets: Sequence[Array] | None = None, left_out: bool = True) -> Array:
+        """Log density (R,) without any candidate of batches left out, or inside the fit, in nats up to a constant.
 
         What the nuisances could do counts too, by the volume that they leave open (the determinant of a covariance),
         and so does how far the parameters must go from what the machine file says: a network that is bent to fit
@@ -138,7 +148,7 @@ class Evidence:
         """
         volume = sum(float(np.sum(np.log1p(-b.damping))) for b in self.batches)
         bent = -0.5 * np.sum(self._parameters(targets) ** 2, axis=0)
-        return self.density(np.nan_to_num(self.mean_squares(self.left_out(targets)))) + volume + bent
+        return self.density(np.nan_to_num(self.mean_squares(self.residuals(targets, left_out)))) + volume + bent
 
     def _parameters(self, targets: Sequence[Array] | None = None) -> Array:
         """z (p, R) of the whole fit."""
@@ -161,17 +171,21 @@ class Evidence:
         volume = sum(float(np.sum(np.log1p(-self.batches[k].damping))) for k in group)
         share = least / np.maximum(self._least, TINY)
         mean = np.where(least > 0, square / np.maximum(least, TINY), 1.0)
-        return float(-0.5 * np.sum(self.rows * share * np.log(np.maximum(mean, QUIET))) + volume)
+        return float(
+            -0.5 * np.sum(self.rows * share * np.log(np.maximum(mean, POLICY.min_noise_variance_share))) + volume
+        )
 
     def density(self, mean_squares: Array) -> Array:
         """Log density (…,) in nats of mean squares (…, K); less than a quiet instrument's is not rewarded."""
-        return np.asarray(-0.5 * np.log(np.maximum(mean_squares, QUIET)) @ self.rows)
+        return np.asarray(-0.5 * np.log(np.maximum(mean_squares, POLICY.min_noise_variance_share)) @ self.rows)
 
-    def gains(self, targets: Sequence[Array] | None = None) -> tuple[Array, Array, Array]:
-        """Of all columns one by one: gains (R, C) in nats, amplitudes (R, C), falls of batches' squares (R, B, C)."""
+    def gains(self, targets: Sequence[Array] | None = None, left_out: bool = True) -> tuple[Array, Array, Array]:
+        """Of all columns one by one: gains (R, C) in nats, amplitudes (R, C), falls of batches' squares (R, B, C).
+
+        Each batch is predicted by the others, or, not `left_out`, by the fit to all.
+        """
         targets = self.targets if targets is None else targets
-        z = self._parameters(targets)
-        inside = [t - b.jacobian @ z for b, t in zip(self.batches, targets, strict=True)]
+        z, inside = self._parameters(targets), self.inside(targets)
         own = np.stack([self._by_channel(b, e**2).T for b, e in zip(self.batches, inside, strict=True)], axis=1)
         cross = np.stack(
             [self._products(b, e, c) for b, e, c in zip(self.batches, inside, self.beyond, strict=True)], 1
@@ -180,14 +194,17 @@ class Evidence:
         sums = own.sum(axis=1), cross.sum(axis=1), square.sum(axis=0)
         prior = z.T @ self.shadow, self._shadow_square
         best = self._first_amplitude(*sums, prior)
-        left = self.left_out(targets)
+        left = self.left_out(targets) if left_out else inside
         before = np.zeros(own[:, 0].shape)
         after = np.zeros(cross[:, 0].shape)
         falls = np.zeros((len(best), len(self.batches), best.shape[1]))
         for k, (b, fold, e) in enumerate(zip(self.batches, self.folds, left, strict=True)):
-            rest = sums[0] - own[:, k], sums[1] - cross[:, k], sums[2] - square[k]
-            g = self._amplitude(best, *rest, prior)
-            change = -2.0 * g[:, None] * self._products(b, e, fold.left) + g[:, None] ** 2 * fold.square
+            if left_out:
+                rest = sums[0] - own[:, k], sums[1] - cross[:, k], sums[2] - square[k]
+                g, shared, squares = self._amplitude(best, *rest, prior), self._products(b, e, fold.left), fold.square
+            else:
+                g, shared, squares = self._amplitude(best, *sums, prior), cross[:, k], square[k]
+            change = -2.0 * g[:, None] * shared + g[:, None] ** 2 * squares
             seen = self._by_channel(b, e**2).T
             before += seen
             after += seen[..., None] + change
@@ -259,11 +276,13 @@ class Evidence:
     def _amplitude(self, g: Array, own: Array, cross: Array, square: Array, prior: Prior, shrink: bool = True) -> Array:
         """Amplitudes (R, C) of the highest density within the bounds, from sums (R, K), (R, K, C), (K, C).
 
-        Reweighted iteratively, the parameters' prior beside the channels; then less what noise alone would give
+        Reweighted iteratively, with the parameters' prior as a further channel; then less what noise alone would give
         (James and Stein 1961, positive part).
         """
-        for _ in range(ROUNDS):
-            mean = np.maximum(self._moved(g, own, cross, square), QUIET * self._least[:, None] + TINY)
+        for _ in range(POLICY.amplitude_reweighting_rounds):
+            mean = np.maximum(
+                self._moved(g, own, cross, square), POLICY.min_noise_variance_share * self._least[:, None] + TINY
+            )
             weight = self.rows[:, None] / mean
             along = np.einsum("rkc,rkc->rc", weight, cross) + prior[0]
             g = along / np.maximum(np.einsum("rkc,kc->rc", weight, square) + prior[1], TINY)

@@ -1,8 +1,7 @@
-"""Sensors under each other's names: how much better one linear step from the machine file would fit, were they named
-the other way round.
+"""Swapped labels of two sensors: how much better one linear step from the machine file fits with the labels exchanged.
 
-A fit bends all it can towards wrong labels; before it, they are plainly wrong. But a file whose values are far off is
-wrong everywhere: so each pair is judged after the step that the readings, named the other way round, ask for.
+A fit adapts to wrong labels; before it they are plainly wrong. A machine file whose values are far off is wrong
+everywhere, so each pair is judged after one linear step with its labels exchanged.
 """
 
 from __future__ import annotations
@@ -17,32 +16,29 @@ from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
 from diagnosis.candidates.alternatives import found_since
-from diagnosis.contracts import Candidate, Fitted
-from diagnosis.fitting.fitted import MISFIT, SMOOTH
+from diagnosis.contracts import Candidate, CandidateKind, Fitted
+from diagnosis.policy import POLICY
 from twin.calibration.least_squares import x_of
 from twin.calibration.problem import Measured
 
-# Pairs, and nats by which each must fit better. On development plants 33 pairs that were exchanged came first, at 70 to
-# 450; of 40 plants with right labels 37 stayed below 31 and three at 66 to 87, with two sensors of one column.
-SUSPECTS, PLAINLY = 1, 60.0
-STEPS = 3  # of reweighting: what no step can fit counts less
 
+def suspected_swaps(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates that exchange the labels of two sensors and fit better so, the best first.
 
-def suspects(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates whose two sensors would fit better under each other's names, the best first.
-
-    Labels come before physics: none, where a fit holds an effect already that the machine file has not.
+    Labels are judged before physics: none are returned where the fit holds an effect that the machine file lacks.
     """
     if found_since(fitted):
         return []
     line = _Line.at(fitted)
     out = []
     for c in proposed:
-        if c.mechanism == "sensor_swap":
+        if c.kind is CandidateKind.SENSOR_SWAP:
             assert c.part is not None and c.part.acts_on is not None
             one, other = (fitted.problem.channels.index(name) for name in c.part.acts_on)
             out.append((line.gain(one, other), c))
-    return [c for gain, c in sorted(out, key=lambda q: -q[0]) if gain > PLAINLY][:SUSPECTS]
+    return [c for gain, c in sorted(out, key=lambda q: -q[0]) if gain > POLICY.label_swap_min_gain_nats][
+        : POLICY.label_swaps
+    ]
 
 
 @dataclass(frozen=True)
@@ -125,8 +121,8 @@ class _Line:
         grams = [np.stack([c.gram for c in b]) for b in batches]
         slopes = [np.stack([c.slope for c in b]) for b in batches]
         squares = np.array([[c.squares for c in b] for b in batches]).sum(axis=0)
-        weight = np.full(len(rows), 1.0 / (MISFIT**2 * SMOOTH))
-        for _ in range(STEPS):
+        weight = np.full(len(rows), 1.0 / (POLICY.initial_noise_factor**2 * POLICY.initial_rows_per_value))
+        for _ in range(POLICY.label_swap_reweighting_rounds):
             gram, slope = np.eye(self.size), np.zeros(self.size)
             for at, g, s in zip(self.numbers, grams, slopes, strict=True):
                 gram[np.ix_(at, at)] += np.tensordot(weight, g, 1)
@@ -136,5 +132,5 @@ class _Line:
             for at, g, s in zip(self.numbers, grams, slopes, strict=True):
                 left += (g @ step[at] - 2 * s) @ step[at]
             rest = np.maximum(left / np.maximum(rows, 1), 1.0)
-            weight = 1.0 / (rest * SMOOTH)
-        return 0.5 * float((rows / SMOOTH) @ np.log(rest) + step @ step)
+            weight = 1.0 / (rest * POLICY.initial_rows_per_value)
+        return 0.5 * float((rows / POLICY.initial_rows_per_value) @ np.log(rest) + step @ step)

@@ -1,6 +1,6 @@
-"""A network in which every candidate is asleep: one linearisation shows what each of them would do.
+"""A network in which every candidate is switched off: one linearisation gives the signatures of all.
 
-A candidate stands at the values that switch it off, so the simulation is the baseline's; the derivatives by its
+Each candidate has the values that switch it off, so the simulation is the baseline's; the derivatives by its
 amplitudes are its signatures (the first-order response, Lindley 1958's score direction).
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from data.arrays import Array
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.contracts import Candidate, Fitted
+from diagnosis.contracts import Candidate, CandidateKind, Fitted
 from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
 from twin.calibration.least_squares import x_of
 from twin.compile import compile_network
@@ -24,7 +24,7 @@ from twin.network import Heat, Law, Network
 from twin.quantity import Parameter, Value
 from twin.schema import TwinPart
 
-MARK = "candidate "  # a parameter's source that says whose amplitude it is
+AMPLITUDE_OF = "candidate "  # a parameter's source that says whose amplitude it is
 NEARLY_OFF = 1e-12  # where a share cannot be 0
 
 
@@ -38,7 +38,7 @@ class Asleep:
 
 
 def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) -> Asleep:
-    """The machine's network with all candidates that have values to be off at; those that do not compile are told."""
+    """The machine's network with all candidates that have values to be off at; `left_out` says which do not compile."""
     smooth = [c for c in candidates if c.amplitudes]
     left_out: dict[str, str] = {}
     try:
@@ -60,17 +60,17 @@ def asleep(machine: Machine, part: TwinPart, candidates: Sequence[Candidate]) ->
         for a in c.amplitudes:
             by_mark[_instance(c), a].append(c.name)
     owner = {c.name: c for c in smooth}
-    rivals = [c for c in candidates if c.change is not None]
-    for c in rivals:
+    doubted = [c for c in candidates if c.change is not None]
+    for c in doubted:
         assert c.change is not None
         j = network.index(c.change.parameter.name)
         if not parameters[j].free:  # in its own scale: what is doubted is a factor
             parameters[j] = replace(parameters[j], free=True, spread=1.0)
         found[c.name].append(j)
     for j, p in enumerate(parameters):
-        if not p.source.startswith(MARK):
+        if not p.source.startswith(AMPLITUDE_OF):
             continue
-        instance, _, amplitude = p.source.removeprefix(MARK).partition(".")
+        instance, _, amplitude = p.source.removeprefix(AMPLITUDE_OF).partition(".")
         parameters[j] = _free(p)
         for name in by_mark[instance, amplitude]:
             if _is_of(owner[name], p):
@@ -93,7 +93,7 @@ def _with(part: TwinPart, candidates: Sequence[Candidate]) -> TwinPart:
         values = {**first.part.parameters, **{k: Value(value=v) for k, v in mechanism.ghost.items()}}
         for amplitude, off in first.amplitudes.items():
             near = mechanism.spec(amplitude).scale == "logit" and off <= 0
-            values[amplitude] = Value(value=NEARLY_OFF if near else off, source=f"{MARK}{name}.{amplitude}")
+            values[amplitude] = Value(value=NEARLY_OFF if near else off, source=f"{AMPLITUDE_OF}{name}.{amplitude}")
         changed = first.part.model_copy(update={"parameters": values})
         if len(members) > 1:
             on = tuple(str(c.part.acts_on) for c in members if c.part is not None)
@@ -156,7 +156,7 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
         if c.amplitudes or c.part is None:
             continue
         try:
-            swap = c.mechanism == "sensor_swap"
+            swap = c.kind is CandidateKind.SENSOR_SWAP
             change = _exchanged(fitted, c, before) if swap else difference(fitted, c.applied(fitted.part), before)
         except (InputError, WorkError) as error:
             left_out[c.name] = str(error)

@@ -10,20 +10,19 @@ import numpy as np
 import pandas as pd
 
 from data.arrays import Array
-from diagnosis.candidates.alternatives import rivals
-from diagnosis.candidates.discretisation import LOOSE, from_run_to_run, slack
+from diagnosis.candidates.alternatives import alternatives
+from diagnosis.candidates.discretisation import SLACK_MECHANISMS, from_run_to_run, slack
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import COLUMNS, Candidate, Fitted, Scored
 from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
-from diagnosis.fitting.regression import Memory, Whitened, whitened
+from diagnosis.fitting.regression import Memory, Whitened
+from diagnosis.policy import POLICY
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.linearisation import Asleep, asleep, differences
 from twin.calibration.fit_problem import Block, Unknown
 from twin.calibration.least_squares import x_of
 from twin.calibration.problem import unknown
 from twin.mechanisms import MECHANISMS
-
-FACTOR = 3.0  # bounds of the logarithm of a value that is doubted
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,8 @@ class Screen:
 
 
 def proposed(fitted: Fitted) -> list[Candidate]:
-    """All mechanisms at all places, and the rivals that doubt the file's values."""
-    return candidates(fitted.machine, fitted.part) + rivals(fitted.problem.network)
+    """All mechanisms at all places, and the alternatives that doubt the machine file's values."""
+    return candidates(fitted.machine, fitted.part) + alternatives(fitted.problem.network)
 
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:
@@ -55,7 +54,10 @@ def screens(fitted: Fitted, every: Sequence[Candidate], memories: Sequence[Memor
     line = _Line.at(fitted, every, slack(every, fitted))
     finite, refused = differences(fitted, every)
     low, high = _bounds(line, every)
-    low, high = np.append(low, np.zeros(len(finite))), np.append(high, np.full(len(finite), 2.0))
+    low, high = (
+        np.append(low, np.zeros(len(finite))),
+        np.append(high, np.full(len(finite), POLICY.finite_change_max_amplitude)),
+    )
     out = []
     for memory in memories:
         batches = tuple(
@@ -97,7 +99,7 @@ def alone(fitted: Fitted, memory: Memory, like: Fitted | None = None) -> Evidenc
 
 def slackened(fitted: Fitted) -> list[Candidate]:
     """The candidates that are slack: what every fit may do by itself."""
-    every = candidates(fitted.machine, fitted.part, LOOSE) + rivals(fitted.problem.network)
+    every = candidates(fitted.machine, fitted.part, SLACK_MECHANISMS) + alternatives(fitted.problem.network)
     loose = slack(every, fitted)
     return [c for c in every if c.name in loose]
 
@@ -156,7 +158,7 @@ class _Line:
         )
 
     def under(self, fitted: Fitted) -> _Line:
-        """The same columns beside another fit of the same rows."""
+        """The same columns with another fit of the same rows."""
         p, own_sd = len(self.own), from_run_to_run(fitted)
         kept = zip(fitted.problem.linearise(fitted.x, fitted.state.nuisance), self.blocks, strict=True)
         return replace(
@@ -175,7 +177,7 @@ class _Line:
     def whitened(self, memory: Memory) -> tuple[Whitened, ...]:
         columns = range(len(self.own), len(self.unknowns))
         return tuple(
-            whitened(b, v, self.z, self.unknowns, columns, self.weight, memory).with_slack(self.loose)
+            Whitened.at(b, v, self.z, self.unknowns, columns, self.weight, memory).with_slack(self.loose)
             for b, v in zip(self.blocks, self.nuisance, strict=True)
         )
 
@@ -191,7 +193,10 @@ def _evidence(fitted: Fitted, batches: tuple[Whitened, ...], memory: Memory, low
 
 def _bounds(line: _Line, every: Sequence[Candidate]) -> tuple[Array, Array]:
     """Of every column's amplitude, less the value at which it is off."""
-    low, high = np.full(len(line.numbers), -FACTOR), np.full(len(line.numbers), FACTOR)
+    low, high = (
+        np.full(len(line.numbers), -POLICY.doubted_value_max_log_factor),
+        np.full(len(line.numbers), POLICY.doubted_value_max_log_factor),
+    )
     place = {j: c for c, j in enumerate(line.numbers)}
     for c in every:
         for amplitude, j in zip(c.amplitudes, line.found.amplitudes.get(c.name, ()), strict=False):
@@ -234,14 +239,13 @@ def _varying(line: _Line, place: Mapping[int, int], evidence: Evidence, c: Candi
     return evidence.own_gain([b.jacobian[:, k] * c.change.per_batch / p.spread for b in evidence.batches])
 
 
-SURE = 1.64  # sd beyond the threshold: seen in 95 of 100 such sets of runs
-NO_TRACE = 1e100  # sd of an amplitude that changes nothing that was recorded
+NO_TRACE_SD = 1e100  # sd of an amplitude that changes nothing that was recorded
 
 
 def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
     """Columns of the table `limits`, most sensitive first within each mechanism.
 
-    The amplitude whose expected gain, half its square over its variance beside all that is recalibrated, reaches the
+    The amplitude whose expected gain, half its square over its variance given all that is recalibrated, reaches the
     threshold (the local power of a score test, Cox and Hinkley 1974, §9.3).
     """
     evidence = seen.evidence
@@ -255,12 +259,12 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
             continue
         amplitude = max(s.amplitudes, key=lambda a: abs(s.amplitudes[a]))
         spec = MECHANISMS[c.mechanism].spec(amplitude)
-        limit = s.sd * (np.sqrt(2.0 * threshold) + SURE)
+        limit = s.sd * (np.sqrt(2.0 * threshold) + POLICY.limit_power_sd)
         by = int(np.argmax(np.abs(shadow[: len(names), s.column]) * own[: len(names)]))
         unseen = limit > max(abs(spec.low), abs(spec.high)) or not np.isfinite(limit)
         rows.append(
-            (c.mechanism, c.where.kind, c.where.name, c.words, np.nan if unseen else float(limit), spec.unit,
-             s.absorbed, names[by] if s.absorbed > 0.3 else "")
+            (c.mechanism, c.where.kind, c.where.name, c.label, np.nan if unseen else float(limit), spec.unit,
+             s.absorbed, names[by] if s.absorbed > POLICY.limit_absorbed_share else "")
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["limits"]))
     digits = table.assign(size=np.log(table["limit"]).round(9))  # what differs by rounding alone is of equal size
@@ -269,4 +273,4 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
 
 def _usual(s: Scored) -> tuple[float, ...]:
     """Sorts the one at the usual value of its shape first, or, where that has no trace, the most sensitive."""
-    return s.sd > NO_TRACE, bool(s.candidate.variant_of), s.sd
+    return s.sd > NO_TRACE_SD, bool(s.candidate.variant_of), s.sd

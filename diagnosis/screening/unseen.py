@@ -1,4 +1,4 @@
-"""Regimes that no fit has seen: all batches of a season, or of the highest speed, predicted by the rest."""
+"""Regimes left out of the fit: all batches of a season, or of the highest speed, predicted by the others."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 
 from data.batch import Batch
 from diagnosis.contracts import Fitted
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import alone
-
-FEWEST = 2  # batches on either side
 
 
 def unseen(before: Fitted, after: Fitted) -> dict[str, Mapping[str, float]]:
@@ -21,7 +20,7 @@ def unseen(before: Fitted, after: Fitted) -> dict[str, Mapping[str, float]]:
         gains = {
             name: float(other.group_score(at) - one.group_score(at))
             for name, at in groups.items()
-            if FEWEST <= len(at) <= len(before.batches) - FEWEST
+            if POLICY.unseen_min_batches <= len(at) <= len(before.batches) - POLICY.unseen_min_batches
         }
         if gains:
             out[key] = gains
@@ -49,6 +48,6 @@ def _fast(batches: Sequence[Batch]) -> dict[str, list[int]]:
     for name in batches[0].names("driver"):
         top = [float(np.nanmax(b.values(name))) for b in batches]
         highest = max(top)
-        if highest > 0 and min(top) < 0.9 * highest:
-            out[f"{name} up to {highest:g}"] = [k for k, v in enumerate(top) if v >= 0.9 * highest]
+        if highest > 0 and min(top) < POLICY.unseen_top_share * highest:
+            out[f"{name} up to {highest:g}"] = [k for k, v in enumerate(top) if v >= POLICY.unseen_top_share * highest]
     return out

@@ -1,4 +1,4 @@
-"""The structural null: what the whole search would find where nothing is missing but a finer network."""
+"""The structural null: gains of all candidates where nothing is missing, but the real network is finer."""
 
 from __future__ import annotations
 
@@ -16,23 +16,21 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError, WorkError
 from data.files import write_atomic
-from diagnosis.candidates.discretisation import no_news
+from diagnosis.candidates.discretisation import never_reported
 from diagnosis.contracts import Candidate, Fitted
+from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.linearisation import difference
-from diagnosis.screening.screen import alone, proposed, screen
-from diagnosis.search.acceptance import balanced
+from diagnosis.screening.screen import alone, proposed, screens
+from diagnosis.search.acceptance import balanced_quantile
+from diagnosis.search.refits import common_memory
 from twin.network import Network
 from twin.quantity import Value
 from twin.schema import Body, ErrorChain, MechanismPart, TwinPart
 
-CELLS = 5
-MIDDLE = (0.25, 0.75)  # where a length's mean temperature stands
-BIOT = (0.03, 0.5)  # of a body: what leaves it per kelvin over what it conducts from end to end
-
 
 def refined(part: TwinPart, network: Network, values: np.ndarray, seed: int) -> TwinPart:
-    """A random finer twin of a fitted network at parameter values (n,); same parameters by the same names."""
+    """A random refinement of a fitted network at parameter values (n,); its parameters keep their names."""
     rng = np.random.default_rng(seed)
     total = network.conductance_W_per_K(values)
     bodies: dict[str, Body] = dict(part.bodies)
@@ -41,10 +39,10 @@ def refined(part: TwinPart, network: Network, values: np.ndarray, seed: int) -> 
         if body.shape != "lump" or name not in linked:
             continue
         (cell,) = network.bodies[name]
-        biot = float(np.exp(rng.uniform(*np.log(BIOT))))
+        biot = float(np.exp(rng.uniform(*np.log(POLICY.null_biot))))
         through = float(total[cell, cell]) / biot
         bodies[name] = body.model_copy(
-            update={"shape": "bar", "cells": CELLS, "conductance": Value(value=f"{through:.6g} W/K")}
+            update={"shape": "bar", "cells": POLICY.null_cells, "conductance": Value(value=f"{through:.6g} W/K")}
         )
     cut = {name for name in bodies if bodies[name].shape == "bar" and part.bodies[name].shape == "lump"}
 
@@ -64,10 +62,10 @@ def refined(part: TwinPart, network: Network, values: np.ndarray, seed: int) -> 
 
 
 def _seen(chain: ErrorChain, cut: set[str], rng: np.random.Generator) -> ErrorChain:
-    """An error whose lengths and levers end somewhere in a body and not evenly over it."""
+    """The error chain with its lengths and levers attached at places in the bodies instead of their means."""
 
     def place(at: str) -> str:
-        return f"{at}@{rng.uniform(*MIDDLE):.3f}" if at in cut else at
+        return f"{at}@{rng.uniform(*POLICY.null_length_centre):.3f}" if at in cut else at
 
     links = tuple(c.model_copy(update={"body": place(c.body)}) for c in chain.chain)
     tilts = tuple(t.model_copy(update={"hot": place(t.hot), "cold": place(t.cold)}) for t in chain.tilts)
@@ -75,7 +73,7 @@ def _seen(chain: ErrorChain, cut: set[str], rng: np.random.Generator) -> ErrorCh
 
 
 def _placed(given: MechanismPart, cut: set[str], rng: np.random.Generator) -> MechanismPart:
-    """Heat into a place of its own; shares that are fitted keep the names that they go by."""
+    """The mechanism with its heat into a place of the body; fitted shares keep their names."""
 
     def place(at: str) -> str:
         return f"{at}@{rng.uniform(0.0, 1.0):.3f}" if at in cut else at
@@ -88,20 +86,18 @@ def _placed(given: MechanismPart, cut: set[str], rng: np.random.Generator) -> Me
     return given
 
 
-TWINS = 14  # refined machines
-# Bounds of the temperature: on development plants an explanation that was wrong led the true one by up to 28 nats.
-HOT = 8.0, 16.0
-SCALES = (0.3, 1.0, 3.0, 8.0)  # of the misfit of each: real castings are finer than bars of five cells
-AS_IT_IS = 1  # the scale that is their own
-MARGIN = 1.25  # on a quantile that so few machines tell
-WIDER = 2.0  # an amplitude's scatter in plants of other numerics than in bars of five cells
-
-
 @dataclass(frozen=True)
 class Null:
-    """Recordings of T refined machines with the misfit at S scales: largest gain of any candidate (T, S) in nats, the
-    log density of batches left out (T, S) before any candidate, their mean squares (T, S, K), and the amplitudes and
-    gains (T, S, C) that the candidates `names` would be given where none is there."""
+    """Gains on recordings of T refined machines with the misfit at S scales, where no candidate is at work.
+
+    Attributes:
+        gain: (T, S) the largest of any candidate, in nats.
+        density: (T, S) log density of batches left out, without a candidate.
+        mean_squares: (T, S, K) left-out mean squares by channel, in units of the given noise's variance.
+        amplitude: (T, S, C) of each candidate.
+        names: of the C candidates.
+        gains: (T, S, C) of each candidate, in nats.
+    """
 
     gain: Array
     density: Array
@@ -110,51 +106,62 @@ class Null:
     names: tuple[str, ...] = ()
     gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
-    def threshold(self, density: float, share: float = 0.99, name: str = "", margin: float = MARGIN) -> float:
-        """The gain that structure alone exceeds in 1 - share of the cases, where it leaves no more than `density` says.
+    def threshold(
+        self, density: float, share: float = POLICY.chance_quantile, name: str = "", margin: float = POLICY.null_margin
+    ) -> float:
+        """The gain in nats that structure alone exceeds with probability 1 - share, times `margin`.
 
-        Of each machine counts the largest misfit that predicts left-out batches no worse. As there are few, a Gumbel
-        distribution goes through their mean and spread.
-
-        With the `name` of a candidate what structure makes of it counts, and not of others (`balanced`).
-        Either is `margin` times that quantile.
+        Of each machine counts the largest misfit that predicts left-out batches no worse than `density`, the log
+        density of the recordings. The quantile is that of a Gumbel distribution, as machines are few. With the `name`
+        of a candidate it is the quantile of its own gains (`balanced_quantile`), else of the largest gain of all.
         """
         gain = self.typical(density)
-        if len(gain) < 3:
+        if len(gain) < POLICY.null_min_machines:
             return float("inf")
         if name not in self.names or not self.gains.size:
-            return margin * balanced(gain[:, None], None, share)
-        return margin * balanced(self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share)
+            return margin * balanced_quantile(gain[:, None], None, share)
+        return margin * balanced_quantile(
+            self.gains[np.arange(len(gain)), self._scale(density)], self.names.index(name), share
+        )
 
     def typical(self, density: float) -> Array:
-        """The largest gain (T,) of each machine at that misfit."""
+        """The largest gain (T,) of each machine at the misfit that `density` allows."""
         return np.asarray(self.gain[np.arange(len(self.gain)), self._scale(density)])
 
     @property
     def temperature(self) -> float:
-        """Nats of score that count as one when explanations are compared: a share of what structure alone gains."""
+        """Nats of score that count as one when explanations are compared: a share of the median null gain."""
         typical = self.typical(self.as_it_is)
-        return float(np.clip(np.median(typical) / 4.0, *HOT)) if self.gain.size else HOT[0]
+        return (
+            float(np.clip(POLICY.temperature_null_share * np.median(typical), *POLICY.temperature_bounds_nats))
+            if self.gain.size
+            else POLICY.temperature_bounds_nats[0]
+        )
 
     @property
     def as_it_is(self) -> float:
-        """The usual log density where the misfit is that of the refined machines themselves."""
-        return float(np.median(self.density[:, min(AS_IT_IS, self.density.shape[1] - 1)])) if self.density.size else 0.0
+        """Median log density at the scale at which the misfit is that of the refined machines."""
+        return (
+            float(np.median(self.density[:, min(POLICY.null_own_scale, self.density.shape[1] - 1)]))
+            if self.density.size
+            else 0.0
+        )
 
     def scatter(self, name: str, density: float) -> float:
-        """By how much structure and noise move a candidate's amplitude in nine of ten machines; 0: that is not known.
+        """By how much structure and noise move a candidate's amplitude in nine of ten machines, in its unit.
 
-        They leave no more than `density` says.
-
-        An amplitude that cannot be negative shows half of that: of it one machine in twenty goes beyond.
+        0 where that is not known. Misfits count as in `threshold`. Of an amplitude that cannot be negative only one
+        side shows, so that one machine in twenty goes beyond.
         """
         if name not in self.names or len(self.gain) < 2:
             return 0.0
         own = self.amplitude[np.arange(len(self.gain)), self._scale(density), self.names.index(name)]
-        return WIDER * float(np.quantile(np.abs(own), 0.9 if (own < 0).any() else 0.95))
+        quantile = POLICY.amplitude_scatter_quantile
+        quantile = quantile if (own < 0).any() else (1.0 + quantile) / 2.0
+        return POLICY.amplitude_scatter_factor * float(np.quantile(np.abs(own), quantile))
 
     def _scale(self, density: float) -> NDArray[np.int64]:
-        """Of each machine (T,) the largest misfit that predicts left-out batches no worse."""
+        """The scale (T,) of the largest misfit of each machine that predicts left-out batches no worse."""
         allowed = self.density >= density
         last = allowed.shape[1] - 1 - np.argmax(allowed[:, ::-1], axis=1)
         return np.where(allowed.any(axis=1), last, 0)
@@ -166,21 +173,23 @@ def structural_null(
     counts: Mapping[str, int],
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    policy: Policy = POLICY,
 ) -> Null:
-    """Refined machines driven as the recordings were, their left-out gains by the same evidence in one step each.
+    """Left-out gains on recordings of refined machines that are driven as the given recordings were.
 
-    Only the target changes: the linearisation, its factors and the folds are the recordings' own. `counts` numbers, by
-    candidate, the columns whose gain would be an alarm. A machine's parameters are what the machine file thinks
-    possible, not those of the fit: bent by what is missing, they would be what a candidate is rewarded for.
+    Only the targets change: the linearisation, its factors and the folds are those of `evidence`. `counts` gives the
+    columns, by candidate, whose gain would be an alarm. Parameters are drawn from the machine file's priors and not
+    taken from the fit: a fit that is bent by what is missing would let candidates gain by bending it back.
     """
     drawn = recordings(structural_misfits(fitted, seed, progress), evidence, seed)
-    gain, amplitude, _ = evidence.gains(drawn)
+    left_out = policy.leaves_batches_out
+    gain, amplitude, _ = evidence.gains(drawn, left_out)
     columns = list(counts.values())
-    squares = evidence.mean_squares(evidence.left_out(drawn))
-    shape = (-1, len(SCALES))
+    squares = evidence.mean_squares(evidence.residuals(drawn, left_out))
+    shape = (-1, len(POLICY.null_scales))
     return Null(
         gain[:, columns].max(axis=1, initial=0.0).reshape(shape),
-        evidence.base_score(drawn).reshape(shape),
+        evidence.base_score(drawn, left_out).reshape(shape),
         squares.reshape(*shape, squares.shape[1]),
         amplitude[:, columns].reshape(*shape, len(columns)),
         tuple(counts),
@@ -191,17 +200,17 @@ def structural_null(
 def structural_misfits(
     fitted: Fitted, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> list[list[Array]]:
-    """Of each refined machine what it shows beyond the fit, (n_b,) of every batch in units of the given noise."""
+    """What each refined machine shows beyond the fit, (n_b,) of every batch in units of the given noise."""
     base = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
     out = []
-    for k in range(TWINS):
+    for k in range(POLICY.null_machines):
         try:
             part = refined(fitted.part, fitted.problem.network, fitted.values, seed + k)
             out.append(difference(fitted, part, base))
         except (InputError, WorkError):
             continue  # a draw that no machine has
         if progress:
-            progress(k + 1, TWINS)
+            progress(k + 1, POLICY.null_machines)
     return out
 
 
@@ -213,33 +222,36 @@ def recordings(misfits: Sequence[Sequence[Array]], evidence: Evidence, seed: int
         z = rng.standard_normal(evidence.batches[0].jacobian.shape[1])
         for own, whitened, misfit in zip(targets, evidence.batches, rows, strict=True):
             plain, noise = whitened.jacobian @ z, rng.standard_normal(len(misfit))
-            own += [plain + whitened.of(scale * misfit + noise) for scale in SCALES]
+            own += [plain + whitened.of(scale * misfit + noise) for scale in POLICY.null_scales]
     return [np.stack(t, axis=1) for t in targets]
 
 
 TINY = 1e-12
-FAR = 10.0  # times the size that was found: no machine without it is given more
 
 
-def null_beside(before: Fitted, after: Fitted, c: Candidate, seed: int) -> tuple[Null, float] | None:
-    """The null, with amplitudes of `c` in its own unit, and the log density of batches left out with `c`.
+def null_with(
+    before: Fitted, after: Fitted, c: Candidate, seed: int, policy: Policy = POLICY
+) -> tuple[Null, float] | None:
+    """The null at the fit with the candidate `c`, and the log density of batches left out there.
 
-    None where `c` adds no size of its own to the fit: a value that is doubted, labels that are swapped.
+    Amplitudes of `c` are in its own unit. None where `c` adds no amplitude to the fit: a doubted value, swapped labels.
     """
     own = _sizes(before, after, c)
     if not own:
         return None
     every = proposed(after)
-    seen, loose = screen(after, every), no_news(every, after)
+    memory = common_memory([after], policy)
+    (seen,), loose = screens(after, every, [memory]), never_reported(every, after)
     evidence = _as_column(seen.evidence, after, own)
     columns = seen.columns({*loose, c.name})
     columns[c.name] = evidence.batches[0].columns.shape[1] - 1
-    return structural_null(after, evidence, columns, seed), float(alone(after, after.memory).base_score()[0])
+    density = alone(after, memory).base_score(left_out=policy.leaves_batches_out)
+    return structural_null(after, evidence, columns, seed, policy=policy), float(density[0])
 
 
 def _sizes(before: Fitted, after: Fitted, c: Candidate) -> list[int]:
-    """Numbers of the unknowns that the candidate added, its shape aside."""
-    if c.part is None or c.mechanism == "coarse_network":
+    """Numbers of the unknowns that the candidate added, without those of its shape."""
+    if c.part is None or not c.kind.is_physics:
         return []
     known = {u.name for u in before.problem.unknowns}
     new = [k for k, u in enumerate(after.problem.unknowns) if u.name not in known]
@@ -247,7 +259,8 @@ def _sizes(before: Fitted, after: Fitted, c: Candidate) -> list[int]:
 
 
 def _as_column(evidence: Evidence, after: Fitted, own: list[int]) -> Evidence:
-    """The largest of these unknowns as one column more, per unit of its value; all of them no parameters any more."""
+    """The evidence with the largest of these unknowns as a further column, per unit of its value, and none of them as a
+    parameter."""
     unknowns, network = after.problem.unknowns, after.problem.network
     value = {k: float(after.values[network.index(unknowns[k].name)]) for k in own}
     norm = {k: sum(float(b.jacobian[:, k] @ b.jacobian[:, k]) for b in evidence.batches) for k in own}
@@ -262,12 +275,12 @@ def _as_column(evidence: Evidence, after: Fitted, own: list[int]) -> Evidence:
         )
         for b in evidence.batches
     )
-    bound = FAR * max(abs(value[most]), TINY)
+    bound = POLICY.null_amplitude_bound_factor * max(abs(value[most]), TINY)
     low = -bound if unknowns[most].scale == "linear" else 0.0
     return replace(evidence, batches=batches, low=np.append(evidence.low, low), high=np.append(evidence.high, bound))
 
 
-MOST = 64  # nulls in a folder; the oldest go
+CACHED_NULLS = 64  # nulls in a folder; the oldest go
 
 
 def cached_null(
@@ -278,9 +291,9 @@ def cached_null(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Null:
-    """`structural_null` as it was worked out before, if `folder` has it, else worked out and kept there.
+    """`structural_null`, read from `folder` if it holds that of the same inputs, else computed and written there.
 
-    What cannot be read counts as not there; a folder that cannot be written keeps nothing.
+    A file that cannot be read counts as missing; a folder that cannot be written keeps nothing.
     """
     if folder is None:
         return structural_null(fitted, evidence, counts, seed, progress)
@@ -308,14 +321,14 @@ def _words(fitted: Fitted, counts: Mapping[str, int], seed: int) -> Iterator[str
     except PackageNotFoundError:  # run from its sources alone
         yield ""
     yield np.__version__
-    yield f"{seed} {TWINS} {SCALES}"
+    yield f"{seed} {POLICY.null_machines} {POLICY.null_scales}"
     yield fitted.machine.machine
     yield fitted.part.model_dump_json()
     yield from (f"{name} {column}" for name, column in counts.items())
 
 
 def _numbers(fitted: Fitted, evidence: Evidence) -> Iterator[np.ndarray]:
-    """All that a null is made of; of the evidence's rows their sums, which tell as much."""
+    """All inputs of a null; sums stand for the evidence's rows."""
     inputs, state = fitted.problem.inputs, fitted.state
     yield from (inputs.time_s, inputs.n_intervals, inputs.clock_h, *inputs.drivers.values(), *inputs.recorded.values())
     yield from (fitted.values, *state.nuisance, fitted.noise.factor, fitted.memory.share, fitted.memory.keep)
@@ -345,7 +358,7 @@ def _write(path: Path, null: Null) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, file.getvalue())
         kept = sorted(path.parent.glob("null-*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
-        for old in kept[MOST:]:
+        for old in kept[CACHED_NULLS:]:
             old.unlink(missing_ok=True)
-    except OSError:  # it is worked out again next time
+    except OSError:  # it is computed again next time
         return

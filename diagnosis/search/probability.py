@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.contracts import Tried
-from diagnosis.search.decision import IMPROVED, Round
-
-LEAST = 0.005  # probabilities below it are not told
-MOST = {1: 0.6, 2: 0.7, 3: 0.8, 4: 0.9, 5: 0.93}  # by number of batches: few agree by chance
+from diagnosis.policy import POLICY
+from diagnosis.search.decision import Round
 
 
 @dataclass(frozen=True)
@@ -23,9 +21,10 @@ class Explanation:
     alike: bool
 
 
-def most_sure(runs: int) -> float:
+def probability_cap(runs: int) -> float:
     """The highest probability that so many runs allow."""
-    return MOST.get(runs, 0.99)
+    few = POLICY.few_runs_max_probability
+    return few[runs - 1] if 1 <= runs <= len(few) else POLICY.max_probability
 
 
 def explanations(done: Round) -> tuple[list[Explanation], float, float]:
@@ -39,26 +38,33 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     batches = len(done.before.batches)
 
     def agrees(x: Tried) -> bool:
-        return x is done.best or x.fitted is None or (x.improved >= IMPROVED * batches and not x.barred)
+        return (
+            x is done.best or x.fitted is None or (x.improved >= POLICY.min_improved_share * batches and not x.barred)
+        )
 
     refits = [x for x in done.tried if x.fitted is not None]
     barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}
     scores = np.array([x.standing(t) if agrees(x) and x.cluster not in barred else -np.inf for x in done.tried])
     nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
-    unlisted = (scores.max(initial=nothing)) - np.log(50.0)
+    unlisted = (scores.max(initial=nothing)) - np.log(POLICY.unlisted_odds)
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())
     weight /= weight.sum()
-    most = most_sure(done.before.runs or len(done.before.batches))
+    most = probability_cap(done.before.runs or len(done.before.batches))
     weight[:-2] *= min(1.0, most / max(weight[:-2].max(initial=0.0), 1e-12))
     best = done.best
     out = [
-        Explanation(x, float(p), best is not None and (x.cluster == best.cluster or p > 0.25 * weight[:-2].max()))
+        Explanation(
+            x,
+            float(p),
+            best is not None
+            and (x.cluster == best.cluster or p > POLICY.alike_min_probability_share * weight[:-2].max()),
+        )
         for x, p in zip(done.tried, weight[:-2], strict=True)
     ]
     return sorted(out, key=lambda e: -e.probability), float(weight[-2]), float(weight[-1])
 
 
-def told(every: Sequence[Explanation], most: int = 5) -> list[Explanation]:
+def reported(every: Sequence[Explanation], most: int = POLICY.reported_alternatives) -> list[Explanation]:
     """The alternatives worth a line."""
-    return [e for e in every[1:] if e.probability >= LEAST][:most]
+    return [e for e in every[1:] if e.probability >= POLICY.reported_min_probability][:most]

@@ -1,27 +1,22 @@
-"""Full refits of the candidates that a screen thinks worth it, and their gains on batches left out."""
+"""Full refits of candidates and their gains on batches left out."""
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import lru_cache, partial, reduce
-from multiprocessing import get_context
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any, TypeVar
+from functools import partial, reduce
+from typing import TypeVar
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from data.arrays import Array
 from data.errors import InputError, WorkError
+from data.processes import Processes
 from diagnosis.candidates.priors import log_prior, start_values
-from diagnosis.contracts import Candidate, Fitted, Scored, Tried
-from diagnosis.fitting.fitted import MISFIT, REFIT_TOLERANCE, SMOOTH, baseline, refitted, settle
-from diagnosis.fitting.regression import QUIET, whiter
+from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried
+from diagnosis.fitting.fitted import baseline, refitted, settle
+from diagnosis.fitting.regression import Memory, whiter
+from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import alone
 from twin.calibration.fit_problem import Noise
@@ -33,83 +28,23 @@ from twin.schema import TwinPart
 
 T = TypeVar("T")
 R = TypeVar("R")
-Progress = Callable[[str, int, int], None]  # told of a step, how many of it are done, and of how many
+Progress = Callable[[str, int, int], None]  # receives the step, how many of it are done, and of how many
 
 
-def _one_thread() -> None:
-    threadpool_limits(limits=1)
-
-
-class Workers:
-    """A pool to be used as a context; results come in the order of the items, whatever the number of processes."""
-
-    def __init__(self, processes: int = 1, start: Callable[[], object] = _one_thread) -> None:
-        self.processes, self._start = processes, start
-        self._pool: ProcessPoolExecutor | None = None
-        self._folder: TemporaryDirectory[str] | None = None
-        self._sent = 0
-
-    def __enter__(self) -> Workers:
-        if self.processes > 1:
-            self._folder = TemporaryDirectory(prefix="thermodrift-")
-            self._pool = ProcessPoolExecutor(self.processes, get_context("spawn"), self._start)
-            for _ in range(self.processes):
-                self._pool.submit(self._start)  # imports go on while the baseline is fitted
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._pool is not None and self._folder is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._folder.cleanup()
-            self._pool = self._folder = None
-
-    def map(self, work: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
-        """`work` of every item; it travels to other processes once for all items, through a file of this session."""
-        if self._pool is None or self._folder is None or len(items) < 2:
-            return map(work, items)
-        path = Path(self._folder.name) / str(self._sent)
-        path.write_bytes(pickle.dumps(work, pickle.HIGHEST_PROTOCOL))
-        self._sent += 1
-        return self._pool.map(partial(_do, path), items)
-
-    def beside(self, work: Callable[[], R]) -> Callable[[], R]:
-        """Work begun in another process while this one goes on; what is returned waits for it."""
-        return work if self._pool is None else self._pool.submit(work).result
-
-
-def _do(path: Path, item: Any) -> Any:
-    return _work(path)(item)
-
-
-@lru_cache(maxsize=1)
-def _work(path: Path) -> Callable[[Any], Any]:
-    """The last work that came, kept for its other items."""
-    work: Callable[[Any], Any] = pickle.loads(path.read_bytes())  # noqa: S301 - written by this session
-    return work
-
-
-FELL, MATES = 0.5, 2  # of its gain in the screen: a refit that gains less speaks for none of its cluster
-AFRESH = 3  # steps of a refit at an error with all rows counted alike
-GIVEN_UP, PROMISED = 2.0, 20.0  # times the noise that a channel is fitted to, and nats, where that is worth its time
-RANKED = 4  # rounds after which a gain stands: with ten, 11 gains of 11 to 900 nats came to 4 more at most
-SMALLER = (0.3, 0.1, 0.03)  # of a screen's amplitude, where a machine with all of it cannot be simulated
-
-Work = tuple[Scored, int]  # a candidate and the number of its cluster
+Work = tuple[Scored, str]  # a candidate and its cluster
 
 
 class Refits:
-    """Full refits beside one fit; `asked` are the names of all that it was asked for, simulated or not."""
+    """Full refits from one fit; `requested` names all candidates, whether they can be simulated or not."""
 
-    def __init__(self, now: Fitted, workers: Workers, tell: Progress) -> None:
-        self.asked: set[str] = set()
+    def __init__(self, now: Fitted, workers: Processes, tell: Progress) -> None:
+        self.requested: set[str] = set()
         self._now, self._workers, self._tell = now, workers, tell
 
     def __call__(self, work: Sequence[Work]) -> list[Tried]:
         """Those that can be simulated."""
         out = []
-        self.asked |= {s.candidate.name for s, _ in work}
+        self.requested |= {s.candidate.name for s, _ in work}
         for n, t in enumerate(self._workers.map(partial(refit, self._now), [s for s, _ in work])):
             self._tell("refit", n + 1, len(work))
             if t is not None:
@@ -117,81 +52,98 @@ class Refits:
         return out
 
 
-def grows(c: Candidate) -> bool:
-    """Whether it multiplies a heat by what that heat brings about."""
+def multiplies_heat(c: Candidate) -> bool:
+    """Whether the candidate multiplies a heat, so that its gain is not linear in its amplitude."""
     return c.mechanism in MECHANISMS and "heat" in MECHANISMS[c.mechanism].acts_at
 
 
-def short_ones_on(now: Fitted, tried: Sequence[Tried], workers: Workers) -> list[Tried]:
-    """The same, those of the highest promises fitted on where the refit fell far short of the screen.
-
-    A few steps may end on the way: air dragged along by the shaft gained 30 nats of a promised 169, and 277 further on.
-    """
-    short = [t for t in tried if t.scored.gain > PROMISED and t.gain < FELL * t.scored.gain and t.fitted is not None]
-    first = sorted(short, key=lambda t: -t.scored.gain)[:MATES]
-    on = dict(zip(map(id, first), workers.map(partial(taken_on, now), first), strict=True))
+def continued(now: Fitted, tried: Sequence[Tried], workers: Processes) -> list[Tried]:
+    """The refits, of which the most promising that fell far short of the screen are fitted to their optimum."""
+    short = [
+        t
+        for t in tried
+        if t.scored.gain > POLICY.continued_min_screen_gain_nats
+        and t.gain < POLICY.short_refit_gain_share * t.scored.gain
+        and t.fitted is not None
+    ]
+    first = sorted(short, key=lambda t: -t.scored.gain)[: POLICY.continued_refits]
+    on = dict(zip(map(id, first), workers.map(partial(optimised, now), first), strict=True))
     return [on.get(id(t), t) for t in tried]
 
 
-def refit(now: Fitted, s: Scored) -> Tried | None:
+def refit(now: Fitted, s: Scored, policy: Policy = POLICY) -> Tried | None:
     """One candidate in full; None where it cannot be simulated."""
-    if s.candidate.mechanism == "sensor_swap":  # the fit was bent towards the wrong labels
+    if s.candidate.kind is CandidateKind.SENSOR_SWAP:  # the fit was bent towards the wrong labels
         try:
             part = s.candidate.applied(now.part, start_values(s, now)[0])
-            return judged(now, Tried(s, 0.0, 0, 0, 0.0, baseline(now.machine, part, now.batches, None, now.runs)))
+            fitted = baseline(now.machine, part, now.batches, None, now.runs)
+            return judged(now, Tried(s, 0.0, 0, s.candidate.name, 0.0, fitted), policy=policy)
         except (InputError, WorkError):
             return None
-    for values, begin in _begins(s, now):
+    for values, begin in _starts(s, now):
         try:
             part = s.candidate.applied(now.part, values)
-            done = judged(now, Tried(s, 0.0, 0, 0, 0.0, refitted(now, part, begin)), roughly=True)
-            if grows(s.candidate) and done.gain < s.gain:
-                return taken_on(now, done)
-            if max(done.gain, s.gain) < PROMISED or not _given_up(now, s.candidate):
+            first = Tried(s, 0.0, 0, s.candidate.name, 0.0, refitted(now, part, begin))
+            done = judged(now, first, roughly=True, policy=policy)
+            if multiplies_heat(s.candidate) and done.gain < s.gain:
+                return optimised(now, done, policy)
+            if max(done.gain, s.gain) < POLICY.continued_min_screen_gain_nats or not _discounted(now, s.candidate):
                 return done
-            again = judged(now, replace(done, fitted=_afresh(now, part, begin)), roughly=True)
+            again = judged(
+                now, replace(done, fitted=_with_equal_weights(now, part, begin)), roughly=True, policy=policy
+            )
             return max(done, again, key=lambda one: one.gain)
         except (InputError, WorkError):
             continue
     return None
 
 
-def _begins(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
-    """Free values and where the refit begins, one after the other until it can: a linear step may lead where no machine
-    is, as heat that feeds itself runs away."""
+def _starts(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
+    """Free values and start values of a refit, in the order of trial.
+
+    A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
+    """
     values, at = start_values(s, now)
-    yield values, {**_beside(s, now), **at}
+    yield values, {**_joint_start(s, now), **at}
     yield values, at
-    for share in SMALLER if s.amplitudes else ():
+    for share in POLICY.start_amplitude_shares if s.amplitudes else ():
         yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
 
 
-def _given_up(now: Fitted, c: Candidate) -> bool:
-    """Whether the candidate is at an error that the fit hardly counts."""
+def _discounted(now: Fitted, c: Candidate) -> bool:
+    """Whether the candidate acts on an error whose noise the fit has inflated, so that it hardly counts."""
     if c.where.kind != "error" or c.part is None:
         return False
     factor = dict(zip(now.problem.channels, now.noise.factor, strict=True))
-    return max(float(factor.get(name, 1.0)) for name in (c.where.name, *several(c.part.acts_on))) > GIVEN_UP
+    return (
+        max(float(factor.get(name, 1.0)) for name in (c.where.name, *several(c.part.acts_on)))
+        > POLICY.discounted_channel_noise_factor
+    )
 
 
-def _afresh(now: Fitted, part: TwinPart, begin: Mapping[str, float]) -> Fitted:
-    """The refit with all channels and rows counted alike at first, as a baseline begins.
+def _with_equal_weights(now: Fitted, part: TwinPart, begin: Mapping[str, float]) -> Fitted:
+    """The refit with all channels and rows weighted alike at first, as a baseline begins.
 
-    An error that lacks a shift of tens of micrometres was given up by the fit before: its rows count little, and in
-    them the shift is never found.
+    The fit before may have inflated the noise of an error that lacks a large shift; with that weight the shift would
+    not be found.
     """
     start = refitted(now, part, begin, steps=0)
     channels = len(start.problem.channels)
-    alike = Noise(np.full(channels, MISFIT), np.full(channels, SMOOTH))
+    alike = Noise(np.full(channels, POLICY.initial_noise_factor), np.full(channels, POLICY.initial_rows_per_value))
     state = State.at(start.problem, start.state.z, start.state.nuisance, alike)
-    state = descend(start.problem, state, AFRESH, REFIT_TOLERANCE)
-    return settle(replace(start, state=state), steps=2, tolerance=REFIT_TOLERANCE, rounds=2)
+    state = descend(start.problem, state, POLICY.equal_weight_steps, POLICY.refit_tolerance)
+    return settle(
+        replace(start, state=state),
+        POLICY.equal_weight_settle_steps,
+        POLICY.refit_tolerance,
+        POLICY.equal_weight_settle_rounds,
+    )
 
 
-def _beside(s: Scored, now: Fitted) -> dict[str, float]:
-    """Values of the fit's own parameters where the refit begins: the linear joint optimum.
+def _joint_start(s: Scored, now: Fitted) -> dict[str, float]:
+    """Start values of the fit's own parameters: the linear joint optimum with the candidate.
 
-    From where they were the start would look bad in some channels, which the noise then gives up.
+    From their old values some channels would start with large residuals, and their noise would be inflated.
     """
     z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
     values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
@@ -199,54 +151,65 @@ def _beside(s: Scored, now: Fitted) -> dict[str, float]:
     return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}
 
 
-def taken_on(now: Fitted, t: Tried) -> Tried:
-    """The same, fitted on to its optimum, unless batches left out are predicted worse there."""
+def optimised(now: Fitted, t: Tried, policy: Policy = POLICY) -> Tried:
+    """The refit continued to its optimum, unless batches left out are predicted worse there."""
     assert t.fitted is not None
     try:
-        done = judged(now, replace(t, fitted=settle(t.fitted, rounds=RANKED)))
-        return done if done.gain >= t.gain else max(done, judged(now, t), key=lambda one: one.gain)
+        done = judged(now, replace(t, fitted=settle(t.fitted, rounds=POLICY.finalist_settle_rounds)), policy=policy)
+        return done if done.gain >= t.gain else max(done, judged(now, t, policy=policy), key=lambda one: one.gain)
     except (InputError, WorkError):
         return t
 
 
-def judged(now: Fitted, t: Tried, roughly: bool = False) -> Tried:
+def judged(now: Fitted, t: Tried, roughly: bool = False, policy: Policy = POLICY) -> Tried:
     """A refit with its gain over the fit before; `roughly` with the slack of that fit.
 
-    Rows remember each other, for both as in the fit that leaves the whiter residuals: a missing effect makes those of
-    the other repeat themselves (as `twin.calibration.least_squares.likelier`).
+    Both fits count rows by the memory of the whiter residuals: a missing effect lengthens that of the other (as in
+    `twin.calibration.least_squares.likelier`).
     """
     assert t.fitted is not None
-    memory = whiter(now.memory, t.fitted.memory)
+    memory = common_memory([now, t.fitted], policy)
     before, after = alone(now, memory), alone(t.fitted, memory, now if roughly else None)
-    gain = float(after.base_score()[0] - before.base_score()[0])
-    return replace(t, gain=gain, improved=improved(before, after), log_prior=log_prior(t.scored, t.fitted))
+    gain = _score(after, policy) - _score(before, policy)
+    better = improved(before, after, policy)
+    return replace(t, gain=gain, improved=better, log_prior=log_prior(t.scored, t.fitted))
 
 
-def compared(now: Fitted, finalists: Sequence[Tried]) -> list[Tried]:
-    """All with their gains where rows count as in the whitest of them: else the whiter would win by the count."""
+def compared(now: Fitted, finalists: Sequence[Tried], policy: Policy = POLICY) -> list[Tried]:
+    """The finalists with gains by one memory, that of the whitest, which alone makes them comparable."""
     if not finalists:
         return []
-    whitest = reduce(whiter, (t.fitted.memory for t in finalists if t.fitted), now.memory)
-    before = float(alone(now, whitest).base_score()[0])
-    return [replace(t, alike=float(alone(t.fitted, whitest).base_score()[0]) - before) for t in finalists if t.fitted]
+    memory = common_memory([now, *(t.fitted for t in finalists if t.fitted)], policy)
+    before = _score(alone(now, memory), policy)
+    return [replace(t, alike=_score(alone(t.fitted, memory), policy) - before) for t in finalists if t.fitted]
 
 
-def improved(before: Evidence, after: Evidence) -> int:
+def common_memory(fits: Sequence[Fitted], policy: Policy = POLICY) -> Memory:
+    """The memory of the shortest reach in each channel, by which the rows of all these fits count."""
+    memory = reduce(whiter, (f.memory for f in fits))
+    return memory if policy.counts_row_memory else Memory.none(len(memory.share))
+
+
+def _score(evidence: Evidence, policy: Policy) -> float:
+    return float(evidence.base_score(left_out=policy.leaves_batches_out)[0])
+
+
+def improved(before: Evidence, after: Evidence, policy: Policy = POLICY) -> int:
     """Left-out batches whose squares fall."""
-    old, new = _squares(before, after)
+    old, new = _squares(before, after, policy.leaves_batches_out)
     return int((new < old).sum())
 
 
 def explained(before: Evidence, after: Evidence) -> float:
-    """The share of left-out squares that goes."""
+    """The share of left-out squares that is explained."""
     old, new = _squares(before, after)
     return float(1.0 - new.sum() / old.sum())
 
 
-def _squares(before: Evidence, after: Evidence) -> tuple[Array, Array]:
+def _squares(before: Evidence, after: Evidence, left_out: bool = True) -> tuple[Array, Array]:
     """Every left-out batch's squares (B,) of both, each channel in units of what is left of it afterwards."""
-    left, right = before.left_out(), after.left_out()
-    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), QUIET)
+    left, right = before.residuals(left_out=left_out), after.residuals(left_out=left_out)
+    unit = np.maximum(np.nan_to_num(after.mean_squares(right)[0], nan=1.0), POLICY.min_noise_variance_share)
     old = [(e[:, 0] ** 2 / (before.weight * unit)[b.channel]).sum() for b, e in zip(before.batches, left, strict=True)]
     new = [(f[:, 0] ** 2 / (after.weight * unit)[a.channel]).sum() for a, f in zip(after.batches, right, strict=True)]
     return np.array(old), np.array(new)

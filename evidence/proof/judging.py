@@ -1,4 +1,4 @@
-"""What scoring needs of each case once the key is open: the answer that was stored, and the true model beside it."""
+"""What scoring needs of each case once the key is open: the stored answer and the true model."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from data.processes import Processes
 from diagnosis.findings.schema import Findings, read_findings
 from evidence.proof.sealing.examinee import FINDINGS, PLAN, read_case
 from evidence.proof.sealing.folder import ProofFolder, files_digest, read_json, source_digest, write_json
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Examinee | None = None) -> Findings | None:
     """Findings of the case with one more recording; None where the run cannot be done or the diagnosis fails.
 
-    What the same source answered before is read from the folder `kept`. Whoever answers sees as little as before.
+    What the same source answered before is read from the folder `kept`. The answering process sees as little as before.
     """
     source = source_digest()
     if not (kept / RUN).exists() or read_json(kept / RUN)["source_digest"] != source:
@@ -44,7 +43,7 @@ def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Exam
                 _add(more, plan, key)
             except InputError:  # a plan that this plant cannot do settles nothing
                 return None
-            files = examine(more, by or Examinee(rivals=None), source)
+            files = examine(more, by or Examinee(baselines=None), source)
         shutil.rmtree(kept, ignore_errors=True)
         kept.mkdir()
         for name, content in files.items():
@@ -53,7 +52,7 @@ def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Exam
 
 
 def _add(case: Path, plan: str, key: Mapping[str, Any]) -> None:
-    """One more recording in a case's folder, and its machine file with the sensor that the plan asked for."""
+    """One more recording in a case's folder, and its machine file with the sensor that the plan requests."""
     from plants.planned import execute
     from plants.plant import csv_text, machine_text
 
@@ -99,12 +98,8 @@ def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | No
 
 def _judged(tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[tuple[str, Judged]]:
     """Names and what `judge` gives, as they come."""
-    if workers == 1:
-        yield from ((task[0].name, judge(*task)) for task in tasks)
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        waiting = {pool.submit(judge, *task): task[0].name for task in tasks}
-        yield from ((waiting[future], future.result()) for future in as_completed(waiting))
+    with Processes(workers) as pool:
+        yield from ((tasks[k][0].name, judged) for k, judged in pool.completed(judge, tasks))
 
 
 def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, Any], source: str) -> Judged:
@@ -122,9 +117,9 @@ def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, A
         held = read_json(kept) if kept.exists() else {}
         if held.get("source") != source:
             truth, trouble = _true(machine, batches, key)
-            held = {"source": source, "truth": _plain(asdict(truth)) if truth else None, "trouble": trouble}
+            held = {"source": source, "truth": plain_json(asdict(truth)) if truth else None, "trouble": trouble}
             write_json(kept, held)
-    return Judged(stored, _truth(held["truth"]), held["trouble"])
+    return Judged(stored, truth_from_json(held["truth"]), held["trouble"])
 
 
 def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tuple[TrueModel | None, str]:
@@ -152,16 +147,16 @@ def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch
     return redraw
 
 
-def _plain(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
     """As JSON has it: what is no number is null."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain_json(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain_json(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _truth(plain: Mapping[str, Any] | None) -> TrueModel | None:
+def truth_from_json(plain: Mapping[str, Any] | None) -> TrueModel | None:
     from evidence.proof.scoring.true_model import TrueModel
 
     if plain is None:

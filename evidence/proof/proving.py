@@ -30,7 +30,7 @@ SEED_BITS = 63  # of a development suite that nobody gave a seed
 class ProofRequest:
     """What to prove: `cases` of simulated plants, and every case that real recordings in `data` give.
 
-    `seed` None: a secret for a sealed suite, a drawn and told number for a development one.
+    `seed` None: a secret for a sealed suite, a drawn number that is reported for a development one.
     """
 
     out: Path
@@ -45,7 +45,7 @@ def drawn(request: ProofRequest) -> Suite:
     """The specs of a request and what they were drawn from.
 
     Raises:
-        InputError: a seed for a sealed suite; real recordings asked for and none there.
+        InputError: a seed for a sealed suite; real recordings requested and none there.
     """
     if request.suite == "sealed" and request.seed is not None:
         raise InputError(
@@ -63,7 +63,7 @@ def specs_of(request: ProofRequest, seed: bytes | int) -> list[CaseSpec]:
     """Cases of simulated plants first, then every case that the real recordings give.
 
     Raises:
-        InputError: real recordings asked for and none there.
+        InputError: real recordings requested and none there.
     """
     from evidence.proof.suite import real_suite, suite
 
@@ -90,7 +90,7 @@ def make_case(spec: CaseSpec, folder: Path, data: Path | None = None) -> dict[st
 
 
 Say = Callable[[str], None]
-# Tables that stand beside the page as CSV.
+# Tables that are written next to the page as CSV.
 WRITTEN = ("outcomes", "terms", "missed", "claims", "goals", "compared", "leak", "convergence")
 
 
@@ -156,18 +156,18 @@ def open_proof(
         if opened.commitment["suite"] == "sealed":
             say("convergence of the plants")
             tables["convergence"] = convergence_of(sorted(set(tables["outcomes"]["plant"])))
-        told = proof_run(opened, judged, tables)
+        run = proof_run(opened, judged, tables)
         files = {f"{name}.csv": out / f"{name}.csv" for name in WRITTEN if name in tables}
         try:
             for name, path in files.items():
                 tables[name.removesuffix(".csv")].to_csv(path, index=False, lineterminator="\n")
         except OSError as error:
             raise WorkError(f"{out}: cannot be written ({error.strerror}); free the folder and open again") from None
-        files["report.html"] = write_proof_report(out, told)
+        files["report.html"] = write_proof_report(out, run)
         folder.ledger().add(
             "scored", cases=len(judged), source=scoring_source(), outcomes=files_digest(out, [files["outcomes.csv"]])
         )
-    return ProofOutcome(told, files)
+    return ProofOutcome(run, files)
 
 
 def prove(
@@ -182,11 +182,11 @@ def prove(
     folder = ProofFolder(request.out)
     if folder.is_sealed:
         held = folder.committed()
-        asked = len(specs_of(replace(request, suite="development"), 0))
-        if (held["number"], held["suite"]) != (asked, request.suite):
+        requested = len(specs_of(replace(request, suite="development"), 0))
+        if (held["number"], held["suite"]) != (requested, request.suite):
             raise InputError(
-                f"--out {request.out}: holds a {held['suite']} proof of {held['number']} cases, asked for is a "
-                f"{request.suite} one of {asked}; give another --out"
+                f"--out {request.out}: holds a {held['suite']} proof of {held['number']} cases, requested is a "
+                f"{request.suite} one of {requested}; give another --out"
             )
     else:
         say("seal")
@@ -198,7 +198,7 @@ def prove(
 
 
 def check_plants(plants: Sequence[str]) -> tuple[PlantKind, ...]:
-    """The plants that were asked for.
+    """The requested plants.
 
     Raises:
         InputError: an unknown one, with the closest.

@@ -1,4 +1,4 @@
-"""What a case of the proof is asked to be, before any plant is built."""
+"""The specification of a case of the proof, before any plant is built."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class CaseSpec:
     its own name and, where it has one, its reference's.
 
     Plants: elements (A, finite elements), volumes (B, finite volumes), grafted (C, an effect's response on real
-    recordings), withheld (D, real recordings with an input or effect kept back).
+    recordings), withheld (D, real recordings with an input or effect withheld).
     """
 
-    name: str  # says nothing: case_0001 in an order drawn by lot
+    name: str  # reveals nothing: case_0001 in an order drawn by lot
     kind: Kind
     plant: PlantKind
     seed: int

@@ -1,4 +1,4 @@
-"""The tables of an opened proof: what its page shows and what is written beside it."""
+"""The tables of an opened proof: what its page shows and what is written next to it."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def tables_of(
     stored = {name: j.stored for name, j in judged.items()}
     truths = {n: j.truth for n, j in judged.items() if j.truth is not None}
     cases, terms = outcomes(keys, stored, truths)
-    beside = compared(keys, stored, truths)
+    methods = compared(keys, stored, truths)
     ten = worst(cases)
     return {
         "ledger": ledger_table(opened.entries),
         "outcomes": cases,
         "terms": terms,
-        "goals": goal_table(cases, terms, beside),
-        "compared": beside,
+        "goals": goal_table(cases, terms, methods),
+        "compared": methods,
         "reliability": reliability(cases)[0],
         "confusion_mechanism": confusion(terms, "mechanism"),
         "confusion_place": confusion(terms, "place"),
@@ -80,7 +80,7 @@ def ledger_table(entries: Sequence[Entry]) -> pd.DataFrame:
             continue
         rows += _counts(counted, last)
         counted.clear()
-        rows.append((e.at, e.step, e.words))
+        rows.append((e.at, e.step, e.summary))
     rows += _counts(counted, last)
     return pd.DataFrame(rows, columns=list(TABLES["ledger"]))
 
@@ -112,7 +112,7 @@ def _windows(keys: Mapping[str, Mapping[str, Any]], cases: Sequence[str]) -> pd.
 # Called without arguments; gives the columns of the page's table.
 STUDIES = Registry(
     "convergence study",
-    {"elements": "plants.elements.convergence:study", "volumes": "plants.volumes.convergence:study"},
+    {"elements": "plants.convergence:elements_study", "volumes": "plants.convergence:volumes_study"},
 )
 
 

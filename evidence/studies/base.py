@@ -1,17 +1,15 @@
-"""What a study is: a published system repeated on simulated machines, its figures and orderings as data.
+"""A study: a published system repeated on simulated machines, its figures and orderings as data.
 
 To add one: a class below `Study` in a file of its own and a line in `evidence/studies/__init__.py`. A seed is another
-machine and another year of it. An ordering says which figures the source found to be less than which; how often that
-holds over the seeds is counted, never asserted.
+machine and another year of it. An ordering states which figures the source found to be less than which; how
+often that holds over the seeds is counted, never asserted.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import ClassVar
 
 import numpy as np
@@ -22,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from data.arrays import Array
 from data.errors import InputError
+from data.processes import Processes
 from evidence.studies import STUDIES
 from features.design import Design
 from features.selectors import SELECTORS
@@ -34,7 +33,7 @@ class Figure:
     """One number of a study, per seed: what it is, its unit, and what the source printed (None: nothing)."""
 
     key: str
-    words: str
+    label: str
     unit: str = "µm"
     published: float | None = None
     digits: int = 2
@@ -45,12 +44,12 @@ class Ordering:
     """A claim about figures: of every pair in `less` the first is less than the second, in one and the same seed.
 
     `published_gain` is the printed part by which the first pair's smaller lies below its greater, 1 − a/b. Evidence is
-    an ordering that no source printed: `evidence_for` names the ordering that it is to explain. `why` says, with the
-    means of figures in braces, what lies behind a claim that does not hold here.
+    an ordering that no source printed: `evidence_for` names the ordering that it is to explain. `why` explains, with
+    the means of figures in braces, a claim that does not hold here.
     """
 
     key: str
-    words: str
+    label: str
     less: tuple[tuple[str, str], ...]
     published_gain: float | None = None
     evidence_for: str = ""
@@ -64,12 +63,12 @@ class Ordering:
 class Study(ABC):
     """A published system. `assumed` are the things its description leaves open and what stands for them here.
 
-    `remarks` say, with the means of figures in braces, what is to be known of the figures themselves.
+    `remarks` on the figures themselves hold means of figures in braces.
     """
 
     key: ClassVar[str]
     title: ClassVar[str]
-    words: ClassVar[str]
+    summary: ClassVar[str]
     source: ClassVar[str]
     machine: ClassVar[str]
     assumed: ClassVar[tuple[str, ...]]
@@ -108,9 +107,7 @@ class StudyResult:
 
     def by_seed(self, names: Sequence[str]) -> list[dict[str, float]]:
         """The named figures of every seed."""
-        return [
-            {n: float(v) for n, v in zip(names, row, strict=True)} for row in self.wide[list(names)].to_numpy(float)
-        ]
+        return self.wide[list(names)].astype(float).to_dict("records")  # type: ignore[return-value]
 
     def figures(self) -> pd.DataFrame:
         """One row per figure: figure, words, unit, published (NaN: not printed), mean, sd (ddof 1), p5, p95, digits."""
@@ -123,7 +120,7 @@ class StudyResult:
                 {
                     "study": self.study.key,
                     "figure": f.key,
-                    "words": f.words,
+                    "words": f.label,
                     "unit": f.unit,
                     "published": np.nan if f.published is None else f.published,
                     "mean": values.mean() if len(values) else np.nan,
@@ -139,9 +136,9 @@ class StudyResult:
     @property
     def remarks(self) -> tuple[str, ...]:
         """The study's remarks with this run's means."""
-        return tuple(self._said(text) for text in self.study.remarks)
+        return tuple(self._filled(text) for text in self.study.remarks)
 
-    def _said(self, text: str) -> str:
+    def _filled(self, text: str) -> str:
         wide = self.wide
         means = {f.key: f"{wide[f.key].mean():.{f.digits}f}".replace("-", "−") for f in self.study.figures}
         return text.format_map(means)
@@ -166,9 +163,9 @@ class StudyResult:
                 {
                     "study": self.study.key,
                     "ordering": o.key,
-                    "words": o.words,
+                    "words": o.label,
                     "evidence_for": o.evidence_for,
-                    "why": self._said(o.why),
+                    "why": self._filled(o.why),
                     "held": held,
                     "seeds": n,
                     "share": held / n if n else np.nan,
@@ -209,14 +206,9 @@ def run_studies(
         if progress:
             progress(f"{study.title}, seed {seed}", sum(map(len, done.values())), len(jobs))
 
-    if workers > 1:
-        # spawned, never forked: a fork of a process that runs threads can hang
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            for job, figures in zip(jobs, pool.map(_run, jobs), strict=True):
-                note(job, figures)
-    else:
-        for job in jobs:
-            note(job, _run(job))
+    with Processes(workers) as pool:
+        for job, figures in zip(jobs, pool.map(_run, jobs), strict=True):
+            note(job, figures)
     return {key: StudyResult.of(STUDIES[key], runs) for key, runs in done.items()}
 
 

@@ -112,7 +112,7 @@ class CoupledLathe(Study):
 
     key = "coupled_lathe"
     title = "Coupled lathe"
-    words = "fuzzy clusters and correlation choose the sensors, least squares the spindle offset and the screw slope"
+    summary = "fuzzy clusters and correlation choose the sensors, least squares the spindle offset and the screw slope"
     source = "coupled-lathe study of an HTC550/500, 17 sensors, three speeds with three feeds, 12 positions an axis"
     machine = (
         "the sample lathe's type (23 bodies), every conductance, capacity and heat ±20 % by seed; 17 sensors to "
@@ -121,7 +121,7 @@ class CoupledLathe(Study):
     )
     assumed: ClassVar[tuple[str, ...]] = (
         "The source does not say on which runs its RMSE and eta were taken: here every run is predicted by models of "
-        "the other eight; the fit is shown beside.",
+        "the other eight; the fit is shown as well.",
         "Four clusters; of their four sensors the one of largest correlation enters, and the room with it.",
         "The axis part is the error along the axis less the spindle's own, the slope least squares from the fixed end.",
         "Errors are zeroed at a run's first sweep, so the constants of the source cannot be seen and enter as 0.",
@@ -129,7 +129,7 @@ class CoupledLathe(Study):
     )
     remarks: ClassVar[tuple[str, ...]] = (
         "Our lathe moves more than the source's ({before_x} against 18.6 µm in X, {before_z} against 24.3 µm in Z); "
-        "its sensors tell more of it ({after_x} against 7.4 µm left, {after_z} against 10.5 µm). A fit on all nine "
+        "its sensors explain more of it ({after_x} against 7.4 µm left, {after_z} against 10.5 µm). A fit on all nine "
         "runs leaves little less ({after_fit_x} and {after_fit_z} µm), so the number of runs does not make the "
         "difference: the simulated lathe has only the scatter that it was given.",
         "A sensor of spindle or headstock is chosen for the offset in {on_spindle_x} % (X) and {on_spindle_z} % (Z) of "

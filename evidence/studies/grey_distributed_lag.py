@@ -59,7 +59,7 @@ class GreyDistributedLag(Study):
 
     key = "grey_distributed_lag"
     title = "Grey model and distributed lag"
-    words = "a grey model behind a distributed lag, sub-models weighted by the start temperature"
+    summary = "a grey model behind a distributed lag, sub-models weighted by the start temperature"
     source = "grey + distributed-lag study, batches at several start temperatures"
     machine = (
         "the sample machine's type (14 bodies), every conductance, capacity and heat ±20 % by seed; 10 sensors to "
@@ -75,28 +75,28 @@ class GreyDistributedLag(Study):
         "A band learns from three runs; with twice the runs, from six.",
     )
     figures: ClassVar[tuple[Figure, ...]] = tuple(
-        Figure(f"{method}_{where}", f"{words}, {said}: S_mean")
-        for where, said in WHERE.items()
-        for method, (words, _, _) in METHODS.items()
+        Figure(f"{method}_{where}", f"{label}, {name}: S_mean")
+        for where, name in WHERE.items()
+        for method, (label, _, _) in METHODS.items()
     )
     orderings: ClassVar[tuple[Ordering, ...]] = (
         *(
             Ordering(
-                f"piecewise_{where}", f"piecewise weighting predicts better {said}",
+                f"piecewise_{where}", f"piecewise weighting predicts better {name}",
                 ((f"piecewise_{where}", f"plain_{where}"),),
-                why=f"S_mean {said}: one pair of layers {{plain_{where}}} µm, four {{piecewise_{where}}}; with twice "
+                why=f"S_mean {name}: one pair of layers {{plain_{where}}} µm, four {{piecewise_{where}}}; with twice "
                 f"the runs {{plain_more_{where}}} and {{piecewise_more_{where}}}; ridge {{ridge_{where}}} µm.",
             )
-            for where, said in WHERE.items()
+            for where, name in WHERE.items()
         ),
         *(
             Ordering(
-                f"layers_{where}", f"grey model and distributed lag predict better than the grey model alone {said}",
+                f"layers_{where}", f"grey model and distributed lag predict better than the grey model alone {name}",
                 ((f"plain_{where}", f"gm1n_{where}"),),
-                why=f"S_mean {said}: grey model {{gm1n_{where}}} µm, with the distributed lag {{plain_{where}}}, the "
+                why=f"S_mean {name}: grey model {{gm1n_{where}}} µm, with the distributed lag {{plain_{where}}}, the "
                 f"distributed lag alone {{lag_{where}}} µm.",
             )
-            for where, said in WHERE.items()
+            for where, name in WHERE.items()
         ),
         *(
             Ordering(

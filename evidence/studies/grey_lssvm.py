@@ -63,7 +63,7 @@ def one_run(seed: int) -> tuple[Array, dict[str, Array]]:
 
 
 def _evidence(c: str) -> tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...]:
-    """Key, words and pairs of what the study says about the RMSE in one channel."""
+    """Key, label and pairs of the evidence on the RMSE in one channel."""
     combined = f"combined_rmse_{c}"
     return (
         *((m, f"RMSE below that of {METHODS[m]}", ((combined, f"{m}_rmse_{c}"),)) for m in ALONE),
@@ -87,7 +87,7 @@ class GreyLSSVM(Study):
 
     key = "grey_lssvm"
     title = "Grey models and LS-SVM"
-    words = "GM(1,6) of four sequence lengths, corrected by an LS-SVM tuned by particle swarm, within one run"
+    summary = "GM(1,6) of four sequence lengths, corrected by an LS-SVM tuned by particle swarm, within one run"
     source = "grey + LS-SVM study of a THM6380 horizontal machining centre, 5 sensors, Y and Z"
     machine = (
         "a horizontal machining centre of 12 bodies, every conductance, capacity and heat ±20 % by seed; 5 sensors to "
@@ -115,11 +115,11 @@ class GreyLSSVM(Study):
     figures: ClassVar[tuple[Figure, ...]] = (
         *(
             Figure(
-                f"{method}_{measure}_{c}", f"{words}, {c.upper()}: {said}", unit, digits=3 if measure == "degree" else 2
+                f"{method}_{measure}_{c}", f"{label}, {c.upper()}: {name}", unit, digits=3 if measure == "degree" else 2
             )
             for c in CHANNELS
-            for method, words in METHODS.items()
-            for measure, (said, unit) in MEASURES.items()
+            for method, label in METHODS.items()
+            for measure, (name, unit) in MEASURES.items()
         ),
         *(
             Figure(f"a_{n}", f"GM(1,6) of {n} rows, Z: development coefficient a", "", a)
@@ -132,25 +132,25 @@ class GreyLSSVM(Study):
     orderings: ClassVar[tuple[Ordering, ...]] = (
         *(
             Ordering(
-                f"{measure}_{c}", f"the combination is better than GM, LS-SVM and BP alone in {said} ({c.upper()})",
+                f"{measure}_{c}", f"the combination is better than GM, LS-SVM and BP alone in {name} ({c.upper()})",
                 tuple(
                     (f"{m}_{measure}_{c}", f"combined_{measure}_{c}") if measure == "degree"
                     else (f"combined_{measure}_{c}", f"{m}_{measure}_{c}")
                     for m in ALONE
                 ),
-                why=f"{said} in {c.upper()}: combined {{combined_{measure}_{c}}}, GM {{gm_{measure}_{c}}}, LS-SVM "
+                why=f"{name} in {c.upper()}: combined {{combined_{measure}_{c}}}, GM {{gm_{measure}_{c}}}, LS-SVM "
                 f"{{lssvm_{measure}_{c}}}, BP {{bp_{measure}_{c}}}. Taught on rows 16–55 alone, as the grey models "
                 f"are, they have {{gm_early_{measure}_{c}}}, {{lssvm_early_{measure}_{c}}} and "
                 f"{{bp_early_{measure}_{c}}}. The corrector's ten rows move by {{seen_{c}}} µm, the test by "
                 f"{{moved_{c}}} µm; one of all 50 rows gives {{combined_wide_{measure}_{c}}}.",
             )
             for c in CHANNELS
-            for measure, (said, _) in MEASURES.items()
+            for measure, (name, _) in MEASURES.items()
         ),
         *(
-            Ordering(f"rmse_{c}_{key}", words, pairs, evidence_for=f"rmse_{c}")
+            Ordering(f"rmse_{c}_{key}", label, pairs, evidence_for=f"rmse_{c}")
             for c in CHANNELS
-            for key, words, pairs in _evidence(c)
+            for key, label, pairs in _evidence(c)
         ),
     )  # fmt: skip
 

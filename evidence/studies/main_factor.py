@@ -36,7 +36,7 @@ def machine_days(seed: int) -> list[Batch]:
     return rig.record(runs, rng)
 
 
-def _words(what: str, channel: str, where: str) -> str:
+def _label(what: str, channel: str, where: str) -> str:
     return f"{what}, {channel.upper()}: S {where}"
 
 
@@ -45,7 +45,7 @@ class MainFactor(Study):
 
     key = "main_factor"
     title = "Main factors and BP"
-    words = "sensors by the products of a net's weights, X and Z summed; a BP net on the best of them"
+    summary = "sensors by the products of a net's weights, X and Z summed; a BP net on the best of them"
     source = "main-factor study of a lathe, 16 sensors, run 3.5 h, stop 1 h, run 3.5 h"
     machine = (
         "the sample lathe's type (23 bodies), every conductance, capacity and heat ±20 % by seed; 16 sensors to "
@@ -60,15 +60,15 @@ class MainFactor(Study):
     )
     figures: ClassVar[tuple[Figure, ...]] = (
         *(
-            Figure(f"{kind}_{n}_{c}", _words(f"{n} main factor{'s' if n > 1 else ''}", c, where))
+            Figure(f"{kind}_{n}_{c}", _label(f"{n} main factor{'s' if n > 1 else ''}", c, where))
             for c in CHANNELS
             for n in POINTS
             for kind, where in (("days", "on other days"), ("fit", "on the run itself"))
         ),
         *(
-            Figure(f"{key}_{c}", _words(words, c, "on other days"))
+            Figure(f"{key}_{c}", _label(label, c, "on other days"))
             for c in CHANNELS
-            for key, words in (
+            for key, label in (
                 ("random", "4 drawn from those behind the gate"),
                 ("correlation", "4 of largest correlation"),
                 ("fcgc", "4 by FCGC"),

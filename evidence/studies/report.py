@@ -1,8 +1,7 @@
-"""The page of repeated studies as data: published figures beside ours, a figure per claim, why what fails fails."""
+"""The page of repeated studies as data: published figures next to ours, a figure per claim, why a claim fails."""
 
 from __future__ import annotations
 
-import base64
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,21 +18,21 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.files import staged
 from evidence.studies.base import Ordering, StudyResult
+from reports.drawing import data_address, picture_bytes
 from reports.labels import BLUE, GREEN, INK, NOTHING, ORANGE, count, number, percent, plus_minus
 from reports.layout import Column, Row, Table
-from reports.rendering import template_environment
-from reports.twin.network_picture import picture_bytes
+from reports.rendering import rendered
 
 _SOFT, _LINE, _FAINT = "#5a6572", "#c5cbd3", "#eef1f4"
 _WIDTH_IN, _ROW_IN, _TOP_IN, _BOTTOM_IN, _LEFT_IN, _RIGHT_IN = 9.6, 0.5, 0.06, 0.5, 3.1, 1.55
-_WORDS_WIDE = 46
+_LABEL_CHARACTERS = 46
 
 
 @dataclass(frozen=True)
 class Strip:
     """One figure of a study over its seeds: values (S,), unit, what was printed (NaN: nothing)."""
 
-    words: str
+    label: str
     values: Array
     unit: str
     published: float
@@ -88,11 +87,11 @@ def _bare(ax: Axes) -> None:
 
 
 def _strip(ax: Axes, place: float, strip: Strip) -> None:
-    """Words on the left; dots, the 5–95 % range, the mean; numbers on the right."""
+    """Label on the left; dots, the 5–95 % range, the mean; numbers on the right."""
     values = strip.values[np.isfinite(strip.values)]  # noqa: PD011 - no frame
     side = ax.get_yaxis_transform()
-    said = textwrap.fill(strip.words, _WORDS_WIDE)
-    ax.text(-0.02, place, said, fontsize=8.5, color=INK, transform=side, va="center", ha="right", linespacing=1.15)
+    name = textwrap.fill(strip.label, _LABEL_CHARACTERS)
+    ax.text(-0.02, place, name, fontsize=8.5, color=INK, transform=side, va="center", ha="right", linespacing=1.15)
     if not len(values):
         return
     low, high = np.quantile(values, [0.05, 0.95])
@@ -117,7 +116,7 @@ Record = dict[Any, Any]
 class Claim:
     """One published ordering: what came out, why, and its picture as a data: address."""
 
-    words: str
+    title: str
     verdict: str
     counted: str
     gain: str
@@ -158,7 +157,7 @@ def reproduction_page(results: Sequence[StudyResult]) -> ReproductionPage:
     verdicts = pd.Series([c.verdict for p in parts for c in p.claims])
     counted = ", ".join(f"{(verdicts == v).sum()} {v}" for v in ("holds", "undecided", "fails"))
     counted = counted.replace("holds", "hold").replace("fails", "fail")
-    rows = [Row((p.title, c.words, c.verdict, c.counted, c.gain)) for p in parts for c in p.claims]
+    rows = [Row.of(p.title, c.title, c.verdict, c.counted, c.gain) for p in parts for c in p.claims]
     columns = (
         Column("Study"), Column("Published ordering", kind="wide"), Column("Verdict"), Column("Holds in"),
         Column("Gain: published | ours"),
@@ -171,7 +170,7 @@ def reproduction_page(results: Sequence[StudyResult]) -> ReproductionPage:
             ("Published orderings", counted),
             ("thermodrift", version("thermodrift")),
         ),
-        overview=Table("Published orderings and what became of them", columns, tuple(rows), simulated=True),
+        overview=Table("Published orderings and their verdicts", columns, tuple(rows), simulated=True),
         parts=parts,
     )
 
@@ -183,12 +182,12 @@ def spread(row: Record) -> tuple[str, str]:
     return plus_minus(float(row["mean"]), float(row["sd"]), digits), f"{low} … {high}"
 
 
-def counted_words(row: Record) -> str:
+def counted_label(row: Record) -> str:
     """``12 of 20 (36 % … 81 %)``."""
     return f"{row['held']} of {row['seeds']} ({percent(row['low'])} … {percent(row['high'])})"
 
 
-def gain_words(row: Record) -> str:
+def gain_label(row: Record) -> str:
     """``23 % | 3 (−38 … 30) %``; a dash where nothing was printed."""
     return f"{printed_gain(row)} | {our_gain(row)}"
 
@@ -218,7 +217,7 @@ def _part(result: StudyResult) -> StudyPart:
     return StudyPart(
         key=study.key,
         title=study.title,
-        source=f"{study.words[0].upper()}{study.words[1:]}, after the {study.source}.",
+        source=f"{study.summary[0].upper()}{study.summary[1:]}, after the {study.source}.",
         machine=study.machine,
         assumed=study.assumed,
         remarks=result.remarks,
@@ -237,14 +236,14 @@ def _claim(
     columns = (Column("Evidence", kind="wide"), Column("Verdict"), Column("Holds in"), Column("Gain"))
     rows = []
     for e in found.to_dict("records") if found is not None else []:
-        rows.append(Row((str(e["words"]), str(e["verdict"]), counted_words(e), our_gain(e))))
+        rows.append(Row.of(str(e["words"]), str(e["verdict"]), counted_label(e), our_gain(e)))
     return Claim(
-        words=ordering.words[0].upper() + ordering.words[1:],
+        title=ordering.label[0].upper() + ordering.label[1:],
         verdict=str(row["verdict"]),
-        counted=counted_words(row),
-        gain=gain_words(row),
+        counted=counted_label(row),
+        gain=gain_label(row),
         why=str(row["why"]),
-        evidence=Table("What the study itself says about it", columns, tuple(rows), simulated=True) if rows else None,
+        evidence=Table("Evidence within the study", columns, tuple(rows), simulated=True) if rows else None,
         picture=_source(claim_figure([strips[n] for n in names], held)),
     )
 
@@ -253,7 +252,7 @@ def _strips(result: StudyResult) -> dict[str, Strip]:
     wide = result.wide
     return {
         f.key: Strip(
-            f.words, wide[f.key].to_numpy(float), f.unit, np.nan if f.published is None else f.published, f.digits
+            f.label, wide[f.key].to_numpy(float), f.unit, np.nan if f.published is None else f.published, f.digits
         )
         for f in result.study.figures
     }
@@ -265,33 +264,31 @@ def _figures(caption: str, table: pd.DataFrame) -> Table:
     rows = []
     for row in table.to_dict("records"):
         published = number(float(row["published"]), int(row["digits"]))
-        rows.append(Row((str(row["words"]), str(row["unit"]), published, *spread(row))))
+        rows.append(Row.of(str(row["words"]), str(row["unit"]), published, *spread(row)))
     note = f"Over {count(int(table['seeds'].max()), 'seed')}, each another machine and year."
     return Table(caption, columns, tuple(rows), simulated=True, notes=(note,))
 
 
 def _source(figure: Figure) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(picture_bytes(figure, "svg")).decode("ascii")
+    return data_address(picture_bytes(figure, "svg"), "svg")
 
 
 FILES = ("values.parquet", "figures.csv", "orderings.csv", "reproduction.md", "reproduction.html")
 
 
 def write_results(results: Sequence[StudyResult], folder: Path) -> Path:
-    """Write all files or none; returns the page's path. Every table says in a column that it is simulated.
+    """Write all files or none; returns the page's path. Every table has a column that marks it as simulated.
 
     Raises:
         WorkError: the folder cannot be written.
     """
     page = reproduction_page(results)
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
     with staged(folder, FILES) as scratch:
         _together([r.table for r in results]).to_parquet(scratch / FILES[0], index=False)
         _together([r.figures() for r in results]).to_csv(scratch / FILES[1], index=False, lineterminator="\n")
         _together([r.orderings() for r in results]).to_csv(scratch / FILES[2], index=False, lineterminator="\n")
         for name in FILES[3:]:
-            template = template_environment(name.endswith(".html")).get_template(f"{name}.j2")
-            (scratch / name).write_text(template.render(page=page, written=written), encoding="utf-8")
+            (scratch / name).write_text(rendered(name, page), encoding="utf-8")
     return folder / FILES[-1]
 
 

@@ -44,7 +44,7 @@ TRAINS = [(k,) for k in range(N_MODELS)]
 class Method:
     """A selector, a number of points and a family."""
 
-    words: str
+    label: str
     selector: str
     n_tsp: int
     family: Family
@@ -95,7 +95,7 @@ class YearRoundPCR(Study):
 
     key = "year_round_pcr"
     title = "Year-round PCR"
-    words = "PCA elimination and principal component regression over a year, trained on one batch"
+    summary = "PCA elimination and principal component regression over a year, trained on one batch"
     source = "year-round PCR study of a Vcenter-55 vertical machining centre"
     machine = (
         "the sample machine's type (14 bodies), every conductance, capacity and heat ±20 % by seed; 10 sensors to "
@@ -115,9 +115,9 @@ class YearRoundPCR(Study):
     )
     figures: ClassVar[tuple[Figure, ...]] = (
         *(
-            Figure(f"{key}_{kind}", f"{m.words}: {words}", published=PUBLISHED.get(f"{key}_{kind}"))
+            Figure(f"{key}_{kind}", f"{m.label}: {label}", published=PUBLISHED.get(f"{key}_{kind}"))
             for key, m in METHODS.items()
-            for kind, words in (("S_mean", "accuracy S_mean"), ("S_std", "robustness S_std"), ("fit", "S of the fit"))
+            for kind, label in (("S_mean", "accuracy S_mean"), ("S_std", "robustness S_std"), ("fit", "S of the fit"))
         ),
         Figure("verified_S_mean", "K models (PCR, 4 points) on V1..V3: S_mean", published=6.12),
         Figure("verified_S_std", "K models (PCR, 4 points) on V1..V3: S_std", published=3.43),

@@ -1,4 +1,4 @@
-"""The selectors, one line each."""
+"""Registry of selectors."""
 
 from data.registry import Registry
 

@@ -1,4 +1,4 @@
-"""What every selector of temperature-sensitive points (TSP) is.
+"""Base class of the selectors of temperature-sensitive points (TSP).
 
 To add one: a class below `Selector` in a file of its own and a line in `features/selectors/__init__.py`.
 """
@@ -18,9 +18,9 @@ from features.rises import temperature_inputs
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One known weakness of a selector, measured: a statistic against the threshold that is usual for it.
+    """A known weakness of a selector as a statistic with its usual threshold.
 
-    `ok` False is a warning, not an error; `comment` says in plain words what the value means.
+    `ok` False is a warning, not an error; `comment` explains the value.
     """
 
     statistic: str
@@ -34,20 +34,20 @@ class Selector(ABC):
     """Chooses n_tsp inputs from training batches alone."""
 
     key: ClassVar[str]
-    words: ClassVar[str]
+    summary: ClassVar[str]
     source: ClassVar[str]
     takes_n_tsp: ClassVar[bool] = True  # False: the selector decides itself (or keeps all)
-    effort: ClassVar[Effort] = "complete"  # which crossings take it unless it is named
+    effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
 
     @abstractmethod
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
-        """Chosen inputs for every asked number of points, learned from the batches `train` of the design alone.
+        """Chosen inputs for every requested number of points, learned from the batches `train` of the design alone.
 
         The inputs come back in the design's order, so equal sets are equal tuples.
         """
 
     def diagnostics(self, design: Design, train: Sequence[int], n_tsp: int) -> tuple[Diagnostic, ...]:
-        """What is known to go wrong with this selector, measured on its choice of n_tsp inputs; none unless it says."""
+        """Known weaknesses of this selector, measured on its choice of n_tsp inputs; by default none."""
         return ()
 
     def select(self, train_batches: Sequence[Batch], target: str, n_tsp: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Fuzzy clusters of sensors: transitive closure of the similarity |corr|, cut into every number of classes."""
+"""Fuzzy clusters of inputs: transitive closure of the similarity |corr|, cut into every number of classes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def partitions(closure: Array) -> NDArray[np.int64]:
 def best_of_clusters(
     design: Design, statistics: Statistics, score: Array, n_tsps: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
-    """From each of n clusters the input of the largest score (p,), for every n asked.
+    """From each of n clusters the input of the largest score (p,), for every requested n.
 
     Constant inputs have no similarity; they join, in the design's order, only when n exceeds the number of the others.
     """
@@ -69,7 +69,7 @@ def best_of_clusters(
 
 
 def chaining(design: Design, statistics: Statistics, n_tsp: int) -> tuple[Diagnostic, ...]:
-    """What single linkage is known for, of the largest of n clusters: members joined over others, and its size."""
+    """Chaining of single linkage in the largest of n clusters: members joined through others, and its size."""
     varying = np.flatnonzero(statistics.varying)
     if not 1 < n_tsp < len(varying):
         return ()

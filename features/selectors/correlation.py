@@ -1,4 +1,4 @@
-"""Inputs of the largest correlation with the error."""
+"""Selector: largest correlation with the error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Correlation(Selector):
     """
 
     key = "correlation"
-    words = "largest |correlation| with the error"
+    summary = "largest |correlation| with the error"
     source = "K. Pearson (1895), Proc. R. Soc. 58, 240–242"
     effort = "quick"
 
@@ -38,7 +38,6 @@ class Correlation(Selector):
         between = np.triu(np.abs(statistics.between[np.ix_(chosen, chosen)]), 1)
         i, j = np.unravel_index(np.argmax(between), between.shape)
         value = float(between[i, j])
-        words = f"{design.inputs[chosen[i]]} and {design.inputs[chosen[j]]} tell " + (
-            "nearly the same" if value > _NEAR_TWINS else "different things; no chosen pair is closer"
-        )
-        return (Diagnostic("largest |corr| among the chosen", value, _NEAR_TWINS, value <= _NEAR_TWINS, words),)
+        pair = f"{design.inputs[chosen[i]]} and {design.inputs[chosen[j]]}"
+        comment = f"{pair} are nearly redundant" if value > _NEAR_TWINS else f"{pair} are the closest chosen pair"
+        return (Diagnostic("largest |corr| among the chosen", value, _NEAR_TWINS, value <= _NEAR_TWINS, comment),)

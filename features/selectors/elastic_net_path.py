@@ -25,6 +25,9 @@ def active_inputs(products: Array, with_target: Array, levels: Array) -> NDArray
     G (S, p, p) are the inputs' products with the ridge part on the diagonal (positive definite), r (S, p) those with
     the target.
 
+    All problems at once take 1/19 of the time of scikit-learn's `lars_path_gram` one by one (50 halves, 10 inputs:
+    ``benchmarks/elastic_net.py``).
+
     Source: B. Efron et al. (2004), Least angle regression, Ann. Statist. 32, 407–499, with the lasso's leaving step;
     H. Zou and T. Hastie (2005), J. R. Statist. Soc. B 67, 301–320, for the ridge part.
     """
@@ -102,7 +105,7 @@ class ElasticNetPath(Selector):
     """
 
     key = "elastic_net_path"
-    words = "picked most often by the elastic net on halves of the training batches"
+    summary = "picked most often by the elastic net on halves of the training batches"
     source = "N. Meinshausen and P. Bühlmann (2010), J. R. Statist. Soc. B 72, 417–473"
     effort = "usual"
 

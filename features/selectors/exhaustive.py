@@ -23,13 +23,13 @@ class Exhaustive(Selector):
     Score: mean S over the training batches, each left out once (`features.selectors.left_out`). All subsets
     of at most `most_inputs` inputs are tried. Of more inputs a beam search tries those that grow, one input at a time,
     from the `width` best of every size (fewer where memory binds): then the result need not be the best of all, and
-    the diagnostics say so. Of equal scores the first in the order of the inputs is taken.
+    the diagnostics report it. Of equal scores the first in the order of the inputs is taken.
 
     Source: G. Furnival and R. Wilson (1974), Technometrics 16, 499–511, for trying all subsets.
     """
 
     key = "exhaustive"
-    words = "of all subsets the least error on left-out training batches"
+    summary = "of all subsets the least error on left-out training batches"
     source = "G. Furnival and R. Wilson (1974), Technometrics 16, 499–511"
     effort = "usual"
 
@@ -55,9 +55,9 @@ class Exhaustive(Selector):
             sets, error = self._best_two(design, train, varying)[n_tsp - 1]
             gap = float(error[1] / error[0] - 1.0) if len(error) > 1 and error[0] > 0 else 0.0
             other = ", ".join(design.inputs[c] for c in varying[sets[-1]])
-            words = "second best" if gap >= _TIE else "as good within the tie"
+            comment = "second best" if gap >= _TIE else "as good within the tie"
             out.append(
-                Diagnostic("gap to the runner-up", gap, _TIE, gap >= _TIE, f"{words}: {other}")
+                Diagnostic("gap to the runner-up", gap, _TIE, gap >= _TIE, f"{comment}: {other}")
             )  # fmt: skip
         return tuple(out)
 

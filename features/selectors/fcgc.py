@@ -1,4 +1,4 @@
-"""Fuzzy clustering + grey correlation: one input from every cluster, by its grey relational degree."""
+"""Selector: fuzzy clusters, from each the input of largest grey relational degree with the error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class FuzzyClusterGreyCorrelation(Selector):
     """
 
     key = "fcgc"
-    words = "fuzzy clusters, from each the largest grey relational degree with the error"
+    summary = "fuzzy clusters, from each the largest grey relational degree with the error"
     source = "fuzzy clustering + grey correlation (FCGC) of the year-round studies; J. L. Deng (1989) for the degree"
     effort = "quick"
 

@@ -1,4 +1,4 @@
-"""Fuzzy c-means + grey action: one input from every cluster, by its driving coefficient in a grey model."""
+"""Selector: clusters by fuzzy c-means, from each the input of largest driving coefficient in a grey model."""
 
 from __future__ import annotations
 
@@ -14,17 +14,12 @@ from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import check_n_tsps, chosen_of_varying, ranking, training_statistics
 
 _NUMBERS_AT_ONCE = 1_000_000  # in a stack of memberships
+_MAX_ITERATIONS = 300
 _SMALLEST_SQUARE = 1e-12  # of a distance, for curves of unit size: nearer is the centre itself
 
 
 def fuzzy_c_means(
-    products: Array,
-    numbers: Sequence[int],
-    starts: int,
-    seed: int,
-    fuzziness: float = 2.0,
-    iterations: int = 300,
-    tolerance: float = 1e-6,
+    products: Array, numbers: Sequence[int], starts: int, seed: int, fuzziness: float = 2.0, tolerance: float = 1e-6
 ) -> dict[int, Array]:
     """Memberships u (c, p) of p curves in c clusters for every c of `numbers`: of all starts the least Σ u^m d².
 
@@ -44,19 +39,14 @@ def fuzzy_c_means(
         at_once = max(1, _NUMBERS_AT_ONCE // (starts * p * left[-1]))
         left, now = left[:-at_once], left[-at_once:]
         membership, cost = _converged(products, np.repeat(now, starts), np.tile(drawn, (len(now), 1)),
-                                      fuzziness, iterations, tolerance)  # fmt: skip
+                                      fuzziness, tolerance)  # fmt: skip
         best = np.argmin(cost.reshape(len(now), starts), axis=1) + starts * np.arange(len(now))
         out |= {c: membership[t, :c] for c, t in zip(now, best, strict=True)}
     return out
 
 
 def _converged(
-    products: Array,
-    number: NDArray[np.int64],
-    drawn: NDArray[np.int64],
-    fuzziness: float,
-    iterations: int,
-    tolerance: float,
+    products: Array, number: NDArray[np.int64], drawn: NDArray[np.int64], fuzziness: float, tolerance: float
 ) -> tuple[Array, Array]:
     """Memberships (T, c, p) of T runs of `number` clusters each, zero beyond them, and their objectives (T,)."""
     p, most = len(products), int(number.max())
@@ -64,7 +54,7 @@ def _converged(
     weight = np.eye(p)[drawn[:, :most]] * present[:, :, None]
     membership, cost = np.zeros_like(weight), np.zeros(len(number))
     running = np.arange(len(number))
-    for _ in range(iterations):
+    for _ in range(_MAX_ITERATIONS):
         if not len(running):
             break
         there = present[running, :, None]
@@ -106,7 +96,7 @@ class FcmGrey(Selector):
     """
 
     key = "fcm_grey"
-    words = "fuzzy c-means clusters, from each the largest driving coefficient of a grey model"
+    summary = "fuzzy c-means clusters, from each the largest driving coefficient of a grey model"
     source = "fuzzy c-means and grey action quantity of GM(1,N); J. Bezdek (1981), J. Deng (1989)"
 
     def __init__(self, fuzziness: float = 2.0, starts: int = 8, seed: int = 0) -> None:
@@ -132,9 +122,9 @@ class FcmGrey(Selector):
         if n_tsp not in clusters:
             return ()
         empty = n_tsp - len(np.unique(clusters[n_tsp]))
-        filled = f"of {n_tsp} asked; their points were filled up by the largest driving coefficients"
-        words = filled if empty else "each has a point of its own"
-        return (Diagnostic("clusters without a member", float(empty), 0.0, empty == 0, words),)
+        filled = f"of {n_tsp} requested; their points were filled up by the largest driving coefficients"
+        comment = filled if empty else "each has a point of its own"
+        return (Diagnostic("clusters without a member", float(empty), 0.0, empty == 0, comment),)
 
     def _clusters(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> tuple[Columns, Clusters]:
         """The inputs that vary, by |corr| with the error, and for n = 2 to all but one of them the cluster of each."""

@@ -1,4 +1,4 @@
-"""Fuzzy clustering + correlation: one input from every cluster, by its correlation with the error."""
+"""Selector: fuzzy clusters, from each the input of largest correlation with the error."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from features.selectors.statistics import check_n_tsps, training_statistics
 class FuzzyCorrelation(Selector):
     """n clusters by the transitive closure of |corr|, from each the input of largest |corr| with the target.
 
-    Chosen anew for every error channel; chains as every single linkage does.
+    Chosen anew for every error channel; subject to chaining, as every single linkage.
     """
 
     key = "fuzzy_correlation"
-    words = "fuzzy clusters, from each the largest |correlation| with the error"
+    summary = "fuzzy clusters, from each the largest |correlation| with the error"
     source = "coupled-lathe study: fuzzy clustering and correlation analysis; L. A. Zadeh (1971) for the closure"
     effort = "quick"
 

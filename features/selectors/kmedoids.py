@@ -1,4 +1,4 @@
-"""The n inputs that stand for all others best: medoids by the distance 1 − |correlation|."""
+"""Selector: medoids of the inputs by the distance 1 − |correlation|."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from features.selectors.base import Diagnostic, Selector
 from features.selectors.statistics import DIGITS, Statistics, check_n_tsps, chosen_of_varying, training_statistics
 
 Columns = NDArray[np.int64]
-_STRUCTURE = 0.25  # a mean silhouette below this is no structure worth the name (Kaufman and Rousseeuw)
+_STRUCTURE = 0.25  # a mean silhouette below this shows no structure (Kaufman and Rousseeuw)
 
 
 class KMedoids(Selector):
@@ -27,7 +27,7 @@ class KMedoids(Selector):
     """
 
     key = "kmedoids"
-    words = "the inputs nearest to all others by 1 − |correlation|"
+    summary = "the inputs nearest to all others by 1 − |correlation|"
     source = "L. Kaufman and P. Rousseeuw (1990), Finding Groups in Data, ch. 2"
     effort = "usual"
 
@@ -49,8 +49,8 @@ class KMedoids(Selector):
         chosen = self.select_design(design, train, [n_tsp])[n_tsp]
         medoids = [int(np.searchsorted(varying, design.inputs.index(name))) for name in chosen]
         value = float(silhouettes(distance, np.argmin(distance[:, medoids], axis=1)).mean())
-        words = "the inputs fall into groups" if value >= _STRUCTURE else "the inputs do not fall into so many groups"
-        return (Diagnostic("mean silhouette", value, _STRUCTURE, value >= _STRUCTURE, words),)
+        comment = "the inputs fall into groups" if value >= _STRUCTURE else "the inputs do not fall into so many groups"
+        return (Diagnostic("mean silhouette", value, _STRUCTURE, value >= _STRUCTURE, comment),)
 
 
 def medoids_of_all(distance: Array, relevance: Array) -> list[Columns]:

@@ -1,13 +1,13 @@
-"""How well subsets of inputs predict left-out batches by least squares, from sums per batch alone.
+"""Leave-batch-out error of least squares on subsets of inputs, from per-batch sums alone.
 
 Every block of a training set is left out once. For it two matrices over [target, inputs] are kept: `learned`, the
 centred products of the other blocks, and `left`, the products of the left-out block about the others' mean. To take
-input j into the model, every remaining column loses its part along j as the other blocks see it, in both matrices
-(one step of Gaussian elimination). What then stands in the target's corner of `left` is the sum of squared errors
-that least squares on the taken inputs makes on the left-out block: no system is solved, no row is read.
+input j into the model, the part along j, as estimated on the other blocks, is eliminated from every remaining column of
+both matrices (one step of Gaussian elimination). The target's diagonal element of `left` then is the sum of squared
+errors that least squares on the taken inputs makes on the left-out block: no system is solved, no row is read.
 
 Source: G. Furnival and R. Wilson (1974), Regressions by leaps and bounds, Technometrics 16, 499–511, for the
-elimination through all subsets; the left-out matrix beside it is ours.
+elimination through all subsets; the left-out matrix is an addition.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Blocks:
 
 
 Sets = NDArray[np.bool_]
-_TAKEN = 1e-10  # share of an input's variance left by the taken ones, below which it says nothing new
+_TAKEN = 1e-10  # share of an input's variance left by the taken ones, below which it adds nothing
 
 
 @dataclass(frozen=True)

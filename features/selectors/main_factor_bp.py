@@ -1,4 +1,4 @@
-"""Main factors by the products of a net's weights."""
+"""Selector: largest products of the weights of small neural nets (main factor strategy)."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class MainFactorBP(Selector):
     """
 
     key = "main_factor_bp"
-    words = "largest product of weights in small neural networks, behind a correlation gate"
+    summary = "largest product of weights in small neural networks, behind a correlation gate"
     source = "main factor strategy: correlation gate and BP weight product, lathe study"
 
     def __init__(
@@ -86,7 +86,7 @@ class MainFactorBP(Selector):
         return chosen_of_varying(design, varying, n_tsps, lambda n: np.searchsorted(varying, order[:n]))
 
     def select_above(self, design: Design, train: Sequence[int], threshold: float) -> tuple[str, ...]:
-        """The published other form: inputs of Sens_i ≥ threshold, in the design's order; perhaps none."""
+        """The other published form: inputs of Sens_i ≥ threshold, in the design's order; perhaps none."""
         found = self.sensitivity(design, train)
         return in_order(design, found.columns[found.mean >= threshold])
 
@@ -120,9 +120,9 @@ class MainFactorBP(Selector):
         side = np.where(statistics.with_target[passed] < 0, -1.0, 1.0)
         x_t = _standardised(design.x[np.ix_(rows, passed)] * side).T
         recorded = error_channels(design)[:, rows]
-        told = [np.count_nonzero(np.isfinite(y)) > 2 and np.nanstd(y) > 0 for y in recorded]
-        known = np.isfinite(recorded[told])
-        y = np.where(known, _standardised(recorded[told].T).T, 0.0)
+        usable = [np.count_nonzero(np.isfinite(y)) > 2 and np.nanstd(y) > 0 for y in recorded]
+        known = np.isfinite(recorded[usable])
+        y = np.where(known, _standardised(recorded[usable].T).T, 0.0)
         total, hidden = np.zeros((self.seeds, len(passed))), []
         if len(passed) and len(y):
             hidden = self._sizes(x_t, y, known, held_out(parts, design.y_um))

@@ -1,4 +1,4 @@
-"""Minimal redundancy, maximal relevance (mRMR) by mutual information."""
+"""Selector: minimal redundancy, maximal relevance (mRMR) by mutual information."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from features.design import Design, decimated_rows
 from features.selectors.base import Selector
 from features.selectors.statistics import DIGITS, check_n_tsps, chosen_of_varying, training_statistics
 
-_MOST_SHARED = 1.0 - 1e-12  # squared correlation of inputs that tell the same
+_MOST_SHARED = 1.0 - 1e-12  # squared correlation of redundant inputs
 
 
 class MRMR(Selector):
@@ -29,7 +29,7 @@ class MRMR(Selector):
     """
 
     key = "mrmr"
-    words = "largest mutual information with the error less that with the points already chosen"
+    summary = "largest mutual information with the error less that with the points already chosen"
     source = "H. Peng, F. Long and C. Ding (2005), IEEE Trans. Pattern Anal. 27, 1226–1238"
     effort = "usual"
 

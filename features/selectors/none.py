@@ -1,4 +1,4 @@
-"""No selection: every input is kept."""
+"""Selector that keeps every input."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from features.selectors.base import Selector
 
 
 class NoSelection(Selector):
-    """All inputs, whatever number is asked for: what a selection has to beat."""
+    """All inputs, whatever number is requested: the baseline of a selection."""
 
     key = "none"
-    words = "all inputs"
+    summary = "all inputs"
     source = "baseline"
     effort = "quick"
     takes_n_tsp = False

@@ -1,4 +1,4 @@
-"""Inputs dropped one by one by the smallest principal component of their correlation matrix."""
+"""Selector: stepwise elimination by the smallest principal component of the correlation matrix."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PcaElimination(Selector):
     """
 
     key = "pca_elimination"
-    words = "drop the largest loading of the smallest principal component, repeatedly"
+    summary = "drop the largest loading of the smallest principal component, repeatedly"
     source = "year-round PCR study; after I. T. Jolliffe (1972), Appl. Statist. 21, 160–173, one variable at a time"
     effort = "quick"
 

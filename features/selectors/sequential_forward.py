@@ -1,4 +1,4 @@
-"""Inputs added one by one, each the one that lowers the error on left-out batches most."""
+"""Selector: forward selection by the error on left-out batches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SequentialForward(Selector):
     """
 
     key = "sequential_forward"
-    words = "one by one the input that lowers the error on left-out training batches most"
+    summary = "one by one the input that lowers the error on left-out training batches most"
     source = "A. Whitney (1971), IEEE Trans. Comput. 20, 1100–1103"
     effort = "usual"
 

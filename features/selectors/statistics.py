@@ -1,4 +1,4 @@
-"""What the training batches say about the inputs: correlations from the design's sums, whatever the number of rows."""
+"""Correlations of the inputs over training batches, from the design's per-batch sums, and helpers of selectors."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def in_order(design: Design, columns: Sequence[int] | Columns) -> tuple[str, ...
 def chosen_of_varying(
     design: Design, varying: NDArray[np.int64], n_tsps: Sequence[int], pick: Callable[[int], Sequence[int] | Columns]
 ) -> dict[int, tuple[str, ...]]:
-    """`pick(n)` says which n of the columns `varying` are chosen, as places in it; it is asked for fewer than all.
+    """`pick(n)` gives n of the columns `varying`, as indices into it; called with fewer than all.
 
     Constant inputs join, in the design's order, only when n exceeds the number of the others.
     """
@@ -86,7 +86,7 @@ def chosen_of_varying(
 
 
 def check_n_tsps(design: Design, n_tsps: Sequence[int], selector: str) -> None:
-    """Every asked number must lie between 1 and the number of inputs.
+    """Every requested number must lie between 1 and the number of inputs.
 
     Raises:
         InputError: it does not.

@@ -1,4 +1,4 @@
-"""Inputs dropped one by one by their variance inflation factor (VIF)."""
+"""Selector: stepwise elimination by variance inflation factor (VIF)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class VifPruning(Selector):
     """
 
     key = "vif_pruning"
-    words = "drop the input that the others explain best, repeatedly"
+    summary = "drop the input that the others explain best, repeatedly"
     source = "D. Belsley, E. Kuh and R. Welsch (1980), Regression Diagnostics, ch. 3"
     effort = "usual"
 
@@ -41,8 +41,8 @@ class VifPruning(Selector):
         kept = pruning_order(statistics)[len(design.inputs) - n_tsp :]
         factor = variance_inflation(statistics.between[np.ix_(kept, kept)])
         largest = float(factor.max())
-        words = f"{design.inputs[kept[int(np.argmax(factor))]]} is the one that the other chosen points explain best"
-        return (Diagnostic("largest VIF left", largest, _USUAL_LIMIT, largest <= _USUAL_LIMIT, words),)
+        comment = f"{design.inputs[kept[int(np.argmax(factor))]]} is the one that the other chosen points explain best"
+        return (Diagnostic("largest VIF left", largest, _USUAL_LIMIT, largest <= _USUAL_LIMIT, comment),)
 
 
 def variance_inflation(correlation: Array) -> Array:

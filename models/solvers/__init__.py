@@ -1,1 +1,1 @@
-"""What families are made of: solvers, responses, kernels, trees and nets, each in a file of its own."""
+"""Numerical methods shared by families: solvers, lag responses, kernels, trees and nets."""

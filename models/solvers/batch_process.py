@@ -1,9 +1,9 @@
-"""A Gaussian process over whole batches: linear in columns, with a drift of its own in every batch.
+"""Gaussian process over whole batches: linear in columns, with an independent drift in every batch.
 
     y_b(t) = x_b(t) · β + r_b(t),   β_j ~ N(0, v_j),   r_b = random walk + offset + noise, independent over batches
 
-The drift says what no column explains: it grows with time, starts anew in every batch, and keeps one odd run from
-counting as hundreds of independent rows. The gains are best linear unbiased predictions (Henderson 1975; Rasmussen
+The drift models what no column explains: it grows with time, restarts in every batch, and correlates the rows of a
+run. The gains are best linear unbiased predictions (Henderson 1975; Rasmussen
 and Williams 2006, eq. 2.27 ff.). Leaving out whole batches, one or two, is closed form: with H = Cov(y)⁻¹ the
 residual of a block b that is left out is H_bb⁻¹ (H y)_b (Rasmussen and Williams 2006, eq. 5.12, in blocks).
 """
@@ -87,7 +87,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class BatchProcess:
-    """What the process says of B batches that it has not seen.
+    """Predictions of the process for B batches left out.
 
     gains (m,), µm per unit of each column; gains_without (B, m), without one batch; alone_um (B, q) residuals of every
     batch, left out alone, 0 behind its end; pairs_um (B, B, q), at k, i those of batch i where k and i are left out.
@@ -102,7 +102,7 @@ class BatchProcess:
     def of(cls, windows: Windows, variance: Array, steady: float = 1.0, mistrusted: Sequence[int] = ()) -> BatchProcess:
         """Pool all batches, for prior variances (m,) in units of the drift's.
 
-        `mistrusted` names batches whose drift variance is let grow hundredfold: they are heard, but do not pull.
+        `mistrusted` names batches whose drift variance is let grow hundredfold: they have little weight.
         """
         w = windows
         wide = np.where(np.isin(w.batch, list(mistrusted)), _MISTRUST, 1.0)
@@ -148,9 +148,8 @@ class LeftOut:
     """C = (K + I)⁻¹ and α = C y over G groups of m rows; K and y are 0 on padding.
 
     Leaving out the rows g: the residual is C_gg⁻¹ α_g, its covariance C_gg⁻¹. With f left out too, C and α are first
-    rid of f by elimination.
-    Source: S. Sundararajan and S. Keerthi, Neural Computation 13 (2001), for single rows; C. Rasmussen and
-    C. Williams (2006), eqs. 5.10 to 5.12.
+    rid of f by elimination. Source: S. Sundararajan and S. Keerthi, Neural Computation 13 (2001), for single rows; C.
+    Rasmussen and C. Williams (2006), eqs. 5.10 to 5.12.
     """
 
     blocks: Array  # (G, G, m, m)
@@ -166,7 +165,7 @@ class LeftOut:
         """Residual and variance (G, m) of each group left out by itself."""
         return _residual_and_variance(np.einsum("ggij->gij", self.blocks), self.alpha)
 
-    def beside(self, f: int) -> tuple[Array, Array]:
+    def without(self, f: int) -> tuple[Array, Array]:
         """Residual and variance (G, m) of each group when it and group f are left out; of f itself 0 and 1."""
         own = np.linalg.inv(self.blocks[f, f])
         across = self.blocks[:, f] @ own  # C_gf C_ff⁻¹

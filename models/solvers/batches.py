@@ -1,4 +1,4 @@
-"""Small helpers of the families that run along a batch: rows padded to one rectangle, steps, words for errors."""
+"""Helpers for families that run along a batch: padding to a rectangle, bridged holes, time steps, caching."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from data.arrays import Array
+from data.arrays import Array, Mask, Numeric
 from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
@@ -57,13 +57,28 @@ def steps_s(design: Design) -> Array:
     return out
 
 
+def fold_masks(key: str, design: Design, folds: Sequence[Sequence[int]], count: Numeric, need: int) -> Mask:
+    """Training sets as masks (F, K) over the batches with rows; `count` (K,) of usable rows.
+
+    Raises:
+        InputError: fewer than `need` rows in a fold.
+    """
+    masks = np.zeros((len(folds), design.n_batches), bool)
+    for f, fold in enumerate(folds):
+        masks[f, list(fold)] = True
+        if (got := int(count[masks[f]].sum())) < need:
+            raise too_few_rows(key, design, fold, got, need)
+    return np.asarray(masks & (count > 0))
+
+
 def too_few_rows(key: str, design: Design, train: Sequence[int], got: int, need: int) -> InputError:
     """The error of a training set with too few usable rows."""
     names = [design.batch_ids[k] for k in train]
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     return InputError(
         f"family {key}: got {got} usable rows of {design.target or 'the target'} in {shown or 'no batch'}, "
-        f"need at least {need}; give more batches or overrule a check in the machine file"
+        f"need at least {need}; give more batches, drop inputs that are missing, or overrule a check in the machine "
+        "file"
     )
 
 
@@ -75,7 +90,7 @@ T = TypeVar("T")
 
 
 class Recent(Generic[T]):
-    """Remembers what was made of the same batch objects under the same key, the last `most` of them."""
+    """Cache of the last `most` results, by key and identity of the batches."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -83,7 +98,7 @@ class Recent(Generic[T]):
         self._lock = RLock()
 
     def of(self, key: Hashable, batches: tuple[Batch, ...], make: Callable[[], T]) -> T:
-        """What is remembered, or what `make` makes now."""
+        """The cached result, else that of `make`."""
         with self._lock:
             for i, (k, held, thing) in enumerate(self._held):
                 if k == key and len(held) == len(batches) and all(a is b for a, b in zip(held, batches, strict=True)):

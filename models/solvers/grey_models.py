@@ -1,8 +1,9 @@
-"""The grey model and its corrector inside one batch, as published: early rows teach, later ones correct, the rest test.
+"""Grey models as the first layer of a corrected model: honest outputs for training, and the published one-batch form.
 
-Functions over arrays for a study; rows are numbered from 0. The study of a THM6380 machining centre (136 rows of 2 min)
-fitted GM(1,6) of the 25, 30, 35 and 40 rows that end with row 55, the LS-SVM on rows 56–65, and tested on 66–116,
-counted from 1: `outputs_um = sequence_outputs(x, y, range(15, 55))`, `corrected(outputs_um, y, range(55, 65))`.
+The one-batch functions work on arrays, rows numbered from 0: early rows train, later ones correct, the rest test. The
+study of a THM6380 machining centre (136 rows of 2 min) fitted GM(1,6) of the 25, 30, 35 and 40 rows that end with row
+55, the LS-SVM on rows 56–65, and tested on 66–116, counted from 1: `outputs_um = sequence_outputs(x, y, range(15,
+55))`, `corrected(outputs_um, y, range(55, 65))`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from models.gm1n import GM1N, response
 from models.lssvm import LSSVM
 
 _FEW = 3  # batches: with fewer, quarters of them are left out
+_STEP_S = 120.0  # nominal step of a sequence; its length does not enter the results
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ def grey_layers(design: Design, folds: Sequence[Sequence[int]], grey: Sequence[G
     sets = list(wanted)
     place = {batches: s for s, batches in enumerate(sets)}
     fitted = [family.fit_folds(design, sets) for family in grey]
-    told = [family.predict_folds(design, own, list(wanted.values())) for family, own in zip(grey, fitted, strict=True)]
+    predicted = [
+        family.predict_folds(design, own, list(wanted.values())) for family, own in zip(grey, fitted, strict=True)
+    ]
     out = []
     for fold in folds:
         outputs_um = np.full((len(design.time_s), len(grey)), np.nan)
@@ -54,7 +58,7 @@ def grey_layers(design: Design, folds: Sequence[Sequence[int]], grey: Sequence[G
             for k in fold:
                 rest = tuple(j for j in fold if j != k)
                 s, at = place[rest], wanted[rest].index(k)
-                outputs_um[design.rows(k)] = np.column_stack([told[g][s][at] for g in range(len(grey))])
+                outputs_um[design.rows(k)] = np.column_stack([predicted[g][s][at] for g in range(len(grey))])
         out.append(GreyLayer([fitted[g][place[tuple(fold)]] for g in range(len(grey))], outputs_um))
     return out
 
@@ -86,15 +90,14 @@ def sequence_outputs(
     y_um: Array,
     fit: range,
     lengths: Sequence[int] = (25, 30, 35, 40),
-    step_s: float = 120.0,
     kind: str = "difference",
     one_step: bool = False,
 ) -> Array:
-    """What GM(1,N) of each sequence length says of every row from its sequence's first on, µm (n, G); NaN before.
+    """Output of GM(1,N) for each sequence length on every row from its sequence's first on, µm (n, G); NaN before.
 
     x (n, p) inputs, y_um (n,) error. A sequence is the `lengths[g]` most recent rows of `fit`; its sums begin with its
     first row, whose measured error it starts from; then it runs free. `one_step` gives instead what follows from
-    all errors measured up to the row before: such scores look perfect and mean nothing for compensation.
+    all errors measured up to the row before: such scores do not apply to compensation.
 
     Raises:
         InputError: a sequence longer than `fit`, or shorter than the model has unknowns, or values not finite in it.
@@ -107,7 +110,7 @@ def sequence_outputs(
                 f"{x.shape[1] + 2} to {len(fit)} rows"
             )
         start, end = fit[-1] + 1 - length, fit[-1] + 1
-        model = GM1N(kind).fit_design(_batch(x[start:end], y_um[start:end], step_s), [0])
+        model = GM1N(kind).fit_design(_batch(x[start:end], y_um[start:end]), [0])
         a, drive = model.fitted["a"], x[start:] @ model.fitted["b"]
         if one_step:
             sums, measured = np.cumsum(drive), np.cumsum(y_um[start:])
@@ -119,7 +122,7 @@ def sequence_outputs(
 
 
 def corrected(outputs_um: Array, y_um: Array, fit: range, tuning: str = "particle_swarm", seed: int = 0) -> Array:
-    """Error_um (n,) by an LS-SVM that learned on rows `fit` what the outputs (n, G) leave over; NaN where they are.
+    """Error_um (n,) by an LS-SVM trained on rows `fit` with the outputs (n, G) as inputs; NaN where they are NaN.
 
     γ and σ by leaving out contiguous quarters of those rows.
 
@@ -128,11 +131,11 @@ def corrected(outputs_um: Array, y_um: Array, fit: range, tuning: str = "particl
     """
     known = np.full(len(y_um), np.nan)
     known[list(fit)] = y_um[list(fit)]
-    design = layer_design(_batch(outputs_um, known, 1.0), outputs_um)
+    design = layer_design(_batch(outputs_um, known), outputs_um)
     return LSSVM(max_rows=len(fit), tuning=tuning, seed=seed).fit_design(design, [0]).predict_design(design, [0])[0]
 
 
-def _batch(x: Array, y_um: Array, step_s: float) -> Design:
+def _batch(x: Array, y_um: Array) -> Design:
     names = tuple(f"x{j + 2}" for j in range(x.shape[1]))
-    time_s = np.arange(len(x), dtype=float) * step_s
-    return Design(names, "error", ("sequence",), x, y_um, time_s, np.array([0, len(x)], np.int64), step_s)
+    time_s = np.arange(len(x), dtype=float) * _STEP_S
+    return Design(names, "error", ("sequence",), x, y_um, time_s, np.array([0, len(x)], np.int64), _STEP_S)

@@ -1,4 +1,4 @@
-"""Models that are sums of kernels over support rows: what LS-SVM and SVR have in common."""
+"""Kernel expansions over support rows, shared by LS-SVM and SVR."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class KernelExpansion(Family):
     ) -> list[list[Array]]:
         """Models that share σ share the kernel of their united support rows."""
         out = np.empty((len(design.x), len(fitted)))
-        asked = np.flatnonzero(np.isin(design.group, sorted({k for batches in wanted for k in batches})))
+        rows = np.flatnonzero(np.isin(design.group, sorted({k for batches in wanted for k in batches})))
         by_kernel: dict[tuple[float, bytes], list[int]] = {}
         for f, m in enumerate(fitted):
             by_kernel.setdefault((m.fitted["sigma"], np.asarray(m.fitted["scale"]).tobytes()), []).append(f)
@@ -62,8 +62,8 @@ class KernelExpansion(Family):
                 np.add.at(alpha[:, c], place[c], m.fitted["alpha"])
             scale = np.asarray(models[0].fitted["scale"], float)
             bias = np.array([m.fitted["bias"] for m in models])
-            for start in range(0, len(asked), _ROWS_AT_ONCE):
-                some = asked[start : start + _ROWS_AT_ONCE]
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
+                some = rows[start : start + _ROWS_AT_ONCE]
                 values = kernel(design.x[some] / scale, support, sigma, self.linear) @ alpha + bias
                 out[some[:, None], members] = values
         return by_batch(design, out, wanted)

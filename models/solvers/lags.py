@@ -1,4 +1,4 @@
-"""What a lag dictionary offers: each input and driver at several delays, and what the start of a run says.
+"""Lagged responses: columns of the lag dictionary, distributed lags, and their penalised regression.
 
 | columns | what | per 1 of |
 |---|---|---|
@@ -6,7 +6,7 @@
 | `spindle^2 after 30 min` | a driver, or the square of a speed, behind such a lag; at rest before | full scale |
 | `front at start, gone in 2 h` | how far a sensor stood from the others at the start, times 1 − exp(−t/τ) | K |
 | `start level, gone in 2 h` | median start temperature above 20 °C (ISO 1), times 1 − exp(−t/τ) | K |
-| `clock, gone in 2 h` | 1 − exp(−t/τ): what every start does | 1 |
+| `clock, gone in 2 h` | 1 − exp(−t/τ): common to all starts | 1 |
 
 All are 0 at the first row of a batch, as the error is.
 """
@@ -23,7 +23,7 @@ from scipy.signal import lfilter
 
 from data.arrays import Array
 from features.design import Design
-from features.rises import first_order_lag
+from features.rises import first_finite, first_order_lag
 from models.linear import Pool, Task, Tuned
 from models.solvers.batches import bridged, steps_s
 
@@ -137,7 +137,7 @@ def _drivers(design: Design) -> list[_Column]:
 
 
 def _starts(design: Design) -> list[_Column]:
-    """How the machine stood at the start: known only where the batches themselves are at hand."""
+    """Columns of the state at the start; beyond the clock they need the batches themselves."""
     out = [_Column(f"clock, gone in {g:g} min", _gone(design, g), _FULL_SCALE_K) for g in _CLOCK_GONE_MIN]
     channels = list(dict.fromkeys(name.partition("@")[0] for name in design.inputs))
     if not design.batches:
@@ -145,7 +145,7 @@ def _starts(design: Design) -> list[_Column]:
     thermal = [c for c in channels if design.batches[0].channels[c].role in _THERMAL]
     if not thermal:
         return out
-    start_degC = np.array([[_first(b.masked(c)) for c in thermal] for b in design.batches])
+    start_degC = np.array([[first_finite(b.masked(c)) for c in thermal] for b in design.batches])
     level_degC = np.median(start_degC, axis=1)
     for g in _GONE_MIN:
         gone = _gone(design, g)
@@ -173,11 +173,6 @@ def _by_batch(design: Design, values: Callable[[slice], Array]) -> Array:
 def _step_s(design: Design, rows: slice) -> float:
     time_s = design.time_s[rows]
     return float((time_s[-1] - time_s[0]) / (len(time_s) - 1)) if len(time_s) > 1 else 0.0
-
-
-def _first(values: Array) -> float:
-    ok = np.isfinite(values)
-    return float(values[np.argmax(ok)]) if ok.any() else float("nan")
 
 
 Response = tuple[float, float]  # delay in s, time constant in s
@@ -264,7 +259,7 @@ class LagRegression(Tuned):
     """Ridge regression on m responses of p inputs, columns response by response; chooses shape and penalty."""
 
     key = "distributed_lag"
-    words = "regression of a distributed lag"
+    summary = "regression of a distributed lag"
     source = "Hoerl and Kennard (1970)"
 
     def __init__(self, shapes: Sequence[Shape], order_by: str) -> None:

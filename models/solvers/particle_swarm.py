@@ -1,4 +1,4 @@
-"""A particle swarm: the least value of a function inside a box, by many points that follow each other."""
+"""Particle swarm minimisation inside a box."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _INERTIA, _PULL = 0.7298, 1.49618  # constriction that settles: Clerc and Kenned
 def least(
     fitness: Callable[[Array], Array], low: Array, high: Array, seed: int, particles: int = 16, steps: int = 25
 ) -> tuple[Array, float]:
-    """Best point (d,) and its value, of all points (P, d) that `fitness` was asked for, one value each (P,).
+    """Best point (d,) and its value, of all points (P, d) that `fitness` evaluated, one value each (P,).
 
     Each particle is drawn to its own best point and to the swarm's; at a wall of the box low … high (d,) it stops.
     A value that is not a number counts as infinite. The same seed gives the same points.

@@ -1,7 +1,7 @@
-"""Where a transfer function's poles stand: a search over a grid by leave-batch-out, then each pole by itself.
+"""Poles of a transfer function: a grid search by leave-batch-out, then refinement of each pole.
 
 All of it on sums per batch. The search is one coordinate after the other: poles that all sources share, which
-sources take part, the penalty. Folds ask for the same few candidates, so each is solved once for all of them.
+sources take part, the penalty. Folds share candidates, so each is solved once for all of them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LIKE_1_K = {"rpm": 1000.0, "mm/min": 1000.0}  # drivers in other units count as
 
 @dataclass(frozen=True)
 class Source:
-    """What acts: `kind` says what is made of the channel or input `name`.
+    """What acts: `kind` is how the channel or input `name` acts.
 
     input: a chosen input as the design has it. speed: (|n| / 1000 rpm)^exponent. load: |another driver|. room: the
     ambient rise. gap: T − T_ambient of a sensor at the batch's start, held; a machine that does not start in
@@ -266,13 +266,13 @@ class Search:
         return PENALTIES[np.argmin(self._left_out(candidate, masks, PENALTIES), axis=1)]
 
     def _better(self, best: Sequence[Candidate], others: Callable[[Candidate], list[Candidate]]) -> list[Candidate]:
-        """Every set's least of what stands beside its best; equal scores keep the first."""
+        """The alternative of least score for every set, next to its best; equal scores keep the first."""
         tried = [list(dict.fromkeys(others(candidate))) for candidate in best]
-        asked: dict[Candidate, list[int]] = {}
+        sets_of: dict[Candidate, list[int]] = {}
         for f, candidates in enumerate(tried):
             for candidate in candidates:
-                asked.setdefault(candidate, []).append(f)
-        for candidate, sets in asked.items():
+                sets_of.setdefault(candidate, []).append(f)
+        for candidate, sets in sets_of.items():
             score = self._scores.setdefault(candidate, np.full(len(best), np.nan))
             if new := [f for f in sets if np.isnan(score[f])]:
                 score[new] = self._left_out(candidate, self.masks[new], _FEW_PENALTIES).min(axis=1)
@@ -299,7 +299,7 @@ def gains(pool: Pool, penalties: Array) -> Array:
 
 
 def _second_pole(c: Candidate) -> list[Candidate]:
-    """One more pole beside the first, on the coarse grid."""
+    """A second pole in addition to the first, on the coarse grid."""
     if len(c.poles) != 1:
         return [c]
     return [c, *(replace(c, poles=tuple(sorted((c.poles[0], b)))) for b in _COARSE if b != c.poles[0])]

@@ -1,4 +1,4 @@
-"""Training sets as sums over blocks of rows: pooled, fitted, and judged on blocks left out, without reading a row."""
+"""Training sets as pooled sums over blocks of rows, with leave-block-out scores from the sums alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from data.arrays import Array, Mask
 from features.design import Moments
 
-FLAT = 1e-12  # an input that moves less than this part of its own size does not move
+FLAT = 1e-12  # an input whose relative variation is below this counts as constant
 AT_ONCE = 4_000_000  # numbers in a stack of covariances
 
 
@@ -19,7 +19,7 @@ AT_ONCE = 4_000_000  # numbers in a stack of covariances
 class Pool:
     """Centred sums of S sets of rows: count (S,), mean_x (S, p), mean_y (S,), xx (S, p, p), xy (S, p).
 
-    xx and xy are of the inputs divided by `scale` (S, p), which is 1 where all inputs are in K. `loss` (S,) says
+    xx and xy are of the inputs divided by `scale` (S, p), which is 1 where all inputs are in K. `loss` (S,) is
     how much the sums about the common origin exceed the centred ones: the digits that centring cost.
     """
 

@@ -21,7 +21,7 @@ from models.linear import Pool
 from models.ridge import Ridge
 from models.solvers.batches import bridged, padded, steps_s
 
-_MOST_PHASES = 4  # that a net learns from: neighbouring rows of a fine recording tell the same
+_MOST_PHASES = 4  # that a net learns from: neighbouring rows of a fine recording are redundant
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _trailing_mean(design: Design, values: Array, window: int) -> Array:
 
 
 _LEAST_SPREAD = 0.1  # inputs that hardly move (K, or the driver's unit) are not blown up to unit size
-FEWEST_BATCHES = 3  # of fewer, none can be spared to tell whether a net helps
+FEWEST_BATCHES = 3  # of fewer, none can be spared for validation
 _LEAST_REST = 1e-3  # of the target's size: below, the linear part leaves rounding only
 
 
@@ -198,7 +198,7 @@ class Stack:
 
 def alike(n_batches: Sequence[int], n_nets: Sequence[int], most: int) -> list[list[int]]:
     """Stacks to train as one: places in the order of their numbers of batches, cut where these are half as many again,
-    where few batches become enough to tell whether a net helps, or where `most` batches are together."""
+    where validation becomes possible, or where `most` batches are together."""
     groups: list[list[int]] = []
     size = 0
     for i in sorted(range(len(n_batches)), key=lambda i: n_batches[i]):
@@ -213,12 +213,12 @@ def alike(n_batches: Sequence[int], n_nets: Sequence[int], most: int) -> list[li
 
 LAG_STEPS = (1.0, 2.5, 6.3, 16.0)  # time constants, in steps of the sequence
 _SHARES = (0.3, 0.03)  # of the lags: how much weaker their columns are before the common penalty
-_SHARE_OF_FEW = (0.01,)  # of one or two batches, which cannot tell memory from drift
+_SHARE_OF_FEW = (0.01,)  # of one or two batches, which cannot separate memory from drift
 _DIRECTIONS = 6  # leading principal directions of the inputs that have a memory
 
 
 def memory_columns(x: Array) -> Array:
-    """Sequences x (…, T, p) beside lag_l x − x of every lag, (…, T, (L + 1) p).
+    """Sequences x (…, T, p) and lag_l x − x of every lag, (…, T, (L + 1) p).
 
     lag is the first-order lag τ dv/dt + v = x, exact for x held over the step before, at rest (0) before the start.
     """
@@ -248,7 +248,7 @@ def fit_memories(sequences: Sequences, columns: Array, folds: Sequence[Sequence[
 
 
 class _MemoryRidge(Ridge):
-    tells_sd = False  # the nets do not, and it costs
+    has_sd = False  # the nets do not, and it costs
 
     def __init__(self, shares: tuple[float, ...]) -> None:
         super().__init__()

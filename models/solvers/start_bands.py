@@ -1,4 +1,4 @@
-"""Bands of start temperature: which training batches teach which sub-model, and which sub-models a batch gets."""
+"""Bands of start temperature: training batches of each sub-model, and weights of the sub-models for a batch."""
 
 from __future__ import annotations
 

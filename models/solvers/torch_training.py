@@ -1,4 +1,4 @@
-"""Many small sequence nets trained at once in torch: Adam on the weights, the readout in closed form in every pass."""
+"""Training of many small sequence nets at once in torch: Adam on the weights, readout in closed form."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from torch import Tensor
 
 from data.arrays import Array
 from features.levenberg_marquardt import openmp
-from models.solvers.sequences import (
-    Stack,
-    Weights,
-)
+from models.solvers.sequences import Stack, Weights
 
 _MOMENTUM, _SECOND, _FLOOR = 0.9, 0.99, 1e-8  # Adam's
 
@@ -43,8 +40,8 @@ def train(net: Trainable, stack: Stack, start: Weights) -> tuple[Weights, Array]
     Net s minimises `mean_n (rest − v·h)² + (decay |w − w_start|² + readout_decay |v|²) / n_batches` over its known
     rows. For given weights the best v is a ridge; at it the slope of the loss by the weights is the partial one
     (variable projection). Every operation runs along the stack net by net, so that no net's result depends on its
-    neighbours. Float64 on any device; on the processor one thread, whatever torch is set to: callers train side by
-    side. Adam's rate falls to 0 as a half cosine.
+    neighbours. Float64 on any device; on the processor one thread, whatever torch is set to: callers train in
+    parallel. Adam's rate falls to 0 as a half cosine.
 
     Source: G. Golub and V. Pereyra (1973); D. Kingma and J. Ba, Adam, ICLR (2015).
     """
@@ -113,12 +110,12 @@ def _descend(net: Trainable, rows: Rows, weights: Weights) -> Weights:
 
 
 def _device(net: Trainable) -> str:
-    """Where to train; a GPU asked for and not there is told in one line, and the processor taken."""
+    """Device to train on; warns and falls back to the processor if a requested GPU is missing."""
     if net.device == "cpu":
         return "cpu"
     if torch.cuda.is_available():
         return "cuda"
     if net.device == "cuda":
-        words = f"family {net.key}: device 'cuda' was asked for, but torch sees no GPU; trained on the processor"
-        warnings.warn(words, stacklevel=2)
+        message = f"family {net.key}: device 'cuda' was requested, but torch sees no GPU; trained on the processor"
+        warnings.warn(message, stacklevel=2)
     return "cpu"

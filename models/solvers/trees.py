@@ -1,4 +1,4 @@
-"""Regression trees as plain arrays, all of them walked at once."""
+"""Regression trees as plain arrays, evaluated together."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _VALUES_AT_ONCE = 2_000_000  # tree × row places walked together
 
 @dataclass(frozen=True)
 class Trees:
-    """T binary trees, their nodes one after the other: node i asks x[feature] ≤ threshold and goes left or right.
+    """T binary trees, their nodes one after the other: node i goes left if x[feature] ≤ threshold, else right.
 
     feature, left, right (N,): whole numbers, children counted over all nodes; a leaf is its own child on both sides.
     threshold, value (N,); roots (T,).
@@ -52,7 +52,7 @@ class Trees:
         )
 
     def values(self, x: Array) -> Array:
-        """Each tree's value (T, n) at rows x (n, p); NaN rows are not to be read."""
+        """Each tree's value (T, n) at rows x (n, p); undefined for NaN rows."""
         out = np.empty((len(self.roots), len(x)))
         step = max(1, _VALUES_AT_ONCE // max(1, len(self.roots)))
         for start in range(0, len(x), step):

@@ -1,4 +1,4 @@
-"""Many training sets of one machine's batches, each calibrated on its own batches alone, sharing the work.
+"""Calibrations of many training sets of one machine's batches, with shared work, and runs of calibrated twins.
 
 The first training set is found by Gauss–Newton steps from the machine file's values. Others begin where a larger
 set ended and reuse its derivatives: the misfit is simulated anew at every step, derivatives only after a long way,
@@ -44,7 +44,7 @@ _TOGETHER = 4
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What one training set says: parameter values (n,), and how its batches started, beside the settled state.
+    """Calibration of one training set: parameter values (n,), and the starts relative to the settled state.
 
     `start_K` (N,) is their mean deviation, shrunk towards 0 as by one batch that had none, `start_cov_K2` (N, N) the
     scatter of a batch's own about it. `left_out` gives, by training batch, the values and the start of the others.
@@ -56,7 +56,7 @@ class Calibrated:
     start_cov_K2: Array
     left_out: dict[int, tuple[Array, Array]]
     rounds: int
-    words: str
+    message: str
 
 
 class _InParts(CalibrationProblem):
@@ -131,7 +131,7 @@ class Calibrations:
     def left_out(self, train: Sequence[int], usual: bool) -> dict[int, tuple[Array, Array]]:
         """By training batch, errors (K, n_errors) and readings (K, n_sensors) that a twin without it predicts.
 
-        Free-running; with `usual`, from the others' mean start beside the settled state. Only of what `of` has done.
+        Free-running; with `usual`, from the others' mean deviation from the settled state. Only of what `of` has done.
         """
         key = tuple(sorted(set(train)))
         with self._lock, threadpool_limits(limits=1):
@@ -160,7 +160,7 @@ class Calibrations:
             place = [begin.at.index(i) for i in at]
             nuisance, blocks = [begin.nuisance[k] for k in place], [begin.blocks[k] for k in place]
             point = _Point(at, begin.z, nuisance, blocks, begin.taken_at)
-        point, noise, rounds, words = _arrived(problem, point)
+        point, noise, rounds, message = _arrived(problem, point)
         values = problem.values_at(x_of(problem.unknowns, point.z))
         own = _own_starts_K(problem, values, point.nuisance)
         typical, scatter = _typical(self.network, own)
@@ -169,7 +169,7 @@ class Calibrations:
             k: (problem.values_at(x_of(problem.unknowns, z)), _typical(self.network, np.delete(own, i, axis=0))[0])
             for i, (k, z) in enumerate(zip(kept, _without_each(problem, point, noise), strict=True))
         }
-        return Calibrated(key, values, typical, scatter, left_out, rounds, words), point
+        return Calibrated(key, values, typical, scatter, left_out, rounds, message), point
 
 
 def _refused(network: Network, batches: Sequence[Batch], every_s: float, channels: tuple[str, ...]) -> dict[int, str]:
@@ -185,7 +185,7 @@ def _refused(network: Network, batches: Sequence[Batch], every_s: float, channel
 
 
 def _from_file(problem: CalibrationProblem, at: list[int]) -> _Point:
-    """The machine file's values and starts as the first readings tell them."""
+    """The machine file's values, with starts from the first readings."""
     z, nuisance = np.zeros(len(problem.unknowns)), [np.zeros(q) for q in problem.nuisance_sizes]
     return _Point(at, z, nuisance, _linearised(problem, z, nuisance), z)
 
@@ -283,7 +283,7 @@ def _own_starts_K(problem: CalibrationProblem, values: Array, nuisance: list[Arr
 
 
 def _typical(network: Network, own_K: Array) -> tuple[Array, Array]:
-    """Mean start (N,) of the batches and the scatter (N, N) about it; the file's words count as one batch more."""
+    """Mean start (N,) of the batches and the scatter (N, N) about it; the file's spread counts as one batch more."""
     n = len(own_K)
     mean = own_K.sum(axis=0) / (n + 1)
     given = np.zeros((network.n_cells, network.n_cells))
@@ -293,7 +293,7 @@ def _typical(network: Network, own_K: Array) -> tuple[Array, Array]:
     return mean, (away.T @ away + given) / (n + 1)
 
 
-_REMEMBERED = 8  # simulations: every selector's cells, and every error channel, ask for the same ones
+_REMEMBERED = 8  # simulations, which the cells of all selectors and error channels share
 
 
 @dataclass(frozen=True)

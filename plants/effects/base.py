@@ -1,4 +1,4 @@
-"""What an effect of a plant is: physics, or a fault of a recording, that the machine file says nothing of.
+"""What an effect of a plant is: physics, or a fault of a recording, that the machine file does not state.
 
 To add one: a class in the file of its group and a line in `plants/effects/__init__.py`; override what it changes.
 """
@@ -44,6 +44,10 @@ class Effect:
 
     def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.plant, self.size = plant, size
+        self.drawn(plant, size, rng)
+
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
+        """Draws what is free of this effect; a subclass sets its attributes here."""
 
     def answer(self) -> Answer:
         """Where and what it is."""

@@ -18,8 +18,7 @@ class SpeedShift(Effect):
     key = "speed_shift"
     driver = "spindle_rpm"
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.shift_um = float(rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 8.0)) * size
 
     def answer(self) -> Answer:
@@ -33,8 +32,7 @@ class SpeedShift(Effect):
 class _OneSensor(Effect):
     """A fault of one sensor of the structure."""
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.channel = str(rng.choice([s.channel for s in plant.sensors]))
         self.sign = float(rng.choice([-1.0, 1.0]))
 
@@ -75,8 +73,7 @@ class SensorSwap(Effect):
 
     key = "sensor_swap"
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         near = {"t_front", "t_motor", "t_rear"} & {s.channel for s in plant.sensors}
         far = {s.channel for s in plant.sensors} - near
         self.one, self.other = (str(rng.choice(sorted(group))) for group in (near, far))
@@ -97,8 +94,7 @@ class TimeSkew(Effect):
 
     key = "time_skew"
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         self.delay_s = float(rng.choice([-1.0, 1.0]) * rng.uniform(240.0, 480.0)) * size
 
     def answer(self) -> Answer:
@@ -113,8 +109,7 @@ class WrongParameter(Effect):
 
     key = "wrong_parameter"
 
-    def __init__(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        super().__init__(plant, size, rng)
+    def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
         joints = [pair for pair in links_W_per_K(plant.structure) if "mandrel" not in pair]
         self.link = "-".join(joints[int(rng.integers(len(joints)))])
         self.stated = 4.0 ** (size * float(rng.choice([-1.0, 1.0])))

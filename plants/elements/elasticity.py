@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from skfem import Basis, ElementHex1, ElementHexS2
 from skfem.assembly.basis import AbstractBasis
 
 from data.arrays import Array
 from plants.elements.mesh import Mesh
-from plants.elements.structure import Contact
+from plants.elements.structure import Contact, factorised, placed
 from plants.structure import MATERIALS, Cells
 
 YOUNG_PA: Mapping[str, float] = {"steel": 210e9, "cast_iron": 120e9}
@@ -67,15 +66,14 @@ class Elasticity:
         first = 0
         for field in self.fields.values():
             k, f = _casting(field)
-            stiffness.append(_moved(k, field.first, field.first, (size, size)))
-            load.append(_moved(f, field.first, first, (size, self.nodes)))
+            stiffness.append(placed(k, field.first, field.first, (size, size)))
+            load.append(placed(f, field.first, first, (size, self.nodes)))
             first += field.mesh.size
         ties = [self._tie(c) for c in contacts]
         self.load = sparse.csc_matrix(sum(load[1:], load[0]))  # N/K
         whole = sum([*stiffness[1:], *ties, self._feet(on_feet)], stiffness[0])
         self.stiffness = sparse.csc_matrix(whole)
-        options = {"SymmetricMode": True}
-        self.solve = splu(self.stiffness, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+        self.solve = factorised(self.stiffness)
 
     def moved_m(self, rise_K: Array, casting: str, points_m: Array) -> Array:
         """Displacement of points (Q, 3) by the nodes' rises (nodes,): (Q, 3)."""
@@ -135,8 +133,3 @@ def _summed(blocks: Array, rows: Cells, columns: Cells, shape: tuple[int, int]) 
     r, c = rows.reshape(e, -1), columns.reshape(e, -1)
     i, j = np.repeat(r, c.shape[1], axis=1).ravel(), np.tile(c, (1, r.shape[1])).ravel()
     return sparse.csr_matrix((blocks.reshape(-1), (i, j)), shape=shape)
-
-
-def _moved(block: sparse.csr_matrix, row: int, column: int, shape: tuple[int, int]) -> sparse.csr_matrix:
-    wide = sparse.coo_matrix(block)
-    return sparse.csr_matrix((wide.data, (wide.row + row, wide.col + column)), shape=shape)

@@ -27,7 +27,6 @@ _JOINTS_W_PER_K = {
 _FIRM = (1.0, 1.0, 1.0)
 _SLIDING = (1.0, 1.0, 1e-3)  # free upwards
 _NUT = (1e-3, 1e-3, 3.0)
-_AROUND = ((0, 0), (0, 1), (1, 0), (1, 1))  # the four upright sides, axis and end
 
 
 def join(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
@@ -48,8 +47,8 @@ def join(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
         points_m, area_m2 = patch.gauss()
         a.contacts.append(Contact(one, other, points_m, points_m, area_m2, g[joint], held))
 
-    def seat(one: str, joint: str, held: tuple[float, float, float], metal: Slabs, around: Piece) -> None:
-        """Inside the head: heat passes to all the iron `around`, a larger box like the seat's own."""
+    def embed(one: str, joint: str, held: tuple[float, float, float], metal: Slabs, around: Piece) -> None:
+        """Inside the head: heat passes to all the iron `around`, a larger box similar to its own."""
         _, under, over = around
         under, over = np.maximum(under, box.low_m), np.minimum(over, box.high_m)
         low, high = metal.low_m.min(axis=0), metal.high_m.max(axis=0)
@@ -65,7 +64,7 @@ def join(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
         meet("shaft", ring, f"shaft-{ring}", held, mesh[ring].bore())
         own = mesh[ring].box
         middle, half = (own.low_m + own.high_m) / 2.0, np.array([0.45, 0.2, 0.2]) * box.size_m
-        seat(ring, f"{ring}-head", _FIRM, mesh[ring].volumes(), (1.0, middle - half, middle + half))
+        embed(ring, f"{ring}-head", _FIRM, mesh[ring].volumes(), (1.0, middle - half, middle + half))
     meet("motor", "head", "motor-head", _FIRM, mesh["motor"].hull([(2, 0)]))
     guided = _SLIDING if "screw" in mesh else _FIRM
     meet("head", "column", "head-column", guided, mesh["head"].hull([(1, 0)]), _rails(a))
@@ -74,7 +73,7 @@ def join(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
         nut = mesh["screw"].volumes().within(box.pieces(height=(0.25, 0.75)))
         low, size = np.asarray(box.low_m), np.asarray(box.size_m)
         back = 1.0, low + size * (0.1, 0.0, 0.125), low + size * (0.9, 0.3, 0.875)
-        seat("screw", "screw-head", _NUT, nut, back)
+        embed("screw", "screw-head", _NUT, nut, back)
         top = mesh["screw"].box.pieces((0.9, 1.0))
         meet("screw", "column", "screw-column", _FIRM, mesh["screw"].hull([(1, 0)]), top)
     below = "saddle" if "saddle" in mesh else "bed"
@@ -178,7 +177,8 @@ def _boxes(m: Measures) -> list[Box]:
     thick = float(np.sqrt(kg / (7850.0 * long)))
     saddle_m = 0.11 * s if m.saddle else 0.0
 
-    def bar(name: str, kg: float, x: float, y: float, z: float, side: float, height: float, n: int) -> Box:
+    def bar(name: str, kg: float, foot: Corner, side: float, height: float, n: int) -> Box:
+        x, y, z = foot
         return Box(name, steel, kg, (x - side / 2, y - side / 2, z), (side, side, height), (1, 1, n), axes="upright")
 
     def ring(name: str, kg: float, span: tuple[float, float]) -> Box:
@@ -190,7 +190,7 @@ def _boxes(m: Measures) -> list[Box]:
 
     aside, over = m.aside_m, low + head_m
     boxes = [
-        bar("shaft", kg, 0.0, axis, nose, thick, long, 20),
+        bar("shaft", kg, (0.0, axis, nose), thick, long, 20),
         ring("front", 17 * f["spindle"], BELT),
         ring("rear", 10.5 * f["spindle"], TAIL),
         Box("head", iron, 300 * s * s * f["head"], (-0.16 * s, back, low), (0.32 * s, 0.64 * s, head_m), (2, 6, 4)),
@@ -207,14 +207,14 @@ def _boxes(m: Measures) -> list[Box]:
         boxes.append(Box("saddle", iron, 210 * s * s * f["saddle"], at, size, (3, 4, 1)))
     if m.screw:
         across = float(np.sqrt(kg / (7850.0 * 0.75 * s)))
-        boxes.append(bar("screw", kg, 0.0, back + across / 2, foot + 0.58 * s, across, 0.75 * s, 12))
+        boxes.append(bar("screw", kg, (0.0, back + across / 2, foot + 0.58 * s), across, 0.75 * s, 12))
     if m.mandrel:
-        boxes.append(bar("mandrel", 3.5, 0.0, axis, nose - 0.25, 0.042, 0.25, 5))
+        boxes.append(bar("mandrel", 3.5, (0.0, axis, nose - 0.25), 0.042, 0.25, 5))
     return boxes
 
 
 def _walled(name: str, kg: float, low: Corner, size: Corner, cells: tuple[int, int, int]) -> Box:
-    """Walls as thick as the mass asks; a bed has a lid."""
+    """Walls of the thickness that the mass requires; a bed has a lid."""
     bulk_m3 = kg / MATERIALS["cast_iron"].density_kg_per_m3
     hollow: Literal["tube", "cap"] = "cap" if name == "bed" else "tube"
 

@@ -70,7 +70,7 @@ def _by_the_motor(s: Elements, bow_um_per_K: Array, rear: str) -> float:
     return float(bow_um_per_K @ rise / (s.bodies["motor"].mean(rise) - s.bodies[rear].mean(rise)))
 
 
-@lru_cache(maxsize=4)  # the same machine is asked for with and without an effect
+@lru_cache(maxsize=4)  # the same machine is drawn with and without an effect
 def draw_layout(seed: int, features: frozenset[str], spread: float = 1.0, finer: int = 1) -> Layout:
     """The castings of a seed, cut into hexahedra, with or without a test mandrel; `finer` times along each axis."""
     drawn = draw_castings(seed, "mandrel" in features, finer, spread)

@@ -266,10 +266,10 @@ class Mesh:
         """Inner faces of a tube's four walls."""
         rims = []
         for axis, end in product((0, 1), (0, 1)):
-            beside = self.cell.copy()
-            beside[:, axis] += 2 * end - 1
-            rim = np.flatnonzero((beside[:, axis] >= 0) & (beside[:, axis] < self.element.shape[axis]))
-            rim = rim[self.element[tuple(beside[rim].T)] < 0]
+            adjacent = self.cell.copy()
+            adjacent[:, axis] += 2 * end - 1
+            rim = np.flatnonzero((adjacent[:, axis] >= 0) & (adjacent[:, axis] < self.element.shape[axis]))
+            rim = rim[self.element[tuple(adjacent[rim].T)] < 0]
             rims.append(self._slabs(self.cell[rim]).side(axis, end))
         return joined(rims)
 

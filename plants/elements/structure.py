@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -44,24 +44,24 @@ def exchange_W_per_K(at: sparse.csr_matrix, conductance_W_per_K: Array) -> spars
     return sparse.csr_matrix(at.T @ sparse.diags(conductance_W_per_K) @ at)
 
 
-def embedded(block: sparse.csr_matrix, first: int, size: int) -> sparse.csr_matrix:
-    """A casting's columns at its place among all nodes: (Q, n) to (Q, N)."""
+def placed(block: sparse.csr_matrix, row: int, column: int, shape: tuple[int, int]) -> sparse.csr_matrix:
+    """A block of a larger matrix of this shape, its first entry at this row and column."""
     wide = sparse.coo_matrix(block)
-    return sparse.csr_matrix((wide.data, (wide.row, wide.col + first)), shape=(block.shape[0], size))
+    return sparse.csr_matrix((wide.data, (wide.row + row, wide.col + column)), shape=shape)
 
 
-def square(block: sparse.csr_matrix, first: int, size: int) -> sparse.csr_matrix:
-    """A casting's matrix at its place among all nodes: (n, n) to (N, N)."""
-    wide = sparse.coo_matrix(block)
-    return sparse.csr_matrix((wide.data, (wide.row + first, wide.col + first)), shape=(size, size))
-
-
-def total(parts: list[sparse.csr_matrix], size: int) -> sparse.csr_matrix:
+def total(parts: Iterable[sparse.csr_matrix], size: int) -> sparse.csr_matrix:
     """Their sum, (N, N)."""
-    out = sparse.csr_matrix((size, size), dtype=np.float64)
-    for part in parts:
-        out = out + part
-    return out
+    return sum(parts, sparse.csr_matrix((size, size), dtype=np.float64))
+
+
+def factorised(matrix: sparse.spmatrix) -> Callable[[Array], Array]:
+    """The solver of a symmetric positive definite matrix."""
+    options = {"SymmetricMode": True}
+    solve: Callable[[Array], Array] = splu(
+        sparse.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+    ).solve
+    return solve
 
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
@@ -79,7 +79,7 @@ def integrate(
     `storage_J_per_K` is M, `losses` L, both (N, N), symmetric, M positive definite.
     """
     M, L, h = storage_J_per_K, losses, step_s
-    solve = _factorised(M + GAMMA * h * L)
+    solve = factorised(M + GAMMA * h * L)
     out = np.empty((steps + 1, *start_degC.shape))
     out[0] = T = np.ascontiguousarray(start_degC)
     for k in range(steps):
@@ -91,11 +91,6 @@ def integrate(
         T = solve(stored + h * ((1.0 - ALPHA) * first + ALPHA * second - DELTA * lost))
         out[k + 1] = T
     return out
-
-
-def _factorised(matrix: sparse.csc_matrix):  # type: ignore[no-untyped-def]
-    options = {"SymmetricMode": True}
-    return splu(sparse.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
 
 
 Matrices = Mapping[frozenset[str], sparse.csr_matrix]
@@ -224,13 +219,16 @@ class Assembly:
 
     def at(self, casting: str, points_m: Array) -> sparse.csr_matrix:
         """Values at the nodes (N,) to values at points of a casting (Q,)."""
-        return embedded(self.meshes[casting].interpolation(points_m), self.first[casting], self.size)
+        return placed(self.meshes[casting].interpolation(points_m), 0, self.first[casting], (len(points_m), self.size))
+
+    def _block(self, casting: str, own: sparse.csr_matrix) -> sparse.csr_matrix:
+        """A casting's matrix (n, n) at its place among all nodes, (N, N)."""
+        return placed(own, self.first[casting], self.first[casting], (self.size, self.size))
 
     def done(self) -> Elements:
         air = self.nodes if self.air_J_per_K is not None else None
         exposed, robin = self._exposed(air)
-        own = [square(storage_J_per_K(m), self.first[n], self.size) for n, m in self.meshes.items()]
-        storage = total(own, self.size)
+        storage = total((self._block(n, storage_J_per_K(m)) for n, m in self.meshes.items()), self.size)
         bodies = {k: v for name in self.meshes for k, v in self._bodies(name).items()}
         room = sum((g for (_, around), g in exposed.items() if around == "room"), np.zeros(self.size))
         above_m = np.concatenate([*(m.points_m[:, 2] for m in self.meshes.values()), np.ones(self.size - self.nodes)])
@@ -280,7 +278,7 @@ class Assembly:
         mesh = self.meshes[casting]
         whose = self._body(casting, mesh.hexahedra.p[:, mesh.hexahedra.t].mean(axis=1).T)
         return {
-            name: square(conduction_W_per_K(mesh, np.flatnonzero(whose == name)), self.first[casting], self.size)
+            name: self._block(casting, conduction_W_per_K(mesh, np.flatnonzero(whose == name)))
             for name in self._names(casting)
         }
 

@@ -1,6 +1,6 @@
-"""What a graft is: a known effect that real recordings are given; the room, speeds and all else in them are real.
+"""What a graft is: a known effect superposed on real recordings; the room, speeds and all else in them are real.
 
-To add one: a class in the file of its group and a line in `plants/grafted/base.py`.
+To add one: a class in the file of its group and a line in `GRAFTS`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from data.batch import Batch
 from data.errors import InputError, closest
 from data.machine import Machine
 from data.registry import Registry
+from plants.real import Term
 
 FACTORS = {
     "J/K": 1.0, "kJ/K": 1e3, "W/K": 1.0, "mW/K": 1e-3, "kW/K": 1e3, "um/K": 1.0, "K": 1.0, "1": 1.0, "": 1.0,
@@ -23,7 +24,7 @@ FACTORS = {
 ROOM = "room"
 
 
-def told(entry: Any, where: str) -> float:
+def magnitude(entry: Any, where: str) -> float:
     """The value that "537 kJ/K", 0.94 or {value: …} stands for, in J/K, W/K, um/K, K or 1.
 
     Raises:
@@ -48,7 +49,7 @@ def ends(key: str) -> tuple[str, str]:
 def room_degC(twin: Mapping[str, Any], batch: Batch) -> Array:
     """The room's air as the twin part takes it: its channel and its offset, (rows,)."""
     room = twin["surroundings"][ROOM]
-    offset_K = told(room["offset"], "surroundings.room.offset") if "offset" in room else 0.0
+    offset_K = magnitude(room["offset"], "surroundings.room.offset") if "offset" in room else 0.0
     return np.asarray(batch.values(room["channel"]) + offset_K)
 
 
@@ -84,8 +85,12 @@ class Graft:
 
     def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         self.setting, self.size = setting, size
+        self.drawn(setting, size, rng)
 
-    def term(self) -> dict[str, Any]:
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
+        """Draws what is free of this effect; a subclass sets its attributes here."""
+
+    def term(self) -> Term:
         """Its term in the answer key."""
         raise NotImplementedError
 

@@ -1,7 +1,7 @@
-"""The cases of plant C by name: a real machine and what its recordings are given; without anything: the reference.
+"""The cases of plant C by name: a real machine and the effects superposed on its recordings; none: the reference.
 
-What real physics the machine's file misses is not known. So a case is read beside its reference, the same runs of the
-same seed without a graft: what is found there too was not grafted.
+What real physics the machine's file misses is not known. So a case is read together with its reference, the same runs
+of the same seed without a graft: what is found there too was not grafted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from data.errors import InputError, closest
 from data.machine import Machine
 from plants.grafted.base import GRAFTS, Graft, Setting
 from plants.options import stream
-from plants.real import ORIGINS, RealCase, answer, recorded, there, thinned
+from plants.real import ORIGINS, RealCase, Term, answer, recorded, there, thinned
 
 SIZES = (0.5, 5.0)  # log-uniform between
 FINE_S = 60.0  # grafts go on rows as fine as the recordings are
@@ -78,7 +78,7 @@ def build(name: str, data: Path, seed: int) -> RealCase:
     given, plain = recorded(case.machine, data, seed, FINE_S)
     machine = given.model_copy(update={"simulated": True, "description": DESCRIBED})
     batches = plain
-    terms: list[dict[str, Any]] = []
+    terms: list[Term] = []
     mapping: dict[str, str] = {}
     for key in case.grafts:
         size = float(np.exp(stream(seed, f"size {name} {key}").uniform(*np.log(SIZES))))
@@ -87,11 +87,11 @@ def build(name: str, data: Path, seed: int) -> RealCase:
         mapping |= graft.mapping()
         batches = [_with(b, graft.shown(k, b)) for k, b in enumerate(batches)]
     seen = [thinned(_rounded(replace(b, simulated=True)), ORIGINS[case.machine].rows_s) for b in batches]
-    told = {"channels": mapping, "largest": _largest(plain, batches, machine)} if terms else None
+    graft_key = {"channels": mapping, "largest": _largest(plain, batches, machine)} if terms else None
     whole = answer(
-        name, "grafted", case.kind, machine, seed, terms,
+        {"plant": "grafted", "name": name, "seed": seed}, case.kind, machine, terms,
         f"{machine.machine}, real runs with {' and '.join(case.grafts) or 'nothing'} superposed",
-        reference=None if name == case.reference else case.reference, graft=told,
+        reference=None if name == case.reference else case.reference, graft=graft_key,
     )  # fmt: skip
     return RealCase(machine, seen, whole)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from data.arrays import Array
 from data.batch import Batch
 from plants.grafted.base import Graft, Setting, room_degC
-from plants.real import term, windows
+from plants.real import Term, windows
 
 RATED_RPM = 5000.0
 
@@ -21,8 +21,7 @@ class OneSensor(Graft):
 
     words: ClassVar[str]
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         self.channel = str(rng.choice(self.suited(setting)))
         self.sign = float(rng.choice([-1.0, 1.0]))
 
@@ -38,8 +37,8 @@ class OneSensor(Graft):
     def shown(self, number: int, batch: Batch) -> Mapping[str, Array]:
         return {self.channel: self.faulty(batch, batch.values(self.channel))}
 
-    def term(self) -> dict[str, Any]:
-        return term(
+    def term(self) -> Term:
+        return Term(
             self.key, self.key, ("sensor", self.channel), parameters=self.parameters(), words=self.words, size=self.size
         )
 
@@ -62,7 +61,7 @@ class SensorDrift(OneSensor):
 
 
 class SensorLag(OneSensor):
-    """A sensor that has come loose and follows late, beside the lag that it always had."""
+    """A sensor that has come loose and follows late, in addition to the lag that it always had."""
 
     key = "sensor_lag"
     words = "a sensor follows late"
@@ -109,8 +108,7 @@ class SensorSwap(Graft):
 
     key = "sensor_swap"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         at = {c: s["at"] for c, s in setting.twin.get("sensors", {}).items()}
         names = setting.sensors()
         pairs = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :] if at.get(a, a) != at.get(b, b)]
@@ -119,9 +117,9 @@ class SensorSwap(Graft):
     def shown(self, number: int, batch: Batch) -> Mapping[str, Array]:
         return {self.one: batch.values(self.other), self.other: batch.values(self.one)}
 
-    def term(self) -> dict[str, Any]:
+    def term(self) -> Term:
         also = [("sensor", self.other)]
-        return term(self.key, self.key, ("sensor", self.one), also=also, words="two sensors exchanged", size=self.size)
+        return Term(self.key, self.key, ("sensor", self.one), also=also, words="two sensors exchanged", size=self.size)
 
 
 class TimeSkew(Graft):
@@ -129,8 +127,7 @@ class TimeSkew(Graft):
 
     key = "time_skew"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         self.delay_s = float(rng.choice([-1.0, 1.0])) * 300.0 * size
         self.probes = setting.machine.names("error")
 
@@ -146,9 +143,9 @@ class TimeSkew(Graft):
             out[probe] = np.where(gap, np.nan, shown)
         return out
 
-    def term(self) -> dict[str, Any]:
+    def term(self) -> Term:
         first, *others = (("error", p) for p in self.probes)
-        return term(
+        return Term(
             self.key, self.key, first, also=others, parameters={"delay": (self.delay_s, "s")},
             words="the clock of the probes is off", size=self.size,
         )  # fmt: skip
@@ -159,8 +156,7 @@ class SpeedShift(Graft):
 
     key = "speed_shift"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         self.probe = str(rng.choice(setting.machine.names("error")))
         self.shift_um = float(rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 4.0)) * size
 
@@ -168,9 +164,9 @@ class SpeedShift(Graft):
         turns = (batch.values("spindle_rpm") / RATED_RPM) ** 2
         return {self.probe: batch.values(self.probe) + self.shift_um * (turns - turns[0])}
 
-    def term(self) -> dict[str, Any]:
+    def term(self) -> Term:
         turning = [b.values("spindle_rpm") > 0 for b in self.setting.batches]
-        return term(
+        return Term(
             self.key, self.key, ("error", self.probe), driver="spindle_rpm", size=self.size,
             parameters={"shift": (self.shift_um, "um"), "rated": (RATED_RPM, "rpm")},
             active=windows(self.setting.batches, turning), words="the shaft moves with the speed",

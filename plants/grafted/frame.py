@@ -17,7 +17,7 @@ from scipy import sparse
 
 from data.arrays import Array
 from data.batch import Batch
-from plants.grafted.base import ROOM, ends, told
+from plants.grafted.base import ROOM, ends, magnitude
 from plants.volumes.structure import integrate
 
 Cells = NDArray[np.int64]
@@ -28,7 +28,7 @@ STIFF = (3.0, 15.0)  # a bar's conductance from end to end, in units of all that
 
 
 @dataclass(frozen=True)
-class Seat:
+class Placement:
     """Where a sensor sits, and the share of the surface's temperature that it shows."""
 
     body: str
@@ -48,7 +48,7 @@ class Frame:
     capacity_J_per_K: Array
     losses: sparse.csc_matrix
     spots: Mapping[str, int]
-    seats: Mapping[str, Seat]
+    placements: Mapping[str, Placement]
     room_W_per_K: Mapping[str, float]
     gains_um_per_K: Mapping[str, Mapping[str, float]]
 
@@ -63,15 +63,15 @@ def draw_frame(twin: Mapping[str, Any], rng: np.random.Generator) -> Frame:
     Raises:
         InputError: a value whose unit is not read here.
     """
-    near = {key: told(value, f"links.{key}") * _off(rng) for key, value in twin["links"].items()}
+    near = {key: magnitude(value, f"links.{key}") * _off(rng) for key, value in twin["links"].items()}
     room = {
-        ends(key)[0]: told(value, f"exposures.{key}") * _off(rng)
+        ends(key)[0]: magnitude(value, f"exposures.{key}") * _off(rng)
         for key, value in twin.get("exposures", {}).items()
         if ends(key)[1] == ROOM
     }
     bodies = {name: k * CELLS + np.arange(CELLS) for k, name in enumerate(twin["bodies"])}
     capacity = np.concatenate([
-        np.full(CELLS, told(b["capacity"], f"bodies.{n}") * _off(rng) / CELLS) for n, b in twin["bodies"].items()
+        np.full(CELLS, magnitude(b["capacity"], f"bodies.{n}") * _off(rng) / CELLS) for n, b in twin["bodies"].items()
     ])  # fmt: skip
     edges = [_joint(bodies, key, g, rng) for key, g in near.items()]
     for name, cells in bodies.items():
@@ -91,7 +91,7 @@ def draw_frame(twin: Mapping[str, Any], rng: np.random.Generator) -> Frame:
         capacity,
         sparse.csc_matrix(sparse.diags(diagonal) - off - off.T),
         {name: int(rng.choice(cells)) for name, cells in bodies.items()},
-        {c: _seat(s, bodies, rng) for c, s in twin.get("sensors", {}).items()},
+        {c: _placement(s, bodies, rng) for c, s in twin.get("sensors", {}).items()},
         room,
         {c: _gains(c, e, rng) for c, e in twin.get("errors", {}).items()},
     )
@@ -108,16 +108,16 @@ def _joint(
     return int(rng.choice(bodies[one])), int(rng.choice(bodies[other])), conductance
 
 
-def _seat(sensor: Mapping[str, Any], bodies: Mapping[str, Cells], rng: np.random.Generator) -> Seat:
+def _placement(sensor: Mapping[str, Any], bodies: Mapping[str, Cells], rng: np.random.Generator) -> Placement:
     body = sensor["at"].partition("@")[0]
-    return Seat(body, int(rng.choice(bodies[body])), told(sensor.get("bonding", 1.0), "sensors.bonding"))
+    return Placement(body, int(rng.choice(bodies[body])), magnitude(sensor.get("bonding", 1.0), "sensors.bonding"))
 
 
 def _gains(channel: str, error: Mapping[str, Any], rng: np.random.Generator) -> dict[str, float]:
     """um/K of each body of a chain that is stated by gains."""
     where = f"errors.{channel}.chain"
     return {
-        part["body"]: told(part["gain"], where) * _off(rng, GAIN_SCATTER)
+        part["body"]: magnitude(part["gain"], where) * _off(rng, GAIN_SCATTER)
         for part in error.get("chain", ())
         if "gain" in part
     }
@@ -201,7 +201,7 @@ def response(frame: Frame, push: Push, clock: Clockwork) -> Array:
 
 def on_channels(frame: Frame, rise_K: Array) -> dict[str, Array]:
     """What the rise adds to every sensor and error channel, (rows, B); errors count from the runs' starts."""
-    out = {c: seat.bonding * rise_K[:, seat.cell] for c, seat in frame.seats.items()}
+    out = {c: placement.bonding * rise_K[:, placement.cell] for c, placement in frame.placements.items()}
     for channel, gains in frame.gains_um_per_K.items():
         moved = sum(
             (g * rise_K[:, frame.bodies[b]].mean(axis=1) for b, g in gains.items()), np.zeros_like(rise_K[:, 0])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from data.batch import Batch
 from plants.grafted.base import ROOM, Graft, Setting, room_degC
 from plants.grafted.frame import Clockwork, Frame, Push, draw_frame, on_channels, response
 from plants.options import stream
-from plants.real import Place, linked, term, windows
+from plants.real import Place, Term, linked, windows
 
 PEAK_K = 1.5  # what a heat of size 1 adds at most to a sensor of its body
 RATED_RPM = 2000.0
@@ -31,8 +32,7 @@ class Heat(Graft):
     alike: ClassVar[tuple[str, ...]] = ()
     words: ClassVar[str]
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
         seen = {s["at"] for c, s in setting.twin["sensors"].items() if c in setting.sensors()}
         self.body = str(rng.choice([b for b in self.bodies if b in seen]))
         self.clock = Clockwork.of(setting.batches)
@@ -43,7 +43,7 @@ class Heat(Graft):
         raise NotImplementedError
 
     def shape(self) -> dict[str, tuple[float, str]]:
-        """The parameters beside the amplitude."""
+        """The parameters other than the amplitude."""
         return {}
 
     def acting(self, batch: Batch) -> Mask:
@@ -58,9 +58,9 @@ class Heat(Graft):
 
     @cached_property
     def amplitude(self) -> float:
-        """So strong that the body's sensors gain what the size asks for, to first order."""
+        """So strong that the body's sensors gain what the size requests, to first order."""
         rise = self._unit_rise
-        own = [s.bonding * rise[:, s.cell] for s in self.frame.seats.values() if s.body == self.body]
+        own = [s.bonding * rise[:, s.cell] for s in self.frame.placements.values() if s.body == self.body]
         inside = np.arange(len(rise))[:, None] < np.array([b.n_rows for b in self.setting.batches])
         return PEAK_K * self.size / max(float(np.abs(o[inside]).max()) for o in own)
 
@@ -74,12 +74,12 @@ class Heat(Graft):
     def shown(self, number: int, batch: Batch) -> Mapping[str, Array]:
         return {c: batch.values(c) + a[: batch.n_rows, number] for c, a in self.added.items()}
 
-    def term(self) -> dict[str, Any]:
+    def term(self) -> Term:
         name, unit = self.unit
         acting = [self.acting(b) for b in self.setting.batches]
         always = all(a.all() for a in acting)
         place: Place = ("node", self.body)
-        return term(
+        return Term(
             self.key, self.mechanism, place, parameters={name: (self.amplitude, unit), **self.shape()},
             neighbours=linked(self.setting.twin, self.body), words=f"{self.words}: {self.body}", size=self.size,
             active="always" if always else windows(self.setting.batches, acting), driver=self.driver,
@@ -87,8 +87,9 @@ class Heat(Graft):
         )  # fmt: skip
 
     def mapping(self) -> dict[str, str]:
-        seats = {c: f"cell {s.cell % len(self.frame.bodies[s.body])} of {s.body}" for c, s in self.frame.seats.items()}
-        return seats | {c: f"means of {', '.join(g)}" for c, g in self.frame.gains_um_per_K.items()}
+        f = self.frame
+        cells = {c: f"cell {p.cell % len(f.bodies[p.body])} of {p.body}" for c, p in f.placements.items()}
+        return cells | {c: f"means of {', '.join(g)}" for c, g in f.gains_um_per_K.items()}
 
 
 class CabinetHeat(Heat):
@@ -98,8 +99,8 @@ class CabinetHeat(Heat):
     unit = ("heat", "W")
     words = "waste heat of a cabinet"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
+        super().drawn(setting, size, rng)
         self.ahead_s = 3600.0 * rng.uniform(0.0, 2.0, len(setting.batches))
 
     def unit_push(self) -> Push:
@@ -114,8 +115,8 @@ class HydraulicUnit(Heat):
     bodies = ("base", "saddle", "cast", "slide", "cover_a", "cover_h")
     words = "a pump that runs by turns"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
+        super().drawn(setting, size, rng)
         self.period_min, self.duty = float(rng.integers(40, 91)), float(rng.uniform(0.25, 0.6))
 
     def shape(self) -> dict[str, tuple[float, str]]:
@@ -156,8 +157,8 @@ class Sun(Heat):
     bodies = ("column", "cover_a", "cover_b", "cover_h", "base")
     words = "the sun on one face"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
+        super().drawn(setting, size, rng)
         self.rise_h, self.set_h = float(rng.uniform(8.0, 10.0)), float(rng.uniform(13.0, 15.0))
 
     def shape(self) -> dict[str, tuple[float, str]]:
@@ -224,8 +225,8 @@ class Draught(Heat):
     unit = ("factor", "1")
     words = "a gate opens for a while"
 
-    def __init__(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        super().__init__(setting, size, rng)
+    def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
+        super().drawn(setting, size, rng)
         self.body = ROOM
         self.start_min, self.duration_min = int(rng.integers(60, 200)), int(rng.integers(20, 46))
         self.factor, self.drop_K = 1.0 + 0.5 * size, 2.0 * size
@@ -261,9 +262,8 @@ class Draught(Heat):
             more[body] = opened * conductance * (self.factor - 1.0) * np.ones_like(lead_K)
         return on_channels(self.frame, response(self.frame, Push(drive, more, spread=True), clock))
 
-    def term(self) -> dict[str, Any]:
-        alone = [("link", key) for key in self.setting.twin["exposures"]]
-        return super().term() | {"also": [{"kind": kind, "name": name} for kind, name in alone]}
+    def term(self) -> Term:
+        return replace(super().term(), also=[("link", key) for key in self.setting.twin["exposures"]])
 
 
 def surface_degC(setting: Setting, body: str, batch: Batch) -> Array:

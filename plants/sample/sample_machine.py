@@ -1,67 +1,103 @@
 """The sample machine: a simulated vertical machining centre as a thermal network of 14 nodes.
 
-The numbers stand in the tables below with their units; typical of the class, none was measured on a machine.
+Its numbers stand in ``machines/sample_vmc.yml``, typical of the class; none was measured on a machine. Laws and
+numerics are this package's own: it shares no code with the twin that is calibrated on its recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from data.arrays import Array
+from data.machine import load_machine
 from plants.sample.thermal_machine import BearingSet, SpeedHeat, ThermalMachine
 
-CAPACITY_J_PER_K: Mapping[str, float] = MappingProxyType({
-    "shaft": 6.6e3, "front": 7.7e3, "rear": 4.8e3, "motor": 25e3, "head_front": 55e3, "head_rear": 65e3, "screw": 6.6e3,
-    "column_front": 165e3, "column_back": 165e3, "bed": 1100e3, "table": 275e3, "mandrel": 1.6e3, "fixture": 3.6e3,
-    "air": 25e3,
-})  # fmt: skip
+FILE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
+_TWIN: Mapping[str, Any] = load_machine(FILE).twin or {}
+_MECHANISMS: Mapping[str, Any] = _TWIN["mechanisms"]
+
+
+def _number(given: Any, unit: str) -> float:
+    """The number of "14 W/K", of {value: 14 W/K, …} or of a bare number, which has the unit "1".
+
+    Raises:
+        ValueError: the file has another unit.
+    """
+    number, _, own = str(given["value"] if isinstance(given, Mapping) else given).partition(" ")
+    if (own or "1") != unit:
+        raise ValueError(f"{FILE}: got {given!r}, expected a number in {unit}")
+    return float(number)
+
+
+def _parameter(mechanism: str, name: str, unit: str) -> float:
+    return _number(_MECHANISMS[mechanism]["parameters"][name], unit)
+
+
+def _conductances_W_per_K(group: str, to: str = "") -> dict[tuple[str, str], float]:
+    """By both ends; of exposures those `to` one surrounding."""
+    ends = {key: (key.split("-")[0], key.split("-")[1]) for key in _TWIN[group]}
+    return {e: _number(_TWIN[group][key], "W/K") for key, e in ends.items() if to in ("", e[1])}
+
+
+def _chain(axis: str) -> tuple[tuple[str, float, bool], ...]:
+    steel = {name for name, body in _TWIN["bodies"].items() if body.get("material") == "steel"}
+    links = _TWIN["errors"][axis]["chain"]
+    return tuple((k["body"], k.get("sign", 1) * _number(k["length"], "m"), k["body"] in steel) for k in links)
+
+
+def _bearings(end: str) -> BearingSet:
+    preload = f"{end}_preload"
+    count, diameter_mm = int(_parameter(preload, "count", "1")), _parameter(preload, "mean_diameter", "mm")
+    return BearingSet(
+        end, count, diameter_mm, _parameter(preload, "preload", "N"), _parameter(preload, "static_capacity", "N")
+    )
+
+
+CAPACITY_J_PER_K: Mapping[str, float] = MappingProxyType(
+    {name: 1e3 * _number(body["capacity"], "kJ/K") for name, body in _TWIN["bodies"].items()}
+)
 NODES: tuple[str, ...] = tuple(CAPACITY_J_PER_K)
 NODE: Mapping[str, int] = MappingProxyType({name: i for i, name in enumerate(NODES)})
-
-LINK_W_PER_K: Mapping[tuple[str, str], float] = MappingProxyType({
-    ("shaft", "front"): 14, ("shaft", "rear"): 8, ("shaft", "mandrel"): 9, ("front", "head_front"): 22,
-    ("rear", "head_rear"): 18, ("motor", "head_rear"): 8, ("head_front", "head_rear"): 45,
-    ("head_front", "column_front"): 14, ("head_rear", "column_front"): 6, ("screw", "head_rear"): 5,
-    ("screw", "column_front"): 5, ("column_front", "column_back"): 35, ("column_front", "bed"): 18,
-    ("column_back", "bed"): 18, ("bed", "table"): 14, ("table", "fixture"): 2.5,
-    # to the enclosure's air
-    ("shaft", "air"): 0.8, ("mandrel", "air"): 0.5, ("front", "air"): 1, ("head_front", "air"): 5,
-    ("screw", "air"): 1.2, ("column_front", "air"): 6, ("bed", "air"): 6, ("table", "air"): 11, ("fixture", "air"): 0.5,
-})  # fmt: skip
-ROOM_W_PER_K: Mapping[str, float] = MappingProxyType(
-    {"rear": 0.6, "motor": 9, "head_rear": 7, "column_front": 3, "column_back": 13, "bed": 16, "air": 70}
+LINK_W_PER_K: Mapping[tuple[str, str], float] = MappingProxyType(
+    _conductances_W_per_K("links") | _conductances_W_per_K("exposures", "air")
 )
-FLOOR_W_PER_K: Mapping[str, float] = MappingProxyType({"bed": 10})
-
-ROTATING: tuple[tuple[str, str], ...] = (("shaft", "air"), ("mandrel", "air"))
-RATED_RPM = 6000.0
+ROOM_W_PER_K: Mapping[str, float] = MappingProxyType(
+    {body: g for (body, _), g in _conductances_W_per_K("exposures", "room").items()}
+)
+FLOOR_W_PER_K: Mapping[str, float] = MappingProxyType(
+    {body: g for (body, _), g in _conductances_W_per_K("exposures", "floor").items()}
+)
+ROTATING = tuple((key.split("-")[0], key.split("-")[1]) for key in _MECHANISMS["spinning"]["acts_on"])
 
 # Preloads and capacities make the load part 10-25 % of the viscous moment, the usual share.
-BEARINGS = (BearingSet("front", 3, 77.5, 800.0, 26e3), BearingSet("rear", 2, 70.0, 600.0, 22e3))
+BEARINGS = (_bearings("front"), _bearings("rear"))
+_MOTOR_W = [_parameter("motor_loss", name, "W") for name in ("idle", "linear", "quadratic")]
 HEATS = (
-    SpeedHeat("motor", ((40.0, 0.0), (110.0, 1.0), (80.0, 2.0))),
-    SpeedHeat("rear", ((70.0, 1.5),)),  # the belt, at the rear housing, where the pulley sits
+    SpeedHeat("motor", tuple(zip(_MOTOR_W, (0.0, 1.0, 2.0), strict=True))),
+    SpeedHeat("rear", ((_parameter("belt", "power", "W"), 1.5),)),  # at the rear housing, where the pulley sits
 )
-AUXILIARIES_W = 60.0  # into the enclosure's air, always
+AUXILIARIES_W = _parameter("auxiliaries", "heat", "W")  # into the enclosure's air, always
 
-STEEL_UM_PER_M_K, IRON_UM_PER_M_K = 11.5, 10.8
 # (node, length m, steel?); + closes the gap between tool and workpiece. Head and column: mean of their halves.
-Z_CHAIN = (
-    ("screw", 0.30, True), ("head_front", 0.15, False), ("head_rear", 0.15, False), ("shaft", 0.09, True),
-    ("mandrel", 0.20, True), ("fixture", 0.08, True), ("table", 0.28, False),
-    ("column_front", -0.625, False), ("column_back", -0.625, False),
-)  # fmt: skip
+Z_CHAIN = _chain("z")
 # + moves the spindle away from the column: the head reaches 0.45 m forward, bed and saddle carry the table as far.
-Y_CHAIN = (("head_front", 0.225, False), ("head_rear", 0.225, False), ("bed", -0.25, False), ("table", -0.20, False))
-# The probe nest sits 0.10 m beside the middle of the table, its scale on the bed.
-X_CHAIN = (("table", 0.10, False), ("bed", -0.10, False))
-COLUMN_HEIGHT_M, COLUMN_DEPTH_M, HEAD_REACH_M = 1.25, 0.50, 0.45
-# The motor is flanged to one side of the head; its heat crosses the head's width through this conductance.
+Y_CHAIN = _chain("y")
+# The probe nest sits 0.10 m from the middle of the table, its scale on the bed.
+X_CHAIN = _chain("x")
+_BENDING: Mapping[str, Any] = _TWIN["errors"]["z"]["tilts"][0]
+COLUMN_HEIGHT_M, COLUMN_DEPTH_M, HEAD_REACH_M = (_number(_BENDING[k], "m") for k in ("height", "depth", "lever"))
+SPEED_SHIFT_UM = _parameter("speed_shift", "shift", "um")  # at 6000 rpm, proportional to n²
+
+# What the file does not hold: the twin has expansions and rated speed in its mechanisms, and lumps the head's bow into
+# one rounded gain. The motor is flanged to one side of the head; its heat crosses the head's width.
+STEEL_UM_PER_M_K, IRON_UM_PER_M_K = 11.5, 10.8
+RATED_RPM = 6000.0
 HEAD_SIDE_W_PER_K, HEAD_WIDTH_M = 50.0, 0.30
-SPEED_SHIFT_UM = 4.0  # at 6000 rpm, proportional to n²
 
 
 def network(speed_rpm: float) -> tuple[Array, Array, Array]:

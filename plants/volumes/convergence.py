@@ -12,9 +12,9 @@ from data.arrays import Array
 from plants.drawing import draw_plant
 from plants.effects import EFFECTS
 from plants.everyday import everyday
-from plants.options import stream
-from plants.physics import simulated
+from plants.options import Options, stream
 from plants.runs import plan_runs
+from plants.simulation import simulated
 from plants.structure import Plant
 from plants.volumes.structure import Volumes
 
@@ -48,7 +48,7 @@ def shown_at(seed: int, effect: str, finer: int, step_s: float) -> Shown:
     table in z."""
     plain, plant = _plant(seed, effect, 1), _plant(seed, effect, finer)
     work = [*everyday(plant, seed), EFFECTS[effect](plant, 1.0, stream(seed, f"effect {effect}"))]
-    runs = plan_runs(seed, 2, HOURS, ROW_S, plant.rated_rpm, 0.0)
+    runs = plan_runs(seed, Options(batches=2, hours=HOURS, step_s=ROW_S), plant.rated_rpm)
     course = simulated(plant, runs, work, step_s, WARM_UP_H)
     cells_degC = course.cells_degC[np.isin(course.time_s, np.arange(0.0, 3600.0 * HOURS + 1.0, ROW_S))]
     weights = np.sum([g.weights_um_per_K for g in plant.growths if g.channel == "z"], axis=0)

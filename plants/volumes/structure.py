@@ -134,7 +134,7 @@ class Volumes(Structure):
     """N finite volumes, each of one body.
 
     surface_m2 and expansion_um_per_mK (N,). `one`, `other` and `between_W_per_K` (E,) are conduction, joints and
-    convection to the enclosure's air, which is a cell of its own; `surfaces` (E,) tells the last kind.
+    convection to the enclosure's air, which is a cell of its own; `surfaces` (E,) is 1 for the last kind.
     """
 
     castings: Mapping[str, Plate]

@@ -1,4 +1,4 @@
-"""How sure the models say they are, and how often they are right in that."""
+"""Certainty of the models: stated intervals, errors outside the trained region, weaknesses of the selectors."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def certainty_table(
     """A row for the best cell of every family that states a standard deviation, and for the promoted one.
 
     Args:
-        cells: one protocol's cells from `extracts.scored`.
+        cells: one protocol's cells from `scored`.
 
     Returns:
         None where no family states one.
     """
-    told = cells[np.isfinite(cells["coverage90"])] if "coverage90" in cells else cells.iloc[:0]
-    if told.empty:
+    stated = cells[np.isfinite(cells["coverage90"])] if "coverage90" in cells else cells.iloc[:0]
+    if stated.empty:
         return None
     promoted = [choice.selector, choice.family, choice.n_tsp]
-    own = told[(told[["selector", "family", "n_tsp"]] == promoted).all(axis=1)]
-    rows = pd.concat([best_per(told, "family"), own]).drop_duplicates(CELL_KEYS)
+    own = stated[(stated[["selector", "family", "n_tsp"]] == promoted).all(axis=1)]
+    rows = pd.concat([best_per(stated, "family"), own]).drop_duplicates(CELL_KEYS)
     rows = rows.sort_values("score_um", kind="stable").reset_index(drop=True)
     seasons = _inside_of_seasons(result, rows)
     columns = [
@@ -90,7 +90,7 @@ def certainty_table(
 
 
 def verdict(mean: float, spread: float, n_batches: int, season: float = math.nan) -> str:
-    """In plain words what a mean share inside the 90 % interval, with its spread over batches, says.
+    """A verdict on a mean share inside the 90 % interval, with its spread over batches.
 
     Within five per cent of nine tenths it is honest; beyond that "perhaps", unless the mean lies further off than
     chance would put it (one-sided 95 % of a mean over batches). `season`: the share where whole seasons are left out.
@@ -99,10 +99,10 @@ def verdict(mean: float, spread: float, n_batches: int, season: float = math.nan
         return NOTHING
     if abs(mean - _MEANT) <= _TOLERATED:
         return "honest, but too sure of a new season" if season < _MEANT - _TOLERATED else "honest"
-    words = "too sure" if mean < _MEANT else "too careful"
+    label = "too sure" if mean < _MEANT else "too careful"
     if math.isfinite(spread) and abs(mean - _MEANT) > _BEYOND_CHANCE * spread / math.sqrt(n_batches):
-        return words
-    return f"perhaps {words}"
+        return label
+    return f"perhaps {label}"
 
 
 def _inside_of_seasons(result: GridResult, rows: pd.DataFrame) -> list[float]:
@@ -110,8 +110,8 @@ def _inside_of_seasons(result: GridResult, rows: pd.DataFrame) -> list[float]:
     cells = result.cells[result.cells["protocol"] == _SEASON]
     if rows["protocol"].iloc[0] == _SEASON or cells.empty:
         return [math.nan] * len(rows)
-    beside = rows[CELL_KEYS[1:]].merge(cells[[*CELL_KEYS[1:], "coverage90"]], on=CELL_KEYS[1:], how="left")
-    return [float(v) for v in beside["coverage90"]]
+    joined = rows[CELL_KEYS[1:]].merge(cells[[*CELL_KEYS[1:], "coverage90"]], on=CELL_KEYS[1:], how="left")
+    return [float(v) for v in joined["coverage90"]]
 
 
 _MARKERS = {
@@ -148,9 +148,9 @@ def rise_table(name: str, distances: pd.DataFrame, digits: int, simulated: bool)
     rows = []
     for edge, count, factor, high in zip(rise.edge, rise.count, rise.factor, rise.high, strict=True):
         inner = [e for e in EDGES if e < edge]
-        words = "inside" if not inner else f"{inner[-1]:g} to {edge:g}" if np.isfinite(edge) else f"above {inner[-1]:g}"
+        label = "inside" if not inner else f"{inner[-1]:g} to {edge:g}" if np.isfinite(edge) else f"above {inner[-1]:g}"
         expected = float(rise.expected_um(np.array([inner[-1] * 1.0001 if inner else 0.0]))[0])
-        rows.append(Row((words, str(count), number(factor, 2), number(high, 2), number(expected, digits))))
+        rows.append(Row.of(label, str(count), number(factor, 2), number(high, 2), number(expected, digits)))
     far = distances[
         distances["protocol"].isin(("leave-season-out", "leave-speed-out")) & (distances["distance"] > 0.05)
     ]
@@ -179,10 +179,10 @@ def rise_figure(factors: pd.DataFrame, rise: Rise, shown: list[str], simulated: 
     data = []
     for protocol in reversed(shown):
         own = factors[factors["protocol"] == protocol]
-        words, color, symbol = _MARKERS[protocol]
+        label, color, symbol = _MARKERS[protocol]
         data.append({
             "type": "scatter", "mode": "markers", "x": _at(own["distance"].to_numpy(float)),
-            "y": own["factor"].to_numpy(float), "name": words,
+            "y": own["factor"].to_numpy(float), "name": label,
             "marker": {"color": color, "symbol": symbol, "size": 7,
                        "opacity": 0.45 if protocol == "train-on-one" else 0.85},
             "customdata": [f"{plain(b)}: {d:.2f} widths{f' in {plain(q)}' if q else ''}" for b, d, q in
@@ -219,8 +219,8 @@ def _at(distance: np.ndarray) -> np.ndarray:
 
 
 _STABILITY = "stability over batches"
-_WORDS = {
-    "largest |corr| among the chosen": "two chosen points tell the same",
+MEANINGS = {
+    "largest |corr| among the chosen": "two chosen points carry the same information",
     "chaining in the largest cluster": "sensors share a cluster only over others",
     "share of inputs in the largest cluster": "nearly all sensors in one cluster",
     "gap of the smallest eigenvalues": "a step of the elimination was chance",
@@ -268,14 +268,18 @@ def _rows(own: pd.DataFrame) -> list[Row]:
     first = (selector_label(own["selector"].iloc[0]), str(own["n_tsp"].iloc[0]), stable)
     unstable = not stability["ok"].all()
     if others.empty:
-        return [Row((*first, "no measure of its own", NOTHING, NOTHING, stability["comment"].iloc[0]), _mark(unstable))]
+        return [
+            Row.of(
+                *first, "no measure of its own", NOTHING, NOTHING, stability["comment"].iloc[0], mark=_mark(unstable)
+            )
+        ]
     rows = []
     for statistic, value, limit, ok, comment in zip(
         others["statistic"], others["value"], others["threshold"], others["ok"], others["comment"], strict=True
     ):
-        words = f"{_WORDS[statistic]}: {statistic}" if statistic in _WORDS else statistic
+        label = f"{MEANINGS[statistic]}: {statistic}" if statistic in MEANINGS else statistic
         side = "at most" if ok == (value <= limit) else "at least"
-        cells = (*first, words, number(value, 2), f"{side} {number(limit, 2)}", comment)
+        cells = (*first, label, number(value, 2), f"{side} {number(limit, 2)}", comment)
         rows.append(Row(cells, _mark(unstable or not ok)))
     return rows
 

@@ -18,6 +18,7 @@ from reports.comparison.figures import fan_panel
 from reports.comparison.story import Verdict, comparison_rows, mark_of
 from reports.comparison.tables import (
     LeftOut,
+    Promoted,
     best_per,
     frequencies,
     is_baseline,
@@ -78,7 +79,7 @@ def channel_part(
     name: str,
     group: Sequence[Training],
     choices: Sequence[Choice],
-    said: Verdict,
+    outcome: Verdict,
     rule: PromotionRule,
 ) -> Channel:
     """A channel's part from its trainings, newest first, and their promoted cells."""
@@ -88,10 +89,9 @@ def channel_part(
     digits = decimals(choice.S_std_um, choice.n_batches)
     mark = mark_of(group[0])
     shown = left_out_batches(result, choice)
+    promoted = Promoted(choice, rule, digits, mark)
     boards = tuple(
-        tables.leaderboard(
-            result, cells, key, choice, rule, digits, f"{name}: best cell of every {key}, {protocol}", mark
-        )
+        tables.leaderboard(result, cells, key, promoted, f"{name}: best cell of every {key}, {protocol}")
         for key in ("family", "selector")
     )
     others = []
@@ -99,14 +99,14 @@ def channel_part(
         own = scored(result, other, rule)
         if len(own):
             caption = f"{name}: best cell of every family, {other}"
-            others.append(tables.leaderboard(result, own, "family", choice, rule, digits, caption, mark))
+            others.append(tables.leaderboard(result, own, "family", promoted, caption))
     changes, change = _changes(name, group, choices)
     return Channel(
         anchor=anchor,
         name=name,
         simulated=result.simulated,
         protocol=protocol,
-        verdict=said,
+        verdict=outcome,
         inputs=", ".join(choice.inputs),
         boards=boards,
         certainty=certainty_table(name, result, cells, choice, digits, mark),
@@ -206,8 +206,8 @@ def _left_out(name: str, result: GridResult, choice: Choice, shown: Sequence[Lef
     )
     every = max(b.every for b in shown)
     symbol = "disc" if shown[0].position_mm is not None else "line"
-    words = (("recorded", INK), ("predicted, batch left out", BLUE), ("residual", ORANGE))
-    keys = tuple(Key(text, color, symbol) for text, color in words)
+    entries = (("recorded", INK), ("predicted, batch left out", BLUE), ("residual", ORANGE))
+    keys = tuple(Key(text, color, symbol) for text, color in entries)
     notes = [
         "Batches by S; every prediction comes from a model that never saw the batch. "
         "Residual axes are equal; the recording stops where it is masked."
@@ -228,24 +228,24 @@ def _changes(name: str, group: Sequence[Training], choices: Sequence[Choice]) ->
         return (), None
     now, before = group[0].result, group[1].result
     new, gone = records.changed_batches(now.batches, before.batches)
-    words = [f"New since {group[1].started:%Y-%m-%d %H:%M} UTC: {listed(new)}." if new else "No new batch."]
+    remarks = [f"New since {group[1].started:%Y-%m-%d %H:%M} UTC: {listed(new)}." if new else "No new batch."]
     if gone:
-        words.append(f"No longer in the training: {listed(gone)}.")
+        remarks.append(f"No longer in the training: {listed(gone)}.")
     c, d = choices[0], choices[1]
     a = left_out(now, c.protocol, c.selector, c.family, c.n_tsp)
     b = left_out(before, d.protocol, d.selector, d.family, d.n_tsp)
     if c.protocol != d.protocol:
-        return (*words, "The trainings were judged by different protocols and are not compared."), None
+        return (*remarks, "The trainings were judged by different protocols and are not compared."), None
     both = a.merge(b, on=["batch_id", "digest"], suffixes=("_new", "_old"))
     if len(both) < 2:
-        return (*words, f"{count(len(both), 'batch')} in common: nothing to compare."), None
+        return (*remarks, f"{count(len(both), 'batch')} in common: nothing to compare."), None
     paired = compare_paired(a, b, PromotionRule(min_batches=2))
-    words.append(
+    remarks.append(
         f"On the {count(len(both), 'batch')} that both know the newest model is "
-        f"{records.interval_words(paired.as_dict())} on average, better on {paired.n_better}."
+        f"{records.interval_label(paired.as_dict())} on average, better on {paired.n_better}."
     )
     order = {b: i for i, b in enumerate(now.batches["batch_id"])}
     both = both.sort_values("batch_id", key=lambda ids: ids.map(order), kind="stable")
     plot = Plot(figures.before_and_after(both, now.simulated), f"{name} before and after")
     keys = (Key("earlier training", "#5a6572", "ring"), Key("newest training", BLUE, "disc"))
-    return tuple(words), Panel(f"{name}: S of the shared batches, before and after", (plot,), now.simulated, keys)
+    return tuple(remarks), Panel(f"{name}: S of the shared batches, before and after", (plot,), now.simulated, keys)

@@ -1,4 +1,4 @@
-"""The figures. Each takes data and returns a figure; none computes a result."""
+"""The figures of the comparison report. Each takes data and returns a figure; none computes a result."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ def heat_map(best: pd.DataFrame, top_um: float, digits: int, simulated: bool) ->
     bar = {"title": {"text": "S_mean, µm", "side": "right"}, "tickvals": [math.log10(v) for v in ticks],
            "ticktext": [f"{v:g}" for v in ticks], "thickness": 10, "outlinewidth": 0, "len": 1.0}  # fmt: skip
     colored = {"type": "heatmap", "x": x, "y": y, "z": z, "colorscale": _BLUES, "zmin": low, "zmax": high,
-               "colorbar": bar, "customdata": [_heat_words(r, digits) for r in rows],
+               "colorbar": bar, "customdata": [_heat_label(r, digits) for r in rows],
                "hovertemplate": "%{customdata}<extra></extra>"}  # fmt: skip
     text = [f"{number(r['S_mean_um'], digits)}<br>n = {r['n_tsp']}" for r in rows]
     dark = (z - low) / (high - low) < 0.3
     return _matrix(colored, text, dark, 44 * len(set(y)) + 84, 52, simulated)
 
 
-def _heat_words(row: dict[Any, Any], digits: int) -> str:
-    words = f"{cell_label(row['selector'], row['family'], row['n_tsp'])}<br>S_mean {number(row['S_mean_um'], digits)}"
-    return f"{words} µm, S_std {number(row['S_std_um'], digits)} µm"
+def _heat_label(row: dict[Any, Any], digits: int) -> str:
+    texts = f"{cell_label(row['selector'], row['family'], row['n_tsp'])}<br>S_mean {number(row['S_mean_um'], digits)}"
+    return f"{texts} µm, S_std {number(row['S_std_um'], digits)} µm"
 
 
 def point_frequency(found: Sequence[Frequency], most: int, simulated: bool) -> go.Figure:
@@ -84,15 +84,15 @@ def point_frequency(found: Sequence[Frequency], most: int, simulated: bool) -> g
 
 
 def _matrix(colored: dict[str, Any], text: list[str], dark: Any, height: int, top: int, simulated: bool) -> go.Figure:
-    """A heat map with words in its cells, white on dark ones."""
-    words = {"type": "scatter", "mode": "text", "x": colored["x"], "y": colored["y"], "text": text, "hoverinfo": "skip",
+    """A heat map with text in its cells, white on dark ones."""
+    texts = {"type": "scatter", "mode": "text", "x": colored["x"], "y": colored["y"], "text": text, "hoverinfo": "skip",
              "textfont": {"size": 12, "color": ["#ffffff" if d else INK for d in dark]}}  # fmt: skip
     still = {"showgrid": False, "fixedrange": True, "ticks": "", "showline": False, "type": "category"}
     layout = base_layout(height, simulated, below=True, top=top)
     layout["xaxis"] |= {**still, "side": "top", "tickangle": 0}
     layout["yaxis"] |= {**still, "autorange": "reversed", "automargin": True}
     layout["margin"] |= {"l": 20, "b": 28}
-    return go.Figure({"data": [{**colored, "xgap": 2, "ygap": 2}, words], "layout": layout})
+    return go.Figure({"data": [{**colored, "xgap": 2, "ygap": 2}, texts], "layout": layout})
 
 
 def against_points(
@@ -263,7 +263,7 @@ def fan_panel(name: str, shown: Sequence[LeftOut], target: str, digits: int, sim
 
 
 def fan(batch: LeftOut, target: str, last_h: float, residual_range: tuple[float, float], simulated: bool) -> go.Figure:
-    """Readings and predicted lines of a batch's sweeps above, what is left below; colours run from 0 to `last_h`."""
+    """Readings and predicted lines of a batch's sweeps above, the residual below; colours run from 0 to `last_h`."""
     assert batch.position_mm is not None
     sweeps = _sweeps(batch)
     picked = (
@@ -281,7 +281,7 @@ def fan(batch: LeftOut, target: str, last_h: float, residual_range: tuple[float,
             "hovertemplate": f"{hour:.2g} h, %{{x:.4g}} mm: predicted %{{y:.1f}} µm<extra></extra>",
         })  # fmt: skip
     rows = np.concatenate([np.zeros(0, int), *picked])
-    words = [f"{h:.2g} h" for h in batch.time_h[rows]]
+    texts = [f"{h:.2g} h" for h in batch.time_h[rows]]
     colour = [_colour(h / last_h) for h in batch.time_h[rows]]
     for what, y, axis in (
         ("recorded", batch.recorded_um[rows], "y"),
@@ -290,7 +290,7 @@ def fan(batch: LeftOut, target: str, last_h: float, residual_range: tuple[float,
         data.append({
             "type": "scatter", "mode": "markers", "x": batch.position_mm[rows], "y": y, "yaxis": axis, "name": what,
             "marker": {"size": 6 if axis == "y" else 5, "color": colour, "line": {"color": "white", "width": 0.6}},
-            "text": words, "hovertemplate": f"%{{text}}, %{{x:.4g}} mm: {what} %{{y:.1f}} µm<extra></extra>",
+            "text": texts, "hovertemplate": f"%{{text}}, %{{x:.4g}} mm: {what} %{{y:.1f}} µm<extra></extra>",
         })  # fmt: skip
     layout = base_layout(400, simulated)
     layout["xaxis"] |= {"title": {"text": "position, mm"}, "anchor": "y2"}

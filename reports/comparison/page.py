@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from data.errors import InputError
-from data.files import write_atomic
 from data.registry import Registry
 from features.selectors import SELECTORS
 from models import FAMILIES
@@ -24,7 +23,7 @@ from reports.comparison.story import Verdict, promoted_cell, verdict
 from reports.comparison.tables import protocols_of, scored
 from reports.labels import count, decimals, family_label, listed, number, selector_label
 from reports.layout import Table
-from reports.rendering import FORMATS, template_environment
+from reports.rendering import FORMATS, check_suffix, write_page
 
 _FEW_FINDINGS = 12
 
@@ -40,7 +39,7 @@ class Page:
     verdicts: tuple[Verdict, ...]
     overview: Table
     channels: tuple[Channel, ...]
-    findings_words: str
+    findings_summary: str
     findings: tuple[Table, ...]  # a summary where there are many, then every finding
     few_findings: bool
     excluded: Table | None
@@ -89,11 +88,11 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
         verdicts=tuple(verdicts),
         overview=tables.overview(overview, protocols_of(results[0])[0], simulated),
         channels=tuple(channels),
-        findings_words=records.findings_words(found, n_batches),
+        findings_summary=records.findings_summary(found, n_batches),
         findings=many + every,
         few_findings=not many,
         excluded=left if left.rows else None,
-        rule=_rule_words(rule),
+        rule=_rule_sentence(rule),
         families=_members(FAMILIES, results, "family", family_label),
         selectors=_members(SELECTORS, results, "selector", selector_label),
         sources=tuple(
@@ -105,9 +104,11 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
 def _members(
     registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]
 ) -> tuple[tuple[str, str], ...]:
-    """Label and words of every member that was tried, in the registry's order."""
+    """Label and summary of every member that was tried, in the registry's order."""
     tried = set().union(*(r.cells[column] for r in results))
-    return tuple((label(key), registry[key].words.removeprefix(f"{label(key)}: ")) for key in registry if key in tried)
+    return tuple(
+        (label(key), registry[key].summary.removeprefix(f"{label(key)}: ")) for key in registry if key in tried
+    )
 
 
 def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
@@ -142,12 +143,12 @@ def _facts(newest: Sequence[Training], names: Sequence[str], n_batches: int) -> 
     return tuple((k, v) for k, v in facts if v)
 
 
-def _speed_order(words: str) -> tuple[float, str]:
-    first = words.split(" ")[0]
-    return (float(first), words) if first.replace(".", "", 1).isdigit() else (math.inf, words)
+def _speed_order(label: str) -> tuple[float, str]:
+    first = label.split(" ")[0]
+    return (float(first), label) if first.replace(".", "", 1).isdigit() else (math.inf, label)
 
 
-def _rule_words(r: PromotionRule) -> str:
+def _rule_sentence(r: PromotionRule) -> str:
     return (
         f"The rule takes the cell of least {r.score} by {r.protocol} among those whose points are stable "
         f"(at least {r.min_tsp_stability:g}); within {r.tie_percent:g} % the simpler one. "
@@ -159,22 +160,12 @@ def _rule_words(r: PromotionRule) -> str:
 def write_report(trainings: Sequence[Training], path: Path, rule: PromotionRule) -> Path:
     """One page from tracked trainings; the suffix of `path`, .html or .md, decides the format.
 
-    The HTML page holds everything it needs and asks no network. The folder is made; the file appears whole or not
-    at all.
+    The HTML page is self-contained. The folder is made; the file appears whole or not at all.
 
     Raises:
         InputError: no training given, one without a judged cell, another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    if path.suffix not in FORMATS:
-        raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html or .md")
-    shown = page(trainings, rule)
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    html = path.suffix == ".html"
-    text = template_environment(html).get_template(f"report{path.suffix}.j2").render(page=shown, written=written)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, text)
-    except OSError as error:
-        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
+    check_suffix(path, FORMATS)
+    write_page(path, "report", page(trainings, rule))
     return path

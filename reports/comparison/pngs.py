@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import threading
 from collections.abc import Sequence
 
@@ -24,7 +23,8 @@ from reports.comparison.tables import (
     scored,
     zero_um,
 )
-from reports.labels import BLUE, INK, ORANGE, cell_label, family_label, family_style, selector_label
+from reports.drawing import picture_bytes
+from reports.labels import BLUE, INK, ORANGE, cell_label, family_label, family_style, selector_label, tex_escaped
 
 _DRAWING = threading.Lock()  # matplotlib's font and text caches are shared by all figures
 _DPI = 80
@@ -62,7 +62,7 @@ def _families(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
     nothing_um = zero_um(cells)
     ax.set_xlim(0, 1.05 * (min(widest, 2 * nothing_um) if nothing_um > 0 else widest) or 1.0)
     _name(ax, f"S_mean ± S_std (µm), {protocol}", _title(result))
-    return _png(fig)
+    return picture_bytes(fig, "png", _DPI)
 
 
 def _points(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
@@ -81,7 +81,7 @@ def _points(result: GridResult, cells: pd.DataFrame, protocol: str) -> bytes:
         ax.legend(fontsize=7, frameon=False, ncols=2, loc="upper right")
     _name(ax, "number of points", _title(result))
     ax.set_ylabel(f"S_mean (µm), {protocol}", fontsize=8)
-    return _png(fig)
+    return picture_bytes(fig, "png", _DPI)
 
 
 def _left_out(result: GridResult, shown: Sequence[LeftOut]) -> bytes:
@@ -93,11 +93,11 @@ def _left_out(result: GridResult, shown: Sequence[LeftOut]) -> bytes:
         ax.plot(x, b.recorded_um, color=INK, lw=1.0, ls=line, marker=marker, label="recorded")
         ax.plot(x, b.predicted_um, color=BLUE, lw=1.4, ls=line, marker=marker, label="predicted, left out")
         ax.plot(x, b.recorded_um - b.predicted_um, color=ORANGE, lw=0.8, ls=line, marker=marker, label="residual")
-        place = f"{b.place}: {_math_free(b.batch_id)}, S = {b.S_um:.1f} µm"
+        place = f"{b.place}: {tex_escaped(b.batch_id)}, S = {b.S_um:.1f} µm"
         _name(ax, "position (mm)" if along_axis else "time since start (h)", place)
     axes[0].set_ylabel(f"{_title(result)} (µm)", fontsize=8)
     axes[0].legend(fontsize=7, frameon=False)
-    return _png(fig)
+    return picture_bytes(fig, "png", _DPI)
 
 
 def _canvas(width_in: float, height_in: float, columns: int, left: float) -> tuple[Figure, list[Axes]]:
@@ -109,11 +109,7 @@ def _canvas(width_in: float, height_in: float, columns: int, left: float) -> tup
 
 
 def _title(result: GridResult) -> str:
-    return _math_free(f"{result.machine} {result.target}") + (" SIMULATED" if result.simulated else "")
-
-
-def _math_free(name: str) -> str:
-    return name.replace("$", r"\$")
+    return tex_escaped(f"{result.machine} {result.target}") + (" SIMULATED" if result.simulated else "")
 
 
 def _name(ax: Axes, x: str, title: str) -> None:
@@ -121,9 +117,3 @@ def _name(ax: Axes, x: str, title: str) -> None:
     ax.set_title(title, fontsize=9)
     ax.tick_params(labelsize=8)
     ax.spines[["top", "right"]].set_visible(False)
-
-
-def _png(fig: Figure) -> bytes:
-    out = io.BytesIO()
-    fig.savefig(out, format="png", dpi=_DPI)
-    return out.getvalue()

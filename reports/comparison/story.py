@@ -1,4 +1,4 @@
-"""What became of a training, in plain sentences."""
+"""Outcome of a training in plain sentences and tables: findings, exclusions, trainings, promotion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from models.promotion import Choice, decide, pick
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
 from reports.comparison.tables import picked
-from reports.labels import between, cell_label, count, decimals, number, p_words, plus_minus
+from reports.labels import between, cell_label, count, decimals, number, p_label, plus_minus
 from reports.layout import Column, Row, Table
 
 _FINDING_KEYS = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
@@ -30,7 +30,7 @@ def findings_of(results: Sequence[GridResult]) -> pd.DataFrame:
     return every.sort_values(["machine", "batch_id", "channel", "start_s"], kind="stable").reset_index(drop=True)
 
 
-def findings_words(found: pd.DataFrame, n_batches: int) -> str:
+def findings_summary(found: pd.DataFrame, n_batches: int) -> str:
     """One sentence about all findings."""
     if found.empty:
         return f"The checks raised no finding in {count(n_batches, 'batch')}; every recorded sample was used."
@@ -38,24 +38,22 @@ def findings_words(found: pd.DataFrame, n_batches: int) -> str:
     masked = int((found["masks"].map(_yes) & ~overruled).sum())
     with_any = found[["machine", "batch_id"]].drop_duplicates()
     where = f"{count(len(found), 'finding')} in {len(with_any)} of {count(n_batches, 'batch')}"
-    words = f"{where}: {masked} masked for training"
+    summary = f"{where}: {masked} masked for training"
     noted = len(found) - masked - int(overruled.sum())
-    words += f", {noted} noted only" if noted else ""
-    return words + (f", {int(overruled.sum())} overruled by the machine file" if overruled.any() else "") + "."
+    summary += f", {noted} noted only" if noted else ""
+    return summary + (f", {int(overruled.sum())} overruled by the machine file" if overruled.any() else "") + "."
 
 
 def findings(found: pd.DataFrame, simulated: bool) -> Table:
     """Every finding: where, when, what, and whether it was masked."""
     rows = [
-        Row(
-            (
-                str(f["batch_id"]),
-                _text(f["channel"]) or "all channels",
-                str(f["check"]).replace("_", " "),
-                between(_time(f["start_s"]), _time(f["end_s"])),
-                _text(f["words"]),
-                _effect(f),
-            )
+        Row.of(
+            str(f["batch_id"]),
+            _text(f["channel"]) or "all channels",
+            str(f["check"]).replace("_", " "),
+            between(_time(f["start_s"]), _time(f["end_s"])),
+            _text(f["words"]),
+            _effect(f),
         )
         for f in found.to_dict("records")
     ]
@@ -80,11 +78,9 @@ def findings_by_channel(found: pd.DataFrame, simulated: bool) -> Table:
     rows = []
     for (check, channel), part in table.groupby(["check", "channel"], sort=True):
         rows.append(
-            Row(
-                (
-                    str(check).replace("_", " "), str(channel), str(len(part)), str(part["batch_id"].nunique()),
-                    str(int(part["masked"].sum())), str(int(part["overruled"].sum())),
-                )
+            Row.of(
+                str(check).replace("_", " "), str(channel), str(len(part)), str(part["batch_id"].nunique()),
+                str(int(part["masked"].sum())), str(int(part["overruled"].sum())),
             )
         )  # fmt: skip
     columns = (
@@ -107,7 +103,7 @@ def excluded(results: Sequence[tuple[str, GridResult]], simulated: bool) -> Tabl
             if name not in targets:
                 targets.append(name)
     rows = [
-        Row((what, why, "all" if len(targets) == len(results) > 1 else ", ".join(targets)))
+        Row.of(what, why, "all" if len(targets) == len(results) > 1 else ", ".join(targets))
         for (what, why), targets in of.items()
     ]
     columns = (Column("what"), Column("why", "", "wide"), Column("error channel"))
@@ -122,15 +118,13 @@ def trainings(rows: Sequence[tuple[Training, Choice, int]]) -> Table:
         new, gone = changed_batches(t.result.batches, earlier) if earlier is not None else ([], [])
         p = t.promotion
         out.append(
-            Row(
-                (
-                    f"{t.started:%Y-%m-%d %H:%M}",
-                    str(len(t.result.batches)),
-                    f"+{len(new)}" + (f" −{len(gone)}" if gone else "") if earlier is not None else "–",
-                    cell_label(choice.selector, choice.family, choice.n_tsp),
-                    plus_minus(choice.S_mean_um, choice.S_std_um, digits),
-                    f"{p['outcome']} (version {p['version']})" if p else "not promoted",
-                )
+            Row.of(
+                f"{t.started:%Y-%m-%d %H:%M}",
+                str(len(t.result.batches)),
+                f"+{len(new)}" + (f" −{len(gone)}" if gone else "") if earlier is not None else "–",
+                cell_label(choice.selector, choice.family, choice.n_tsp),
+                plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+                f"{p['outcome']} (version {p['version']})" if p else "not promoted",
             )
         )
     columns = (
@@ -171,13 +165,13 @@ def _yes(value: object) -> bool:
     return bool(value) if isinstance(value, bool | np.bool_) else True
 
 
-def interval_words(comparison: dict[str, float], digits: int = 2) -> str:
+def interval_label(comparison: dict[str, float], digits: int = 2) -> str:
     """``0.60 µm better (90 %: 0.20 to 1.00)`` of a paired comparison."""
     d = float(comparison["difference_um"])
     sign = 1.0 if d >= 0 else -1.0
     ends = sorted([sign * float(comparison["low_um"]), sign * float(comparison["high_um"])])
-    words = f"{number(abs(d), digits)} µm {'better' if d >= 0 else 'worse'}"
-    return f"{words} (90 %: {number(ends[0], digits)} to {number(ends[1], digits)} µm)"
+    text = f"{number(abs(d), digits)} µm {'better' if d >= 0 else 'worse'}"
+    return f"{text} (90 %: {number(ends[0], digits)} to {number(ends[1], digits)} µm)"
 
 
 _CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unchanged", "": "not promoted"}
@@ -190,7 +184,7 @@ class Verdict:
     channel: str
     outcome: str
     chip: str
-    words: str
+    summary: str
     caution: str = ""
 
 
@@ -225,22 +219,22 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     )
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
     if outcome == "champion":
-        words = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
+        summary = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
     elif outcome == "challenger":
-        words = (
+        summary = (
             f"Version {p['champion_version']} stays champion; version {p['version']}, {model}, is challenger: "
             f"{score}; {_why_challenger(p)}."
         )
     elif outcome == "unchanged":
-        words = (
+        summary = (
             f"Nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
             f"Version {p['champion_version']} is champion."
         )
     else:
-        words = f"Nothing was promoted. The rule would take {model}: {score}."
+        summary = f"Nothing was promoted. The rule would take {model}: {score}."
     why = str(p.get("caution", "")) if p else choice.caution
     caution = f"Do not trust this model: {why}." if why else ""
-    return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), words, caution)
+    return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), summary, caution)
 
 
 def mark_of(training: Training) -> str:
@@ -261,9 +255,9 @@ def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:
         ("batches in common", f"{c['n_batches']}"),
         ("mean S of the newcomer", f"{number(c['new_S_mean_um'], 2)} µm"),
         (f"mean S of the champion{f' (version {old})' if old else ''}", f"{number(c['old_S_mean_um'], 2)} µm"),
-        ("newcomer against champion", interval_words(c) if math.isfinite(c["low_um"]) else number(math.nan)),
+        ("newcomer against champion", interval_label(c) if math.isfinite(c["low_um"]) else number(math.nan)),
         ("better on", f"{c['n_better']} of {count(c['n_batches'], 'batch')}"),
-        ("one-sided paired sign-flip test", p_words(c["p_value"]) if math.isfinite(c["p_value"]) else "–"),
+        ("one-sided paired sign-flip test", p_label(c["p_value"]) if math.isfinite(c["p_value"]) else "–"),
         ("decision", "replaces the champion" if promotion["outcome"] == "champion" else "the champion stays"),
     ]
 
@@ -274,11 +268,11 @@ def _why_champion(p: dict[str, Any]) -> str:
     if not c:
         return "put in place by force" if forced else "it is the first model of this machine and channel"
     old = p.get("against")
-    words = f"replaces version {old}" if old else "replaces the former champion"
-    words += " by force" if forced and not c["better"] else ""
+    reason = f"replaces version {old}" if old else "replaces the former champion"
+    reason += " by force" if forced and not c["better"] else ""
     if not math.isfinite(c["difference_um"]):
-        return words
-    return f"{words}, {interval_words(c)} on {count(c['n_batches'], 'batch')}"
+        return reason
+    return f"{reason}, {interval_label(c)} on {count(c['n_batches'], 'batch')}"
 
 
 def _why_challenger(p: dict[str, Any]) -> str:
@@ -288,7 +282,7 @@ def _why_challenger(p: dict[str, Any]) -> str:
     if "need at least" in str(c.get("words", "")):
         return str(c["words"]).replace(": the champion stays", "")
     return (
-        f"on {count(c['n_batches'], 'batch')} it is {interval_words(c)}, {p_words(c['p_value'])}: "
+        f"on {count(c['n_batches'], 'batch')} it is {interval_label(c)}, {p_label(c['p_value'])}: "
         "not shown to be better"
     )
 

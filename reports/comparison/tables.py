@@ -1,4 +1,4 @@
-"""Tables of scores: overview, leaderboards, one per protocol and never two protocols in one."""
+"""Extracts of a training's result, and tables of scores: overview, leaderboards, one per protocol, batches."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def S_by_batch(result: GridResult, cells: pd.DataFrame) -> list[pd.DataFrame]:
 def frequencies(result: GridResult, cells: pd.DataFrame, protocol: str) -> list[Frequency]:
     """Per selector that chooses, at the number of points of its best cell: how often each point was chosen.
 
-    Where all points are taken there is no choice to look at, so the best cell with fewer stands for it.
+    Where all points are taken there is no choice, so the best cell with fewer represents it.
     """
     out = []
     with_inputs = cells[(cells["n_tsp"] > 0) & ~is_baseline(cells)]
@@ -159,24 +159,22 @@ _WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches
 
 
 def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: str, simulated: bool) -> Table:
-    """A row per channel: name, its cells from `extracts.scored`, the promoted cell, decimals."""
+    """A row per channel: name, its cells from `scored`, the promoted cell, decimals."""
     out = []
     for name, cells, choice, digits in rows:
         zero = cells[cells["family"] == "zero"]
         nothing = float(zero["S_mean_um"].iloc[0]) if len(zero) else math.nan
         own = _row_of(cells, choice)
         out.append(
-            Row(
-                (
-                    name,
-                    plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else NOTHING,
-                    plus_minus(choice.S_mean_um, choice.S_std_um, digits),
-                    plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits),
-                    number(float(own["max_abs_um"]), 1) if own is not None else NOTHING,
-                    percent(1 - choice.S_mean_um / nothing) if nothing else NOTHING,
-                    cell_label(choice.selector, choice.family, choice.n_tsp),
-                    ", ".join(choice.inputs) or "none",
-                )
+            Row.of(
+                name,
+                plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else NOTHING,
+                plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+                plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits),
+                number(float(own["max_abs_um"]), 1) if own is not None else NOTHING,
+                percent(1 - choice.S_mean_um / nothing) if nothing else NOTHING,
+                cell_label(choice.selector, choice.family, choice.n_tsp),
+                ", ".join(choice.inputs) or "none",
             )
         )
     columns = (
@@ -193,26 +191,28 @@ def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: st
     return Table(caption, columns, tuple(out), simulated)
 
 
-def leaderboard(
-    result: GridResult,
-    cells: pd.DataFrame,
-    key: str,
-    choice: Choice | None,
-    rule: PromotionRule,
-    digits: int,
-    caption: str,
-    mark: str = "chosen",
-) -> Table:
+@dataclass(frozen=True)
+class Promoted:
+    """The promoted cell with its `mark` in tables, the rule that orders them, and the decimals of a score."""
+
+    choice: Choice
+    rule: PromotionRule
+    digits: int
+    mark: str = "chosen"
+
+
+def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Promoted, caption: str) -> Table:
     """The best cell of every family or selector under one protocol, least score first; baselines always in it.
 
     Args:
-        cells: one protocol's cells from `extracts.scored`.
+        cells: one protocol's cells from `scored`.
         key: family or selector.
-        choice: the promoted cell; it gets a row of its own where it is no row's best, and the `mark`.
+        promoted: its cell gets a row of its own where it is no row's best.
     """
+    choice, rule, digits = promoted.choice, promoted.rule, promoted.digits
     base = is_baseline(cells)
     rows = best_per(cells[~base], key)
-    own = _row_of(cells, choice) if choice else None
+    own = _row_of(cells, choice)
     if own is not None and not (rows[CELL_KEYS] == own[CELL_KEYS]).all(axis=1).any():
         rows = pd.concat([rows, own.to_frame().T.astype(cells.dtypes)], ignore_index=True)
     rows = pd.concat([rows, cells[base]], ignore_index=True).drop_duplicates(CELL_KEYS)
@@ -241,7 +241,7 @@ def leaderboard(
             "stability": number(row["tsp_stability"], 2) + (" †" if unstable else "") if row["n_tsp"] else NOTHING,
             **{n: number(group.get(n, math.nan), digits) for n in names},
         }
-        body.append(Row(tuple(cells_of[c.key] for c in columns), mark if chosen else ""))
+        body.append(Row(tuple(cells_of[c.key] for c in columns), promoted.mark if chosen else ""))
     dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
     notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}; {_rests_on(result, protocol)}."]
     if any(isinstance(cell, Strip) and cell.beyond for row in body for cell in row.cells):
@@ -283,18 +283,16 @@ def batches(result: GridResult, choice: Choice, digits: int) -> Table:
     for row in result.batches.to_dict("records"):
         b = row["batch_id"]
         out.append(
-            Row(
-                (
-                    str(b),
-                    str(row.get("start") or NOTHING).replace("T", " ")[:16].removesuffix(" 00:00"),
-                    str(row.get("speed", "–")),
-                    number(float(row.get("start_ambient_degC", math.nan)), 1),
-                    f"{row['n_rows']}",
-                    number(_at(zero, b, "S_um"), digits),
-                    number(_at(own, b, "S_um"), digits),
-                    number(_at(own, b, "max_abs_um"), 1),
-                    number(_at(own, b, "bias_um"), 1, sign=True),
-                )
+            Row.of(
+                str(b),
+                str(row.get("start") or NOTHING).replace("T", " ")[:16].removesuffix(" 00:00"),
+                str(row.get("speed", "–")),
+                number(float(row.get("start_ambient_degC", math.nan)), 1),
+                f"{row['n_rows']}",
+                number(_at(zero, b, "S_um"), digits),
+                number(_at(own, b, "S_um"), digits),
+                number(_at(own, b, "max_abs_um"), 1),
+                number(_at(own, b, "bias_um"), 1, sign=True),
             )
         )
     columns = (
@@ -324,8 +322,8 @@ def _strip(values: np.ndarray, mean_um: float, scale: Scale, digits: int) -> Str
     beyond = int((good > scale.high_um).sum())
     if not len(good):
         return Strip((), 0.0, 0, NOTHING)
-    words = f"{number(good[0], digits)} to {number(good[-1], digits)}, median {number(float(np.median(good)), digits)}"
-    return Strip(tuple(scale.at(float(v)) for v in good), scale.at(mean_um), beyond, words)
+    label = f"{number(good[0], digits)} to {number(good[-1], digits)}, median {number(float(np.median(good)), digits)}"
+    return Strip(tuple(scale.at(float(v)) for v in good), scale.at(mean_um), beyond, label)
 
 
 def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[str, float]]:
@@ -339,7 +337,7 @@ def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[
 
 
 def _group_order(name: str) -> tuple[int, float, str]:
-    """Seasons from cold to warm, speeds from slow to fast, words last."""
+    """Seasons from cold to warm, speeds from slow to fast, other names last."""
     found = re.search(r"[\d.]+", name)
     side = {"below": -1, "above": 1}.get(name.split(" ")[0], 0)
     return (side if found else 2, float(found[0]) if found else 0.0, name)

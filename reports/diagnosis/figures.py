@@ -1,4 +1,4 @@
-"""Before and after: left-out rms by channel, and left-out batches. Each takes data and returns a figure."""
+"""The figures of a diagnosis. Each takes data and returns a figure; none computes a result."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from reports.diagnosis.map import KINDS
-from reports.diagnosis.tables import SEEN_Z, UNITS, ordered, strongest
-from reports.labels import BLUE, INK, ORANGE, number
-from reports.twin.figures import _WIDTH_IN, MUTED, SIGNED, _calm, _head
+from reports.diagnosis.tables import SEEN_Z, ordered, strongest
+from reports.drawing import MUTED, SIGNED, WIDTH_IN, calm, head, legend_row
+from reports.labels import BLUE, INK, ORANGE, number, tex_escaped, unit_label
 
 FLOOR = "#cfd6dd"
 _ROW_IN, _MOST_ROWS, _MOST_RUNS = 0.27, 12, 30
@@ -26,23 +27,23 @@ def before_after(channels: pd.DataFrame, changed: bool, simulated: bool) -> Figu
     """A dumbbell per channel, displacements left and temperatures right, with the noise floor as a bar behind.
 
     Args:
-        channels: `diagnosis_extracts.by_channel`, in the order to draw; at most 12 of a unit are drawn.
+        channels: `tables.by_channel`, in the order to draw; at most 12 of a unit are drawn.
         changed: whether something was found; else there is one dot a channel.
     """
     groups = [part for _, part in channels.groupby(channels["unit"].isin(["K", "degC"]), sort=False)]
-    left_over = [max(len(g) - _MOST_ROWS, 0) for g in groups]
+    hidden = [max(len(g) - _MOST_ROWS, 0) for g in groups]
     groups = [g[:_MOST_ROWS] for g in groups]
     high = _ROW_IN * max(len(g) for g in groups) + 1.3
-    fig = Figure(figsize=(_WIDTH_IN, high))
-    panel = _WIDTH_IN / len(groups)
+    fig = Figure(figsize=(WIDTH_IN, high))
+    panel = WIDTH_IN / len(groups)
     for k, part in enumerate(groups):
         left, wide, tall = k * panel + _NAMES_IN, panel - _NAMES_IN - _NUMBERS_IN, _ROW_IN * len(part)
-        ax = fig.add_axes((left / _WIDTH_IN, 1 - (0.86 + tall) / high, wide / _WIDTH_IN, tall / high))
+        ax = fig.add_axes((left / WIDTH_IN, 1 - (0.86 + tall) / high, wide / WIDTH_IN, tall / high))
         _bells(ax, part, [str(c) for c in part["channel"]], changed)
         _numbers(ax, part, changed, wide)
-        if left_over[k]:
-            ax.set_xlabel(f"{ax.get_xlabel()}; {left_over[k]} more channels change less", fontsize=8, labelpad=1)
-    _head(fig, "Error of left-out runs against the noise floor", simulated)
+        if hidden[k]:
+            ax.set_xlabel(f"{ax.get_xlabel()}; {hidden[k]} more channels change less", fontsize=8, labelpad=1)
+    head(fig, "Error of left-out runs against the noise floor", simulated)
     _keys(fig, changed)
     return fig
 
@@ -52,27 +53,27 @@ def by_run(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated:
     every = list(dict.fromkeys(rms["batch"]))
     runs = every[:_MOST_RUNS]
     high = 0.2 * len(runs) + 1.35
-    fig = Figure(figsize=(_WIDTH_IN, high))
-    wide = (_WIDTH_IN - _NAMES_IN) / len(channels)
+    fig = Figure(figsize=(WIDTH_IN, high))
+    wide = (WIDTH_IN - _NAMES_IN) / len(channels)
     for k, channel in enumerate(channels):
         own = rms[rms["channel"] == channel].drop_duplicates("batch").set_index("batch")
         part = own.reindex(runs)
-        size = ((_NAMES_IN + k * wide) / _WIDTH_IN, 0.45 / high, (wide - 0.25) / _WIDTH_IN, 0.2 * len(runs) / high)
+        size = ((_NAMES_IN + k * wide) / WIDTH_IN, 0.45 / high, (wide - 0.25) / WIDTH_IN, 0.2 * len(runs) / high)
         ax = fig.add_axes(size)
         _bells(ax, part, [_shortened(str(r)) for r in runs] if k == 0 else [""] * len(runs), changed)
-        ax.set_title(_free(channel), fontsize=9, loc="left", color=INK, pad=4)
+        ax.set_title(tex_escaped(channel), fontsize=9, loc="left", color=INK, pad=4)
         if changed:
             better = f"{int((own['after'] < own['before']).sum())} of {int(own['after'].notna().sum())} better"
             ax.set_title(better, fontsize=8, loc="right", color=MUTED, pad=4)
     first = f" (the first {len(runs)} of {len(every)})" if len(every) > len(runs) else ""
-    _head(fig, f"Run by run, each predicted from the others{first}", simulated)
+    head(fig, f"Run by run, each predicted from the others{first}", simulated)
     _keys(fig, changed)
     return fig
 
 
 def _bells(ax: Axes, part: pd.DataFrame, names: Sequence[str], changed: bool) -> None:
     """Floor, before and after of every row."""
-    _calm(ax)
+    calm(ax)
     top = float(np.nanmax(part[["before", "after", "floor"]].to_numpy(float), initial=0.0)) or 1.0
     units = part["unit"].dropna()
     at = np.arange(len(part))
@@ -82,8 +83,8 @@ def _bells(ax: Axes, part: pd.DataFrame, names: Sequence[str], changed: bool) ->
         ax.plot(part["before"], at, "o", ms=7, mfc=ORANGE, mec="white", mew=0.9, zorder=4)
     ax.plot(part["after"], at, "o", ms=7, mfc=BLUE, mec="white", mew=0.9, zorder=5)
     ax.set(xlim=(0, 1.06 * top), ylim=(len(part) - 0.5, -0.5))
-    ax.set_yticks(at, [_free(n) for n in names], fontsize=8.5)
-    unit = UNITS.get(str(units.iloc[0]), str(units.iloc[0])) if len(units) else ""
+    ax.set_yticks(at, [tex_escaped(n) for n in names], fontsize=8.5)
+    unit = unit_label(str(units.iloc[0])) if len(units) else ""
     ax.set_xlabel(f"rms, {unit}", fontsize=8, labelpad=1)
     ax.grid(axis="y", visible=False)
     ax.tick_params(axis="y", length=0)
@@ -93,98 +94,85 @@ def _bells(ax: Axes, part: pd.DataFrame, names: Sequence[str], changed: bool) ->
 def _numbers(ax: Axes, part: pd.DataFrame, changed: bool, wide_in: float) -> None:
     """Columns right of a panel: before → after, noise, runs that improve."""
     columns = [1 + x / wide_in for x in (0.8, 1.2, 1.9)]
-    look: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "ha": "right"}
-    for x, words in zip(columns, ("rms", "noise", "runs better" if changed else ""), strict=True):
-        ax.text(x, -0.86, words, fontsize=7.5, color=MUTED, **look)
+    style: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "ha": "right"}
+    for x, label in zip(columns, ("rms", "noise", "runs better" if changed else ""), strict=True):
+        ax.text(x, -0.86, label, fontsize=7.5, color=MUTED, **style)
     for i, r in enumerate(part.to_dict("records")):
         digits = _digits(max(r["before"], r["after"]))
         after = number(r["after"], digits)
         values = f"{number(r['before'], digits)} → {after}" if changed else after
         cells = (values, number(r["floor"], digits), f"{r['improved']} of {r['batches']}" if changed else "")
-        for x, words, color in zip(columns, cells, (INK, MUTED, MUTED), strict=True):
-            ax.text(x, i, words, fontsize=8.5, color=color, **look)
+        for x, label, color in zip(columns, cells, (INK, MUTED, MUTED), strict=True):
+            ax.text(x, i, label, fontsize=8.5, color=color, **style)
 
 
 def _keys(fig: Figure, changed: bool) -> None:
     """What the marks mean, below the title."""
     entries = [("●", "before", ORANGE), ("●", "after", BLUE)] if changed else [("●", "simulation", BLUE)]
-    x, y = _NAMES_IN / _WIDTH_IN, 1 - 0.5 / fig.get_figheight()
-    for mark, words, color in (*entries, ("■", "noise floor", FLOOR)):
-        fig.text(x, y, mark, fontsize=10, color=color, va="center")
-        fig.text(x + 0.016, y, words, fontsize=8.5, color=MUTED if color == FLOOR else color, va="center")
-        x += 0.034 + 0.0068 * len(words)
+    legend_row(fig, [*entries, ("■", "noise floor", FLOOR)], _NAMES_IN, 0.5)
 
 
 def left_out_batches(
-    series: pd.DataFrame,
-    rms: pd.DataFrame,
-    batches: Sequence[tuple[str, str]],
-    channels: Sequence[str],
-    changed: bool,
+    series: pd.DataFrame, rms: pd.DataFrame, batches: Sequence[tuple[str, str]], channels: Sequence[str], changed: bool,
     simulated: bool,
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Small multiples: a row per left-out batch (with the reason why it is shown), a column per channel."""
     n, m = len(batches), max(len(channels), 1)
-    cell, head = 1.75, 0.95
-    high = cell * n + head + 0.35
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    cell, top = 1.75, 0.95
+    high = cell * n + top + 0.35
+    fig = Figure(figsize=(WIDTH_IN, high))
     left, gap = 0.05, 0.04
     wide = (1 - left - 0.005 - gap * (m - 1)) / m
     for i, (batch, why) in enumerate(batches):
-        y = 1 - (head + cell * i) / high
-        fig.text(0.1 / _WIDTH_IN, y + 0.12 / high, _free(batch), fontsize=9, color=INK, fontweight="bold", va="center")
-        x = 0.1 / _WIDTH_IN + 0.0086 * len(batch) + 0.012
+        y = 1 - (top + cell * i) / high
+        fig.text(
+            0.1 / WIDTH_IN, y + 0.12 / high, tex_escaped(batch), fontsize=9, color=INK, fontweight="bold", va="center"
+        )
+        x = 0.1 / WIDTH_IN + 0.0086 * len(batch) + 0.012
         fig.text(x, y + 0.12 / high, why, fontsize=8.5, color=MUTED, va="center")
         for j, channel in enumerate(channels):
             bottom = y - (cell - 0.42) / high
             ax = fig.add_axes((left + j * (wide + gap), bottom, wide, (cell - 0.72) / high))
             own = series[(series["batch"] == batch) & (series["channel"] == channel)]
-            told = rms[(rms["batch"] == batch) & (rms["channel"] == channel)]
-            _run(ax, own, told, channel, changed)
+            scores = rms[(rms["batch"] == batch) & (rms["channel"] == channel)]
+            _run(ax, own, scores, channel, changed)
             if i == n - 1:
                 ax.set_xlabel("time, h", fontsize=8, labelpad=1)
             else:
                 ax.tick_params(labelbottom=False)
-    _head(fig, "Left-out runs, predicted without ever having been seen", simulated)
-    entries = [("recording", INK)]
-    entries += [("simulation before", ORANGE), ("simulation after", BLUE)] if changed else [("simulation", BLUE)]
-    x = left
-    for words, color in entries:
-        fig.text(x, 1 - 0.5 / high, f"— {words}", fontsize=8.5, color=color, va="center")
-        x += 0.034 + 0.0068 * len(words)
+    head(fig, "Left-out runs, predicted without ever having been seen", simulated)
+    entries = [("—", "recording", INK)]
+    entries += [("—", "simulation before", ORANGE)] if changed else []
+    legend_row(fig, [*entries, ("—", "simulation after" if changed else "simulation", BLUE)], left * WIDTH_IN, 0.5)
     return fig
 
 
-def _run(ax: Axes, own: pd.DataFrame, told: pd.DataFrame, channel: str, changed: bool) -> None:
-    _calm(ax)
+def _run(ax: Axes, own: pd.DataFrame, scores: pd.DataFrame, channel: str, changed: bool) -> None:
+    calm(ax)
     hours = own["time_s"].to_numpy(float) / 3600
     if changed:
         ax.plot(hours, own["before"], color=ORANGE, lw=1.5, label="before")
     ax.plot(hours, own["after"], color=BLUE, lw=1.9, label="after")
     ax.plot(hours, own["recorded"], color=INK, lw=0.9, label="recorded")
-    unit = UNITS.get(str(own["unit"].iloc[0]), str(own["unit"].iloc[0])) if len(own) else ""
-    ax.set_title(_free(f"{channel}, {unit}"), fontsize=8.5, loc="left", color=INK, pad=3)
-    for r in told.to_dict("records"):
+    unit = unit_label(str(own["unit"].iloc[0])) if len(own) else ""
+    ax.set_title(tex_escaped(f"{channel}, {unit}"), fontsize=8.5, loc="left", color=INK, pad=3)
+    for r in scores.to_dict("records"):
         digits = _digits(max(r["before"], r["after"]))
-        after = f"rms {number(r['after'], digits)} {UNITS.get(r['unit'], r['unit'])}"
-        words = after.replace("rms ", f"rms {number(r['before'], digits)} → ") if changed else after
-        ax.set_title(words, fontsize=8, loc="right", color=BLUE, pad=3)
+        after = f"rms {number(r['after'], digits)} {unit_label(r['unit'])}"
+        label = after.replace("rms ", f"rms {number(r['before'], digits)} → ") if changed else after
+        ax.set_title(label, fontsize=8, loc="right", color=BLUE, pad=3)
     ax.locator_params(axis="y", nbins=4)
     if len(hours) > 1:
         ax.set_xlim(hours[0], hours[-1])
 
 
 def _shortened(name: str) -> str:
-    """Both ends of a long name: what tells runs apart stands mostly last."""
+    """Both ends of a long name: what distinguishes runs stands mostly last."""
     return name if len(name) <= 13 else f"{name[:4]}…{name[-8:]}"
 
 
 def _digits(value: float) -> int:
     return 0 if value >= 99.5 else 1 if value >= 0.95 else 2
-
-
-def _free(name: str) -> str:
-    return name.replace("$", r"\$")
 
 
 BY = {"regime": "by regime", "batch": "by run", "hour": "by time of day", "since_start": "since the run's start"}
@@ -207,39 +195,37 @@ def where_when(where: pd.DataFrame, groups: Sequence[str], simulated: bool) -> F
     feet = 0.066 * min(max(len(x) for g in groups for x in labels[g]), 22) + 0.12
     heights = [_CELL_IN * len(places[k]) for k in kinds]
     high = sum(heights) + 0.42 * len(kinds) + feet + 0.72
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     left, right, gap = 1.25, 0.85, 0.22
     share = [max(len(labels[g]), 3) for g in groups]
-    room = _WIDTH_IN - left - right - gap * (len(groups) - 1)
+    room = WIDTH_IN - left - right - gap * (len(groups) - 1)
     y = high - 0.67
     for i, kind in enumerate(kinds):
         own = where[where["kind"] == kind]
-        unit = UNITS.get(str(own["unit"].iloc[0]), str(own["unit"].iloc[0]))
+        unit = unit_label(str(own["unit"].iloc[0]))
         norm = _symmetric(own[own["by"].isin(groups)])
-        fig.text(0.1 / _WIDTH_IN, 1 - (high - y + 0.26) / high, KINDS[kind], fontsize=8.5, color=MUTED, va="center")
+        fig.text(0.1 / WIDTH_IN, 1 - (high - y + 0.26) / high, KINDS[kind], fontsize=8.5, color=MUTED, va="center")
         y -= 0.42
         x = left
         for g, n in zip(groups, share, strict=True):
             wide = room * n / sum(share)
-            ax = fig.add_axes((x / _WIDTH_IN, (y - heights[i]) / high, wide / _WIDTH_IN, heights[i] / high))
+            ax = fig.add_axes((x / WIDTH_IN, (y - heights[i]) / high, wide / WIDTH_IN, heights[i] / high))
             _matrix(ax, own[own["by"] == g], places[kind], labels[g], norm)
-            ax.set_yticks(range(len(places[kind])), [_free(p) if x == left else "" for p in places[kind]], fontsize=8)
+            ax.set_yticks(
+                range(len(places[kind])), [tex_escaped(p) if x == left else "" for p in places[kind]], fontsize=8
+            )
             if i == 0:
                 ax.set_title(BY.get(g, g), fontsize=9, color=INK, loc="left", pad=4)
             if i == len(kinds) - 1:
-                ax.set_xticks(range(len(labels[g])), [_free(_cut(t)) for t in labels[g]], fontsize=7.5, rotation=90)
+                ax.set_xticks(
+                    range(len(labels[g])), [tex_escaped(_cut(t)) for t in labels[g]], fontsize=7.5, rotation=90
+                )
             x += wide + gap
         _bar(fig, norm, unit, (x - gap + 0.1, y - heights[i], 0.1, heights[i]), high)
         y -= heights[i]
-    _head(fig, "Where × when the recordings hold more (+) or less (−) than the simulation", simulated)
-    fig.text(
-        0.1 / _WIDTH_IN,
-        1 - 0.46 / high,
-        f"Pale: within chance, |z| < {SEEN_Z:g}.",
-        fontsize=8,
-        color=MUTED,
-        va="center",
-    )
+    head(fig, "Where × when the recordings hold more (+) or less (−) than the simulation", simulated)
+    below = f"Pale: within chance, |z| < {SEEN_Z:g}."
+    fig.text(0.1 / WIDTH_IN, 1 - 0.46 / high, below, fontsize=8, color=MUTED, va="center")
     return fig
 
 
@@ -271,11 +257,9 @@ def _matrix(ax: Axes, own: pd.DataFrame, places: Sequence[str], labels: Sequence
 
 def _bar(fig: Figure, norm: Normalize, unit: str, at: tuple[float, float, float, float], high: float) -> None:
     """A colour bar in inches from the lower left corner."""
-    from matplotlib.cm import ScalarMappable
-
     tall = max(at[3], 0.6)
     low = at[1] - (tall - at[3]) / 2
-    cax = fig.add_axes((at[0] / _WIDTH_IN, low / high, at[2] / _WIDTH_IN, tall / high))
+    cax = fig.add_axes((at[0] / WIDTH_IN, low / high, at[2] / WIDTH_IN, tall / high))
     bar = fig.colorbar(ScalarMappable(norm, SIGNED), cax=cax)
     bar.set_label(unit, fontsize=8)
     bar.ax.locator_params(nbins=3)
@@ -287,12 +271,12 @@ def autocorrelation(acf: pd.DataFrame, changed: bool, simulated: bool, most: int
     """The residual against itself some time later, before and after, a panel per channel."""
     channels = list(dict.fromkeys(acf["channel"]))[:most]
     high = 2.35
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     wide = 0.945 / len(channels)
     for k, channel in enumerate(channels):
         own = acf[acf["channel"] == channel]
         ax = fig.add_axes((0.05 + k * wide, 0.42 / high, wide - 0.035, 1.15 / high))
-        _calm(ax)
+        calm(ax)
         hours = own["lag_s"].to_numpy(float) / 3600
         if changed:
             ax.plot(hours, own["before"], color=ORANGE, lw=1.6)
@@ -300,12 +284,11 @@ def autocorrelation(acf: pd.DataFrame, changed: bool, simulated: bool, most: int
         ax.axhline(0, color=MUTED, lw=0.7)
         ax.set_ylim(min(-0.25, float(np.nanmin(own[["before", "after"]].to_numpy(float)))), 1.03)
         ax.set_xlim(0, hours[-1])
-        ax.set_title(_free(str(channel)), fontsize=8.5, loc="left", color=INK, pad=3)
+        ax.set_title(tex_escaped(str(channel)), fontsize=8.5, loc="left", color=INK, pad=3)
         ax.set_xlabel("later by, h", fontsize=8, labelpad=1)
-    _head(fig, "Autocorrelation of what is left in left-out runs", simulated)
-    entries = [("before", ORANGE), ("after", BLUE)] if changed else [("simulated", BLUE)]
-    for k, (words, color) in enumerate(entries):
-        fig.text(0.05 + 0.08 * k, 1 - 0.48 / high, f"— {words}", fontsize=8.5, color=color, va="center")
+    head(fig, "Autocorrelation of the residual of left-out runs", simulated)
+    entries = [("—", "before", ORANGE), ("—", "after", BLUE)] if changed else [("—", "simulated", BLUE)]
+    legend_row(fig, entries, 0.05 * WIDTH_IN, 0.48)
     return fig
 
 
@@ -313,9 +296,9 @@ def null_gains(null: pd.DataFrame, steps: pd.DataFrame, simulated: bool) -> Figu
     """Best gains when nothing is missing (refined twins), the threshold, and the gain of every step that was tried."""
     gains = null["gain"].to_numpy(float)
     high = 2.2
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     ax = fig.add_axes((0.05, 0.45 / high, 0.945, 1.3 / high))
-    _calm(ax)
+    calm(ax)
     least = max(float(np.nanmin(np.r_[gains[gains > 0], steps["gain"][steps["gain"] > 0], 1.0])), 0.1)
     most = float(np.nanmax(np.r_[gains, steps["gain"], steps["threshold"], 10 * least]))
     edges = np.geomspace(0.9 * least, 1.35 * most, 49)
@@ -327,8 +310,8 @@ def null_gains(null: pd.DataFrame, steps: pd.DataFrame, simulated: bool) -> Figu
         at = float(np.clip(r["gain"], edges[0], edges[-1]))
         ax.plot([at, at], [0, 0.72 * top], color=color, lw=2.0)
         side = "right" if at > np.sqrt(edges[0] * edges[-1]) else "left"
-        words = f"step {r['step']}, {'accepted' if r['accepted'] else 'rejected'}"
-        ax.annotate(words, (at, (0.62 - 0.16 * (k % 3)) * top), (-5 if side == "right" else 5, 0), color=color,
+        label = f"step {r['step']}, {'accepted' if r['accepted'] else 'rejected'}"
+        ax.annotate(label, (at, (0.62 - 0.16 * (k % 3)) * top), (-5 if side == "right" else 5, 0), color=color,
                     textcoords="offset points", ha=side, va="center", fontsize=8.5,
                     path_effects=[withStroke(linewidth=3, foreground="white")])  # fmt: skip
     if len(steps):
@@ -341,7 +324,7 @@ def null_gains(null: pd.DataFrame, steps: pd.DataFrame, simulated: bool) -> Figu
     ax.set_xlabel("gain in left-out log score, nats", fontsize=8, labelpad=1)
     ax.set_ylabel("twins", fontsize=8)
     ax.locator_params(axis="y", nbins=3)
-    _head(fig, f"Gains that structure alone gives: {len(gains)} refined twins with nothing missing", simulated)
+    head(fig, f"Gains that structure alone gives: {len(gains)} refined twins with nothing missing", simulated)
     return fig
 
 
@@ -350,15 +333,15 @@ def missing_flux(flux: pd.DataFrame, simulated: bool, most: int = 6) -> Figure:
     pairs = list(dict.fromkeys(zip(flux["kind"], flux["place"], flux["batch"], strict=True)))[:most]
     columns = min(len(pairs), 3)
     rows = -(-len(pairs) // columns)
-    cell, head = 1.65, 0.5
-    high = cell * rows + head + 0.2
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    cell, above = 1.65, 0.5
+    high = cell * rows + above + 0.2
+    fig = Figure(figsize=(WIDTH_IN, high))
     wide = 0.945 / columns
     for k, (kind, place, batch) in enumerate(pairs):
         i, j = divmod(k, columns)
-        bottom = 1 - (head + cell * (i + 1) - 0.3) / high
+        bottom = 1 - (above + cell * (i + 1) - 0.3) / high
         ax = fig.add_axes((0.05 + j * wide, bottom, wide - 0.035, (cell - 0.6) / high))
-        _calm(ax)
+        calm(ax)
         own = flux[(flux["kind"] == kind) & (flux["place"] == place) & (flux["batch"] == batch)]
         hours, value, sd = (own[c].to_numpy(float) for c in ("time_s", "value", "sd"))
         hours = hours / 3600
@@ -370,14 +353,14 @@ def missing_flux(flux: pd.DataFrame, simulated: bool, most: int = 6) -> Figure:
         ax.set_ylim(min(low, 0.0) - 0.04 * (top - low or 1), max(top, 0.0) + 0.04 * (top - low or 1))
         if len(hours) > 1:
             ax.set_xlim(hours[0], hours[-1])
-        unit = UNITS.get(str(own["unit"].iloc[0]), str(own["unit"].iloc[0]))
-        ax.set_title(_free(f"{place}, {unit}"), fontsize=8.5, loc="left", color=INK, pad=3)
-        ax.set_title(_free(str(batch)), fontsize=8, loc="right", color=MUTED, pad=3)
+        unit = unit_label(str(own["unit"].iloc[0]))
+        ax.set_title(tex_escaped(f"{place}, {unit}"), fontsize=8.5, loc="left", color=INK, pad=3)
+        ax.set_title(tex_escaped(str(batch)), fontsize=8, loc="right", color=MUTED, pad=3)
         ax.locator_params(axis="y", nbins=4)
         if i == rows - 1:
             ax.set_xlabel("time, h", fontsize=8, labelpad=1)
     kinds = " and ".join(dict.fromkeys("heat" if k == "heat" else str(k) for k, _, _ in pairs))
-    _head(fig, f"Reconstructed missing {kinds}, with its 90 % band", simulated)
+    head(fig, f"Reconstructed missing {kinds}, with its 90 % band", simulated)
     return fig
 
 

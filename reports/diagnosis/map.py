@@ -11,7 +11,7 @@ from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from reports.labels import BLUE, INK, number
+from reports.labels import BLUE, INK, number, unit_label
 from reports.twin.glyphs import SOFT, Point, Rect, box, pills, pills_width, say, width_in
 from reports.twin.network_picture import (
     NAME_PT,
@@ -35,7 +35,6 @@ CALM, GREY = "#f6f8fa", "#9aa5b1"
 _LEGEND_IN, _ERRORS_IN, _SPARE_IN = 0.62, 0.72, 0.42
 _WIDEST_IN, _MOST_PILL_ROWS, _ROW_IN, _LINE_IN = 1.42, 2, 0.17, 0.165  # of the sensors in a box
 KINDS = {"heat": "unexplained heat", "displacement": "unexplained displacement", "sensor": "unexplained reading"}
-_UNITS = {"um": "µm", "um/m": "µm/m", "degC": "K"}
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class _Drawn:
 
 @dataclass(frozen=True)
 class _Tints:
-    """Colour and words of every place whose mismatch is more than chance."""
+    """Colour and label of every place whose mismatch is more than chance."""
 
     of: dict[tuple[str, str], tuple[float, float, str]]  # size, mean, unit
     top: dict[str, tuple[float, str]]  # by kind
@@ -67,7 +66,7 @@ class _Tints:
         found = self.of.get((kind, place))
         return calm if found is None else to_hex(MISMATCH(found[0] / self.top[kind][0]))
 
-    def words(self, kind: str, place: str) -> str:
+    def label(self, kind: str, place: str) -> str:
         found = self.of.get((kind, place))
         if found is None:
             return ""
@@ -80,8 +79,8 @@ def mismatch_picture(view: Overview, found: pd.DataFrame, marks: Sequence[Mark])
     """The network with its bodies, links, sensors and errors tinted by their unexplained part.
 
     Args:
-        found: `diagnosis_extracts.mismatch`: kind, place, unit, size, mean, shown.
-        marks: what was accepted; places that the picture lacks are told in its head.
+        found: `tables.mismatch`: kind, place, unit, size, mean, shown.
+        marks: what was accepted; places that the picture lacks are listed in its head.
     """
     tints = _tints(found)
     low = _LEGEND_IN + (_ERRORS_IN if view.chains else 0.0)
@@ -123,7 +122,11 @@ def _below(found: pd.DataFrame) -> str:
 def _tints(found: pd.DataFrame) -> _Tints:
     shown = found[found["shown"].astype(bool)]
     of = {
-        (str(r["kind"]), str(r["place"])): (float(r["size"]), float(r["mean"]), _UNITS.get(str(r["unit"]), r["unit"]))
+        (str(r["kind"]), str(r["place"])): (
+            float(r["size"]),
+            float(r["mean"]),
+            unit_label(str(r["unit"])).replace("°C", "K"),
+        )
         for r in shown.to_dict("records")
     }
     top: dict[str, tuple[float, str]] = {}
@@ -133,12 +136,12 @@ def _tints(found: pd.DataFrame) -> _Tints:
 
 
 def _body(view: Overview, b: BodyView, tints: _Tints) -> Body:
-    words = tints.words("heat", b.name)
+    label = tints.label("heat", b.name)
     stubs = tuple(_stub(view, t) for t in view.ties if t.ground and t.ends[0] == b.name)
     ring = "#7c8896" if given_to(view, b.name) else ""
     rows = _sensor_rows(view, b.name, tints)
     last = rows[-1] if rows else ()
-    lines = (((words, INK),) if words else ()) + ((" ", INK),) * (len(rows) - 1)  # lines that further pills take
+    lines = (((label, INK),) if label else ()) + ((" ", INK),) * (len(rows) - 1)  # lines that further pills take
     return Body(b.name, lines, grown(view, b), tuple(last), (), stubs, tints.color("heat", b.name), ring)
 
 
@@ -148,7 +151,7 @@ def _sensor_rows(view: Overview, body: str, tints: _Tints) -> list[list[tuple[st
     own.sort(key=lambda c: -tints.of.get(("sensor", c), (0.0, 0.0, ""))[0])
     rows: list[list[tuple[str, str]]] = []
     for k, c in enumerate(own):
-        pill = (_pill(c, tints.words("sensor", c)), tints.color("sensor", c, "#ffffff"))
+        pill = (_pill(c, tints.label("sensor", c)), tints.color("sensor", c, "#ffffff"))
         if rows and pills_width([*rows[-1], pill]) <= _WIDEST_IN:
             rows[-1].append(pill)
         elif len(rows) < _MOST_PILL_ROWS:
@@ -159,12 +162,12 @@ def _sensor_rows(view: Overview, body: str, tints: _Tints) -> list[list[tuple[st
     return sorted(rows, key=pills_width)  # the widest last: the box is made for it
 
 
-def _pill(channel: str, told: str) -> str:
-    words = f"◆ {channel} {told}".strip()
-    while pills_width([(words, "")]) > _WIDEST_IN and len(channel) > 4:
+def _pill(channel: str, size: str) -> str:
+    label = f"◆ {channel} {size}".strip()
+    while pills_width([(label, "")]) > _WIDEST_IN and len(channel) > 4:
         channel = channel[:-2].rstrip("…") + "…"
-        words = f"◆ {channel} {told}".strip()
-    return words
+        label = f"◆ {channel} {size}".strip()
+    return label
 
 
 def _sensors(ax: Axes, b: Body, rows: list[list[tuple[str, str]]]) -> None:
@@ -184,18 +187,18 @@ def _errors(ax: Axes, view: Overview, tints: _Tints) -> dict[str, Rect]:
         return {}
     y = _LEGEND_IN + 0.36
     ax.plot([SIDE_IN, ax.get_xlim()[1] - SIDE_IN], [_LEGEND_IN + 0.72] * 2, color="#d5dbe1", lw=0.8)
-    words = "Tool against workpiece, given the temperatures"
-    say(ax, (SIDE_IN, y), words, TEXT_PT + 0.5, SOFT, ha="left")
-    x = SIDE_IN + width_in(words, TEXT_PT + 0.5) + 0.3
+    label = "Tool against workpiece, given the temperatures"
+    say(ax, (SIDE_IN, y), label, TEXT_PT + 0.5, SOFT, ha="left")
+    x = SIDE_IN + width_in(label, TEXT_PT + 0.5) + 0.3
     out = {}
     for c in view.chains:
-        told = tints.words("displacement", c.channel)
-        w = 0.36 + width_in(c.channel, NAME_PT, True) + (width_in(told, TEXT_PT) + 0.1 if told else 0.0)
+        size = tints.label("displacement", c.channel)
+        w = 0.36 + width_in(c.channel, NAME_PT, True) + (width_in(size, TEXT_PT) + 0.1 if size else 0.0)
         out[c.channel] = Rect(x + w / 2, y, w, 0.36)
         box(ax, out[c.channel], tints.color("displacement", c.channel))
         say(ax, (x + 0.18, y), c.channel, NAME_PT, INK, ha="left", fontweight="bold")
-        if told:
-            say(ax, (x + w - 0.16, y), told, TEXT_PT, INK, ha="right")
+        if size:
+            say(ax, (x + w - 0.16, y), size, TEXT_PT, INK, ha="right")
         x += w + 0.22
     return out
 
@@ -205,9 +208,9 @@ def _legend(ax: Axes, tints: _Tints, found: pd.DataFrame) -> None:
     y, x = 0.3, SIDE_IN + 0.05
     ax.plot([SIDE_IN, ax.get_xlim()[1] - SIDE_IN], [y + 0.32] * 2, color="#d5dbe1", lw=0.8)
     for kind in dict.fromkeys(str(k) for k in found["kind"]):
-        words = KINDS.get(kind, kind)
+        label = KINDS.get(kind, kind)
         if kind not in tints.top:
-            text = f"no {words}"
+            text = f"no {label}"
             say(ax, (x, y), text, TEXT_PT, SOFT, ha="left")
             x += width_in(text, TEXT_PT) + 0.32
             continue
@@ -215,7 +218,7 @@ def _legend(ax: Axes, tints: _Tints, found: pd.DataFrame) -> None:
         for i in range(41):
             shade = to_hex(MISMATCH(i / 40))
             ax.plot([x + 0.025 * i] * 2, [y - 0.06, y + 0.06], color=shade, lw=2.4, solid_capstyle="butt")
-        text = f"{words} 0 to {_digits(top)} {unit}"
+        text = f"{label} 0 to {_digits(top)} {unit}"
         say(ax, (x + 1.1, y), text, TEXT_PT, SOFT, ha="left")
         x += 1.1 + width_in(text, TEXT_PT) + 0.32
     say(ax, (x, y), "◆ sensor", TEXT_PT, SOFT, ha="left")

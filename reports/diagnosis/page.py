@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import pandas as pd
-from matplotlib.figure import Figure
-
-from data.errors import InputError
-from data.files import write_atomic
 from diagnosis.findings.schema import Finding
 from diagnosis.result import Diagnosis
 from reports.diagnosis import figures as evidence
 from reports.diagnosis import tables
-from reports.diagnosis import tables as words
 from reports.diagnosis.figures import before_after, by_run, left_out_batches
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, telling
-from reports.labels import number
+from reports.drawing import Picture, picture
+from reports.labels import number, unit_label
 from reports.layout import Table
-from reports.rendering import template_environment
-from reports.twin.network_picture import picture_bytes
-from reports.twin.page import Picture
+from reports.rendering import write_page
 from twin.compile import compile_network, expanded
 from twin.views.overview import overview
 
@@ -55,11 +47,11 @@ class Part:
     notes: tuple[str, ...] = ()
     folded: tuple[Table, ...] = ()
     more: tuple[Picture, ...] = ()  # folded too
-    more_words: str = ""
+    more_label: str = ""
 
 
 def diagnosis_parts(d: Diagnosis, pictures: bool = True) -> Iterator[Part]:
-    """Every section that has something to show, in the page's order; without `pictures`, tables and words alone."""
+    """Every section that has something to show, in the page's order; without `pictures`, tables and text alone."""
     makers = (_where, _better, _runs, _evidence, _flux, _limits, _next, _equations)
     for make in makers:
         part = make(d, pictures)
@@ -78,7 +70,7 @@ def _where(d: Diagnosis, pictures: bool) -> Part | None:
             Mark(f"{k} {_short(x.mechanism)}", x.where.kind, x.where.name) for k, x in enumerate(d.findings.findings, 1)
         ]
         figure = mismatch_picture(view, places, marks)
-        shown.append(_picture(figure, "The machine with the mismatch coloured in", d.simulated, "svg"))
+        shown.append(picture(figure, "The machine with the mismatch coloured in", d.simulated, "svg"))
     title = "Where the simulation falls short" if places["shown"].any() else "No place where the simulation falls short"
     notes = (
         "Coloured is what chance gives in fewer than 1 of 1000 cases (χ² of the runs' z); a body's size on paper grows "
@@ -100,10 +92,10 @@ def _better(d: Diagnosis, pictures: bool) -> Part | None:
     shown = []
     if pictures:
         figure = before_after(channels, changed, d.simulated)
-        shown.append(_picture(figure, "Left-out rms by channel", d.simulated))
+        shown.append(picture(figure, "Left-out rms by channel", d.simulated))
     if pictures and rms["batch"].nunique() > 1:
         names = chosen_channels(channels, changed)
-        shown.append(_picture(by_run(rms, names, changed, d.simulated), "Left-out rms run by run", d.simulated))
+        shown.append(picture(by_run(rms, names, changed, d.simulated), "Left-out rms run by run", d.simulated))
     fit = d.findings.fit
     lead = f"{fit.batches_improved} of {fit.batches} left-out runs are predicted better than before." if changed else ""
     title = "Before and after" if changed else "Error against the noise"
@@ -121,7 +113,7 @@ def _runs(d: Diagnosis, pictures: bool) -> Part | None:
     if not batches or not channels:
         return None
     figure = left_out_batches(series, rms, batches, channels, changed, d.simulated)
-    shown = (_picture(figure, "Left-out runs: recording and simulation", d.simulated),)
+    shown = (picture(figure, "Left-out runs: recording and simulation", d.simulated),)
     return Part("runs", "Runs", "Recording and simulation", pictures=shown)
 
 
@@ -133,12 +125,12 @@ def _evidence(d: Diagnosis, pictures: bool) -> Part | None:
         for groups, into in ((("regime", "batch"), shown), (("hour", "since_start"), more)):
             if t["map"]["by"].isin(groups).any():
                 figure = evidence.where_when(t["map"], groups, sim)
-                told = " and ".join(evidence.BY[g] for g in groups)
-                into.append(_picture(figure, f"Mismatch {told}", sim))
+                grouped = " and ".join(evidence.BY[g] for g in groups)
+                into.append(picture(figure, f"Mismatch {grouped}", sim))
     if pictures and len(t["acf"]):
-        shown.append(_picture(evidence.autocorrelation(t["acf"], changed, sim), "Residual autocorrelation", sim))
+        shown.append(picture(evidence.autocorrelation(t["acf"], changed, sim), "Residual autocorrelation", sim))
     if pictures and len(t["null"]):
-        shown.append(_picture(evidence.null_gains(t["null"], t["steps"], sim), "Gains with nothing missing", sim))
+        shown.append(picture(evidence.null_gains(t["null"], t["steps"], sim), "Gains with nothing missing", sim))
     found = frozenset((x.mechanism, x.where.name) for x in d.findings.findings)
     own = [tables.candidates(t["candidates"], sim, found)] if len(t["candidates"]) else []
     own += [tables.steps(t["steps"], sim)] if len(t["steps"]) else []
@@ -147,7 +139,7 @@ def _evidence(d: Diagnosis, pictures: bool) -> Part | None:
         return None
     folded = [tables.windows(x, f"Finding {k}", sim) for k, x in enumerate(d.findings.findings, 1) if x.when.windows]
     return Part("evidence", "Evidence", "Evidence", pictures=tuple(shown), tables=tuple(own), folded=tuple(folded),
-                more=tuple(more), more_words="Where × when by time of day and since the run's start")  # fmt: skip
+                more=tuple(more), more_label="Where × when by time of day and since the run's start")  # fmt: skip
 
 
 def _flux(d: Diagnosis, pictures: bool) -> Part | None:
@@ -155,8 +147,8 @@ def _flux(d: Diagnosis, pictures: bool) -> Part | None:
     if not len(flux) or not pictures:
         return None
     figure = evidence.missing_flux(flux, d.simulated)
-    notes = ("What would have to arrive there so that the simulation meets the recordings; no law is assumed.",)
-    shown = (_picture(figure, "Reconstructed missing heat over time", d.simulated),)
+    notes = ("What would have to arrive there for the simulation to meet the recordings; no law is assumed.",)
+    shown = (picture(figure, "Reconstructed missing heat over time", d.simulated),)
     return Part("flux", "Over time", "What is missing over time", pictures=shown, notes=notes)
 
 
@@ -180,24 +172,18 @@ def _next(d: Diagnosis, pictures: bool) -> Part | None:
     run = d.findings.next_experiment
     if run is None:
         return None
-    facts = [("Tells apart", " from ".join(name.replace("_", " ") for name in run.separates))]
+    facts = [("Distinguishes", " from ".join(name.replace("_", " ") for name in run.separates))]
     facts += [("Run plan", run.file)] if run.file else []
-    return Part("next", "Next experiment", "Next experiment", words.experiment_words(run), tuple(facts))
+    return Part("next", "Next experiment", "Next experiment", tables.experiment_sentence(run), tuple(facts))
 
 
 def _equations(d: Diagnosis, pictures: bool) -> Part | None:
     laws = []
     for k, x in enumerate(d.findings.findings, 1):
-        label = f"{k}. {words.mechanism_words(x.mechanism)}, {words.where_words(x.where.kind, x.where.name)}"
+        label = f"{k}. {tables.mechanism_label(x.mechanism)}, {tables.place_label(x.where.kind, x.where.name)}"
         if x.equation or x.parameters:
             laws.append(Law(label, x.equation, tables.parameters(x.parameters, d.simulated, "Parameters")))
     return Part("equation", "Equation", "The equation with its numbers", laws=tuple(laws)) if laws else None
-
-
-def _picture(figure: Figure, said: str, simulated: bool, kind: str = "png") -> Picture:
-    content = base64.b64encode(picture_bytes(figure, kind)).decode("ascii")
-    mime = "image/svg+xml" if kind == "svg" else "image/png"
-    return Picture(said, f"data:{mime};base64,{content}", simulated)
 
 
 _MOST_FIGURES, _TELLING = 3, 0.1  # a change by the noise floor
@@ -247,7 +233,7 @@ class DiagnosisPage:
     drafted: str
     found: tuple[Found, ...]
     figures: tuple[KeyFigure, ...]
-    settle: str  # the run that would tell tied causes apart
+    settle: str  # the run that would distinguish tied causes
     remarks: tuple[str, ...]
     parts: tuple[Part, ...]
     method: tuple[str, ...]
@@ -256,62 +242,52 @@ class DiagnosisPage:
 
 
 def write_diagnosis_report(path: Path, d: Diagnosis, pictures: bool = True) -> None:
-    """Write the page. It holds everything it needs and asks no network; it appears whole or not at all.
+    """Write the page. It is self-contained; it appears whole or not at all.
 
-    Without `pictures` the tables and words alone.
+    Without `pictures` the tables and text alone.
 
     Raises:
         InputError: another suffix than .html, or a place that cannot be written.
     """
-    path = Path(path)
-    if path.suffix != ".html":
-        raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html")
-    shown = diagnosis_page(d, pictures)
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    text = template_environment(True).get_template("diagnosis.html.j2").render(page=shown, written=written)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, text)
-    except OSError as error:
-        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
+    write_page(Path(path), "diagnosis", diagnosis_page(d, pictures), (".html",))
 
 
 def diagnosis_page(d: Diagnosis, pictures: bool = True) -> DiagnosisPage:
     """Collect the page; whatever table is empty leaves its section out."""
     f = d.findings
-    lead = f.statement or words.below_headline(f.verdict, f.fit.batches, bool(len(d.tables["limits"])))
+    lead = f.statement or tables.below_headline(f.verdict, f.fit.batches, bool(len(d.tables["limits"])))
     return DiagnosisPage(
-        title=f"Diagnosis of {f.machine}: {words.CHIPS[f.verdict]}",
+        title=f"Diagnosis of {f.machine}: {tables.CHIPS[f.verdict]}",
         machine=f.machine,
         simulated=d.simulated,
         verdict=f.verdict,
-        chip=words.CHIPS[f.verdict],
-        headline=words.headline(f.verdict, [x.probability for x in f.findings]),
+        chip=tables.CHIPS[f.verdict],
+        headline=tables.headline(f.verdict, [x.probability for x in f.findings]),
         lead="" if f.findings else lead,  # the findings say it themselves
         drafted=_DRAFTED if d.drafted else "",
         found=tuple(_found(k, x) for k, x in enumerate(f.findings, 1)),
         figures=tuple(_figures(d)),
-        settle="" if f.next_experiment is None else words.experiment_words(f.next_experiment),
-        remarks=d.words,
+        settle="" if f.next_experiment is None else tables.experiment_sentence(f.next_experiment),
+        remarks=d.remarks,
         parts=tuple(diagnosis_parts(d, pictures)),
-        method=words.METHOD,
-        glossary=words.GLOSSARY,
-        seconds="" if f.seconds is None else words.seconds_words(f.seconds),
+        method=tables.METHOD,
+        glossary=tables.GLOSSARY,
+        seconds="" if f.seconds is None else tables.seconds_label(f.seconds),
     )
 
 
 def _found(k: int, x: Finding) -> Found:
-    what = words.mechanism_words(x.mechanism)
+    what = tables.mechanism_label(x.mechanism)
     others = [(o.mechanism, o.where.kind, o.where.name, o.probability) for o in x.alternatives]
     return Found(
         k,
         x.statement,
         what,
-        words.where_words(x.where.kind, x.where.name),
+        tables.place_label(x.where.kind, x.where.name),
         x.when.regime,
-        words.alternative_words(others),
-        words.probability_words(x.probability),
-        words.likelihood(x.probability),
+        tables.alternatives_label(others),
+        tables.probability_label(x.probability),
+        tables.likelihood(x.probability),
         round(100 * x.probability, 1),
     )
 
@@ -326,7 +302,7 @@ def _figures(d: Diagnosis) -> list[KeyFigure]:
         ranked = telling if changed and len(telling) else ranked
         for r in ranked[:_MOST_FIGURES].to_dict("records"):
             digits = 1 if max(r["before"], r["after"]) >= 0.95 else 2
-            unit = words.UNITS.get(str(r["unit"]), str(r["unit"]))
+            unit = unit_label(str(r["unit"]))
             before = number(r["before"], digits) if changed else ""
             small = f"noise {number(r['floor'], digits)} {unit}"
             out.append(KeyFigure(f"{r['channel']}, left-out rms", before, number(r["after"], digits), unit, small))

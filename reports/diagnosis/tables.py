@@ -1,4 +1,4 @@
-"""The tables of a diagnosis: candidates, steps, refinements, limits, parameters."""
+"""Labels and texts of a diagnosis, its tables, and the extracts that its figures draw."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pandas as pd
 from scipy.stats import chi2
 
 from diagnosis.findings.schema import Finding, FoundParameter, NextExperiment
-from diagnosis.findings.statement import LIKELY, SURE
-from reports.labels import NOTHING, between, count, listed, number, percent
+from diagnosis.policy import POLICY
+from reports.labels import NOTHING, between, count, listed, number, percent, three_digits, unit_label
 from reports.layout import Column, Row, Table
 from reports.twin.tables import quantity
 
-# Mastrandrea et al. 2010, IPCC guidance note on uncertainties, table 1: lower bound of the probability, its words.
+# Mastrandrea et al. 2010, IPCC guidance note on uncertainties, table 1: lower bound of the probability, its term.
 _LIKELIHOOD = (
     (0.99, "virtually certain"), (0.95, "extremely likely"), (0.90, "very likely"), (0.66, "likely"),
     (0.50, "more likely than not"), (0.33, "about as likely as not"), (0.10, "unlikely"), (0.0, "very unlikely"),
@@ -26,23 +26,22 @@ CHIPS = {
     "consistent": "consistent", "explained": "explained", "partly_explained": "partly explained",
     "unlisted": "not in the library", "undecidable": "cannot tell yet",
 }  # fmt: skip
-_RIVALS = {
+_ALTERNATIVES = {
     "wrong_parameter": "a wrong parameter", "coarse_network": "too coarse a network",
     "varies_between_runs": "something that varies between runs", "free_flux": "missing heat of no listed mechanism",
     "free_shift": "missing displacement of no listed mechanism", "unlisted": "no listed mechanism",
 }  # fmt: skip
-UNITS = {"um": "µm", "um/m": "µm/m", "degC": "°C", "1": "", "um/K": "µm/K", "um/m/K": "µm/m/K"}
 
 METHOD = (
     "The simulation was first given its best chance: its free parameters were recalibrated, and bodies and sensor "
     "places were refined as long as that lowered the error of runs left out of the fit.",
     "Every mechanism of the library was then tried at every place where it may act, together with sensor faults, "
-    "clock shifts, wrong parameters and too coarse a network as rivals.",
+    "clock shifts, wrong parameters and too coarse a network as alternatives.",
     "The best were refitted in full and judged only on runs left out of the fit.",
     "A finding is accepted when its gain exceeds what structure alone gives when nothing is missing, and when most "
     "left-out runs improve.",
     "Probabilities include “nothing is missing” and “not in the library”; candidates that these "
-    "recordings cannot tell apart share theirs.",
+    "recordings cannot distinguish share theirs.",
 )
 
 GLOSSARY = (
@@ -58,21 +57,21 @@ GLOSSARY = (
     ("unexplained heat, displacement, reading", "What a smooth free input at that place would have to be to close the "
      "gap, the free parameters readjusted. + : the recording has more than the simulation."),
     ("z", "Such a value by its own standard deviation."),
-    ("cluster", "Candidates whose signatures agree so closely that these recordings cannot tell them apart."),
+    ("cluster", "Candidates whose signatures agree so closely that these recordings cannot distinguish them."),
     ("detection limit", "The least effect that these recordings would have shown."),
     ("autocorrelation", "How alike the residual is to itself some time later: 0 for noise, near 1 for physics that is "
      "missing."),
-    ("likelihood words", "After Mastrandrea et al. 2010: virtually certain from 99 %, extremely likely from 95 %, very "
+    ("likelihood terms", "After Mastrandrea et al. 2010: virtually certain from 99 %, extremely likely from 95 %, very "
      "likely from 90 %, likely from 66 %, more likely than not from 50 %."),
 )  # fmt: skip
 
 
 def likelihood(probability: float) -> str:
     """``very likely``, by the scale of the IPCC."""
-    return next(words for least, words in _LIKELIHOOD if probability >= least)
+    return next(term for least, term in _LIKELIHOOD if probability >= least)
 
 
-def probability_words(probability: float) -> str:
+def probability_label(probability: float) -> str:
     """``97 %``, never 0 or 100, and never broken over two lines."""
     percent = 100 * probability
     return ("> 99 %" if percent > 99 else "< 1 %" if percent < 1 else f"{percent:.0f} %").replace(" ", NARROW)
@@ -81,8 +80,9 @@ def probability_words(probability: float) -> str:
 def headline(verdict: str, probabilities: Sequence[float]) -> str:
     """The verdict as one line for the shop floor, as certain as its surest finding; the others may be fewer."""
     n, most, least = len(probabilities), max(probabilities, default=1.0), min(probabilities, default=1.0)
-    the = "The" if most >= SURE else "Most likely the" if most >= LIKELY else "Perhaps the"
-    effects = "one effect" if n == 1 else f"{'up to ' if least < SURE else ''}{_spelled(n)} effects"
+    the = "Perhaps the" if most < POLICY.likely_probability else "Most likely the"
+    the = "The" if most >= POLICY.plain_probability else the
+    effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
     return {
         "consistent": "Consistent: nothing is missing that these runs could show.",
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",
@@ -96,40 +96,40 @@ def below_headline(verdict: str, runs: int, limits: int) -> str:
     """One sentence where a verdict has no finding to speak for it."""
     if verdict != "consistent":
         return ""
-    words = f"In {count(runs, 'left-out run')} the simulation misses no more than noise and a coarse network leave"
-    return words + ("; an effect above the limits below would have been seen." if limits else ".")
+    text = f"In {count(runs, 'left-out run')} the simulation misses no more than noise and a coarse network leave"
+    return text + ("; an effect above the limits below would have been seen." if limits else ".")
 
 
-def where_words(kind: str, name: str) -> str:
+def place_label(kind: str, name: str) -> str:
     """``bed``, ``link bed-floor``, ``sensor z1``, ``error z``."""
     return name if kind == "node" else f"{kind} {name}"
 
 
-def mechanism_words(key: str) -> str:
-    """A mechanism's name for engineers, from the registry; rivals have their own."""
+def mechanism_label(key: str) -> str:
+    """A mechanism's name for engineers, from the registry; alternatives that are no mechanism have their own."""
     from twin.mechanisms import MECHANISMS
 
-    if key in _RIVALS:
-        return _RIVALS[key]
-    return MECHANISMS[key].words if key in MECHANISMS else key.replace("_", " ")
+    if key in _ALTERNATIVES:
+        return _ALTERNATIVES[key]
+    return MECHANISMS[key].summary if key in MECHANISMS else key.replace("_", " ")
 
 
-def alternative_words(others: Sequence[tuple[str, str, str, float]]) -> str:
+def alternatives_label(others: Sequence[tuple[str, str, str, float]]) -> str:
     """``radiation at bed (2 %)`` for every (mechanism, kind, name, probability)."""
     said = [
-        f"{mechanism_words(key)} at {where_words(kind, name)} ({probability_words(p)})" for key, kind, name, p in others
+        f"{mechanism_label(key)} at {place_label(kind, name)} ({probability_label(p)})" for key, kind, name, p in others
     ]
     return listed(said, 4)
 
 
-def experiment_words(run: NextExperiment) -> str:
+def experiment_sentence(run: NextExperiment) -> str:
     """The run as a sentence, with its hours."""
     hours = "" if run.hours is None else f"; {run.hours:.3g} h in all"
     said = run.run[:1].upper() + run.run[1:].rstrip(".")
     return f"{said}{hours}."
 
 
-def seconds_words(seconds: float) -> str:
+def seconds_label(seconds: float) -> str:
     return f"{number(seconds, 0)} s" if seconds < 120 else f"{number(seconds / 60, 1)} min"
 
 
@@ -149,17 +149,15 @@ def candidates(table: pd.DataFrame, simulated: bool, accepted: frozenset[tuple[s
     """
     shown = table.sort_values("rank", kind="stable")[:_MOST_CANDIDATES]
     rows = [
-        Row(
-            (
-                str(r["words"]),
-                number(float(r["gain"]), 0 if abs(float(r["gain"])) >= 9.95 else 1, sign=True),
-                f"{int(r['improved'])} of {int(r['batches'])}",
-                _amplitude(float(r["amplitude"]), str(r["unit"])),
-                percent(float(r["absorbed"])),
-                _chance(float(r["probability"])),
-                f"{int(r['cluster'])}",
-            ),
-            "found" if (str(r["mechanism"]), place(r)) in accepted else "",
+        Row.of(
+            str(r["words"]),
+            _nats(r["gain"], sign=True),
+            f"{int(r['improved'])} of {int(r['batches'])}",
+            _amplitude(float(r["amplitude"]), str(r["unit"])),
+            percent(float(r["absorbed"])),
+            _chance(float(r["probability"])),
+            f"{int(r['cluster'])}",
+            mark="found" if (str(r["mechanism"]), place(r)) in accepted else "",
         )
         for r in shown.to_dict("records")
     ]
@@ -180,12 +178,16 @@ def place(row: Mapping[Any, Any]) -> str:
     return str(row["name"]).removeprefix(f"{row['mechanism']}_")
 
 
+def _nats(value: Any, sign: bool = False) -> str:
+    return number(float(value), 0 if abs(float(value)) >= 9.95 else 1, sign)
+
+
 def _amplitude(value: float, unit: str) -> str:
     return quantity(float(f"{value:.3g}"), unit) if math.isfinite(value) else NOTHING
 
 
 def _chance(p: float) -> str:
-    return probability_words(p) if math.isfinite(p) else NOTHING
+    return probability_label(p) if math.isfinite(p) else NOTHING
 
 
 def runs(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated: bool) -> Table:
@@ -200,8 +202,8 @@ def runs(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated: b
             before, after = at.get((batch, c), (math.nan, math.nan))
             digits = 1 if max(before, after) >= 0.95 else 2
             cells.append(f"{number(before, digits)} → {number(after, digits)}" if changed else number(after, digits))
-        rows.append(Row((str(batch), *cells)))
-    columns = (Column("run"), *(Column(c, UNITS.get(unit[c], unit[c]), "number") for c in shown))
+        rows.append(Row.of(str(batch), *cells))
+    columns = (Column("run"), *(Column(c, unit_label(unit[c]), "number") for c in shown))
     left = len(channels) - len(shown)
     notes = (f"Without {left} more channels, which change less.",) if left > 0 else ()
     return Table("Left-out rms of every run", columns, tuple(rows), simulated, notes=notes)
@@ -209,19 +211,11 @@ def runs(rms: pd.DataFrame, channels: Sequence[str], changed: bool, simulated: b
 
 def steps(table: pd.DataFrame, simulated: bool) -> Table:
     """The search, step by step."""
-    rows = [
-        Row(
-            (
-                f"{r['step']}",
-                str(r["words"]),
-                number(float(r["gain"]), 0 if abs(float(r["gain"])) >= 9.95 else 1, sign=True),
-                number(float(r["threshold"]), 0 if abs(float(r["threshold"])) >= 9.95 else 1),
-                f"{int(r['improved'])}",
-                "accepted" if r["accepted"] else "rejected",
-            )
-        )
-        for r in table.to_dict("records")
-    ]
+    rows = []
+    for r in table.to_dict("records"):
+        gain, threshold = _nats(r["gain"], sign=True), _nats(r["threshold"])
+        verdict = "accepted" if r["accepted"] else "rejected"
+        rows.append(Row.of(f"{r['step']}", str(r["words"]), gain, threshold, f"{int(r['improved'])}", verdict))
     columns = (
         Column("step"), Column("tried", kind="wide"), Column("gain", "nats", "number"),
         Column("threshold", "nats", "number"), Column("runs better", kind="number"), Column("verdict"),
@@ -232,12 +226,12 @@ def steps(table: pd.DataFrame, simulated: bool) -> Table:
 def refinements(table: pd.DataFrame, simulated: bool) -> Table:
     """What was made finer before any physics was named."""
     rows = [
-        Row((str(r["what"]), str(r["why"]), _figure(r["before"]), _figure(r["after"])))
+        Row.of(str(r["what"]), str(r["why"]), _figure(r["before"]), _figure(r["after"]))
         for r in table.to_dict("records")
     ]
     columns = (
-        Column("refined", kind="wide"), Column("why", kind="wide"), Column("left-out error before", kind="number"),
-        Column("after", kind="number"),
+        Column("refined", kind="wide"), Column("why", kind="wide"),
+        Column("left-out log score before (nats)", kind="number"), Column("after", kind="number"),
     )  # fmt: skip
     notes = ("A network that is too coarse looks like missing physics, so it is refined first.",)
     return Table("Refinements of the baseline", columns, tuple(rows), simulated, notes=notes)
@@ -249,17 +243,10 @@ def _figure(value: Any) -> str:
 
 def limits(table: pd.DataFrame, simulated: bool) -> Table:
     """The least effect that would have been seen, per candidate, and what hides it."""
-    rows = [
-        Row(
-            (
-                str(r["words"]),
-                _amplitude(float(r["limit"]), str(r["unit"])),
-                percent(float(r["absorbed"])),
-                str(r["absorbed_by"] or NOTHING),
-            )
-        )
-        for r in table.to_dict("records")
-    ]
+    rows = []
+    for r in table.to_dict("records"):
+        limit, absorbed = _amplitude(float(r["limit"]), str(r["unit"])), percent(float(r["absorbed"]))
+        rows.append(Row.of(str(r["words"]), limit, absorbed, str(r["absorbed_by"] or NOTHING)))
     columns = (
         Column("effect", kind="wide"), Column("least that would be seen", kind="number"),
         Column("absorbed", "by recalibrating", "number"), Column("mostly by"),
@@ -271,24 +258,20 @@ def parameters(given: Mapping[str, FoundParameter], simulated: bool, caption: st
     """Fitted values with their 90 % intervals."""
     rows = []
     for name, p in given.items():
-        unit = UNITS.get(p.unit, p.unit)
+        unit = unit_label(p.unit)
         low, high = p.interval90 or (None, None)
-        interval = NOTHING if low is None or high is None else f"{_three(low)} to {_three(high)} {unit}".strip()
-        value = NOTHING if p.value is None else f"{_three(p.value)} {unit}".strip()
-        rows.append(Row((name.replace("_", " "), value, interval)))
+        interval = (
+            NOTHING if low is None or high is None else f"{three_digits(low)} to {three_digits(high)} {unit}".strip()
+        )
+        value = NOTHING if p.value is None else f"{three_digits(p.value)} {unit}".strip()
+        rows.append(Row.of(name.replace("_", " "), value, interval))
     columns = (Column("parameter"), Column("value", kind="number"), Column("90 % interval", kind="number"))
     return Table(caption, columns, tuple(rows), simulated)
 
 
-def _three(value: float) -> str:
-    """Three digits, without a power of ten up to a million."""
-    text = f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
-    return text.replace("-", "−")
-
-
 def windows(finding: Finding, label: str, simulated: bool) -> Table:
     """In which stretches of which runs a finding shows."""
-    rows = [Row((batch, between(start_s, end_s))) for batch, start_s, end_s in finding.when.windows]
+    rows = [Row.of(batch, between(start_s, end_s)) for batch, start_s, end_s in finding.when.windows]
     return Table(f"{label}: windows", (Column("run"), Column("from, to", "h:min of the run")), tuple(rows), simulated)
 
 
@@ -332,8 +315,8 @@ def telling(rms: pd.DataFrame, changed: bool, most: int = 3) -> list[tuple[str, 
     what = "change" if changed else "error"
     names = [str(b) for b in of_batch.index]
     great = names[: max(min(most - 1, len(names) - 1), 1)]
-    words = [f"greatest {what}", f"second greatest {what}", f"third greatest {what}"]
-    chosen = list(zip(great, words, strict=False))
+    reasons = [f"greatest {what}", f"second greatest {what}", f"third greatest {what}"]
+    chosen = list(zip(great, reasons, strict=False))
     typical = names[len(names) // 2]
     return chosen if typical in great else [*chosen, (typical, f"typical, median {what}")]
 

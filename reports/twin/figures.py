@@ -1,27 +1,25 @@
-"""Figures of the twin. Each takes data and returns a figure; none computes a result."""
+"""The figures of a twin and of simulated run plans. Each takes data and returns a figure; none computes a result."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from data.arrays import Array
 from data.batch import Batch
-from reports.labels import BLUE, INK, ORANGE, count, number
-from reports.twin.iso230_3 import _COLOURS, _canvas, _free, _legend, _plain, png
+from reports.drawing import LINES, MUTED, SIGNED, SIZE, WIDTH_IN, calm, head, legend_row, picture_bytes
+from reports.labels import BLUE, INK, ORANGE, count, number, tex_escaped, unit_label
+from reports.twin.iso230_3 import side_legend, stacked
 from twin.views.compared import Compared
 from twin.views.overview import ModeView, time_words
 
-MUTED, GRID = "#5a6572", "#eef1f4"
-SIGNED = LinearSegmentedColormap.from_list("signed", ["#004d7a", "#5fa3cf", "#ffffff", "#e99a66", "#963f00"])
-SIZE = LinearSegmentedColormap.from_list("size", ["#ffffff", "#8ebbd9", "#0b5a8f"])
-_WIDTH_IN, _COLUMNS = 10.5, 4
+_COLUMNS = 4
 
 
 def fit_figure(shown: Compared) -> Figure:
@@ -29,7 +27,7 @@ def fit_figure(shown: Compared) -> Figure:
     n = len(shown.channels)
     columns = min(_COLUMNS, max(n, 1))
     rows = max(math.ceil(n / columns), 1)
-    fig = Figure(figsize=(_WIDTH_IN, 2.35 * rows + 0.75))
+    fig = Figure(figsize=(WIDTH_IN, 2.35 * rows + 0.75))
     top, low, wide = 1 - 0.62 / fig.get_figheight(), 0.5 / fig.get_figheight(), 1.0
     hours = shown.time_s / 3600
     for k in range(n):
@@ -41,28 +39,24 @@ def fit_figure(shown: Compared) -> Figure:
         upper = fig.add_axes((left, bottom + 0.40 * cell, width, 0.43 * cell))
         lower = fig.add_axes((left, bottom + 0.14 * cell, width, 0.22 * cell), sharex=upper)
         _pair(upper, lower, hours, shown, k, bottom_row=k + columns >= n)
-    _head(fig, f"{shown.batch_id}: recorded and simulated", shown.simulated)
-    y = 1 - 0.52 / fig.get_figheight()
-    for x, words, color in (
-        (0.055, "recorded", INK),
-        (0.145, "simulated", BLUE),
-        (0.240, "recorded − simulated", ORANGE),
-    ):
-        fig.text(x, y, f"— {words}", fontsize=8.5, color=color, va="center")
+    head(fig, f"{shown.batch_id}: recorded and simulated", shown.simulated)
+    legend_row(
+        fig, [("—", "recorded", INK), ("—", "simulated", BLUE), ("—", "recorded − simulated", ORANGE)], 0.58, 0.52
+    )
     return fig
 
 
 def _pair(upper: Axes, lower: Axes, hours: Array, shown: Compared, k: int, bottom_row: bool) -> None:
     for ax in (upper, lower):
-        _calm(ax)
+        calm(ax)
     upper.plot(hours, shown.recorded[k], color=INK, lw=1.0, label="recorded")
     upper.plot(hours, shown.computed[k], color=BLUE, lw=1.8, alpha=0.9, label="simulated")
     lower.plot(hours, shown.residual[k], color=ORANGE, lw=1.0, label="residual")
     lower.axhline(0, color=MUTED, lw=0.6)
-    unit = _unit(shown.units[k])
+    unit = unit_label(shown.units[k])
     level = "°C" if unit == "K" else unit
     title = f"{shown.channels[k]}, {level}"
-    upper.set_title(title.replace("$", r"\$"), fontsize=9, loc="left", color=INK, pad=3)
+    upper.set_title(tex_escaped(title), fontsize=9, loc="left", color=INK, pad=3)
     upper.set_title(f"rms {number(float(shown.rms[k]), 2)} {unit}", fontsize=8, loc="right", color=ORANGE, pad=3)
     upper.tick_params(labelbottom=False)
     lower.set_xlim(hours[0], hours[-1] if hours[-1] > hours[0] else hours[0] + 1)
@@ -76,10 +70,10 @@ def _pair(upper: Axes, lower: Axes, hours: Array, shown: Compared, k: int, botto
 
 def residual_map(shown: Compared) -> Figure:
     """Channel × time: recorded less simulated; temperatures and displacements each on their own colours."""
-    groups = _by_unit(shown.units)
+    groups = _byunit_label(shown.units)
     heights = [0.26 * len(g) + 0.05 for g in groups.values()]
     high = sum(heights) + 0.62 * len(heights) + 0.55
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     y = high - 0.55
     hours = shown.time_s / 3600
     for (unit, at), h in zip(groups.items(), heights, strict=True):
@@ -91,17 +85,17 @@ def residual_map(shown: Compared) -> Figure:
         image = ax.imshow(
             values, aspect="auto", cmap=SIGNED, vmin=-top, vmax=top, extent=extent, interpolation="nearest"
         )
-        ax.set_yticks(range(len(at)), [shown.channels[i].replace("$", r"\$") for i in at], fontsize=8)
+        ax.set_yticks(range(len(at)), [tex_escaped(shown.channels[i]) for i in at], fontsize=8)
         ax.tick_params(labelsize=8, length=2, color=MUTED)
         ax.set_facecolor("#d5dbe1")  # nothing usable recorded
         ax.spines[:].set_visible(False)
         bar = fig.colorbar(image, cax=fig.add_axes((0.895, (y - h) / high, 0.012, h / high)))
-        bar.set_label(_unit(unit), fontsize=8)
+        bar.set_label(unit_label(unit), fontsize=8)
         bar.ax.tick_params(labelsize=7.5, length=2)
         bar.outline.set_visible(False)
         y -= h + 0.62
         ax.set_xlabel("time, h", fontsize=8, labelpad=1)
-    _head(fig, f"{shown.batch_id}: residual, recorded − simulated", shown.simulated)
+    head(fig, f"{shown.batch_id}: residual, recorded − simulated", shown.simulated)
     return fig
 
 
@@ -116,7 +110,7 @@ def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of ev
     wide = rms.pivot(index="batch", columns="channel", values="rms").reindex(index=batches, columns=channels)
     values = wide.to_numpy(float)
     high = 0.27 * len(batches) + 1.2
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     ax = fig.add_axes((0.16, 0.08 / high, 0.83, 0.27 * len(batches) / high))
     shade = np.zeros_like(values)
     for u in dict.fromkeys(unit):
@@ -128,8 +122,8 @@ def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of ev
             if np.isfinite(values[i, j]):
                 text = number(values[i, j], 2 if values[i, j] < 9.95 else 1)
                 ax.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if shade[i, j] > 0.6 else INK)
-    ax.set_yticks(range(len(batches)), [b.replace("$", r"\$") for b in batches], fontsize=8)
-    names = [f"{c.replace('_', chr(10)) if len(c) > 9 else c}\n{_unit(unit[c])}".replace("$", r"\$") for c in channels]
+    ax.set_yticks(range(len(batches)), [tex_escaped(b) for b in batches], fontsize=8)
+    names = [tex_escaped(f"{c.replace('_', chr(10)) if len(c) > 9 else c}\n{unit_label(unit[c])}") for c in channels]
     ax.set_xticks(range(len(channels)), names, fontsize=8)
     ax.xaxis.tick_top()
     ax.tick_params(length=0)
@@ -138,7 +132,7 @@ def rms_map(rms: pd.DataFrame, simulated: bool, title: str = "Residual rms of ev
     ax.set_yticks(np.arange(len(batches) + 1) - 0.5, minor=True)
     ax.grid(which="minor", color="white", lw=1.5)
     ax.tick_params(which="minor", length=0)
-    _head(fig, title, simulated)
+    head(fig, title, simulated)
     return fig
 
 
@@ -147,11 +141,11 @@ def mode_shapes(views: Sequence[ModeView], simulated: bool, most: int = 6) -> Fi
     shown = views[:most]
     bodies = list(shown[0].shape)
     high = 0.2 * len(bodies) + 1.6
-    fig = Figure(figsize=(_WIDTH_IN, high))
+    fig = Figure(figsize=(WIDTH_IN, high))
     for k, v in enumerate(shown):
         width = 0.875 / len(shown)
         ax = fig.add_axes((0.115 + k * width, 0.30 / high, width - 0.012, 0.2 * len(bodies) / high))
-        _calm(ax)
+        calm(ax)
         size = [v.shape[b] for b in bodies]
         strong = max(v.weight.values())
         for i, b in enumerate(bodies):
@@ -160,40 +154,22 @@ def mode_shapes(views: Sequence[ModeView], simulated: bool, most: int = 6) -> Fi
         ax.axvline(0, color=INK, lw=0.8)
         ax.set(xlim=(-1.08, 1.08), ylim=(len(bodies) - 0.4, -0.6))
         ax.set_xticks([-1, 0, 1], ["−1", "0", "1"])
-        ax.set_yticks(range(len(bodies)), [b.replace("$", r"\$") for b in bodies] if k == 0 else [""] * len(bodies))
+        ax.set_yticks(range(len(bodies)), [tex_escaped(b) for b in bodies] if k == 0 else [""] * len(bodies))
         ax.set_title(time_words(v.time_constant_s), fontsize=11, color=INK, loc="left", pad=40, fontweight="bold")
         ax.annotate(
-            _wrapped(v.words, 23), (0, 1), (0, 37), xycoords="axes fraction", textcoords="offset points",
+            _wrapped(v.label, 23), (0, 1), (0, 37), xycoords="axes fraction", textcoords="offset points",
             fontsize=7.2, color=MUTED, va="top",
         )  # fmt: skip
-    _head(fig, "Slowest thermal modes", simulated)
+    head(fig, "Slowest thermal modes", simulated)
     return fig
 
 
-def _wrapped(words: str, most: int) -> str:
-    import textwrap
-
-    lines = textwrap.wrap(words, most)
+def _wrapped(text: str, most: int) -> str:
+    lines = textwrap.wrap(text, most)
     return "\n".join(lines if len(lines) <= 3 else [*lines[:2], lines[2][: most - 1] + "…"]).replace("$", r"\$")
 
 
-def _head(fig: Figure, title: str, simulated: bool) -> None:
-    high, wide = fig.get_figheight(), fig.get_figwidth()
-    y = 1 - 0.2 / high
-    fig.text(0.1 / wide, y, title.replace("$", r"\$"), fontsize=11.5, color=INK, fontweight="bold", va="center")
-    if simulated:
-        fig.text(1 - 0.1 / wide, y, "SIMULATED", fontsize=10, color=ORANGE, fontweight="bold", ha="right", va="center")
-
-
-def _calm(ax: Axes) -> None:
-    ax.tick_params(labelsize=7.5, color=MUTED, length=2.5)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color("#b5bec8")
-    ax.grid(color=GRID, lw=0.8)
-    ax.set_axisbelow(True)
-
-
-def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
+def _byunit_label(units: Sequence[str]) -> dict[str, list[int]]:
     out: dict[str, list[int]] = {}
     for i, u in enumerate(units):
         out.setdefault(u, []).append(i)
@@ -205,16 +181,12 @@ def _top(values: Array) -> float:
     return float(np.quantile(good, 0.995)) or 1.0 if len(good) else 1.0
 
 
-def _unit(unit: str) -> str:
-    return {"um": "µm", "um/m": "µm/m", "degC": "°C"}.get(unit, unit)
-
-
 _MOST_PANELS = 8
 
 
 def overview_png(plans: Sequence[tuple[str, Batch]]) -> bytes:
     """The overview of (name, batch) pairs as PNG."""
-    return png(overview(plans))
+    return picture_bytes(overview(plans), "png", 150)
 
 
 def overview(plans: Sequence[tuple[str, Batch]]) -> Figure:
@@ -225,26 +197,26 @@ def overview(plans: Sequence[tuple[str, Batch]]) -> Figure:
     panels = [(1.9, n) for n in errors] + ([(1.9, "")] if sensors else []) + [(1.0, n) for n in drivers]
     if not panels:
         panels = [(1.9, n) for n in first.channels][:1]
-    fig, axes = _canvas([height for height, _ in panels[:_MOST_PANELS]])
+    fig, axes = stacked([height for height, _ in panels[:_MOST_PANELS]])
     for ax, (_, channel) in zip(axes, panels, strict=False):
         for k, (name, batch) in enumerate(plans):
-            hours, colour = batch.time_s / 3600, _COLOURS[k % len(_COLOURS)]
-            dash = ("-", "--", ":", "-.")[k // len(_COLOURS) % 4]
+            hours, colour = batch.time_s / 3600, LINES[k % len(LINES)]
+            dash = ("-", "--", ":", "-.")[k // len(LINES) % 4]
             if channel:
                 how = "steps-post" if channel in drivers else "default"
                 ax.plot(hours, batch.values(channel), lw=1.3, color=colour, ls=dash, drawstyle=how, label=_short(name))
             else:
                 warmest = np.max([batch.values(n) for n in sensors], axis=0)
                 ax.plot(hours, warmest, lw=1.3, color=colour, ls=dash, label=_short(name))
-        unit = _plain(first.channels[channel].unit) if channel else "°C"
-        ax.set_ylabel(f"{_free(channel) if channel else 'warmest sensor'}\n({unit})", fontsize=8)
+        unit = unit_label(first.channels[channel].unit) if channel else "°C"
+        ax.set_ylabel(f"{tex_escaped(channel) if channel else 'warmest sensor'}\n({unit})", fontsize=8)
         ax.margins(x=0, y=0.08)
         if channel in errors:
-            ax.axhline(0, color="#5a6572", lw=0.6)
-    _legend(axes[0])
+            ax.axhline(0, color=MUTED, lw=0.6)
+    side_legend(axes[0])
     axes[-1].set_xlabel("time (h)", fontsize=9)
     height_in = fig.get_figheight()
-    title = f"{_free(first.machine)}, {count(len(plans), 'run plan')}"
+    title = f"{tex_escaped(first.machine)}, {count(len(plans), 'run plan')}"
     fig.text(0.075, 1 - 0.24 / height_in, title, fontsize=11, fontweight="bold", va="center")
     fig.text(0.988, 1 - 0.24 / height_in, "SIMULATED", fontsize=11, color=ORANGE, fontweight="bold", ha="right",
              va="center")  # fmt: skip
@@ -253,4 +225,4 @@ def overview(plans: Sequence[tuple[str, Batch]]) -> Figure:
 
 def _short(name: str, most: int = 20) -> str:
     text = name if len(name) <= most else name[: most - 1] + "…"
-    return _free(text)
+    return tex_escaped(text)

@@ -1,4 +1,4 @@
-"""Where the watts go, drawn: stacked areas over time, and the network at one moment."""
+"""Heat flows drawn: stacked areas over time, and the network at one moment."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize, to_hex
 from matplotlib.figure import Figure
 
 from data.arrays import Array
-from reports.labels import INK, number
-from reports.twin.figures import _WIDTH_IN, MUTED, _calm, _head
+from reports.drawing import MUTED, WIDTH_IN, calm, head
+from reports.labels import INK, number, tex_escaped
 from reports.twin.glyphs import LINK, SOFT, arrow, ground, say, width_in
 from reports.twin.network_picture import (
     SIDE_IN,
@@ -43,9 +43,9 @@ def heat_stack(flows: HeatFlows) -> Figure:
 
     What gives heat back (a body that cools, a surrounding warmer than the machine) stands on the other side.
     """
-    fig = Figure(figsize=(_WIDTH_IN, 5.4))
+    fig = Figure(figsize=(WIDTH_IN, 5.4))
     ax = fig.add_axes((0.07, 0.10, 0.66, 0.80))
-    _calm(ax)
+    calm(ax)
     hours = np.repeat(flows.time_s / 3600, 2)[1:-1]
     groups: list[tuple[str, Mapping[str, Array], LinearSegmentedColormap, float]] = [
         ("heat", flows.heat_W, _HEATS, 1.0),
@@ -66,7 +66,7 @@ def heat_stack(flows: HeatFlows) -> Figure:
     ax.set_xlabel("time, h", fontsize=9)
     ax.set_ylabel("W, put in above, stored and given off below", fontsize=9)
     _entries(fig, entries)
-    _head(fig, f"{flows.batch_id}: where the watts go", flows.simulated)
+    head(fig, f"{flows.batch_id}: where the watts go", flows.simulated)
     return fig
 
 
@@ -101,7 +101,7 @@ def _entries(fig: Figure, entries: Sequence[tuple[str, str, float]]) -> None:
             fig.text(0.75, y, name, fontsize=8.5, color=INK, va="center", fontweight="bold")
         else:
             fig.text(0.755, y, "■", fontsize=10, color=color, va="center")
-            fig.text(0.777, y, name.replace("$", r"\$"), fontsize=8.5, color=INK, va="center")
+            fig.text(0.777, y, tex_escaped(name), fontsize=8.5, color=INK, va="center")
             fig.text(
                 0.985, y, number(mean, 0 if abs(mean) >= 9.95 else 1), fontsize=8.5, color=INK, ha="right", va="center"
             )
@@ -133,11 +133,11 @@ def flow_picture(view: Overview, flows: HeatFlows, time_s: float) -> Figure:
         draw(ax, body)
     _legend(ax, view, warmth, most)
     minutes = round(float(flows.time_s[k + 1]) / 60)
-    words = f"{flows.batch_id} at {minutes // 60}:{minutes % 60:02d} h: heat through {view.machine}"
+    label = f"{flows.batch_id} at {minutes // 60}:{minutes % 60:02d} h: heat through {view.machine}"
     put_in, stored = (sum(float(w[k]) for w in f.values()) for f in (flows.heat_W, flows.storage_W))
     gone = sum(float(w[k]) for w in flows.loss_W.values())
     below = f"{number(put_in, 0)} W put in, {number(stored, 0)} W stored, {number(gone, 0)} W to the surroundings"
-    title(ax, words, below, flows.simulated)
+    title(ax, label, below, flows.simulated)
     return fig
 
 
@@ -207,9 +207,9 @@ def _legend(ax: Axes, view: Overview, warmth: Normalize, most: float) -> None:
     for i in range(41):
         rise = low + i * (high - low) / 40
         ax.plot([x + 0.035 * i] * 2, [y - 0.07, y + 0.07], color=_color(rise, warmth), lw=3.0, solid_capstyle="butt")
-    words = f"rise {number(low, 1)} to {number(high, 1)} K"
-    say(ax, (x + 1.52, y), words, TEXT_PT, SOFT, ha="left")
-    x += 1.75 + width_in(words, TEXT_PT)
+    label = f"rise {number(low, 1)} to {number(high, 1)} K"
+    say(ax, (x + 1.52, y), label, TEXT_PT, SOFT, ha="left")
+    x += 1.75 + width_in(label, TEXT_PT)
     names = list(dict.fromkeys(t.ends[1] for t in view.ties if t.ground))
     for name in names:
         ring = any(b.name == name for b in view.bodies)

@@ -1,4 +1,4 @@
-"""Pieces of the network picture, in inches on paper: text that knows its width, boxes, ground symbols, arrows."""
+"""Pieces of the network picture, in inches on paper: text of known width, boxes, ground symbols, arrows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
 
-from reports.labels import INK
+from reports.labels import INK, tex_escaped
 
 SOFT, LINK, FILL, EDGE = "#5a6572", "#8593a1", "#eef3f8", "#41566b"
 HEAT = "#b84a00"
@@ -77,7 +77,7 @@ def say(ax: Axes, at: Point, text: str, size_pt: float = 7.5, color: str = INK, 
     look = {"ha": "center", "va": "center", "zorder": 6, **look}
     if halo:
         look["path_effects"] = [withStroke(linewidth=halo, foreground="white")]
-    ax.text(*at, text.replace("$", r"\$"), fontsize=size_pt, color=color, **look)
+    ax.text(*at, tex_escaped(text), fontsize=size_pt, color=color, **look)
 
 
 def box(ax: Axes, r: Rect, fill: str = FILL, edge: str = EDGE, dashed: bool = False) -> None:
@@ -92,9 +92,9 @@ def box(ax: Axes, r: Rect, fill: str = FILL, edge: str = EDGE, dashed: bool = Fa
 
 def pills(ax: Axes, y: float, x: float, labels: Sequence[tuple[str, str]], size_pt: float = 6.8) -> None:
     """A row of coloured badges about x."""
-    widths = [width_in(t, size_pt, True) + 0.11 for t, _ in labels]
-    left = x - (sum(widths) + 0.05 * (len(widths) - 1)) / 2
-    for (text, color), w in zip(labels, widths, strict=True):
+    left = x - pills_width(labels, size_pt) / 2
+    for text, color in labels:
+        w = width_in(text, size_pt, True) + 0.11
         ax.add_patch(
             FancyBboxPatch(
                 (left + 0.03, y - 0.04), w - 0.06, 0.08, boxstyle="round,pad=0.03", fc=color,
@@ -107,7 +107,7 @@ def pills(ax: Axes, y: float, x: float, labels: Sequence[tuple[str, str]], size_
 
 
 def _light(color: str) -> bool:
-    """Whether dark words read better on it (relative luminance, WCAG 2.1)."""
+    """Whether dark text reads better on it (relative luminance, WCAG 2.1)."""
     rgb = np.array(to_rgb(color))
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722]) > 0.22
@@ -131,12 +131,11 @@ def ground(ax: Axes, top: Point, color: str, width_pt: float, drop: float, air: 
         ax.plot([x - half, x + half], [y - 0.034 * k] * 2, color=color, lw=1.3, solid_capstyle="butt", zorder=5)
 
 
-def arrow(ax: Axes, a: Point, b: Point, color: str, width_pt: float, zorder: float = 2.0, head: float = 0.0) -> None:
+def arrow(ax: Axes, a: Point, b: Point, color: str, width_pt: float, zorder: float = 2.0) -> None:
     """An arrow from a to b whose head grows with its width."""
-    size = head or 7.0 + 2.2 * width_pt
     ax.add_patch(
         FancyArrowPatch(
-            a, b, arrowstyle="-|>", mutation_scale=size, color=color, lw=width_pt, shrinkA=0, shrinkB=0, zorder=zorder,
-            joinstyle="miter", capstyle="butt",
+            a, b, arrowstyle="-|>", mutation_scale=7.0 + 2.2 * width_pt, color=color, lw=width_pt, shrinkA=0, shrinkB=0,
+            zorder=zorder, joinstyle="miter", capstyle="butt",
         )
     )  # fmt: skip

@@ -1,9 +1,7 @@
-"""The report of one thermal test "in the style of ISO 230-3": header, picture over one time axis, table."""
+"""The report of one thermal test "in the style of ISO 230-3": figure over one time axis, test sheet, page."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,77 +18,59 @@ from data.batch import Batch
 from data.errors import InputError
 from data.files import write_atomic
 from features.iso230_3 import HOUR_S, ProbePair, ThermalTest, Trace, clock, thermal_test
-from reports.labels import INK, ORANGE, count, listed, number
+from reports.drawing import GREY, LINES, MUTED, data_address, picture_bytes
+from reports.labels import INK, ORANGE, count, listed, number, tex_escaped, unit_label
 from reports.layout import Column, Row, Table
-from reports.rendering import template_environment
+from reports.rendering import rendered
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7d6608", "#4b3f72")
-_GREY, _SOFT = "#c5cbd3", "#5a6572"
 _WIDTH_IN, _LEFT_IN, _RIGHT_IN, _TOP_IN, _BOTTOM_IN, _GAP_IN = 10.0, 0.75, 1.75, 0.62, 0.5, 0.16
 _MOST_NAMED = 6
 _DPI = 150
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG, 1500 px wide."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=_DPI)
-    return out.getvalue()
-
-
 def iso_figure(batch: Batch, test: ThermalTest) -> Figure:
-    """Stacked panels. Simulated data are stamped beside the title and across the displacement."""
+    """Stacked panels. Simulated data are stamped next to the title and across the displacement."""
     displacement = [t for t in test.traces if t.unit != "um/m"]
     tilts = [t for t in test.traces if t.unit == "um/m"]
     panels: list[tuple[float, str]] = [(2.5, "displacement")]
     panels += [(1.6, "tilt")] if tilts else []
     panels += [(2.3, "temperatures")] if len(test.temperatures) else []
     panels += [(1.0, name) for name in (test.speed, test.feed, test.position) if name]
-    fig, axes = _canvas([height for height, _ in panels])
+    fig, axes = stacked([height for height, _ in panels])
     rows = (batch.time_s >= test.start_s - 1e-6) & (batch.time_s <= test.end_s + 1e-6)
     hours = batch.time_s[rows] / 3600
     for ax, (_, name) in zip(axes, panels, strict=True):
         if name == "displacement":
             units = sorted({t.unit for t in displacement}) or ["um"]
-            _traces(ax, displacement, f"displacement ({', '.join(map(_plain, units))})")
+            _traces(ax, displacement, f"displacement ({', '.join(map(unit_label, units))})")
         elif name == "tilt":
             _traces(ax, tilts, "tilt (µm/m)")
         elif name == "temperatures":
             _draw_temperatures(ax, batch, test, rows)
         else:
-            unit = _plain(batch.channels[name].unit)
+            unit = unit_label(batch.channels[name].unit)
             values = batch.values(name)[rows]
             ax.step(hours, values, where="post", color=INK, lw=1.2)
             if np.nanmin(values) == np.nanmax(values):
                 ax.set_yticks([float(np.nanmin(values))])
-            ax.set_ylabel(f"{_free(name)}\n({unit})", fontsize=8)
+            ax.set_ylabel(f"{tex_escaped(name)}\n({unit})", fontsize=8)
             ax.margins(y=0.15)
         ax.set_xlim(test.start_s / 3600, test.end_s / 3600)
     _periods(axes, test)
     axes[-1].set_xlabel("time (h)", fontsize=9)
     height_in = fig.get_figheight()
-    title = f"{test.title.removesuffix(' (SIMULATED)')}, {_free(test.machine)}, {_free(test.batch_id)}"
+    title = f"{test.title.removesuffix(' (SIMULATED)')}, {tex_escaped(test.machine)}, {tex_escaped(test.batch_id)}"
     fig.text(_LEFT_IN / _WIDTH_IN, 1 - 0.24 / height_in, title, fontsize=11, color=INK, fontweight="bold", va="center")
     if test.simulated:
-        right = 1 - 0.12 / _WIDTH_IN
-        fig.text(
-            right,
-            1 - 0.24 / height_in,
-            "SIMULATED",
-            fontsize=11,
-            color=ORANGE,
-            fontweight="bold",
-            ha="right",
-            va="center",
-        )
+        stamp: dict[str, Any] = {"color": ORANGE, "fontweight": "bold", "va": "center"}
+        fig.text(1 - 0.12 / _WIDTH_IN, 1 - 0.24 / height_in, "SIMULATED", fontsize=11, ha="right", **stamp)
         axes[0].text(
-            0.5, 0.5, "SIMULATED", transform=axes[0].transAxes, fontsize=40, color=ORANGE, alpha=0.10,
-            ha="center", va="center", fontweight="bold", zorder=0,
-        )  # fmt: skip
+            0.5, 0.5, "SIMULATED", transform=axes[0].transAxes, fontsize=40, alpha=0.10, ha="center", zorder=0, **stamp
+        )
     return fig
 
 
-def _canvas(heights_in: Sequence[float]) -> tuple[Figure, list[Axes]]:
+def stacked(heights_in: Sequence[float]) -> tuple[Figure, list[Axes]]:
     """Stacked axes of given heights in inches, one time axis."""
     total = _TOP_IN + sum(heights_in) + _GAP_IN * (len(heights_in) - 1) + _BOTTOM_IN
     fig = Figure(figsize=(_WIDTH_IN, total))
@@ -99,7 +79,7 @@ def _canvas(heights_in: Sequence[float]) -> tuple[Figure, list[Axes]]:
     for height in heights_in:
         box = (_LEFT_IN / _WIDTH_IN, (top - height) / total, 1 - (_LEFT_IN + _RIGHT_IN) / _WIDTH_IN, height / total)
         ax = fig.add_axes(box, sharex=axes[0] if axes else None)
-        ax.tick_params(labelsize=8, labelbottom=False, color=_SOFT)
+        ax.tick_params(labelsize=8, labelbottom=False, color=MUTED)
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(axis="y", color="#eef1f4", lw=0.8)
         ax.set_axisbelow(True)
@@ -112,19 +92,11 @@ def _canvas(heights_in: Sequence[float]) -> tuple[Figure, list[Axes]]:
 
 def _traces(ax: Axes, traces: Sequence[Trace], label: str) -> None:
     for k, t in enumerate(traces):
-        marker = "o" if t.every_stay else None
-        ax.plot(
-            t.time_s / 3600,
-            t.value,
-            color=_COLOURS[k % len(_COLOURS)],
-            lw=1.4,
-            marker=marker,
-            ms=2.5,
-            label=_free(t.name),
-        )
-    ax.axhline(0, color=_SOFT, lw=0.6)
+        look: dict[str, Any] = {"color": LINES[k % len(LINES)], "lw": 1.4, "marker": "o" if t.every_stay else None}
+        ax.plot(t.time_s / 3600, t.value, ms=2.5, label=tex_escaped(t.name), **look)
+    ax.axhline(0, color=MUTED, lw=0.6)
     ax.set_ylabel(label, fontsize=8)
-    _legend(ax)
+    side_legend(ax)
 
 
 def _draw_temperatures(ax: Axes, batch: Batch, test: ThermalTest, rows: NDArray[np.bool_]) -> None:
@@ -136,14 +108,14 @@ def _draw_temperatures(ax: Axes, batch: Batch, test: ThermalTest, rows: NDArray[
     named, rest = [str(n) for n in sensors[:_MOST_NAMED]], [str(n) for n in sensors[_MOST_NAMED:]]
     hours = batch.time_s[rows] / 3600
     for k, name in enumerate(named):
-        ax.plot(hours, batch.masked(name)[rows], color=_COLOURS[k], lw=1.2, label=_free(name))
+        ax.plot(hours, batch.masked(name)[rows], color=LINES[k], lw=1.2, label=tex_escaped(name))
     for name, dash in zip(ambient, ("--", ":", "-.") * len(ambient), strict=False):
-        ax.plot(hours, batch.masked(name)[rows], color=INK, lw=1.1, ls=dash, label=f"{_free(name)} (ambient)")
+        ax.plot(hours, batch.masked(name)[rows], color=INK, lw=1.1, ls=dash, label=f"{tex_escaped(name)} (ambient)")
     for k, name in enumerate(rest):  # last in the legend, behind the others in the picture
         label = count(len(rest), "other") if k == 0 else None
-        ax.plot(hours, batch.masked(name)[rows], color=_GREY, lw=0.8, zorder=1.5, label=label)
+        ax.plot(hours, batch.masked(name)[rows], color=GREY, lw=0.8, zorder=1.5, label=label)
     ax.set_ylabel("temperature (°C)", fontsize=8)
-    _legend(ax)
+    side_legend(ax)
 
 
 def _periods(axes: Sequence[Axes], test: ThermalTest) -> None:
@@ -153,13 +125,13 @@ def _periods(axes: Sequence[Axes], test: ThermalTest) -> None:
         hour = begin + 1 if period.length_s >= HOUR_S else None
         for ax in axes:
             if k or period.start_s > test.start_s:
-                ax.axvline(begin, color=_SOFT, lw=0.9)
+                ax.axvline(begin, color=MUTED, lw=0.9)
             if hour is not None:
-                ax.axvline(hour, color=_SOFT, lw=0.8, ls=(0, (1, 3)))
+                ax.axvline(hour, color=MUTED, lw=0.8, ls=(0, (1, 3)))
         text: dict[str, Any] = {
             "transform": axes[0].get_xaxis_transform(),
             "fontsize": 8,
-            "color": _SOFT,
+            "color": MUTED,
             "va": "bottom",
         }
         axes[0].text((begin + end) / 2, 1.02, period.name, ha="center", **text)
@@ -167,7 +139,8 @@ def _periods(axes: Sequence[Axes], test: ThermalTest) -> None:
             axes[0].text(hour, 1.02, "60 min", ha="center", **text)
 
 
-def _legend(ax: Axes) -> None:
+def side_legend(ax: Axes) -> None:
+    """A legend right of the axes."""
     if not ax.get_legend_handles_labels()[0]:
         return  # every channel is masked
     ax.legend(
@@ -175,19 +148,8 @@ def _legend(ax: Axes) -> None:
     )
 
 
-def _plain(unit: str) -> str:
-    return {"um": "µm", "degC": "°C", "um/m": "µm/m"}.get(unit, unit)
-
-
-def _free(name: str) -> str:
-    """A name that matplotlib reads as text, not as mathematics."""
-    return name.replace("$", r"\$")
-
-
 NOT_STATED = "not stated"
-STYLE = "in the style of ISO 230-3"
 FILES = ("report.html", "report.md", "thermal_test.png", "quantities.csv")
-_UNITS = {"um": "µm", "um/m": "µm/m", "degC": "°C"}
 
 
 class Tilt(BaseModel):
@@ -201,7 +163,7 @@ class Tilt(BaseModel):
 
 
 class TestSheet(BaseModel):
-    """What only the person at the machine knows; every field may be left out and is then "not stated".
+    """What only the person at the machine knows; a field that is left out is "not stated" on the page.
 
     Reads as YAML by `data.yaml_file.load_yaml(path, TestSheet, "test sheet")`.
     """
@@ -230,25 +192,21 @@ class IsoPage:
 
     title: str
     simulated: bool
-    words: str
+    summary: str
     facts: tuple[tuple[str, str], ...]
     quantities: Table
     temperatures: Table | None
     notes: tuple[str, ...]
-    figure_words: str
+    figure_label: str
 
 
 def write_iso_report(
-    batch: Batch,
-    folder: Path | str,
-    sheet: TestSheet | None = None,
-    kind: str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-) -> Path:
+    batch: Batch, folder: Path | str, sheet: TestSheet | None = None, kind: str | None = None,
+    start_s: float | None = None, end_s: float | None = None,
+) -> Path:  # fmt: skip
     """Judge the batch and write report.html, report.md, thermal_test.png and quantities.csv; returns the HTML's path.
 
-    The HTML page holds its picture and asks no network. Each file appears whole or not at all. `kind`, `start_s` and
+    The HTML page is self-contained. Each file appears whole or not at all. `kind`, `start_s` and
     `end_s` as in `features.iso230_3.thermal_test`.
 
     Raises:
@@ -257,24 +215,23 @@ def write_iso_report(
     folder = Path(folder)
     sheet = sheet or TestSheet()
     test = thermal_test(batch, sheet.pairs, sheet.axes, kind, start_s, end_s)
-    picture = png(iso_figure(batch, test))
+    picture = picture_bytes(iso_figure(batch, test), "png", _DPI)
     shown = iso_page(batch, test, sheet)
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    embedded = base64.b64encode(picture).decode("ascii")
+    embedded = data_address(picture, "png")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / FILES[2], picture)
         write_atomic(folder / FILES[3], test.quantities.to_csv(index=False, lineterminator="\n"))
         for name in FILES[:2]:
-            template = template_environment(name.endswith(".html")).get_template(f"iso230_3{Path(name).suffix}.j2")
-            write_atomic(folder / name, template.render(page=shown, written=written, picture=embedded, file=FILES[2]))
+            text = rendered(f"iso230_3{Path(name).suffix}", shown, picture=embedded, file=FILES[2])
+            write_atomic(folder / name, text)
     except OSError as error:
         raise InputError(f"report {folder}: cannot be written ({error.strerror}); give another folder") from None
     return folder / FILES[0]
 
 
 def iso_page(batch: Batch, test: ThermalTest, sheet: TestSheet) -> IsoPage:
-    """Collect the page: what is not known is said to be not stated."""
+    """Collect the page: what is not known appears as not stated."""
     pairs = "; ".join(f"{p.name} = ({p.first} − {p.second}) / {p.distance_mm:g} mm" for p in test.pairs)
     probes = "; ".join(p for p in (sheet.probes, pairs) if p)
     length = f"{clock(test.end_s - test.start_s)} h, a reading every {batch.step_s:g} s"
@@ -294,12 +251,12 @@ def iso_page(batch: Batch, test: ThermalTest, sheet: TestSheet) -> IsoPage:
     return IsoPage(
         title=test.title.removesuffix(" (SIMULATED)"),
         simulated=test.simulated,
-        words=test.words,
+        summary=test.explanation,
         facts=tuple((k, v or NOT_STATED) for k, v in facts),
         quantities=_quantities(test),
         temperatures=_temperatures(test) if len(test.temperatures) else None,
         notes=test.notes,
-        figure_words=_figure_words(test),
+        figure_label=_figure_label(test),
     )
 
 
@@ -310,11 +267,11 @@ def _start(batch: Batch) -> str:
     return f"{batch.start:%Y-%m-%d}" if batch.start == batch.start.normalize() else f"{batch.start:%Y-%m-%d %H:%M}"
 
 
-def _figure_words(test: ThermalTest) -> str:
+def _figure_label(test: ThermalTest) -> str:
     shown = {"tilt": test.pairs, "temperatures": len(test.temperatures), "speed": test.speed, "feed": test.feed}
     names = ["displacement", *(n for n, there in shown.items() if there)] + (["position"] if test.position else [])
-    words = listed(names)
-    return f"{words[0].upper()}{words[1:]} over one time axis"
+    text = listed(names)
+    return f"{text[0].upper()}{text[1:]} over one time axis"
 
 
 def _quantities(test: ThermalTest) -> Table:
@@ -330,8 +287,8 @@ def _quantities(test: ThermalTest) -> Table:
                 q: test.value(trace.name, q, period.name) for q in ("range", "range in 60 min", "d(60 min)", "d(t)")
             }
             cells = [number(v, trace.digits, sign=q.startswith("d(")) for q, v in values.items()]
-            unit = _UNITS.get(trace.unit, trace.unit)
-            rows.append(Row((period.name, trace.name, unit, *cells, clock(period.length_s))))
+            unit = unit_label(trace.unit)
+            rows.append(Row.of(period.name, trace.name, unit, *cells, clock(period.length_s)))
     return Table("Ranges and changes", columns, tuple(rows), test.simulated)
 
 
@@ -344,5 +301,5 @@ def _temperatures(test: ThermalTest) -> Table:
     for record in test.temperatures.to_dict("records"):
         begin, end, least, greatest = (float(record[f"{k}_degC"]) for k in ("start", "end", "least", "greatest"))
         numbers = [number(v) for v in (begin, end, least, greatest)]
-        rows.append(Row((str(record["channel"]), str(record["role"]), *numbers, number(end - begin, sign=True))))
+        rows.append(Row.of(str(record["channel"]), str(record["role"]), *numbers, number(end - begin, sign=True)))
     return Table("Temperatures over the stated period", columns, tuple(rows), test.simulated)

@@ -6,7 +6,6 @@ ground symbol below it, as in a circuit diagram: so no line runs through the pic
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from dataclasses import dataclass, replace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.labels import INK, ORANGE, count, number
+from reports.labels import INK, ORANGE, count, number, unit_label
 from reports.twin.glyphs import (
     CHAINS,
     EDGE,
@@ -84,7 +83,7 @@ class Body:
 
     @property
     def width_in(self) -> float:
-        """What its words need."""
+        """What its text needs."""
         wide = [width_in(self.name, NAME_PT, True), pills_width(self.badges), 0.75]
         return max(wide + [width_in(t, TEXT_PT) for t, _ in self.lines])
 
@@ -102,7 +101,7 @@ def arranged(view: Overview, bodies: Sequence[Body], low_in: float) -> tuple[Fig
     ax.set(xlim=(0, width), ylim=(0, height))
     ax.axis("off")
     left = (width - across) / 2
-    # the same room for words in every box, so that a larger one always means more capacity
+    # the same room for text in every box, so that a larger one always means more capacity
     wide, rows = max(b.width_in - _WIDER_IN * b.grow for b in bodies), max(b.rows for b in bodies)
     rects = {
         b.name: Rect(
@@ -124,7 +123,7 @@ def segments(links: Sequence[Tie], bodies: Sequence[Body], gap_in: float = 0.0) 
 
 
 def placed(bodies: Sequence[Body], lines: Sequence[tuple[Point, Point]]) -> list[Body]:
-    """Heat above (or beside) and stubs below every box, shifted to where the fewest lines and words are."""
+    """Heat above (or next to) and stubs below every box, shifted to where the fewest lines and texts are."""
     boxes = [b.rect for b in bodies]
     heat: dict[str, Rect] = {}
     stubs: dict[str, Rect] = {}
@@ -208,7 +207,7 @@ def _heat(ax: Axes, b: Body, at: Rect) -> None:
     if at.y < r.y + r.h / 2:
         _heat_aside(ax, b, at, 1 if at.x > r.x else -1)
         return
-    left = abs(at.x - at.w / 2 - r.x) > abs(at.x + at.w / 2 - r.x)  # the words stand left of the arrow
+    left = abs(at.x - at.w / 2 - r.x) > abs(at.x + at.w / 2 - r.x)  # the text stands left of the arrow
     x = at.x + at.w / 2 if left else at.x - at.w / 2
     arrow(ax, (x, at.y + at.h / 2), (x, r.y + r.h / 2 + 0.01), HEAT, 1.8, zorder=5)
     for k, text in enumerate(b.heats):
@@ -244,10 +243,10 @@ def ground_color(view: Overview, name: str) -> str:
     return GROUNDS[names.index(name) % len(GROUNDS)]
 
 
-def title(ax: Axes, words: str, below: str, simulated: bool) -> None:
+def title(ax: Axes, label: str, below: str, simulated: bool) -> None:
     """The head of the picture."""
     width, height = ax.get_xlim()[1], ax.get_ylim()[1]
-    say(ax, (SIDE_IN, height - 0.27), words, 14, INK, ha="left", fontweight="bold")
+    say(ax, (SIDE_IN, height - 0.27), label, 14, INK, ha="left", fontweight="bold")
     say(ax, (SIDE_IN, height - 0.52), below, 9, SOFT, ha="left")
     if simulated:
         say(ax, (width - SIDE_IN, height - 0.27), "SIMULATED", 12, ORANGE, ha="right", fontweight="bold")
@@ -279,11 +278,11 @@ def chain_strip(fig: Figure, chains: Sequence[ChainView], height_in: float) -> N
     tilt_in = 3.25
     scale = (width - _LEFT_IN - _RIGHT_IN - tilt_in) / max(left + right, 1e-12)
     zero = _LEFT_IN + left * scale
-    unit = "m" if metres else f"{_unit(chains[0].unit)}/K"
+    unit = "m" if metres else f"{unit_label(chains[0].unit)}/K"
     ax.plot([0.3, width - 0.3], [height_in - 0.05] * 2, color="#d5dbe1", lw=0.8)
     drawn = any(sides)  # errors of laws alone have no lengths to draw
-    words = "Errors" if not drawn else f"Error chains, lengths in {unit}" if metres else f"Error chains in {unit}"
-    say(ax, (0.3, height_in - 0.24), words, 8.5, INK, ha="left", fontweight="bold")
+    label = "Errors" if not drawn else f"Error chains, lengths in {unit}" if metres else f"Error chains in {unit}"
+    say(ax, (0.3, height_in - 0.24), label, 8.5, INK, ha="left", fontweight="bold")
     if drawn:
         say(ax, (zero - 0.1, height_in - 0.24), "◂ −", 7.5, SOFT, ha="right")
         say(ax, (zero + 0.1, height_in - 0.24), "+ ▸", 7.5, SOFT, ha="left")
@@ -293,7 +292,7 @@ def chain_strip(fig: Figure, chains: Sequence[ChainView], height_in: float) -> N
         color = CHAINS[k % len(CHAINS)]
         say(ax, (0.3, y), c.channel, 10, color, ha="left", fontweight="bold")
         _bars(ax, c, row, zero, scale, y, color)
-        _side_words(ax, c, row, metres, width - tilt_in if drawn else _LEFT_IN + width_in(c.channel, 10), y)
+        _side_text(ax, c, row, metres, width - tilt_in if drawn else _LEFT_IN + width_in(c.channel, 10), y)
 
 
 def _values(c: ChainView, metres: bool) -> list[float]:
@@ -318,34 +317,20 @@ def _bars(ax: Axes, c: ChainView, row: Sequence[float], zero: float, scale: floa
             say(ax, (middle, y + (0.165 if k % 2 == 0 else -0.165)), body, 7.0, SOFT)
 
 
-def _side_words(ax: Axes, c: ChainView, row: Sequence[float], metres: bool, x: float, y: float) -> None:
+def _side_text(ax: Axes, c: ChainView, row: Sequence[float], metres: bool, x: float, y: float) -> None:
     total = sum(row)
     lines = []
     if metres and row:
         closed = abs(total) < 1e-9
         lines.append("closes: both sides are equal" if closed else f"open by {number(total, 3, sign=True)} m")
     for hot, cold, gain in c.tilts:
-        lines.append(f"tilt {number(gain, 2, sign=True)} {_unit(c.unit)}/K × ({hot} − {cold})")
+        lines.append(f"tilt {number(gain, 2, sign=True)} {unit_label(c.unit)}/K × ({hot} − {cold})")
     lines += [f"and {name}" if lines else name for name in c.also]
     for k, text in enumerate(lines):
         say(ax, (x, y + 0.13 * ((len(lines) - 1) / 2 - k)), text, 7.6, SOFT, ha="left")
 
 
-def _unit(unit: str) -> str:
-    return {"um": "µm", "um/m": "µm/m"}.get(unit, unit)
-
-
 _LEGEND_IN = 0.78
-
-
-def picture_bytes(figure: Figure, kind: str) -> bytes:
-    """The figure as svg or png; the same figure gives the same bytes."""
-    import matplotlib as mpl
-
-    out = io.BytesIO()
-    with mpl.rc_context({"svg.hashsalt": "thermodrift"}):
-        figure.savefig(out, format=kind, dpi=160, metadata={"Date": None} if kind == "svg" else None)
-    return out.getvalue()
 
 
 def network_picture(view: Overview) -> Figure:
@@ -377,14 +362,14 @@ def counted(view: Overview) -> str:
     return f"{', '.join(parts)}; {view.free} free and {view.fixed} fixed parameters"
 
 
-def capacity_words(b: BodyView) -> str:
+def capacity_label(b: BodyView) -> str:
     """``6.6 kJ/K``, with the number of cells where a body has several."""
     joules = b.capacity_J_per_K
-    words = f"{number(joules / 1e3, 1 if joules < 1e5 else 0)} kJ/K" if joules >= 1e3 else f"{joules:.3g} J/K"
-    return words + (f", {b.n_cells} cells" if b.n_cells > 1 else "")
+    label = f"{number(joules / 1e3, 1 if joules < 1e5 else 0)} kJ/K" if joules >= 1e3 else f"{joules:.3g} J/K"
+    return label + (f", {b.n_cells} cells" if b.n_cells > 1 else "")
 
 
-def heat_words(h: HeatView) -> str:
+def heat_label(h: HeatView) -> str:
     """The law by its name in the file, with its watts where a speed is stated."""
     return h.law if math.isnan(h.watts) else f"{h.law}  {number(h.watts, 0 if abs(h.watts) >= 9.5 else 1)} W"
 
@@ -404,7 +389,7 @@ def link_width_pt(g: float, every: Sequence[float]) -> float:
 
 def _body(view: Overview, b: BodyView) -> Body:
     sensors = [c for c, body in view.sensors if body == b.name]
-    lines = [(capacity_words(b), SOFT)] + ([(f"◆ {', '.join(sensors)}", INK)] if sensors else [])
+    lines = [(capacity_label(b), SOFT)] + ([(f"◆ {', '.join(sensors)}", INK)] if sensors else [])
     badges = []
     for k, c in enumerate(view.chains):
         gain = sum(gain for body, _, gain in c.parts if body == b.name)
@@ -415,7 +400,7 @@ def _body(view: Overview, b: BodyView) -> Body:
         tuple(lines),
         grown(view, b),
         tuple(badges),
-        shortened([heat_words(h) for h in view.heats if h.body == b.name]),
+        shortened([heat_label(h) for h in view.heats if h.body == b.name]),
         tuple(_stub(view, t) for t in view.ties if t.ground and t.ends[0] == b.name),
         fill="white" if given_to(view, b.name) else "#eef3f8",
         ring=ground_color(view, b.name) if given_to(view, b.name) else "",
@@ -433,11 +418,11 @@ def _legend(ax: Axes, view: Overview, y: float) -> None:
     """What the marks mean, and how every surrounding is known."""
     ax.plot([SIDE_IN, ax.get_xlim()[1] - SIDE_IN], [y + 0.42] * 2, color="#d5dbe1", lw=0.8)
     x = SIDE_IN + 0.05
-    for name, words, ring in _ground_words(view):
+    for name, label, ring in _ground_labels(view):
         color = ground_color(view, name)
         ground(ax, (x + 0.05, y + 0.27), color, 2.0, 0.09, ring)
-        say(ax, (x + 0.24, y + 0.18), words, TEXT_PT, color, ha="left")
-        x += 0.5 + width_in(words, TEXT_PT)
+        say(ax, (x + 0.24, y + 0.18), label, TEXT_PT, color, ha="left")
+        x += 0.5 + width_in(label, TEXT_PT)
     x, y = SIDE_IN + 0.05, y - 0.12
     every = sorted(t.conductance_W_per_K for t in view.ties if not t.ground)
     for g in dict.fromkeys((every[0], every[len(every) // 2], every[-1])) if every else ():
@@ -445,17 +430,17 @@ def _legend(ax: Axes, view: Overview, y: float) -> None:
         say(ax, (x + 0.36, y), f"{g:.3g} W/K", TEXT_PT, SOFT, ha="left")
         x += 0.54 + width_in(f"{g:.3g} W/K", TEXT_PT)
     if view.heats:
-        words = f"heat, {view.stated}" if view.stated else "heat, by its law"
+        label = f"heat, {view.stated}" if view.stated else "heat, by its law"
         arrow(ax, (x + 0.05, y + 0.11), (x + 0.05, y - 0.11), HEAT, 1.8)
-        say(ax, (x + 0.18, y), words, TEXT_PT, HEAT, ha="left")
-        x += 0.46 + width_in(words, TEXT_PT)
-    for words, color in ((("◆ sensor", INK),) if view.sensors else ()) + (("box: larger with heat capacity", SOFT),):
-        say(ax, (x, y), words, TEXT_PT, color, ha="left")
-        x += 0.28 + width_in(words, TEXT_PT)
+        say(ax, (x + 0.18, y), label, TEXT_PT, HEAT, ha="left")
+        x += 0.46 + width_in(label, TEXT_PT)
+    for label, color in ((("◆ sensor", INK),) if view.sensors else ()) + (("box: larger with heat capacity", SOFT),):
+        say(ax, (x, y), label, TEXT_PT, color, ha="left")
+        x += 0.28 + width_in(label, TEXT_PT)
 
 
-def _ground_words(view: Overview) -> list[tuple[str, str, bool]]:
+def _ground_labels(view: Overview) -> list[tuple[str, str, bool]]:
     used = {t.ends[1] for t in view.ties if t.ground}
-    out = [(s.name, f"{s.name}: {s.words}", False) for s in view.surroundings if s.name in used]
+    out = [(s.name, f"{s.name}: {s.label}", False) for s in view.surroundings if s.name in used]
     shared = [b for b in view.bodies if b.name in used]
-    return out + [(b.name, f"{b.name}: {b.words or 'a body of its own'}", True) for b in shared]
+    return out + [(b.name, f"{b.name}: {b.label or 'a body of its own'}", True) for b in shared]

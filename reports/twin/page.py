@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from data.batch import Batch
 from data.errors import InputError
-from data.files import write_atomic
 from data.machine import Machine
+from reports.drawing import Picture, picture, picture_bytes
 from reports.layout import Table
-from reports.rendering import FORMATS, template_environment
+from reports.rendering import check_suffix, write_page
 from reports.twin import tables
 from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
 from reports.twin.flows import flow_picture, heat_stack
-from reports.twin.network_picture import counted, network_picture, picture_bytes
+from reports.twin.network_picture import counted, network_picture
 from twin.calibration import Calibration
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, expanded
@@ -44,7 +42,7 @@ class TwinData:
     """What the report is made of; whatever is empty is left out of the page.
 
     `intervals` by parameter and `left_out` (`LeftOut.by_channel()`) come from a calibration, `compared` and `flows`
-    from a simulation. `origin` says in words where the values come from, `findings` are sentences for the engineer.
+    from a simulation. `origin` states where the values come from, `findings` are sentences for the engineer.
     """
 
     view: Overview
@@ -56,15 +54,6 @@ class TwinData:
     compared: Sequence[Compared] = ()
     flows: Sequence[HeatFlows] = ()
     modes: Sequence[ModeView] = ()
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure on the page."""
-
-    words: str
-    source: str  # a data: address
-    simulated: bool
 
 
 @dataclass(frozen=True)
@@ -86,13 +75,13 @@ class TwinPage:
 
     title: str
     simulated: bool
-    words: str
+    summary: str
     facts: tuple[tuple[str, str], ...]
     parts: tuple[Part, ...]
 
 
 def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST_BATCHES) -> Path:
-    """One page that holds everything it needs and asks no network; .md has the tables and no pictures.
+    """One self-contained page; .md has the tables and no pictures.
 
     Figures are drawn of the `most_batches` with the greatest residual; the map shows all. The file appears whole or
     not at all.
@@ -101,17 +90,7 @@ def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST
         InputError: another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    if path.suffix not in FORMATS:
-        raise InputError(f"report {path}: got suffix {path.suffix!r}, expected .html or .md")
-    html = path.suffix == ".html"
-    page = twin_page(data, most_batches, pictures=html)
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    text = template_environment(html).get_template(f"twin{path.suffix}.j2").render(page=page, written=written)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, text)
-    except OSError as error:
-        raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
+    write_page(path, "twin", twin_page(data, most_batches, pictures=path.suffix == ".html"))
     return path
 
 
@@ -122,8 +101,7 @@ def write_picture(path: Path | str, view: Overview) -> Path:
         InputError: another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    if path.suffix not in PICTURES:
-        raise InputError(f"picture {path}: got suffix {path.suffix!r}, expected .svg, .png or .html")
+    check_suffix(path, PICTURES, "picture")
     if path.suffix == ".html":
         return write_twin_report(path, TwinData(view, ()))
     try:
@@ -152,7 +130,7 @@ def twin_page(data: TwinData, most_batches: int = MOST_BATCHES, pictures: bool =
 
 
 def _network(data: TwinData, pictures: bool) -> Part:
-    shown = [_picture(network_picture(data.view), "Thermal network and error chains", data.view.simulated, "svg")]
+    shown = [picture(network_picture(data.view), "Thermal network and error chains", data.view.simulated, "svg")]
     return Part("network", "Network", (tables.bodies(data.view),), tuple(shown) if pictures else ())
 
 
@@ -171,11 +149,11 @@ def _fit(data: TwinData, most: int, pictures: bool) -> Part:
         notes.append(f"Drawn: the {len(chosen)} of {len(data.compared)} batches with the greatest residual.")
     if pictures and data.compared:
         simulated = any(c.simulated for c in data.compared)
-        words = "Residual rms of every batch and channel"
-        shown.append(_picture(rms_map(rms_table(data.compared), simulated), words, simulated))
+        label = "Residual rms of every batch and channel"
+        shown.append(picture(rms_map(rms_table(data.compared), simulated), label, simulated))
         for c in chosen:
-            shown.append(_picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated))
-            shown.append(_picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated))
+            shown.append(picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated))
+            shown.append(picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated))
     return Part("fit", "Simulated against recorded", tuple(own), tuple(shown), tuple(notes))
 
 
@@ -183,19 +161,17 @@ def _heat(data: TwinData, most: int, pictures: bool) -> Part:
     shown = []
     for f in data.flows[:most] if pictures else ():
         moment = min(_HOUR_S, 0.5 * float(f.time_s[-1]))
-        shown.append(_picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated))
-        words = f"{f.batch_id}: heat through the network"
-        shown.append(_picture(flow_picture(data.view, f, moment), words, f.simulated, "svg"))
+        shown.append(picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated))
+        label = f"{f.batch_id}: heat through the network"
+        shown.append(picture(flow_picture(data.view, f, moment), label, f.simulated, "svg"))
     notes = ("Every watt is computed, also where a recording gave drivers and surroundings.",)
     return Part("heat", "Where the watts go", tuple(tables.heat(f) for f in data.flows[:most]), tuple(shown), notes)
 
 
 def _modes(data: TwinData, pictures: bool) -> Part:
     simulated = data.view.simulated
-    shown = (
-        (_picture(mode_shapes(data.modes, simulated), "Shapes of the slowest modes", simulated),) if pictures else ()
-    )
-    return Part("modes", "Time constants and modes", (tables.modes(data.modes, data.view),), shown)
+    shown = [picture(mode_shapes(data.modes, simulated), "Shapes of the slowest modes", simulated)] if pictures else []
+    return Part("modes", "Time constants and modes", (tables.modes(data.modes, data.view),), tuple(shown))
 
 
 def worst(parts: Sequence[Compared], most: int) -> list[Compared]:
@@ -207,12 +183,6 @@ def worst(parts: Sequence[Compared], most: int) -> list[Compared]:
     size = (table["rms"] / usual).groupby(table["batch"], sort=False).mean().fillna(0.0)
     chosen = set(size.sort_values(ascending=False, kind="stable").index[:most])
     return [c for c in parts if c.batch_id in chosen]
-
-
-def _picture(figure: Figure, words: str, simulated: bool, kind: str = "png") -> Picture:
-    content = base64.b64encode(picture_bytes(figure, kind)).decode("ascii")
-    mime = "image/svg+xml" if kind == "svg" else "image/png"
-    return Picture(words, f"data:{mime};base64,{content}", simulated)
 
 
 AIR_DEGC = 20.0
@@ -275,6 +245,6 @@ def _origin(calibration: Calibration | None) -> str:
 
 
 def _findings(calibration: Calibration) -> tuple[str, ...]:
-    """What the fit says of itself, of what the recordings leave open, and of its residuals."""
-    said = [calibration.fit.words, *(u.words for u in calibration.undetermined)]
+    """Remarks on the fit, on what the recordings leave undetermined, and on the residuals."""
+    said = [calibration.fit.message, *(u.summary for u in calibration.undetermined)]
     return tuple(s for s in (*said, *calibration.whiteness_in_words.values()) if s)

@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from reports.labels import NOTHING, number, percent
+from reports.labels import NOTHING, number, percent, three_digits, unit_label
 from reports.layout import Column, Row, Table
-from reports.twin.network_picture import capacity_words
+from reports.twin.network_picture import capacity_label
 from twin.calibration.identifiability import Interval
 from twin.quantity import Parameter
 from twin.views.heat_flows import HeatFlows
 from twin.views.overview import ModeView, Overview, time_words
 
-_UNITS = {"1": "", "um": "µm", "um/K": "µm/K", "um/m/K": "µm/m/K", "degC": "°C", "m**2": "m²", "mm**2/s": "mm²/s",
-          "W/m**2/K": "W/m²/K"}  # fmt: skip
 _KINDS = {"heat": "put in", "storage": "stored in", "loss": "taken by", "link": "through"}
 _KNOWN = 0.5  # posterior sd by prior sd, below which the recordings say more than the prior
 
@@ -24,7 +22,7 @@ _KNOWN = 0.5  # posterior sd by prior sd, below which the recordings say more th
 def bodies(view: Overview) -> Table:
     """Bodies, capacities, time constants, counts of parameters."""
     rows = [
-        Row((b.name, b.words or NOTHING, capacity_words(b), time_words(b.time_constant_s), f"{b.free}", f"{b.fixed}"))
+        Row.of(b.name, b.label or NOTHING, capacity_label(b), time_words(b.time_constant_s), f"{b.free}", f"{b.fixed}")
         for b in view.bodies
     ]
     columns = (
@@ -41,23 +39,23 @@ def bodies(view: Overview) -> Table:
 
 def parameters(given: Sequence[Parameter], intervals: Mapping[str, Interval], free: bool, simulated: bool) -> Table:
     """Every free (or fixed) parameter: value, prior and, when calibrated, its 90 % interval and what it rests on."""
-    rows, told = [], any(p.source for p in given if p.free == free)
+    rows, sourced = [], any(p.source for p in given if p.free == free)
     for p in given:
         if p.free != free:
             continue
         cells = [p.name, p.words, quantity(p.value, p.unit)]
         found = intervals.get(p.name)
         if free:
-            cells.append(prior_words(p))
+            cells.append(prior_label(p))
         if intervals and free:
-            cells.append(interval_words(found, p.unit))
+            cells.append(interval_label(found, p.unit))
             cells.append(NOTHING if found is None else "recordings" if found.prior_shrinkage < _KNOWN else "prior")
-        cells += [p.source or NOTHING] if told else []
+        cells += [p.source or NOTHING] if sourced else []
         rows.append(Row(tuple(cells)))
     columns = [Column("parameter"), Column("what it is", kind="wide"), Column("value", kind="number")]
     columns += [Column("prior", kind="number")] if free else []
     columns += [Column("90 % interval", kind="number"), Column("rests on")] if intervals and free else []
-    columns += [Column("source", kind="wide")] if told else []
+    columns += [Column("source", kind="wide")] if sourced else []
     notes = []
     if free:
         notes.append("Prior: centre ×/÷ one standard deviation of the logarithm, or centre ± one standard deviation.")
@@ -67,7 +65,7 @@ def parameters(given: Sequence[Parameter], intervals: Mapping[str, Interval], fr
     return Table(caption, tuple(columns), tuple(rows), simulated, notes=tuple(notes))
 
 
-def prior_words(p: Parameter) -> str:
+def prior_label(p: Parameter) -> str:
     """``14 W/K ×/÷ 1.65``, ``0 ± 0.2 K`` or, of a share, its range of one standard deviation."""
     if not math.isfinite(p.spread):
         return NOTHING
@@ -79,16 +77,11 @@ def prior_words(p: Parameter) -> str:
     return f"{float(p.from_x(x - p.spread)):.2f} to {float(p.from_x(x + p.spread)):.2f}"
 
 
-def interval_words(found: Interval | None, unit: str) -> str:
+def interval_label(found: Interval | None, unit: str) -> str:
     if found is None:
         return NOTHING
     scale, shown = _scale(max(abs(found.low), abs(found.high)), unit)
-    return f"{_three(found.low / scale)} to {_three(found.high / scale)} {shown}".strip().replace("-", "−")
-
-
-def _three(value: float) -> str:
-    """Three digits, without a power of ten up to a million."""
-    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
+    return f"{three_digits(found.low / scale)} to {three_digits(found.high / scale)} {shown}".strip()
 
 
 def quantity(value: float, unit: str) -> str:
@@ -100,15 +93,15 @@ def quantity(value: float, unit: str) -> str:
 def _scale(size: float, unit: str) -> tuple[float, str]:
     if unit in ("J/K", "W", "N") and size >= 1e3:
         return 1e3, f"k{unit}"
-    return 1.0, _UNITS.get(unit, unit)
+    return 1.0, unit_label(unit)
 
 
 def modes(views: Sequence[ModeView], view: Overview, most: int = 10) -> Table:
     """Time constants, what moves against what, and how much of each displacement comes with that time constant."""
     channels = list(views[0].error) if views else []
-    units = {c.channel: _UNITS.get(c.unit, c.unit) for c in view.chains}
+    units = {c.channel: unit_label(c.unit) for c in view.chains}
     rows = [
-        Row((time_words(v.time_constant_s), v.words, *(x for c in channels for x in _brought(v, c))))
+        Row.of(time_words(v.time_constant_s), v.label, *(x for c in channels for x in _brought(v, c)))
         for v in views[:most]
     ]
     columns = [Column("time constant"), Column("what moves", kind="wide")]
@@ -129,18 +122,12 @@ def heat(flows: HeatFlows) -> Table:
     """Where a batch's energy went, and whether it adds up."""
     totals: pd.DataFrame = flows.totals()
     totals = totals[totals["kind"] != "link"]
-    rows = [
-        Row(
-            (
-                _KINDS[str(r["kind"])],
-                str(r["name"]),
-                number(r["energy_kJ"], 0),
-                number(r["mean_W"], 1),
-                percent(r["share"]).replace("-", "−"),
-            )
+    rows = []
+    for r in totals.to_dict("records"):
+        share = percent(r["share"]).replace("-", "−")
+        rows.append(
+            Row.of(_KINDS[str(r["kind"])], str(r["name"]), number(r["energy_kJ"], 0), number(r["mean_W"], 1), share)
         )
-        for r in totals.to_dict("records")
-    ]
     columns = (
         Column(""), Column("where"), Column("energy", "kJ", "number"), Column("mean", "W", "number"),
         Column("of the heat put in", kind="number"),
@@ -154,9 +141,9 @@ def left_out(table: pd.DataFrame, simulated: bool) -> Table:
     """The error on batches that a calibration never saw, by channel."""
     rows = []
     for r in table.to_dict("records"):
-        unit = _UNITS.get(str(r["unit"]), str(r["unit"]))
+        unit = unit_label(str(r["unit"]))
         numbers = [number(float(r[k]), 2) for k in ("left_out", "left_out_sd", "before", "zero")]
-        rows.append(Row((str(r["channel"]), unit, f"{r['batches']}", *numbers)))
+        rows.append(Row.of(str(r["channel"]), unit, f"{r['batches']}", *numbers))
     columns = (
         Column("channel"), Column("unit"), Column("batches", kind="number"), Column("left out", "rms", "number"),
         Column("its spread", "sd", "number"), Column("as before", "rms", "number"),

@@ -93,9 +93,9 @@ def row_of(batch: Batch, finding: Finding) -> int:
 def the_one(batch: Batch, check: str, channel: str | None) -> Finding:
     """The fault is found, and nothing is claimed of other channels."""
     found = findings(batch)
-    assert [f for f in found if f.masks and f.channel != channel] == [], [f.words for f in found]
+    assert [f for f in found if f.masks and f.channel != channel] == [], [f.message for f in found]
     hits = [f for f in found if f.check == check and f.channel == channel]
-    assert hits, [(f.check, f.words) for f in found]
+    assert hits, [(f.check, f.message) for f in found]
     return hits[0]
 
 
@@ -107,14 +107,14 @@ def test_clean_batches_raise_nothing(step_s: float) -> None:
     machine = toy_machine()
     batches = [toy_batch(seed, step_s) for seed in range(30)]
     batches = [b.with_findings(check_batch(b, machine)) for b in batches]
-    told = [f.words for b in check_machine(batches, machine) for f in b.findings]
+    told = [f.message for b in check_machine(batches, machine) for f in b.findings]
     assert told == []
 
 
 def test_every_check_says_what_it_is() -> None:
     for key, check in CHECKS.items():
         assert check.key == key
-        assert check.words
+        assert check.summary
     with pytest.raises(InputError, match="unknown check 'spyke': did you mean 'spike'"):
         CHECKS["spyke"]
 
@@ -138,7 +138,7 @@ def test_a_loose_contact_is_masked_until_it_comes_back(seed: int) -> None:
     bad = added(toy_batch(seed), "bed", row, row + 6, 12.0)
     found = the_one(bad, "jump_no_return", "bed")
     assert row_of(bad, found) == row and found.end_s == (row + 5) * STEP_S
-    assert "comes back at" in found.words
+    assert "comes back at" in found.message
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -165,7 +165,7 @@ def test_samples_out_of_range(seed: int) -> None:
     bad = added(toy_batch(seed), "rear", row, row + 5, 850.0)
     found = the_one(bad, "out_of_range", "rear")
     assert (found.start_s, found.end_s) == (row * STEP_S, (row + 4) * STEP_S)
-    assert "outside -20 to 90" in found.words
+    assert "outside -20 to 90" in found.message
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -175,7 +175,7 @@ def test_a_probe_at_its_full_scale(seed: int) -> None:
     v = batch.values("x").copy()
     v[row:] = 99.9998
     found = the_one(changed(batch, "x", v), "saturated", "x")
-    assert found.start_s == row * STEP_S and "full scale 100 um" in found.words
+    assert found.start_s == row * STEP_S and "full scale 100 um" in found.message
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -209,7 +209,7 @@ def test_an_interruption_costs_the_errors_their_zero(seed: int) -> None:
     found = findings(bad)
     assert {(f.check, f.channel) for f in found} == {("interruption", "x"), ("interruption", "z")}
     assert all(row - 1 <= row_of(bad, f) <= row and f.end_s is None for f in found)
-    assert "cannot be tied to the zero" in found[0].words
+    assert "cannot be tied to the zero" in found[0].message
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -223,21 +223,21 @@ def test_errors_held_while_the_spindle_stands(seed: int, driver: float) -> None:
     found = findings(replace(batch, table=table))
     assert {(f.check, f.channel) for f in found} == {("error_held", "x"), ("error_held", "z")}
     assert all(f.start_s == (stop + 1) * STEP_S and f.end_s == batch.time_s[-1] for f in found)
-    assert "while the spindle stands" in found[0].words
+    assert "while the spindle stands" in found[0].message
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_wrong_units_name_the_right_one(seed: int) -> None:
     batch = toy_batch(seed)
     kelvin = changed(batch, "head", batch.values("head") + 273.15)
-    assert "set unit_in_file: K" in the_one(kelvin, "wrong_unit", "head").words
+    assert "set unit_in_file: K" in the_one(kelvin, "wrong_unit", "head").message
     warm = batch
     for name in (*THERMAL, "room"):
         warm = changed(warm, name, batch.values(name) - batch.values("room")[0] + 25.0)
     fahrenheit = changed(warm, "bed", warm.values("bed") * 1.8 + 32.0)
-    assert "set unit_in_file: degF" in the_one(fahrenheit, "wrong_unit", "bed").words
+    assert "set unit_in_file: degF" in the_one(fahrenheit, "wrong_unit", "bed").message
     exact = batch.values("z") + np.random.default_rng(seed).normal(0, 0.1, batch.n_rows)
-    assert "set unit_in_file: mm" in the_one(changed(batch, "z", exact / 1000.0), "wrong_unit", "z").words
+    assert "set unit_in_file: mm" in the_one(changed(batch, "z", exact / 1000.0), "wrong_unit", "z").message
 
 
 def test_gaps_and_repairs_are_told_without_a_mask() -> None:
@@ -252,8 +252,8 @@ def test_gaps_and_repairs_are_told_without_a_mask() -> None:
         ("gap", "rear", False),
         ("clock", None, False),
     ]
-    assert "clock: 3 rows with the time of another row" in found[2].words
-    assert "rear has no values from 1 h 40 min to 2 h 25 min (50 min)" in found[1].words
+    assert "clock: 3 rows with the time of another row" in found[2].message
+    assert "rear has no values from 1 h 40 min to 2 h 25 min (50 min)" in found[1].message
 
 
 def year() -> list[Batch]:

@@ -59,7 +59,7 @@ def findings(batch: Batch) -> tuple[Finding, ...]:
 @pytest.mark.parametrize("step_s", RATES_S)
 @pytest.mark.parametrize("noise_K", [0.0, 0.02, 0.3])
 def test_a_clean_recording_is_clean_at_every_rate(step_s: float, noise_K: float) -> None:
-    assert [f.words for f in findings(recorded(step_s, noise_K))] == []
+    assert [f.message for f in findings(recorded(step_s, noise_K))] == []
 
 
 @pytest.mark.parametrize("step_s", RATES_S)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from data import guess_axes
+from data import guess
 from data.describe import draft_machine_file
 from data.machine import Machine, parse_machine
 from data.recording import read_batches
@@ -88,8 +88,8 @@ def test_a_column_for_each_position(tmp_path: Path, pattern: str) -> None:
 
 def test_two_axes_in_columns_are_two_channels() -> None:
     columns = ["time", *(f"x={p}" for p in (0, 60, 90)), *(f"z={p}" for p in (-500, -200, 20)), "T=20"]
-    found = guess_axes.groups(columns, range(1, len(columns)))
-    assert guess_axes.groups(["0", "60", "90"], range(3))[0].pattern == "*"
+    found = guess.position_groups(columns, range(1, len(columns)))
+    assert guess.position_groups(["0", "60", "90"], range(3))[0].pattern == "*"
     assert [(g.pattern, g.letter, g.position_mm) for g in found] == [
         ("x=*", "x", (0.0, 60.0, 90.0)),
         ("z=*", "z", (-500.0, -200.0, 20.0)),
@@ -102,7 +102,7 @@ def test_two_axes_in_columns_are_two_channels() -> None:
      ["ch10", "ch20", "ch30"]],
 )  # fmt: skip
 def test_numbered_channels_are_no_positions(names: list[str]) -> None:
-    assert guess_axes.groups(names, range(len(names))) == []
+    assert guess.position_groups(names, range(len(names))) == []
 
 
 def test_an_axis_that_moves_beside_a_steady_record_is_no_sweep(tmp_path: Path) -> None:

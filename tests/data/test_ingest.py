@@ -126,11 +126,7 @@ def test_two_files_with_one_id_are_a_conflict_and_neither_is_lost(tmp_path: Path
     for status in ("new", "unchanged"):  # the same again is the same again
         report = ingest([one, two], MACHINE, lake)
         balanced(report)
-        assert [(r.batch_id, r.status) for r in report.rows] == [
-            ("run", status),
-            ("run", "conflict"),
-            ("more", status),
-        ]
+        assert [(r.batch_id, r.status) for r in report.rows] == [("run", status), ("run", "conflict"), ("more", status)]
         assert (report.rows_stored, report.rows_dropped) == (7, 4)
         (entry,) = lake.quarantined("vmc")
         assert entry.name == "two.csv"

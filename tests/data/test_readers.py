@@ -309,7 +309,9 @@ def test_every_reader_tells_damage_in_one_line(tmp_path, key):
 
 
 def test_unknown_suffix_lists_the_known_ones():
-    with pytest.raises(InputError, match=r"run\.doc: unknown suffix '\.doc'; expected one of \.csv, \.xlsx, \.parquet"):
+    with pytest.raises(
+        InputError, match=r"run\.doc: unsupported file extension '\.doc'; expected one of \.csv, \.xlsx, \.parquet"
+    ):
         reader_for(Path("run.doc"))
     assert type(reader_for(Path("RUN.CSV"))) is READERS["csv"]
 

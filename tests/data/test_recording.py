@@ -135,7 +135,7 @@ def test_schedule_gives_drivers_and_labels(tmp_path):
     with pytest.raises(InputError, match=r"runs.csv row 7 column 'n1': got 'fast', expected a number"):
         only(tmp_path / "7.csv", m)
     (tmp_path / "runs.csv").unlink()
-    with pytest.raises(InputError, match=r"schedule 'runs.csv' is missing beside the recording"):
+    with pytest.raises(InputError, match=r"schedule 'runs.csv' is missing next to the recording"):
         only(tmp_path / "7.csv", m)
 
 
@@ -259,7 +259,7 @@ def bad_files(folder: Path) -> dict[str, str]:
         "folder.csv": "is a directory, expected one recording file",
         "empty.csv": "the file is empty (0 bytes)",
         "junk.csv": "not a text file (binary content)",
-        "run.doc": "unknown suffix '.doc'",
+        "run.doc": "unsupported file extension '.doc'",
         "cut.xlsx": "damaged or truncated XLSX",
         "foreign.csv": "none of its 200 columns is a channel of machine mill; got 'A0', 'A1', 'A2' …,"
         " expected 'front', 'Hall', 'dz'",

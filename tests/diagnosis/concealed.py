@@ -12,7 +12,7 @@ from data.batch import Batch
 from data.machine import Machine
 from tests.twin.machines import machine
 from tests.twin.recordings import drawn, empty_batches, recorded
-from twin.calibration.least_squares import Fit, fit
+from twin.calibration.least_squares import Fit, FitOptions, fit
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.network import Network
@@ -118,4 +118,4 @@ def case(mechanisms: dict[str, Any] | None = None, count: int = 6, seed: int = 1
 
 def calibrated(known: Machine, batches: list[Batch]) -> Case:
     problem = CalibrationProblem.of(compile_network(known), batches)
-    return Case(known, batches, problem, fit(problem, tolerance=1e-3, reweight=True))
+    return Case(known, batches, problem, fit(problem, FitOptions(tolerance=1e-3, reweight=True)))

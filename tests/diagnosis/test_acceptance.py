@@ -9,8 +9,9 @@ import pytest
 from scipy.stats import binomtest, gumbel_r
 
 from diagnosis.contracts import Fitted, Scored, Tried
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import alone, proposed, screen
-from diagnosis.search.acceptance import FLIPS, balanced, flipped_gains, flipped_threshold, gumbel, sign_p, stands_out
+from diagnosis.search.acceptance import balanced_quantile, flipped_gains, flipped_threshold, gumbel, sign_p, stands_out
 from diagnosis.search.refits import refit
 from tests.diagnosis.small_cases import DRIFT, consistent, fitted, runs, two_bodies
 from twin.calibration.identifiability import Z90
@@ -24,7 +25,7 @@ def test_the_quantile_of_a_gumbel_distribution() -> None:
 
 
 def test_few_batches_have_few_patterns_of_signs() -> None:
-    gains = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=(FLIPS, 3), random_state=1))
+    gains = np.asarray(gumbel_r.rvs(loc=3.0, scale=2.0, size=(POLICY.sign_flips, 3), random_state=1))
     assert flipped_threshold(gains, 4) == gains.max()
     assert flipped_threshold(gains, 8) == max(gumbel(gains.max(axis=1)), gains.max()) > np.median(gains)
     assert flipped_threshold(np.zeros((0, 0)), 8) == 0.0
@@ -39,17 +40,17 @@ def test_what_chance_makes_of_one_candidate_is_no_reason_to_doubt_another() -> N
         return scale * rng.gumbel(0.5, 1.0, (n, 200))
 
     known = drawn(14)
-    every, quiet, loud = (balanced(known, which) for which in (None, 50, 1))
+    every, quiet, loud = (balanced_quantile(known, which) for which in (None, 50, 1))
     assert loud <= every
     assert quiet < 0.15 * every
-    thresholds = np.array([balanced(known, k) for k in range(200)])
+    thresholds = np.array([balanced_quantile(known, k) for k in range(200)])
     alarms = (drawn(4000) > thresholds).any(axis=1).mean()
     assert alarms < 0.05  # fourteen draws know little of their own quantiles
 
 
 def test_where_all_candidates_are_alike_the_largest_gain_decides() -> None:
     known = np.random.default_rng(3).gumbel(60.0, 20.0, (40, 50))
-    assert balanced(known, 7) == pytest.approx(balanced(known, None), rel=0.3)
+    assert balanced_quantile(known, 7) == pytest.approx(balanced_quantile(known, None), rel=0.3)
 
 
 @pytest.mark.parametrize(("better", "n"), [(0, 6), (3, 6), (5, 6), (6, 6), (9, 12)])
@@ -71,7 +72,7 @@ def largest_flipped(done: Fitted) -> float:
     columns = [s.column for s in found.scored if s.candidate.mechanism == "sensor_drift"]
     after = alone(done, done.memory)
     gains = flipped_gains(found.evidence, after, columns, seed=0)
-    assert gains.shape == (FLIPS, len(columns))
+    assert gains.shape == (POLICY.sign_flips, len(columns))
     np.testing.assert_array_equal(gains, flipped_gains(found.evidence, after, columns, seed=0))
     return float(gains.max())
 

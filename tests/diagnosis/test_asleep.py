@@ -20,7 +20,7 @@ from twin.quantity import Value
 from twin.schema import MechanismPart, TwinPart, twin_part
 from twin.simulation import simulate
 from twin.simulation.inputs import Inputs, inputs_of
-from twin.simulation.sensitivity import sensitivities
+from twin.simulation.sensitivity import Selected, sensitivities
 
 SUBSTEPS = 2
 TOLERANCE = 3e-3  # of a derivative's largest value
@@ -59,7 +59,9 @@ class Small:
 
     def slopes(self, network: Network, numbers: list[int], substeps: int = SUBSTEPS) -> Array:
         """Of all channels by the parameters, (Q, B, K, C)."""
-        _, *slopes = sensitivities(network, network.values, *self.run(network, substeps), numbers, tolerance_K=1e-8)
+        _, *slopes = sensitivities(
+            network, network.values, *self.run(network, substeps), Selected(numbers), tolerance_K=1e-8
+        )
         return np.concatenate(slopes, axis=-1)
 
     def difference(self, c: Candidate, amplitude: str, substeps: int = SUBSTEPS) -> Array:

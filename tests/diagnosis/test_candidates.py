@@ -14,7 +14,7 @@ import yaml
 from data.arrays import Numeric
 from data.machine import Machine, load_machine, parse_machine
 from data.registry import Registry
-from diagnosis.candidates.alternatives import coarse_candidates, rivals
+from diagnosis.candidates.alternatives import alternatives, coarse_candidates
 from diagnosis.candidates.library import candidates, linked
 from diagnosis.contracts import Candidate, pieces_of
 from diagnosis.search.search import search
@@ -169,9 +169,9 @@ def test_the_order_of_the_file_does_not_matter() -> None:
 def test_names_are_unique_and_keys_of_a_machine_file(machine: Machine) -> None:
     every = of(machine)
     part = twin_part(machine)
-    more = rivals(compile_network(machine))
+    more = alternatives(compile_network(machine))
     assert len({c.name for c in [*every, *more]}) == len(every) + len(more)
-    assert len({c.words for c in [*every, *more]}) == len(every) + len(more)
+    assert len({c.label for c in [*every, *more]}) == len(every) + len(more)
     stated = {c.name: c.part.model_dump(exclude_none=True) for c in every if c.part}
     assert list(TwinPart.model_validate({**(machine.twin or {}), "mechanisms": stated}).mechanisms) == list(stated)
     assert yaml.safe_load(yaml.safe_dump(dict.fromkeys(stated))) == dict.fromkeys(stated)
@@ -229,7 +229,7 @@ class Pump(Mechanism):
     """A mechanism that nobody has heard of."""
 
     key = "morning_pump"
-    words = "pump that runs while the oil is cold"
+    summary = "pump that runs while the oil is cold"
     equation = "P = heat until duration"
     source = "none"
     signature = "heat at the start of every run"

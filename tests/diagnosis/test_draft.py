@@ -102,10 +102,10 @@ def test_values_are_right_but_for_the_scale_that_is_held(given: Machine, drafted
 
 
 def test_it_is_said_that_values_are_relative(drafted: Drafted) -> None:
-    assert drafted.words[0].startswith(
+    assert drafted.remarks[0].startswith(
         "the machine file has no twin part: 2 bodies drafted from 6 batches, named after"
     )
-    assert drafted.words[1] == (
+    assert drafted.remarks[1] == (
         "temperatures determine ratios alone: heat_of_rpm is held at 300 W at 5000 rpm, "
         "and every other W, W/K and J/K is relative to that"
     )
@@ -176,14 +176,14 @@ def test_few_batches_are_cut_into_blocks(
     given: Machine, batches: list[Batch], count: int, blocks: int, told: str
 ) -> None:
     found = drafted_part(given, batches[1 : 1 + count])
-    assert len(found.part.bodies) == 2 and told in found.words
-    assert f"drafted from {blocks} blocks" in found.words[0]
+    assert len(found.part.bodies) == 2 and told in found.remarks
+    assert f"drafted from {blocks} blocks" in found.remarks[0]
 
 
 def test_too_short_to_leave_any_out_is_one_body_and_says_so(given: Machine, batches: list[Batch]) -> None:
     found = drafted_part(given, [replace(batches[1], table=batches[1].table.iloc[:14])])
-    assert len(found.part.bodies) == 1 and found.words[0].endswith("of the movement that it was fitted to")
-    assert "the recordings are too short to leave any out: one body alone is drafted" in found.words
+    assert len(found.part.bodies) == 1 and found.remarks[0].endswith("of the movement that it was fitted to")
+    assert "the recordings are too short to leave any out: one body alone is drafted" in found.remarks
 
 
 def test_missing_samples_and_coarse_readings_do_no_harm(given: Machine, batches: list[Batch]) -> None:
@@ -203,7 +203,7 @@ def test_without_an_ambient_the_room_is_what_first_readings_say(given: Machine, 
     found = drafted_part(bare, batches)
     room = found.part.surroundings["room"]
     assert room.first == ("t_shaft", "t_head") and room.per_batch == "1 K"
-    assert "no ambient was recorded: the room is taken from first readings" in found.words
+    assert "no ambient was recorded: the room is taken from first readings" in found.remarks
     assert by(found.left_out, "channel", "left_out")["t_shaft"] < 1.0
     alone = drafted_part(bare, batches[1:2]).part.surroundings["room"]  # blocks start warm: no first readings then
     assert alone.first is None and alone.value is not None
@@ -212,14 +212,14 @@ def test_without_an_ambient_the_room_is_what_first_readings_say(given: Machine, 
 def test_channels_without_values_are_left_out_and_named(given: Machine, batches: list[Batch]) -> None:
     found = drafted_part(given, with_tables(batches, lambda t: t.assign(t_shaft=np.nan, z=np.nan)))
     assert list(found.part.bodies) == ["t_head"] and list(found.part.errors) == []
-    assert "temperature t_shaft has values in 0 of 6 batches: left out" in found.words
-    assert "error z has values in 0 of 6 batches: left out" in found.words
+    assert "temperature t_shaft has values in 0 of 6 batches: left out" in found.remarks
+    assert "error z has values in 0 of 6 batches: left out" in found.remarks
 
 
 def test_a_batch_without_its_driver_is_left_out(given: Machine, batches: list[Batch]) -> None:
     found = drafted_part(given, [*with_tables(batches[:1], lambda t: t.assign(rpm=np.nan)), *batches[1:]])
-    assert "batch b00 has holes in rpm: left out of the draft" in found.words
-    assert "drafted from 5 batches" in found.words[0]
+    assert "batch b00 has holes in rpm: left out of the draft" in found.remarks
+    assert "drafted from 5 batches" in found.remarks[0]
 
 
 def test_a_room_that_moves_is_enough_and_one_capacity_is_held(given: Machine) -> None:
@@ -227,9 +227,9 @@ def test_a_room_that_moves_is_enough_and_one_capacity_is_held(given: Machine) ->
         empty_batches(given, 6, hours=8.0), lambda t: t.assign(rpm=0.0, room=t["room"] + t["time_s"] / 5e3)
     )
     found = drafted_part(given, recorded(given, idle, start_K=0.1))
-    assert not found.part.mechanisms and "driver rpm is never other than 0: left out" in found.words
+    assert not found.part.mechanisms and "driver rpm is never other than 0: left out" in found.remarks
     first = next(iter(found.part.bodies))
-    assert f"the capacity of {first} is held at 10 kJ/K" in found.words[1]
+    assert f"the capacity of {first} is held at 10 kJ/K" in found.remarks[1]
     assert not compile_network(given, part=found.part).parameters[0].free
     assert min(by(found.scores, "bodies", "share_left").values()) < 0.5
 
@@ -249,7 +249,7 @@ def test_every_kind_of_driver_heats_by_its_own_law(given: Machine, batches: list
 
 def test_a_driver_that_no_heat_grows_with_is_named(given: Machine, batches: list[Batch]) -> None:
     found = drafted_part(changed(given, rpm={"unit": "l/min"}), batches)
-    assert "driver rpm is in l/min, which no drafted heat grows with: it warms nothing there" in found.words
+    assert "driver rpm is in l/min, which no drafted heat grows with: it warms nothing there" in found.remarks
 
 
 def test_noise_is_stated_where_no_resolution_is(given: Machine, batches: list[Batch]) -> None:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from data.arrays import Array
-from diagnosis.fitting.regression import QUIET, whitened
+from diagnosis.fitting.regression import Whitened
+from diagnosis.policy import POLICY
 from diagnosis.screening.evidence import Evidence
 from twin.calibration.fit_problem import Block, Unknown
 
@@ -42,7 +43,7 @@ def blocks(seed: int = 0, rows: NDArray[np.int64] = CHANNEL, size: float = 1.0, 
 
 
 def evidence_of(given: list[Block]) -> Evidence:
-    every = tuple(whitened(b, np.zeros(Q), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT) for b in given)
+    every = tuple(Whitened.at(b, np.zeros(Q), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT) for b in given)
     rows = B * np.bincount(given[0].channel, minlength=len(ROWS)).astype(float)
     return Evidence(every, rows, WEIGHT, np.full(C, -FAR), np.full(C, FAR))
 
@@ -100,7 +101,7 @@ def test_the_point_of_linearisation_does_not_matter(given: list[Block], seen: Ev
     there = replace(
         given[0], residual=given[0].residual - given[0].jacobian[:, :P] @ (SPREAD * z) - given[0].nuisance @ v
     )
-    moved = whitened(there, v, z, UNKNOWNS, range(P, P + C), WEIGHT)
+    moved = Whitened.at(there, v, z, UNKNOWNS, range(P, P + C), WEIGHT)
     np.testing.assert_allclose(moved.target, seen.batches[0].target, atol=1e-9)
 
 
@@ -119,7 +120,9 @@ def test_the_score_is_the_log_density_of_refits(given: list[Block], seen: Eviden
     means = squares / (B * np.array(ROWS) * WEIGHT)
     np.testing.assert_allclose(seen.mean_squares(seen.left_out())[0], means)
     bent = -0.5 * float(np.sum(refit_without(given, set())[0] ** 2))  # how far from what the machine file says
-    assert seen.base_score()[0] == pytest.approx(-0.5 * COUNT @ np.log(np.maximum(means, QUIET)) + volume + bent)
+    assert seen.base_score()[0] == pytest.approx(
+        -0.5 * COUNT @ np.log(np.maximum(means, POLICY.min_noise_variance_share)) + volume + bent
+    )
 
 
 def test_noise_below_the_given_is_not_rewarded(given: list[Block]) -> None:
@@ -133,7 +136,7 @@ def test_a_group_left_out_is_predicted_by_all_others(given: list[Block], seen: E
     squares = sum(np.bincount(CHANNEL, e**2) for e in refit_without(given, set(group))[1])
     means = squares / (len(group) * np.array(ROWS) * WEIGHT)
     volume = -0.5 * sum(np.linalg.slogdet(covariance(given[k]))[1] for k in group)
-    expected = -0.5 * (COUNT * len(group) / B) @ np.log(np.maximum(means, QUIET)) + volume
+    expected = -0.5 * (COUNT * len(group) / B) @ np.log(np.maximum(means, POLICY.min_noise_variance_share)) + volume
     assert seen.group_score(group) == pytest.approx(expected)
 
 
@@ -220,7 +223,9 @@ def test_gains_are_those_of_refits_with_one_column_more() -> None:
         better += int(right @ right < left @ left)
         assert scores.by_batch[k, 0] == pytest.approx(left @ left - right @ right, rel=0.02)
     n = seen.rows[0]
-    expected = 0.5 * n * (np.log(before / seen.rows[0]) - np.log(max(after / seen.rows[0], QUIET)))
+    expected = (
+        0.5 * n * (np.log(before / seen.rows[0]) - np.log(max(after / seen.rows[0], POLICY.min_noise_variance_share)))
+    )
     assert scores.gain[0] == pytest.approx(expected, rel=0.01)
     assert scores.improved[0] == better == B
     assert scores.gain[0] > 10 > scores.gain[1:].max()
@@ -237,7 +242,9 @@ def test_several_channels_are_weighed_by_what_is_left_of_each(given: list[Block]
 
     def cost(g: float) -> float:
         squares = sum(np.bincount(CHANNEL, (e - g * c[:, 0]) ** 2) for e, c in zip(inside, seen.beyond, strict=True))
-        return float(COUNT @ np.log(np.maximum(squares / (B * np.array(ROWS) * WEIGHT), QUIET)))
+        return float(
+            COUNT @ np.log(np.maximum(squares / (B * np.array(ROWS) * WEIGHT), POLICY.min_noise_variance_share))
+        )
 
     best = minimize_scalar(cost, bounds=(-2, 2), method="bounded").x
     got = seen.scores()
@@ -278,7 +285,7 @@ def test_an_unknown_of_each_batchs_own_is_one_nuisance_more() -> None:
     seen = evidence_of(given)
     columns = [0.7 * b.jacobian[:, P + 1] for b in given]
     more = [replace(b, nuisance=np.column_stack([b.nuisance, c])) for b, c in zip(given, columns, strict=True)]
-    every = tuple(whitened(b, np.zeros(Q + 1), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT) for b in more)
+    every = tuple(Whitened.at(b, np.zeros(Q + 1), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT) for b in more)
     expected = replace(seen, batches=every).base_score()[0] - seen.base_score()[0]
     got = seen.own_gain([w.of(c) for w, c in zip(seen.batches, columns, strict=True)])
     assert got == pytest.approx(expected, rel=1e-9)
@@ -298,7 +305,7 @@ def test_an_own_unknown_gains_where_batches_differ_and_not_where_they_agree() ->
 def test_slack_is_a_shared_unknown_of_that_prior(given: list[Block]) -> None:
     sd = 0.3
     loose = [
-        whitened(b, np.zeros(Q), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT).with_slack({1: sd}) for b in given
+        Whitened.at(b, np.zeros(Q), np.zeros(P), UNKNOWNS, range(P, P + C), WEIGHT).with_slack({1: sd}) for b in given
     ]
     for b, w in zip(given, loose, strict=True):
         assert w.jacobian.shape == (len(CHANNEL), P + 1) and w.columns.shape == (len(CHANNEL), C)

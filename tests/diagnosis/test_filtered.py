@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.regression import Filtered, Memory, memory_left, settle_filtered
+from diagnosis.policy import POLICY
 from diagnosis.search import null as refined
 from tests.diagnosis.small_cases import cold_floor, consistent, fitted, four_bodies
 from tests.twin.recordings import empty_batches, recorded
-from twin.calibration.least_squares import noise_left, x_of
+from twin.calibration.least_squares import FitOptions, noise_left, x_of
 from twin.calibration.least_squares import settled as annealed
 from twin.compile import compile_network
 from twin.schema import twin_part
@@ -70,11 +73,11 @@ def test_it_ends_where_it_stands() -> None:
 def test_no_channel_is_given_up_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Castings that one temperature does not tell: by channels weighted alone the head would be left 50 times its
     noise, for a spindle and a displacement that fit to the last digit."""
-    monkeypatch.setattr(refined, "BIOT", (1.0, 5.0))
+    monkeypatch.setattr(refined, "POLICY", replace(POLICY, null_biot=(1.0, 5.0)))
     known, network = four_bodies(), compile_network(four_bodies())
     finer = refined.refined(twin_part(known), network, network.values, seed=7)
     truth = known.model_copy(update={"twin": finer.model_dump(mode="json", by_alias=True, exclude_none=True)})
     done = fitted(known, recorded(truth, empty_batches(known, 6), compile_network(truth).values, seed=7))
-    started, _ = annealed(done.problem, reweight=True, tolerance=1e-2, max_iterations=40)
+    started, _ = annealed(done.problem, FitOptions(reweight=True, tolerance=1e-2, max_iterations=40))
     assert noise_left(done.problem, started).factor.max() > 30.0
     assert done.noise.factor.max() < 12.0

@@ -13,7 +13,7 @@ from diagnosis.candidates.alternatives import coarse_candidates
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, pieces_of, refitted, settle
 from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent, fitted, four_bodies, runs
-from twin.calibration.estimate import LeftOut, leave_batch_out
+from twin.calibration.estimate import CalibrationOptions, LeftOut, leave_batch_out
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
 from twin.quantity import Value
@@ -40,7 +40,7 @@ def with_the_floor() -> Fitted:
 @cache
 def by_refits() -> LeftOut:
     """Every batch predicted by a calibration on all others."""
-    return leave_batch_out(consistent().problem, reweight=False)
+    return leave_batch_out(consistent().problem, CalibrationOptions(reweight=False))
 
 
 @cache

@@ -24,14 +24,14 @@ def test_every_term_at_every_place_once() -> None:
     batches = [replace(b, table=b.table.assign(rpm=np.where(b.table["coolant"] > 0, 4000.0, 2500.0))) for b in batches]
     forms = free_forms(machine, twin_part(machine), batches)
     assert len(set(forms)) == len(forms)
-    heat = [(f.role, f.words) for f in forms if f.where == BED]
+    heat = [(f.role, f.label) for f in forms if f.where == BED]
     assert heat == [
         ("constant", "1"), ("linear", "rpm"), ("square", "rpm^2"), ("linear", "coolant"), ("cross", "rpm coolant"),
         ("square_cross", "rpm^2 coolant"), ("per_K", "T_bed - 20"), ("product", "rpm (T_bed - 20)"),
         ("product", "coolant (T_bed - 20)"),
     ]  # fmt: skip
     assert {f.where.name for f in forms if f.heat} == set(BODIES)
-    shift = [f.words for f in forms if f.where == Z]
+    shift = [f.label for f in forms if f.where == Z]
     assert shift[:2] == ["rpm", "rpm^2"] and "θ_bed" in shift and "rpm θ_bed" in shift and "1" not in shift
     for f in forms:
         c = candidate_of([f], "head")
@@ -48,7 +48,7 @@ def test_drivers_that_say_nothing_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "value", "words"),
+    ("form", "value", "label"),
     [
         (Form(BED, "constant"), 25.0, "25 W into bed"),
         (Form(BED, "linear", COOLANT), -60.0, "60 W out of bed while coolant is on"),
@@ -66,8 +66,8 @@ def test_drivers_that_say_nothing_are_left_out() -> None:
         (Form(Z, "product", COOLANT, body="head"), 2.0, "2.0 um of z per K of head's rise, while coolant is on"),
     ],
 )  # fmt: skip
-def test_words(form: Form, value: float, words: str) -> None:
-    assert form.told(value) == words.replace("um", "µm")
+def test_words(form: Form, value: float, label: str) -> None:
+    assert form.phrase(value) == label.replace("um", "µm")
 
 
 def test_terms_of_one_mechanism() -> None:

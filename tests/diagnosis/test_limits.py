@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from diagnosis.candidates.discretisation import LAG_S
 from diagnosis.contracts import COLUMNS, Scored
-from diagnosis.screening.screen import SURE, Screen, best_variants, limits, proposed, screen
+from diagnosis.policy import POLICY
+from diagnosis.screening.screen import Screen, best_variants, limits, proposed, screen
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
 from twin.mechanisms import MECHANISMS
 
@@ -46,8 +46,8 @@ def of(found: Screen, name: str) -> tuple[int, Scored]:
 
 
 def limit_of(name: str) -> pd.Series:
-    words = of(seen(), name)[1].candidate.words
-    own = table()[table()["words"] == words]
+    label = of(seen(), name)[1].candidate.label
+    own = table()[table()["words"] == label]
     assert len(own) == 1
     return own.iloc[0]
 
@@ -67,7 +67,7 @@ def test_an_effect_of_three_times_its_limit_is_seen_and_of_a_third_is_not(name: 
 def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:
     for name in HIDDEN:
         scored = of(seen(), name)[1]
-        assert limit_of(name)["limit"] == pytest.approx(scored.sd * (np.sqrt(2 * THRESHOLD) + SURE))
+        assert limit_of(name)["limit"] == pytest.approx(scored.sd * (np.sqrt(2 * THRESHOLD) + POLICY.limit_power_sd))
     higher = limits(consistent(), seen(), 4 * THRESHOLD).set_index("words")["limit"]
     lower = table().set_index("words")["limit"]
     both = pd.concat([higher, lower], axis=1, keys=["higher", "lower"]).dropna()
@@ -78,9 +78,9 @@ def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:
 def test_every_mechanism_that_can_be_switched_off_has_one() -> None:
     assert tuple(table().columns) == COLUMNS["limits"]
     smooth = {s.candidate.plain for s in best_variants(seen().scored) if s.candidate.amplitudes}
-    name_of = {c.words: c.plain for c in proposed(consistent())}
+    name_of = {c.label: c.plain for c in proposed(consistent())}
     assert {name_of[words] for words in table()["words"]} == smooth and len(table()) == len(smooth)
-    every = {c.plain: c.words for c in proposed(consistent()) if c.amplitudes}
+    every = {c.plain: c.label for c in proposed(consistent()) if c.amplitudes}
     assert len(every) == len(smooth)
     for row in rows():
         assert row.unit in {s.unit for s in MECHANISMS[row.mechanism].parameters}
@@ -100,7 +100,7 @@ def test_limits_that_differ_by_rounding_alone_stand_in_a_fixed_order() -> None:
 
 def test_what_every_fit_has_slack_for_is_seen_only_far_beyond_it() -> None:
     own = table()[table()["mechanism"] == "sensor_lag"]
-    assert len(own) == 2 and (own["limit"] > 8 * LAG_S).all() and (own["absorbed"] > 0.99).all()
+    assert len(own) == 2 and (own["limit"] > 8 * POLICY.sensor_lag_sd_s).all() and (own["absorbed"] > 0.99).all()
 
 
 def test_what_absorbs_it_is_named_where_much_is_absorbed() -> None:

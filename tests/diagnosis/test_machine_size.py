@@ -8,9 +8,10 @@ from typing import Any, cast
 import pytest
 
 from diagnosis.candidates.library import candidates
-from diagnosis.candidates.priors import TYPICAL_W_PER_K, at_size, log_prior, size_of, start_values
+from diagnosis.candidates.priors import at_size, log_prior, size_of, start_values
 from diagnosis.contracts import Fitted, Scored
 from diagnosis.fitting.fitted import refitted
+from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import FLOOR, cold_floor, four_bodies
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
@@ -52,7 +53,7 @@ def test_a_machine_tool_is_of_the_usual_size_and_grams_are_not() -> None:
     small = size_of(standing(of_grams()))
     assert 1e-4 < small < 1e-3
     links_W_per_K = (15e-3 * 15e-3 * 20e-3 * 1e-3 * 4e-3 * 10e-3) ** (1 / 6)
-    assert small == pytest.approx(links_W_per_K / TYPICAL_W_PER_K)
+    assert small == pytest.approx(links_W_per_K / POLICY.typical_conductance_W_per_K)
 
 
 def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:

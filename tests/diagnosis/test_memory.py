@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from data.arrays import Array
-from diagnosis.fitting.regression import ROWS, SHARES, SHORT, Memory, memory_of, whiter
+from diagnosis.fitting.regression import (
+    MATRIX_FILTER_ROWS,
+    MEMORY_REACHES_ROWS,
+    MEMORY_SHARES,
+    Memory,
+    memory_of,
+    whiter,
+)
 
 N = 80
 CASES = [(0.6, 4.0), (0.94, 16.0), (0.25, 2.0), (0.87, 64.0)]  # share, rows to 1/e
@@ -51,10 +58,10 @@ def test_what_is_filtered_can_be_restored() -> None:
 
 def test_few_rows_are_filtered_as_many_are() -> None:
     """A matrix filters the few, a recursion the many."""
-    rows = np.random.default_rng(2).standard_normal((SHORT + 1, 2))
+    rows = np.random.default_rng(2).standard_normal((MATRIX_FILTER_ROWS + 1, 2))
     own = memory(0.87, 8.0)
-    many, few = (own.filtered([(1, slice(0, n))], rows[:n]) for n in (SHORT + 1, SHORT))
-    np.testing.assert_allclose(few, many[:SHORT], atol=1e-12)
+    many, few = (own.filtered([(1, slice(0, n))], rows[:n]) for n in (MATRIX_FILTER_ROWS + 1, MATRIX_FILTER_ROWS))
+    np.testing.assert_allclose(few, many[:MATRIX_FILTER_ROWS], atol=1e-12)
     np.testing.assert_allclose(own.filtered([(1, slice(0, 7))], rows[:7, 0]), many[:7, 0], atol=1e-12)
 
 
@@ -101,6 +108,6 @@ def test_what_is_found_is_as_likely_as_any_by_the_series_own_covariance(share: f
         n = sum(map(len, series))
         return float(-0.5 * n * np.log(square) - sum(np.log(np.diag(r)).sum() for r in roots))
 
-    best = max(likelihood(w, float(np.exp(-1.0 / r))) for w in SHARES for r in ROWS)
+    best = max(likelihood(w, float(np.exp(-1.0 / r))) for w in MEMORY_SHARES for r in MEMORY_REACHES_ROWS)
     assert likelihood(float(found.share[0]), float(found.keep[0])) > best - 3.0  # the filter begins in its steady state
     assert best > likelihood(0.0, 0.0) + (5.0 if share > 0.3 else 0.0)

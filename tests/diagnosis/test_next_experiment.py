@@ -1,4 +1,4 @@
-"""The run that tells rivals apart: the menu, what each run would say, and the chosen one carried out."""
+"""The run that tells alternatives apart: the menu, what each run would say, and the chosen one carried out."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, load_machine
 from diagnosis.contracts import Fitted
-from diagnosis.next_experiment.foreseen import _floating, _Model, begun, foreseen
+from diagnosis.next_experiment.foreseen import AlternativeModel, begun, foreseen, with_free_offset
 from diagnosis.next_experiment.menu import Run, menu
-from diagnosis.next_experiment.proposal import COLUMNS, SETTLES, TELLS, Proposal, next_experiment
+from diagnosis.next_experiment.proposal import COLUMNS, Proposal, next_experiment
+from diagnosis.policy import POLICY
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
-from twin.calibration.least_squares import settled
+from twin.calibration.least_squares import FitOptions, settled
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.run_plan import RunPlan, load_run_plan
@@ -40,12 +41,14 @@ LOSS = {"exposures__shaft-room": {"value": "3 W/K", "spread": 0.7}}  # or more a
 
 def fitted(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> Fitted:
     problem = CalibrationProblem.of(compile_network(of), batches)
-    return Fitted(of, twin_part(of), tuple(batches), problem, settled(problem, tolerance=1e-3, reweight=reweight)[0])
+    return Fitted(
+        of, twin_part(of), tuple(batches), problem, settled(problem, FitOptions(tolerance=1e-3, reweight=reweight))[0]
+    )
 
 
 @cache
 def tied(bare: bool = False) -> dict[str, Fitted]:
-    """Two rivals and recordings at one speed, which tell little of them; `bare`: no sensor on the shaft."""
+    """Two alternatives and recordings at one speed, which tell little of them; `bare`: no sensor on the shaft."""
     changes: dict[str, Any] = {"sensors__t_shaft": None} if bare else {}
     air, loss = machine(**AIR, **changes), machine(**LOSS, **changes)
     steady = [replace(b, table=b.table.assign(rpm=3000.0)) for b in empty_batches(air, 4)]
@@ -82,39 +85,43 @@ def lead_nats(truth: Fitted, other: Fitted, more: Sequence[Batch] = ()) -> float
 
 
 def again(run: Run, hours: float, rpm: float) -> Run:
-    return replace(run, words=f"again at {rpm:g} rpm", stages=(Stage(3600.0 * hours, {"rpm": rpm}),))
+    return replace(run, label=f"again at {rpm:g} rpm", stages=(Stage(3600.0 * hours, {"rpm": rpm}),))
 
 
 def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
-    rivals, chosen = tied(), proposal()
+    alternatives, chosen = tied(), proposal()
     assert chosen.separates == ("air", "loss") and chosen.tied == () and chosen.sensor is None
-    assert chosen.nats >= SETTLES and chosen.nats_per_hour == pytest.approx(chosen.nats / chosen.hours)
-    first = menu(rivals["air"].machine, rivals["air"].batches, ["rpm"])[0]
-    like_before = foreseen(list(rivals.values()), [again(first, 4.0, 3000.0)]).nats[..., 0]
+    assert chosen.nats >= POLICY.settling_nats and chosen.nats_per_hour == pytest.approx(chosen.nats / chosen.hours)
+    first = menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"])[0]
+    like_before = foreseen(list(alternatives.values()), [again(first, 4.0, 3000.0)]).nats[..., 0]
     by_words = chosen.table.set_index("run")["nats"]
     assert like_before.max() < 0.1 * by_words.min()  # another one at that speed tells next to nothing
-    run = next(r for r in menu(rivals["air"].machine, rivals["air"].batches, ["rpm"]) if r.words == chosen.words)
-    both = foreseen(list(rivals.values()), [run]).nats[..., 0]
+    run = next(
+        r for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"]) if r.label == chosen.label
+    )
+    both = foreseen(list(alternatives.values()), [run]).nats[..., 0]
     assert chosen.nats == pytest.approx(min(both[0, 1], both[1, 0])) and both[0, 1] > 2 * both[1, 0]
     assert list(chosen.table.columns) == list(COLUMNS) and by_words.is_monotonic_decreasing
     cool = next(w for w in by_words.index if w.startswith("a cool-down"))
-    assert by_words[cool] > SETTLES
+    assert by_words[cool] > POLICY.settling_nats
     # several settle it: the shortest of them
-    assert chosen.hours == chosen.table.loc[chosen.table["nats"] >= SETTLES, "hours"].min()
-    assert chosen.sentence.startswith(f"{chosen.words.capitalize()} would tell air and loss apart: 4.0 h, ")
+    assert chosen.hours == chosen.table.loc[chosen.table["nats"] >= POLICY.settling_nats, "hours"].min()
+    assert chosen.sentence.startswith(f"{chosen.label.capitalize()} would tell air and loss apart: 4.0 h, ")
 
 
 @pytest.mark.parametrize(("truth", "other"), [("air", "loss"), ("loss", "air")])
 def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) -> None:
-    rivals, chosen = tied(), proposal()
+    alternatives, chosen = tied(), proposal()
     path = tmp_path / "next.yml"
     path.write_text(chosen.plan_text)
-    batch = carried_out(load_run_plan(path, rivals[truth].machine), rivals[truth], seed=3)
-    before = lead_nats(rivals[truth], rivals[other])
-    after = lead_nats(rivals[truth], rivals[other], [batch])
-    run = next(r for r in menu(rivals["air"].machine, rivals["air"].batches, ["rpm"]) if r.words == chosen.words)
-    told = foreseen([rivals[truth], rivals[other]], [run]).nats[0, 1, 0]
-    assert after - before > SETTLES
+    batch = carried_out(load_run_plan(path, alternatives[truth].machine), alternatives[truth], seed=3)
+    before = lead_nats(alternatives[truth], alternatives[other])
+    after = lead_nats(alternatives[truth], alternatives[other], [batch])
+    run = next(
+        r for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"]) if r.label == chosen.label
+    )
+    told = foreseen([alternatives[truth], alternatives[other]], [run]).nats[0, 1, 0]
+    assert after - before > POLICY.settling_nats
     # linear foresight: a parameter that must move far costs less or more than its first step says
     assert 0.5 * told < after - before < 1.5 * told
 
@@ -122,12 +129,12 @@ def test_the_run_carried_out_settles_it(tmp_path: Path, truth: str, other: str) 
 @pytest.mark.parametrize(("bare", "number"), [(False, 0), (False, 4), (True, 3)])
 def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) -> None:
     """The same number from one dense system: data of one rival, parameters and nuisances of the other with priors."""
-    rivals = list(tied(bare).values())
-    run = menu(rivals[0].machine, rivals[0].batches, ["rpm"])[number]
-    truth, other = (_Model.of(f, [run], ()) for f in rivals)
-    weight = np.min([f.noise.weight for f in rivals], axis=0)
+    alternatives = list(tied(bare).values())
+    run = menu(alternatives[0].machine, alternatives[0].batches, ["rpm"])[number]
+    truth, other = (AlternativeModel.of(f, [run], ()) for f in alternatives)
+    weight = np.min([f.noise.weight for f in alternatives], axis=0)
 
-    def left(model: _Model) -> float:
+    def left(model: AlternativeModel) -> float:
         block, spread = model.blocks[0], np.array([u.spread for u in model.problem.unknowns])
         apart = model.foretold(truth.first)[0] - truth.shown[0]
         scale = np.sqrt(weight[block.channel])
@@ -137,17 +144,19 @@ def test_foreseen_is_the_least_squares_after_a_refit(bare: bool, number: int) ->
         system, aim = np.vstack([rows, prior]), np.append(scale * apart, np.zeros(len(prior)))
         return float(np.sum((aim - system @ np.linalg.lstsq(system, aim, rcond=None)[0]) ** 2))
 
-    seen = foreseen(rivals, [run]).nats[..., 0]
-    own, count = left(truth), run.rows * sum(1 / np.max([f.noise.inflation for f in rivals], axis=0))
+    seen = foreseen(alternatives, [run]).nats[..., 0]
+    own, count = left(truth), run.rows * sum(1 / np.max([f.noise.inflation for f in alternatives], axis=0))
     assert seen[0, 1] == pytest.approx(0.5 * (left(other) - own) / (1 + own / count), rel=1e-6)
     assert (own > 1.0) == bare  # a hot body without a sensor: no rival knows where it starts
     assert (np.diagonal(seen) == 0).all()
 
 
 def test_a_rival_begins_where_the_sensors_say() -> None:
-    rivals = list(tied().values())
-    model = _Model.of(rivals[0], menu(rivals[0].machine, rivals[0].batches, ["rpm"])[:2], ())
-    sensor = rivals[0].problem.network.readings[0]
+    alternatives = list(tied().values())
+    model = AlternativeModel.of(
+        alternatives[0], menu(alternatives[0].machine, alternatives[0].batches, ["rpm"])[:2], ()
+    )
+    sensor = alternatives[0].problem.network.readings[0]
     warmer = {n: v + 1.5 for n, v in model.first.items()}
     for r in range(2):
         before, after = (-sensor.noise * model.foretold(first)[r][0] for first in (model.first, warmer))
@@ -159,9 +168,9 @@ def test_a_new_sensor_tells_nothing_of_a_constant() -> None:
     """Its own error is one more unknown: the rows' covariance is I + offset offsetᵀ."""
     rng = np.random.default_rng(0)
     rows, offset = rng.standard_normal((7, 3)), rng.uniform(1, 2, (7, 1))
-    white = _floating(rows, offset)
+    white = with_free_offset(rows, offset)
     np.testing.assert_allclose(white.T @ white, rows.T @ np.linalg.inv(np.eye(7) + offset @ offset.T) @ rows)
-    np.testing.assert_array_equal(_floating(rows, 0 * offset), rows)
+    np.testing.assert_array_equal(with_free_offset(rows, 0 * offset), rows)
 
 
 def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
@@ -171,27 +180,27 @@ def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
     beside = chain(mechanisms__hidden={**heat, "into": {"column": 0.5, "bed": "rest"}})
     shown = recorded(saddle, [replace(b, table=b.table.assign(coolant=0.0)) for b in empty(5)], seed=2)
     got = next_experiment({"saddle": fitted(saddle, shown), "beside": fitted(beside, shown)})
-    assert got.table["nats"].max() < TELLS and got.table["nats_with_sensor"].min() > SETTLES
+    assert got.table["nats"].max() < POLICY.telling_nats and got.table["nats_with_sensor"].min() > POLICY.settling_nats
     assert got.sensor == "saddle" and set(got.table["sensor"]) == {"saddle"}
-    assert got.words.endswith(" with one more sensor at saddle") and got.nats > SETTLES
+    assert got.label.endswith(" with one more sensor at saddle") and got.nats > POLICY.settling_nats
     assert "# Put one more temperature sensor at saddle before.\n" in got.plan_text
 
 
 def test_rivals_that_no_run_separates() -> None:
-    rivals = tied()
-    same = next_experiment({"air": rivals["air"], "twin": rivals["air"]})
-    assert (same.words, same.plan_text, same.separates, same.tied) == ("", "", (), (("air", "twin"),))
+    alternatives = tied()
+    same = next_experiment({"air": alternatives["air"], "twin": alternatives["air"]})
+    assert (same.label, same.plan_text, same.separates, same.tied) == ("", "", (), (("air", "twin"),))
     assert same.sentence.startswith("None of 6 runs would tell them apart: the best, ")
-    three = next_experiment({"air": rivals["air"], "twin": rivals["air"], "loss": rivals["loss"]})
+    three = next_experiment({"air": alternatives["air"], "twin": alternatives["air"], "loss": alternatives["loss"]})
     assert three.separates == ("air", "twin", "loss") and three.tied == (("air", "twin"),)
-    assert three.words == proposal().words and three.nats == pytest.approx(proposal().nats)
+    assert three.label == proposal().label and three.nats == pytest.approx(proposal().nats)
     assert three.sentence.endswith(" air and twin would stay tied.")
-    none = next_experiment(rivals, runs=[])
-    assert none.words == "" and none.sentence.startswith("No run is known")
-    with pytest.raises(ValueError, match="two rivals or more, got 1"):
-        next_experiment({"air": rivals["air"]})
+    none = next_experiment(alternatives, runs=[])
+    assert none.label == "" and none.sentence.startswith("No run is known")
+    with pytest.raises(ValueError, match="two alternatives or more, got 1"):
+        next_experiment({"air": alternatives["air"]})
     with pytest.raises(ValueError, match="same channels"):
-        next_experiment({"air": rivals["air"], "bare": tied(bare=True)["loss"]})
+        next_experiment({"air": alternatives["air"], "bare": tied(bare=True)["loss"]})
 
 
 @pytest.mark.parametrize(
@@ -208,13 +217,13 @@ def test_plans_read_back_as_they_are(tmp_path: Path, name: str, hours: float, st
         for b in batches
     ]
     runs = menu(known, batches, drivers, step_s)
-    assert len({r.words for r in runs}) == len(runs) >= 3
+    assert len({r.label for r in runs}) == len(runs) >= 3
     for run in runs:
         path = tmp_path / "plan.yml"
         start = {next(iter((known.twin or {})["bodies"])): 23.4} if run.surroundings else {}
         path.write_text(run.text(start, ["said above"]))
         got, want = load_run_plan(path, known), run.plan(known, start)
-        assert path.read_text().startswith("# said above\n") and got.name == run.words
+        assert path.read_text().startswith("# said above\n") and got.name == run.label
         np.testing.assert_allclose(got.time_s, want.time_s, atol=1e-5)
         for read, meant in ((got.drivers, want.drivers), (got.surroundings, want.surroundings)):
             assert set(read) == set(meant)
@@ -227,7 +236,7 @@ def test_plans_read_back_as_they_are(tmp_path: Path, name: str, hours: float, st
 
 def test_the_menu_goes_as_far_as_the_recordings() -> None:
     known = machine()
-    runs = {r.words: r for r in menu(known, empty_batches(known, 3), ["rpm"])}
+    runs = {r.label: r for r in menu(known, empty_batches(known, 3), ["rpm"])}
     assert list(runs) == [
         "3 h at 5000 rpm and 2 h at rest",
         "a staircase of speeds up to 5000 rpm and 1 h at rest",
@@ -253,13 +262,13 @@ def test_without_a_spindle_and_without_a_room() -> None:
     pumped = pumped.model_copy(update={"channels": channels})
     switched = empty_batches(pumped, 3)
     switched = [replace(b, table=b.table.assign(pump=np.minimum(b.table["pump"], 1.0))) for b in switched]
-    words = [r.words for r in menu(pumped, switched, ["pump"])]
-    assert words[:2] == ["pump alone, 3 h on and 1 h off", "a cool-down of 5 h after 4 h of pump on"]
-    assert len(words) == 4  # and a night and a heated hall
+    label = [r.label for r in menu(pumped, switched, ["pump"])]
+    assert label[:2] == ["pump alone, 3 h on and 1 h off", "a cool-down of 5 h after 4 h of pump on"]
+    assert len(label) == 4  # and a night and a heated hall
     board = load_machine(MACHINES / "tclab_board.yml")
     runs = menu(board, empty_batches(board, 2, 0.25, 5.0), ["heater1", "heater2"], 5.0)
     assert not any(r.surroundings for r in runs) and all(r.hours < 0.5 for r in runs)
-    assert runs[0].words == "heater1 alone, 15 min at 100 % and 5 min off"
+    assert runs[0].label == "heater1 alone, 15 min at 100 % and 5 min off"
     # a driver that cannot be 0 is an outcome, such as a cell's voltage
     cell = load_machine(MACHINES / "cell_30q.yml")
     assert menu(cell, empty_batches(cell, 1, 0.25, 10.0), ["current", "voltage"], 10.0) == []
@@ -268,7 +277,7 @@ def test_without_a_spindle_and_without_a_room() -> None:
 def test_a_hot_run_begins_hot() -> None:
     rival = tied()["air"]
     runs = menu(rival.machine, rival.batches, ["rpm"])
-    cool = next(r for r in runs if r.words.startswith("a cool-down"))
+    cool = next(r for r in runs if r.label.startswith("a cool-down"))
     room = cool.surroundings["room"][0][1]
     hot, cold = begun(rival, cool), begun(rival, runs[0])
     assert hot["shaft"] > hot["head"] > room + 1.0

@@ -10,8 +10,9 @@ import pytest
 
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
-from diagnosis.search.null import CELLS, MARGIN, SCALES, TWINS, WIDER, Null, refined, structural_null
+from diagnosis.search.null import Null, refined, structural_null
 from tests.diagnosis.small_cases import consistent, fitted, four_bodies, runs
 from twin.calibration.least_squares import x_of
 from twin.compile import compile_network
@@ -53,16 +54,20 @@ def test_the_threshold_is_beyond_all_that_was_seen() -> None:
     many = given([[g] for g in rng.gumbel(5.0, 2.0, 4000)], [[-1.0]] * 4000)
     exact = 5.0 - 2.0 * np.log(-np.log(0.99))
     quantile = replace(many, gain=np.minimum(many.gain, exact))  # only the largest would lift it
-    assert quantile.threshold(-1.0) == pytest.approx(MARGIN * exact, rel=0.05)
+    assert quantile.threshold(-1.0) == pytest.approx(POLICY.null_margin * exact, rel=0.05)
     assert quantile.threshold(-1.0, margin=1.0) == pytest.approx(exact, rel=0.05)
     assert null.threshold(-1.0, 0.999) > null.threshold(-1.0, 0.99) > 0
 
 
 def test_amplitudes_scatter_as_those_of_the_machines_that_count() -> None:
     null = given([[1, 2, 3], [4, 5, 6]], [[-1, -2, -3], [-1, -1, -1]])
-    assert null.scatter("lamp", -2.0) == pytest.approx(WIDER * (1.0 + 0.95 * 4.0))  # all positive: that is half of it
+    assert null.scatter("lamp", -2.0) == pytest.approx(
+        POLICY.amplitude_scatter_factor * (1.0 + 0.95 * 4.0)
+    )  # all positive: that is half of it
     signed = replace(null, amplitude=null.amplitude * np.array([1.0, -1.0])[:, None, None])
-    assert signed.scatter("lamp", -2.0) == pytest.approx(WIDER * (1.0 + 0.9 * 4.0))  # nine tenths from 1 to 5
+    assert signed.scatter("lamp", -2.0) == pytest.approx(
+        POLICY.amplitude_scatter_factor * (1.0 + 0.9 * 4.0)
+    )  # nine tenths from 1 to 5
     assert null.scatter("sun", -2.0) == 0.0
     assert given([[3.0]], [[-1.0]]).scatter("lamp", -1.0) == 0.0
 
@@ -86,7 +91,7 @@ def test_a_refined_machine_is_the_same_machine_cut_finer() -> None:
     done = four()
     part = refined(done.part, done.problem.network, done.values, 0)
     network = compile_network(done.machine, part=part)
-    assert network.n_cells == CELLS * done.problem.network.n_cells
+    assert network.n_cells == POLICY.null_cells * done.problem.network.n_cells
     assert {p.name for p in done.problem.network.parameters} <= {p.name for p in network.parameters}
     free = [network.parameters[k].name for k in network.free]
     assert free == [done.problem.network.parameters[k].name for k in done.problem.network.free]
@@ -137,9 +142,11 @@ def test_it_has_every_machine_at_every_scale(machine: str) -> None:
     done, found, counts = seen(machine)
     null = structural_null(done, found.evidence, counts)
     channels = len(done.problem.channels)
-    assert null.gain.shape == null.density.shape == (TWINS, len(SCALES))
-    assert null.mean_squares.shape == (TWINS, len(SCALES), channels)
-    assert null.amplitude.shape == (TWINS, len(SCALES), len(counts)) and null.names == tuple(counts)
+    assert null.gain.shape == null.density.shape == (POLICY.null_machines, len(POLICY.null_scales))
+    assert null.mean_squares.shape == (POLICY.null_machines, len(POLICY.null_scales), channels)
+    assert null.amplitude.shape == (POLICY.null_machines, len(POLICY.null_scales), len(counts)) and null.names == tuple(
+        counts
+    )
     assert np.isfinite(null.gain).all() and (null.gain > -1e-6).all()
     worse = null.mean_squares.mean(axis=(0, 2))
     assert (np.diff(worse) > -0.01).all() and worse[-1] > worse[
@@ -168,4 +175,4 @@ def test_progress_counts_the_machines() -> None:
     done, found, counts = seen("two")
     told: list[tuple[int, int]] = []
     structural_null(done, found.evidence, counts, progress=lambda n, of: told.append((n, of)))
-    assert told == [(k + 1, TWINS) for k in range(TWINS)]
+    assert told == [(k + 1, POLICY.null_machines) for k in range(POLICY.null_machines)]

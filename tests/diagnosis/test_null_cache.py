@@ -13,7 +13,7 @@ import diagnosis.search.null as null_cache
 from diagnosis.contracts import Fitted
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import proposed, screen
-from diagnosis.search.null import MOST, Null, cached_null, structural_null
+from diagnosis.search.null import CACHED_NULLS, Null, cached_null, structural_null
 from tests.diagnosis.small_cases import consistent
 
 
@@ -104,9 +104,9 @@ def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path: Path, calls: li
 
 
 def test_the_oldest_go(tmp_path: Path, calls: list[int]) -> None:
-    for k in range(MOST + 3):
+    for k in range(CACHED_NULLS + 3):
         (tmp_path / f"null-{k}.npz").write_bytes(b"old")
     cached_null(tmp_path, *seen())
-    assert len(list(tmp_path.iterdir())) == MOST
+    assert len(list(tmp_path.iterdir())) == CACHED_NULLS
     cached_null(tmp_path, *seen())
     assert calls == [0]

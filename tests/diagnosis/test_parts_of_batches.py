@@ -10,7 +10,8 @@ import pytest
 
 from data.batch import Batch, Finding
 from data.errors import InputError
-from diagnosis.fitting.batches import ENOUGH, SHORTEST_ROWS, enough_batches, usable_batches
+from diagnosis.fitting.batches import enough_batches, usable_batches
+from diagnosis.policy import POLICY
 from tests.diagnosis.small_cases import runs, two_bodies
 from twin.compile import compile_network
 
@@ -30,7 +31,7 @@ def test_fewer_are_cut_as_far_as_their_rows_allow(count: int, blocks: int) -> No
     assert given[0].n_rows == 49  # two blocks of 24 rows or more
     out, words = enough_batches(given)
     assert len(out) == blocks
-    assert min(b.n_rows for b in out) >= SHORTEST_ROWS
+    assert min(b.n_rows for b in out) >= POLICY.min_block_rows
     assert [b.batch_id for b in out] == [f"b{k:02d}_{n}" for k in range(count) for n in (1, 2)]
     (told,) = words
     assert told.startswith(f"{count} run{'s' if count > 1 else ''} only: cut into {blocks} blocks")
@@ -41,7 +42,7 @@ def test_a_long_run_gives_four_blocks() -> None:
     table = pd.concat([long.table] * 4, ignore_index=True)
     table["time_s"] = long.step_s * np.arange(len(table))
     out, _ = enough_batches([replace(long, table=table)])
-    assert len(out) == ENOUGH
+    assert len(out) == POLICY.min_batches
 
 
 def test_blocks_hold_the_same_rows_at_the_same_time_of_day() -> None:

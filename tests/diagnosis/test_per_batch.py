@@ -14,7 +14,7 @@ from data.batch import Batch
 from data.errors import InputError
 from tests.diagnosis.small_cases import four_bodies, two_bodies
 from tests.twin.recordings import empty_batches, recorded
-from twin.calibration.least_squares import Fit, fit
+from twin.calibration.least_squares import Fit, FitOptions, fit
 from twin.calibration.problem import CalibrationProblem, Nuisances
 from twin.compile import compile_network
 from twin.network import Network
@@ -39,7 +39,7 @@ def scattered() -> list[Batch]:
 def calibrated(varying: bool) -> tuple[CalibrationProblem, Fit]:
     network = compile_network(two_bodies(**(VARYING if varying else {})))
     problem = CalibrationProblem.of(network, scattered())
-    return problem, fit(problem, tolerance=1e-4, reweight=True)
+    return problem, fit(problem, FitOptions(tolerance=1e-4, reweight=True))
 
 
 def size_W(problem: CalibrationProblem, done: Fit) -> Array:
@@ -115,15 +115,15 @@ def test_a_fixed_value_may_differ_from_run_to_run() -> None:
     network = compile_network(two_bodies(mechanisms__belt__parameters__power={"value": "120 W", "per_batch": 0.3}))
     assert network.index("mechanisms.belt.power") not in network.free
     problem = CalibrationProblem.of(network, scattered())
-    done = fit(problem, tolerance=1e-4, reweight=True)
+    done = fit(problem, FitOptions(tolerance=1e-4, reweight=True))
     np.testing.assert_allclose(size_W(problem, done), 120 * np.array(FACTORS), rtol=0.03)
 
 
-# Inputs.with_times
+# Inputs.with_own
 
 
 def shown(network: Network, batches: list[Batch], times: dict[str, Array], values: Array | None = None) -> Array:
-    inputs = inputs_of(network, batches, 2).with_times(times)
+    inputs = inputs_of(network, batches, 2).with_own(times)
     start = np.full((1, len(batches), network.n_cells), 21.0)
     return simulate(network, network.values if values is None else values, inputs, start, tolerance_K=1e-9).readings[0]
 
@@ -146,7 +146,7 @@ def test_times_go_with_their_batches_and_leave_no_trace() -> None:
     inputs = inputs_of(network, empty_batches(two_bodies(), 3))
     start = np.full((1, 3, 2), 21.0)
     before = simulate(network, network.values, inputs, start).readings
-    double = inputs.with_times({"belt": np.array([1.0, 1.0, 2.0])})
+    double = inputs.with_own({"belt": np.array([1.0, 1.0, 2.0])})
     hot = simulate(network, network.values, double, start).readings
     np.testing.assert_array_equal(simulate(network, network.values, inputs, start).readings, before)
     np.testing.assert_array_equal(hot[0, :2], before[0, :2])

@@ -9,9 +9,10 @@ import pytest
 
 from data.errors import InputError
 from diagnosis.contracts import Scored, Tried
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed, screen
 from diagnosis.search import refits
-from diagnosis.search.refits import refit, taken_on
+from diagnosis.search.refits import optimised, refit
 from tests.diagnosis.small_cases import SHIFT, fitted, four_bodies, runs
 
 
@@ -30,13 +31,13 @@ def test_at_an_error_the_better_of_two_beginnings_counts(
 ) -> None:
     now, shift, heat = shifted
     begun: list[str] = []
-    afresh = refits._afresh
+    afresh = refits._with_equal_weights
 
     def watched(now: Any, part: Any, begin: Any) -> Any:
         begun.append("afresh")
         return afresh(now, part, begin)
 
-    monkeypatch.setattr(refits, "_afresh", watched)
+    monkeypatch.setattr(refits, "_with_equal_weights", watched)
     got = refit(now, shift)
     assert got is not None and got.gain > 100.0 and begun == ["afresh"]
     plain = replace(shift, candidate=replace(shift.candidate, where=replace(shift.candidate.where, kind="node")))
@@ -44,7 +45,9 @@ def test_at_an_error_the_better_of_two_beginnings_counts(
     assert once is not None and got.gain >= once.gain
     refit(now, heat)
     assert begun == ["afresh"]  # what acts on temperatures begins where the fit is
-    monkeypatch.setattr(refits, "GIVEN_UP", 1.01 * float(max(now.noise.factor)))
+    monkeypatch.setattr(
+        refits, "POLICY", replace(POLICY, discounted_channel_noise_factor=1.01 * float(max(now.noise.factor)))
+    )
     refit(now, shift)
     assert begun == ["afresh"]  # and so does an error that the fit counts as it should
 
@@ -76,6 +79,6 @@ def test_a_fit_is_not_taken_on_to_where_it_predicts_worse(
     good = refit(now, shift)
     assert good is not None
     monkeypatch.setattr(refits, "settle", lambda *_, **__: now)  # as if the way down led back to the fit before
-    kept = taken_on(now, good)
+    kept = optimised(now, good)
     assert kept.fitted is good.fitted and kept.gain > 50.0
     assert isinstance(kept, Tried)

@@ -11,16 +11,15 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
-from diagnosis.candidates.discretisation import no_news
+from data.processes import Processes
+from diagnosis.candidates.discretisation import never_reported
 from diagnosis.contracts import Candidate, Scored, Tried, Where
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
 from diagnosis.search import decision
-from diagnosis.search import search as looks
 from diagnosis.search import search as search_module
-from diagnosis.search.acceptance import EVEN
-from diagnosis.search.decision import IMPROVED, Round
+from diagnosis.search.decision import Criteria, Round
 from diagnosis.search.probability import explanations
-from diagnosis.search.refits import Workers
 from diagnosis.search.search import Search, one_round, search
 from diagnosis.search.shortlist import Shortlist
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, fitted, runs, two_bodies
@@ -88,9 +87,9 @@ def test_a_cold_floor_is_found_with_its_size() -> None:
 def test_what_is_accepted_clears_every_bar() -> None:
     for r in found("floor and shift").accepted:
         assert r.best is not None
-        assert r.best.gain > r.threshold >= EVEN
-        assert r.best.improved >= IMPROVED * COUNT
-        assert r.threshold >= (r.beside or r.null).threshold(r.density, name=r.best.candidate.name)
+        assert r.best.gain > r.threshold >= POLICY.even_odds_gain_nats
+        assert r.best.improved >= POLICY.min_improved_share * COUNT
+        assert r.threshold >= (r.own_null or r.null).threshold(r.density, name=r.best.candidate.name)
         assert r.sign_p < 0.2
 
 
@@ -120,7 +119,7 @@ def test_friction_that_differs_from_run_to_run_is_told_as_that() -> None:
     done = found("scatter")
     (r,) = done.accepted
     assert r.best is not None and r.best.candidate.mechanism == "varies_between_runs"
-    assert r.best.candidate.words == "a value that differs from run to run: mechanisms.belt.power"
+    assert r.best.candidate.label == "a value that differs from run to run: mechanisms.belt.power"
     own = done.final.problem.nuisances
     assert done.final.problem.network.parameters[own.parameters[0]].name == "mechanisms.belt.power"
     sizes = np.exp([own.deviation[0] * v[own.shared - 1] for v in done.final.state.nuisance])
@@ -143,26 +142,31 @@ def test_the_best_is_first_and_slack_is_no_news() -> None:
             full = [t for t in r.tried if t.fitted is not None and t.candidate.mechanism != "coarse_network"]
             order = [t.standing(r.null.temperature) for t in full]
             assert order == sorted(order, reverse=True)
-            assert not {t.candidate.name for t in r.tried} & no_news(proposed(r.before), r.before)
+            assert not {t.candidate.name for t in r.tried} & never_reported(proposed(r.before), r.before)
 
 
 def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside a strong effect a finer network stays below what flipped residuals reach."""
     now = found("drift").baseline
     none = Scored(Candidate("coarse_network", Where("node", "head"), "finer_head", ""), 0.0, 0, 0.0, {}, 0.0, -1)
-    finer, asked, real = Tried(none, 45.0, COUNT, 0, 0.0, now), [], decision.asked
+    finer, asked, real = Tried(none, 45.0, COUNT, "finer_head", 0.0, now), [], decision.evaluated
 
     def watched(*given: Any) -> Round:
         asked.append(real(*given))
         return asked[-1]
 
-    monkeypatch.setattr(decision, "_apart", lambda *_: finer)
-    monkeypatch.setattr(decision, "asked", watched)
-    done = one_round(now, 0, Workers(), lambda *_: None)
+    monkeypatch.setattr(decision, "_independent_refinement", lambda *_: finer)
+    monkeypatch.setattr(decision, "evaluated", watched)
+    done = one_round(now, 0, Processes(), lambda *_: None)
     assert [(r.best.candidate.name, r.accepted) for r in asked if r.best is not None] == [
         ("finer_head", False), ("sensor_drift_t_head", True),
     ]  # fmt: skip
     assert done is asked[-1] and asked[0].threshold > finer.gain
+
+
+def criteria() -> Criteria:
+    r = found("drift").rounds[0]
+    return Criteria(r.before, r.screen, r.null, {}, 0)
 
 
 @pytest.mark.parametrize("second_gain", [150.0, 90.0])
@@ -173,13 +177,13 @@ def test_a_finer_network_that_a_second_effect_explains_does_not_go_first(
     best = found("drift").rounds[0].best
     assert best is not None
     bare = replace(best.candidate, where=Where("node", "head"), mechanism="motor_loss", name="loss")
-    second = replace(best, scored=replace(best.scored, candidate=bare), gain=second_gain, cluster=best.cluster + 1)
+    second = replace(best, scored=replace(best.scored, candidate=bare), gain=second_gain, cluster="another")
     coarse = replace(best.candidate, mechanism="coarse_network", name="finer_head")
-    finer = replace(best, scored=replace(best.scored, candidate=coarse), gain=60.0, cluster=-1000)
-    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: first is not second)
-    monkeypatch.setattr(decision, "taken_on", lambda now, t: t)
-    got = decision._apart(found("drift").baseline, best, [best, second, finer], COUNT)
-    assert got is (None if second_gain > EVEN else finer)
+    finer = replace(best, scored=replace(best.scored, candidate=coarse), gain=60.0, cluster="finer_head")
+    monkeypatch.setattr(decision, "_gains_jointly", lambda _, first, t, least=0.0: first is not second)
+    monkeypatch.setattr(decision, "optimised", lambda now, t, policy: t)
+    got = decision._independent_refinement(criteria(), best, [best, second, finer])
+    assert got is (None if second_gain > POLICY.even_odds_gain_nats else finer)
 
 
 def test_after_one_that_may_not_be_claimed_its_like_is_asked_only_if_it_gains_more(
@@ -189,16 +193,16 @@ def test_after_one_that_may_not_be_claimed_its_like_is_asked_only_if_it_gains_mo
     best = found("drift").rounds[0].best
     assert best is not None
 
-    def named(name: str, gain: float, cluster: int) -> Tried:
+    def named(name: str, gain: float, cluster: str) -> Tried:
         scored = replace(best.scored, candidate=replace(best.candidate, mechanism="motor_loss", name=name))
         return replace(best, scored=scored, gain=gain, cluster=cluster)
 
-    first, more, less = named("first", 176.0, 1), named("more", 298.0, 1), named("less", 150.0, 1)
-    apart, weak = named("apart", 160.0, 2), named("weak", 100.0, 3)
-    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: True)
-    assert decision.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more, apart]
-    monkeypatch.setattr(decision, "_beside", lambda first, t, least=0.0: False)
-    assert decision.elsewhere(first, [first, less, more, apart, weak], COUNT) == [more]
+    first, more, less = named("first", 176.0, "first"), named("more", 298.0, "first"), named("less", 150.0, "first")
+    apart, weak = named("apart", 160.0, "apart"), named("weak", 100.0, "weak")
+    monkeypatch.setattr(decision, "_gains_jointly", lambda _, first, t, least=0.0: True)
+    assert decision.alternatives_to(criteria(), first, [first, less, more, apart, weak]) == [more, apart]
+    monkeypatch.setattr(decision, "_gains_jointly", lambda _, first, t, least=0.0: False)
+    assert decision.alternatives_to(criteria(), first, [first, less, more, apart, weak]) == [more]
 
 
 def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,7 +213,7 @@ def test_a_baseline_stays_where_without_the_effect_no_machine_is(monkeypatch: py
 
     now = fitted(two_bodies(), recordings("drift"))
     monkeypatch.setattr(search_module, "refitted", stiff)
-    done = search_module._fair_round(now, 0, Workers(), lambda *_: None, None)
+    done = search_module._round_with_fair_baseline(now, 0, Processes(), lambda *_: None, None)
     assert done.accepted and done.before is now and done.best is not None
     assert done.best.candidate.name == "sensor_drift_t_head"
 
@@ -219,11 +223,11 @@ def test_what_gains_by_its_own_memory_alone_is_not_claimed() -> None:
     best = found("drift").rounds[0].best
     assert best is not None
     lever = replace(best, gain=240.0, alike=96.0)
-    assert decision._unlikely(lever, 197.0, 10.0)  # 101 nats below, in units of 10: odds of e^10
-    assert not decision._unlikely(replace(lever, alike=180.0), 197.0, 10.0)
-    assert not decision._unlikely(replace(lever, alike=None), 197.0, 10.0)
+    assert decision._less_likely_than_nothing(lever, 197.0, 10.0)  # 101 nats below, in units of 10: odds of e^10
+    assert not decision._less_likely_than_nothing(replace(lever, alike=180.0), 197.0, 10.0)
+    assert not decision._less_likely_than_nothing(replace(lever, alike=None), 197.0, 10.0)
     finer = replace(best.scored, candidate=replace(best.candidate, mechanism="coarse_network"))
-    assert not decision._unlikely(replace(lever, scored=finer), 197.0, 10.0)
+    assert not decision._less_likely_than_nothing(replace(lever, scored=finer), 197.0, 10.0)
 
 
 def test_physics_never_takes_the_place_of_a_finer_network() -> None:
@@ -232,7 +236,9 @@ def test_physics_never_takes_the_place_of_a_finer_network() -> None:
     assert r.best is not None
     near = replace(r.best, cluster=r.best.cluster)
     finer = replace(r.best.scored, candidate=replace(r.best.candidate, mechanism="coarse_network"))
-    assert search_module._rival(near, r.best) and not search_module._rival(near, replace(r.best, scored=finer))
+    assert search_module._exchangeable(near, r.best) and not search_module._exchangeable(
+        near, replace(r.best, scored=finer)
+    )
 
 
 @pytest.mark.parametrize("imitates", [True, False])
@@ -240,17 +246,19 @@ def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
     imitates: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A warm fixture gains 258 nats where the floor is cold, and ten beside a cold floor."""
-    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], decision.asked
+    now, asked, real = fitted(two_bodies(), recordings("floor and shift")), [], decision.evaluated
 
     def watched(*given: Any) -> Round:
         done = real(*given)
         asked.append(done if asked else replace(done, accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(decision, "asked", watched)
+    monkeypatch.setattr(decision, "evaluated", watched)
     if not imitates:
-        monkeypatch.setattr(decision, "_beside", lambda _, t, *least: t.candidate.name == "mandrel_fixture_z_shaft")
-    done = one_round(now, 0, Workers(), lambda *_: None)
+        monkeypatch.setattr(
+            decision, "_gains_jointly", lambda _, first, t, *least: t.candidate.name == "mandrel_fixture_z_shaft"
+        )
+    done = one_round(now, 0, Processes(), lambda *_: None)
     every_asked = [r.best.candidate.plain for r in asked if r.best is not None]
     assert every_asked == ["floor_sink_head_room", *([] if imitates else ["mandrel_fixture_z_shaft"])]
     assert done is asked[-1] and done.accepted is not imitates
@@ -267,20 +275,20 @@ def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_c
         of(name, mechanism, gain)
         for name, mechanism, gain in (
             ("floor_sink_bed", "floor_sink", 90.0), ("sun_head", "sun", 62.0), ("finer", "coarse_network", 61.0),
-            ("draught_room", "draught", looks.LEFT - 1.0), ("radiation_head", "radiation", 45.0),
-            ("sun_bed", "sun", 44.0),
+            ("draught_room", "draught", POLICY.second_pass_min_finalist_gain_nats - 1.0),
+            ("radiation_head", "radiation", 45.0), ("sun_bed", "sun", 44.0),
         )
     )  # fmt: skip
     begun = replace(refused.scored.candidate, name="floor_sink_bed_2", variant_of="floor_sink_bed")
     again = replace(refused, scored=replace(refused.scored, candidate=begun), gain=80.0)
-    more = looks._left_behind([refused, again, far, finer, third, fourth, weak], [refused])
+    more = search_module._second_finalists([refused, again, far, finer, third, fourth, weak], [refused])
     assert more == [far, third]  # not what was refused once, wherever it begins
 
 
 def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The shortlist passes the floor over, and what imitates it is refused."""
     asked: list[Round] = []
-    listing, real = looks.shortlist, looks.decided
+    listing, real = search_module.shortlist, search_module.decided
 
     def passing_over(*given: Any) -> Shortlist:
         listed = listing(*given)
@@ -292,9 +300,9 @@ def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyP
         asked.append(done if asked else replace(done, accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(looks, "shortlist", passing_over)
-    monkeypatch.setattr(looks, "decided", refusing_once)
-    done = one_round(found("floor").baseline, 0, Workers(), lambda *_: None)
+    monkeypatch.setattr(search_module, "shortlist", passing_over)
+    monkeypatch.setattr(search_module, "decided", refusing_once)
+    done = one_round(found("floor").baseline, 0, Processes(), lambda *_: None)
     assert done is asked[1] and done.accepted and done.best is not None
     assert done.best.candidate.plain == "floor_sink_head_room"
     assert asked[0].best is not None and asked[0].best.candidate.mechanism != "floor_sink"
@@ -303,24 +311,24 @@ def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyP
 def test_what_is_no_better_the_second_time_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both looks of a round come to the same best, which was refused."""
     asked: list[Round] = []
-    real = looks.decided
+    real = search_module.decided
 
     def refusing(bars: Any, tried: Any) -> Round:
         asked.append(replace(real(bars, tried), accepted=False))
         return asked[-1]
 
-    monkeypatch.setattr(looks, "decided", refusing)
-    assert one_round(found("drift").baseline, 0, Workers(), lambda *_: None) is asked[0] and len(asked) == 1
+    monkeypatch.setattr(search_module, "decided", refusing)
+    assert one_round(found("drift").baseline, 0, Processes(), lambda *_: None) is asked[0] and len(asked) == 1
 
 
 def of(name: str, mechanism: str, gain: float) -> Tried:
     scored = Scored(Candidate(mechanism, Where("node", name), name, ""), gain, 10, 0.0, {}, 1.0, 1)
-    return Tried(scored, gain, 10, 0, 0.0, found("floor").baseline)
+    return Tried(scored, gain, 10, name, 0.0, found("floor").baseline)
 
 
 @cache
 def first_round(seed: int, processes: int = 1) -> Round:
-    with Workers(processes) as workers:
+    with Processes(processes) as workers:
         return one_round(found("drift").baseline, seed, workers, lambda *_: None)
 
 

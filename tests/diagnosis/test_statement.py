@@ -22,14 +22,14 @@ from diagnosis.findings.report_data import (
     Rms,
     amount,
     as_given,
-    beside_words,
+    context_label,
     few,
     percent,
-    place_words,
+    place_label,
 )
 from diagnosis.findings.schema import DetectionLimit, Place
 from diagnosis.findings.statement import (
-    claim_words,
+    claim_phrase,
     equation_with_numbers,
     falls,
     finding_of,
@@ -76,9 +76,9 @@ def test_claim_evidence_advice_and_caveat() -> None:
      (0.59, "Perhaps (59 %) missing: heat"), (0.005, "Perhaps (under 1 %) missing")],
 )  # fmt: skip
 def test_no_surer_than_the_probability(probability: float, begins: str) -> None:
-    assert claim_words(replace(SINK, probability=probability, others=())).startswith(begins)
+    assert claim_phrase(replace(SINK, probability=probability, others=())).startswith(begins)
     drift = replace(found("sensor_drift", "sensor"), probability=probability)
-    assert claim_words(drift).startswith("The sensor") == (probability > 0.9)
+    assert claim_phrase(drift).startswith("The sensor") == (probability > 0.9)
 
 
 def test_a_tie_is_said_as_one() -> None:
@@ -90,12 +90,12 @@ def test_a_tie_is_said_as_one() -> None:
         "would tell them apart."
     )
     likelier = replace(tied, probability=0.004, others=(replace(tied.others[0], probability=0.92),))
-    assert claim_words(likelier) == (
+    assert claim_phrase(likelier) == (
         "These runs cannot tell two explanations apart: radiation to walls or from a hot neighbour at the bed "
         "(surrounding: the room) (92 %) or heat to the floor at the bed, 10 W/K (90 %: 9–12) (under 1 %)"
     )
     unlike = replace(tied, others=(replace(tied.others[0], alike=False),))
-    assert claim_words(unlike).startswith("Perhaps (52 %) missing: heat to the floor")
+    assert claim_phrase(unlike).startswith("Perhaps (52 %) missing: heat to the floor")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_tie_is_said_as_one() -> None:
         (found("sensor_bonding", "sensor", 0.8, "1"),
          "In the measurement: poorly bonded sensor head_rear, bonding 0.80 (90 %: 0.72–0.88)"),
         (found("sensor_place", "sensor", 0.12, "1"), "In the measurement: the sensor head_rear off its body's mean"),
-        (Found("sensor_swap", Where("sensor", "front"), "front", {}, 0.95, beside="with: rear"),
+        (Found("sensor_swap", Where("sensor", "front"), "front", {}, 0.95, context="with: rear"),
          "In the measurement: two sensors exchanged: front (with: rear)."),
         (found("time_skew", "error", 120.0, "s"), "clock of the channel z against the others, 120 s (90 %: 110–130)"),
         (found("joint_conductance", "link", 0.4, "1", 0.7),
@@ -152,7 +152,7 @@ def test_every_mechanism_is_worded_with_its_place_and_size(key: str) -> None:
 
 class WiperFriction(Mechanism):
     key = "wiper_friction"
-    words = "friction of the wipers"
+    summary = "friction of the wipers"
     equation = "P = force |v|"
     acts_at = ("node",)
     parameters = (Spec("force", "N", "drag of all wipers", 60.0, 0.6, 0.0, 2000.0),)
@@ -303,21 +303,21 @@ def test_every_value_stands_in_the_equation(key: str) -> None:
 
 def test_places_go_by_the_files_words() -> None:
     part = twin_part(load_machine(Path(__file__).parents[2] / "machines" / "sample_vmc.yml"))
-    assert place_words(Where("node", "front"), part) == "the front bearing housing"
-    assert place_words(Where("node", "column_back"), part) == "the column back"
-    assert place_words(Where("node", "room"), part) == "the room"
-    assert place_words(Where("link", "shaft-front"), part) == "the shaft and the front bearing housing"
-    assert place_words(Where("link", "bed-floor"), part) == "the bed and the floor"
-    assert place_words(Where("sensor", "head_rear"), part) == "head_rear"
+    assert place_label(Where("node", "front"), part) == "the front bearing housing"
+    assert place_label(Where("node", "column_back"), part) == "the column back"
+    assert place_label(Where("node", "room"), part) == "the room"
+    assert place_label(Where("link", "shaft-front"), part) == "the shaft and the front bearing housing"
+    assert place_label(Where("link", "bed-floor"), part) == "the bed and the floor"
+    assert place_label(Where("sensor", "head_rear"), part) == "head_rear"
     numbered = part.model_copy(update={"bodies": {"node3": part.bodies["bed"]}})
-    assert place_words(Where("node", "node3"), numbered) == "node3"
+    assert place_label(Where("node", "node3"), numbered) == "node3"
     drafted = part.bodies["bed"].model_copy(update={"words": "drafted: where bed sits"})
-    assert place_words(BED, part.model_copy(update={"bodies": {"bed": drafted}})) == "the bed"
+    assert place_label(BED, part.model_copy(update={"bodies": {"bed": drafted}})) == "the bed"
     radiation = MechanismPart(law="radiation", at={"body": "bed", "surrounding": "room"}, into="bed")
-    assert beside_words(radiation, BED, part) == "surrounding: the room"
+    assert context_label(radiation, BED, part) == "surrounding: the room"
     grease = MechanismPart(law="viscosity_feedback", at={"oil": ("front", "shaft")}, acts_on="front_bearings")
-    assert beside_words(grease, Where("node", "shaft"), part) == (
+    assert context_label(grease, Where("node", "shaft"), part) == (
         "acts on: front_bearings, oil: the front bearing housing and the shaft"
     )
     growth = MechanismPart(law="speed_shift", acts_on="z", drivers="spindle_rpm")
-    assert beside_words(growth, Where("error", "z"), part) == "driver: spindle_rpm"
+    assert context_label(growth, Where("error", "z"), part) == "driver: spindle_rpm"

@@ -7,14 +7,15 @@ from typing import Any
 import pytest
 
 from diagnosis.contracts import Candidate, Kind, Scored, Tried, Where
-from diagnosis.search.acceptance import EVEN, LEAST_FINER, least_gain, trust
+from diagnosis.policy import POLICY
+from diagnosis.search.acceptance import least_gain, trust
 
 BATCHES = 12
 
 
 def tried(mechanism: str, gain: float, improved: int = BATCHES, kind: Kind = "node") -> Tried:
     c = Candidate(mechanism, Where(kind, "head"), mechanism, "")
-    return Tried(Scored(c, gain, improved, 0.0, {}, 0.0, -1), gain, improved, 0, 0.0)
+    return Tried(Scored(c, gain, improved, 0.0, {}, 0.0, -1), gain, improved, c.name, 0.0)
 
 
 def test_a_claim_is_as_likely_false_as_true_at_the_least_gain() -> None:
@@ -28,23 +29,30 @@ def test_a_claim_is_as_likely_false_as_true_at_the_least_gain() -> None:
 
 
 def test_more_gain_more_trust() -> None:
-    gained = [trust(tried("cabinet_heat", g), BATCHES) for g in (1.0, EVEN, 2 * EVEN, 20 * EVEN)]
+    gained = [
+        trust(tried("cabinet_heat", g), BATCHES)
+        for g in (1.0, POLICY.even_odds_gain_nats, 2 * POLICY.even_odds_gain_nats, 20 * POLICY.even_odds_gain_nats)
+    ]
     assert gained == sorted(gained)
     assert gained[0] < 0.01 and gained[-1] > 0.99
 
 
 def test_batches_that_do_not_improve_ask_for_more() -> None:
     least = [least_gain(tried("cabinet_heat", 1.0, n), BATCHES) for n in (12, 11, 10)]
-    assert least[0] == EVEN
+    assert least[0] == POLICY.even_odds_gain_nats
     assert least[1] / least[0] == pytest.approx(least[2] / least[1]) and least[1] > 1.5 * least[0]
 
 
 def test_so_does_what_says_how_a_network_or_a_lever_is_drawn() -> None:
-    assert least_gain(tried("heat_bridge", 1.0), BATCHES) > 1.5 * EVEN
-    assert least_gain(tried("joint_conductance", 1.0), BATCHES) > 1.5 * EVEN
-    assert least_gain(tried("column_bending", 1.0, kind="error"), BATCHES) > 1.7 * EVEN
-    assert least_gain(tried("speed_shift", 1.0, kind="error"), BATCHES) == EVEN  # a driver makes it
-    assert least_gain(tried("time_skew", 1.0, kind="error"), BATCHES) == EVEN  # and a clock's fault is no lever
+    assert least_gain(tried("heat_bridge", 1.0), BATCHES) > 1.5 * POLICY.even_odds_gain_nats
+    assert least_gain(tried("joint_conductance", 1.0), BATCHES) > 1.5 * POLICY.even_odds_gain_nats
+    assert least_gain(tried("column_bending", 1.0, kind="error"), BATCHES) > 1.7 * POLICY.even_odds_gain_nats
+    assert (
+        least_gain(tried("speed_shift", 1.0, kind="error"), BATCHES) == POLICY.even_odds_gain_nats
+    )  # a driver makes it
+    assert (
+        least_gain(tried("time_skew", 1.0, kind="error"), BATCHES) == POLICY.even_odds_gain_nats
+    )  # and a clock's fault is no lever
 
 
 def test_exchanged_labels_must_be_plain() -> None:
@@ -52,4 +60,4 @@ def test_exchanged_labels_must_be_plain() -> None:
 
 
 def test_a_finer_network_claims_nothing() -> None:
-    assert least_gain(tried("coarse_network", 1.0, 9), BATCHES) == LEAST_FINER
+    assert least_gain(tried("coarse_network", 1.0, 9), BATCHES) == POLICY.coarse_min_gain_nats

@@ -85,11 +85,11 @@ def test_what_no_file_states_cannot_be_changed_there() -> None:
 
 
 def test_a_wrong_parameter_of_every_rival_can_be_freed() -> None:
-    from diagnosis.candidates.alternatives import rivals
+    from diagnosis.candidates.alternatives import alternatives
 
     for machine in (MACHINE, four_bodies(), equipped()):
         network, part = compile_network(machine), twin_part(machine)
-        found = rivals(network)
+        found = alternatives(network)
         assert {c.mechanism for c in found} == {"wrong_parameter", "varies_between_runs"}
         for c in found:
             after = compile_network(machine, part=c.applied(part))

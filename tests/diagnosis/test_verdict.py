@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from diagnosis.contracts import Where
-from diagnosis.findings.conclude import REST, REST_OF_FEW, STRUCTURE, left_words, moved_rms, slow_remainder, verdict_of
+from diagnosis.findings.conclude import moved_rms, residual_remarks, slow_residual_ratio, verdict_of
 from diagnosis.findings.report_data import Found, Rms
+from diagnosis.policy import POLICY
 from twin.calibration.problem import Measured
 
 
@@ -33,26 +34,33 @@ def test_a_slow_misfit_counts_by_what_its_channel_moves() -> None:
     ]
     fit = moving(t_head=8.0, z=60.0, x=20.0)
     assert moved_rms(fit) == pytest.approx({"t_head": 8.0, "z": 60.0, "x": 20.0})
-    assert slow_remainder(rms, fit) == pytest.approx(0.4 / 8.0 / STRUCTURE)  # the median channel
-    assert slow_remainder(rms, moving(t_head=0.2, z=60.0, x=0.5)) == pytest.approx(0.5 / STRUCTURE)  # noise moves both
-    assert slow_remainder([], fit) == 0.0
+    assert slow_residual_ratio(rms, fit) == pytest.approx(
+        0.4 / 8.0 / POLICY.structure_error_share
+    )  # the median channel
+    assert slow_residual_ratio(rms, moving(t_head=0.2, z=60.0, x=0.5)) == pytest.approx(
+        0.5 / POLICY.structure_error_share
+    )  # noise moves both
+    assert slow_residual_ratio([], fit) == 0.0
 
 
 def test_finer_sensors_are_no_reason_to_doubt_the_same_misfit() -> None:
     fit = moving(t_head=8.0)
     coarse, fine = (Rms("t_head", "K", 0.4, math.hypot(0.3, noise), noise, sensor=True) for noise in (0.1, 0.006))
-    assert slow_remainder([coarse], fit) == pytest.approx(slow_remainder([fine], fit))
+    assert slow_residual_ratio([coarse], fit) == pytest.approx(slow_residual_ratio([fine], fit))
 
 
 @pytest.mark.parametrize(
     ("slow", "runs", "verdict"),
     [
-        (0.9 * REST, 12, "consistent"), (1.1 * REST, 12, "undecidable"),
-        (0.9 * REST, 4, "undecidable"), (0.9 * REST_OF_FEW, 4, "consistent"),
+        (0.9 * POLICY.residual_max_units, 12, "consistent"),
+        (1.1 * POLICY.residual_max_units, 12, "undecidable"),
+        (0.9 * POLICY.residual_max_units, 4, "undecidable"),
+        (0.9 * POLICY.few_runs_residual_max_units, 4, "consistent"),
     ],
-)  # fmt: skip
+)
 def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(slow: float, runs: int, verdict: str) -> None:
-    assert verdict_of([], False, 2.0 * REST, slow, runs) == verdict  # filtered rows alone are no claim
+    rest = 2.0 * POLICY.residual_max_units
+    assert verdict_of([], False, rest, slow, runs) == verdict  # filtered rows alone are no claim
     assert verdict_of([], True, 0.0, slow, runs) == "unlisted"
 
 
@@ -64,13 +72,13 @@ def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(slow: float,
 )  # fmt: skip
 def test_beside_what_was_found_either_is_more(rest: float, slow: float, verdict: str) -> None:
     sink = Found("floor_sink", Where("node", "bed"), "the bed", {}, 0.95)
-    assert verdict_of([sink], False, rest * REST, slow * REST, 12) == verdict
+    assert verdict_of([sink], False, rest * POLICY.residual_max_units, slow * POLICY.residual_max_units, 12) == verdict
 
 
 def test_what_is_left_is_told_with_what_it_is_compared_with() -> None:
     share = "left-out errors are 20 % of what their channels move (median over channels); up to 15 % may be the coarse"
-    assert left_words(0.0, 0.20 / STRUCTURE, 12) == (f"{share} network's",)
-    both = left_words(9.0, 0.20 / STRUCTURE, 4)
+    assert residual_remarks(0.0, 0.20 / POLICY.structure_error_share, 12) == (f"{share} network's",)
+    both = residual_remarks(9.0, 0.20 / POLICY.structure_error_share, 4)
     assert both[0].startswith("left-out errors filtered by their memory are 9.0 times what a coarse network makes")
     assert both[1].endswith("up to 10 % may be the coarse network's")
-    assert left_words(REST, REST, 12) == ()
+    assert residual_remarks(POLICY.residual_max_units, POLICY.residual_max_units, 12) == ()

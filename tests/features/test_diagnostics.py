@@ -54,7 +54,7 @@ def test_near_twins_among_the_chosen_are_named() -> None:
         i, j = max(((a, b) for a in chosen for b in chosen if a < b), key=lambda pair: r[pair])
         (d,) = SELECTORS["correlation"]().diagnostics(design, TRAIN, n)
         assert d.value == pytest.approx(r[i, j]) and d.ok == (r[i, j] <= 0.95)
-        assert d.comment.startswith(f"t{i} and t{j} tell")
+        assert d.comment.startswith(f"t{i} and t{j} are")
     assert SELECTORS["correlation"]().diagnostics(design, TRAIN, 1) == ()
 
 

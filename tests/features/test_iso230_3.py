@@ -42,7 +42,7 @@ def test_a_spindle_test_gives_exactly_its_numbers() -> None:
     t = thermal_test(spindle_batch(), [ProbePair("B", "X1", "x2", 200.0)])
     assert t.kind == "spindle" and t.title == "Rotating-spindle test" and t.notes == ()
     assert (
-        t.words
+        t.explanation
         == "The spindle (rpm) stood still for 0:05 h, then ran at 4000 rpm for 4:00 h, then stood still for 1:00 h."
     )
     assert [(p.name, p.length_s) for p in t.periods] == [("warm-up", 14400), ("after the stop", 3600)]
@@ -70,7 +70,7 @@ def test_the_jump_at_the_start_belongs_to_the_warm_up() -> None:
 def test_environment_is_the_range_over_the_stated_period() -> None:
     drift = 0.05 * MINUTES
     t = thermal_test(batch(disp_z=drift))
-    assert t.kind == "environment" and t.words == "The spindle stood still all the time."
+    assert t.kind == "environment" and t.explanation == "The spindle stood still all the time."
     assert t.value("Z", "range") == pytest.approx(0.05 * 305) and t.value("Z", "d(60 min)") == pytest.approx(3.0)
     part = thermal_test(batch(disp_z=drift), start_s=3600, end_s=3 * 3600)
     assert part.value("Z", "range") == part.value("Z", "d(t)") == pytest.approx(6.0)
@@ -82,7 +82,9 @@ def test_a_linear_axis_gives_shift_and_change_of_span() -> None:
     minutes = np.arange(float(n))
     far = (np.arange(n) // 3) % 2 == 1
     t = thermal_test(batch(n, disp_z=np.where(far, 0.03, 0.01) * minutes + 5.0 * far, pos=400.0 * far))
-    assert t.kind == "linear_axis" and t.words == "The axis pos went 40 times between 0 and 400 mm, spindle stopped."
+    assert (
+        t.kind == "linear_axis" and t.explanation == "The axis pos went 40 times between 0 and 400 mm, spindle stopped."
+    )
     assert t.position == "pos" and [x.name for x in t.traces][:3] == ["Z at 0 mm", "Z at 400 mm", "Z span"]
     # stays at 0 mm are centred on 1, 7, … 235 and 240 min, those at 400 mm on 4, 10, … 238 min
     assert t.value("Z at 0 mm", "d(t)") == pytest.approx(0.01 * 239) == t.value("Z at 0 mm", "range")
@@ -94,17 +96,19 @@ def test_a_linear_axis_gives_shift_and_change_of_span() -> None:
 def test_what_is_neither_is_said_in_words() -> None:
     far = (np.arange(306) // 3) % 2 == 1
     both = thermal_test(batch(rpm=1000.0, pos=400.0 * far))
-    assert both.kind == "other" and both.words.startswith("The spindle ran while pos went")
+    assert both.kind == "other" and both.explanation.startswith("The spindle ran while pos went")
     fed = thermal_test(batch(feed=2000.0))
     assert (
-        fed.words
+        fed.explanation
         == "The spindle stood still while the axes moved (feed up to 2000 mm/min), and no position was recorded."
     )
     blind = thermal_test(replace(batch(), table=batch(rpm=np.nan).table))
-    assert blind.kind == "other" and "the kind of test cannot be told" in blind.words
+    assert blind.kind == "other" and "the kind of test is unknown" in blind.explanation
     assert thermal_test(replace(batch(), table=batch(rpm=np.nan).table), kind="environment").kind == "environment"
     spectrum = thermal_test(batch(rpm=np.where(MINUTES % 30 < 10, 2000.0, np.where(MINUTES % 30 < 20, 0.0, 5000.0))))
-    assert "ran at 2000 to 5000 rpm (speed spectrum) for 5:05 h, 1:40 h of it at rest, to the end." in spectrum.words
+    assert (
+        "ran at 2000 to 5000 rpm (speed spectrum) for 5:05 h, 1:40 h of it at rest, to the end." in spectrum.explanation
+    )
 
 
 def test_holes_are_bridged_up_to_five_minutes_and_counted() -> None:
@@ -164,7 +168,7 @@ def test_axes_choose_and_name_the_channels() -> None:
         (batch(), {"pairs": [ProbePair("A", "x1", "x9", 100)]}, "tilt A: no error channel 'x9'; did you mean"),
         (batch(), {"pairs": [ProbePair("A", "x1", "x2", 0)]}, "tilt A: distance 0 mm, expected more than 0"),
         (batch(), {"kind": "spindel"}, "unknown kind of test 'spindel'; did you mean 'spindle'?"),
-        (batch(), {"kind": "spindle"}, "kind 'spindle' was asked for, but the spindle stood still all the time"),
+        (batch(), {"kind": "spindle"}, "kind 'spindle' was requested, but the spindle stood still all the time"),
         (batch(), {"kind": "linear_axis"}, "but no position channel cycles between two targets"),
         (batch(), {"end_s": 1e6}, "the period 0 to 1e+06 s does not lie in the record, 0 to 18300 s; correct it"),
         (batch(), {"start_s": 70, "end_s": 100}, "the period 70 to 100 s holds 0 readings, expected at least 2"),

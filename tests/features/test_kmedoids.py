@@ -25,7 +25,7 @@ def cost(distance: Array, medoids: tuple[int, ...]) -> float:
     return sum(min(distance[i, m] for m in medoids) for i in range(len(distance)))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_all_sets_are_searched(seed: int) -> None:
     distance, relevance = distances(seed)
     p = len(distance)
@@ -35,7 +35,7 @@ def test_all_sets_are_searched(seed: int) -> None:
         assert tuple(best[n]) == truth
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_swapping_ends_where_no_swap_helps(seed: int) -> None:
     distance, relevance = distances(seed)
     p = len(distance)

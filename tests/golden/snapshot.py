@@ -39,7 +39,7 @@ from models import FAMILIES
 from models.crossing import Plan
 from models.grid import run_grid
 from plants.sample.sample_year import write_sample_year
-from twin.calibration import calibrate
+from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.run_plan import load_run_plan
 from twin.simulation import simulate
@@ -80,7 +80,7 @@ def simulation() -> Any:
 
 def calibration() -> Any:
     """The sample machine calibrated on six batches of the sample year, with each left out in turn."""
-    found = calibrate(load_machine(SAMPLE), _year()[::5], leave_out=True, processes=2)
+    found = calibrate(load_machine(SAMPLE), _year()[::5], CalibrationOptions(leave_out=True, processes=2))
     assert found.left_out is not None
     intervals = [[i.name, i.value, i.low, i.high] for i in found.intervals90]
     return {"intervals90": intervals, "rms": _table(found.rms), "left_out": _table(found.left_out.by_channel())}

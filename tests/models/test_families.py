@@ -119,7 +119,7 @@ def fitted(key, design) -> Family:
 def test_says_what_it_is(key):
     cls = FAMILIES[key]
     assert cls.key == key and issubclass(cls, Family)
-    assert cls.words and cls.source and isinstance(cls.rank, int)
+    assert cls.summary and cls.source and isinstance(cls.rank, int)
 
 
 def test_fit_gives_a_new_copy_that_predicts_every_row(key, design, fitted):

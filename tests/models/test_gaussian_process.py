@@ -63,7 +63,7 @@ def test_left_out_groups_are_those_of_refits():
     whole = covariance(u, group, setting)
     left = LeftOut.of(np.linalg.inv(whole), y, 7)
     for f in (None, 1):
-        error, variance = left.alone() if f is None else left.beside(f)
+        error, variance = left.alone() if f is None else left.without(f)
         for g in (0, 3):
             train, test = (group != g) & (group != f) if f is not None else group != g, group == g
             weight = whole[np.ix_(test, train)] @ np.linalg.inv(whole[np.ix_(train, train)])

@@ -101,5 +101,5 @@ def test_an_exact_model_states_none_and_a_silent_family_says_so() -> None:
     design = make_design()
     exact = Design(design.inputs, "z", design.batch_ids, design.x, 3 * design.x[:, 0], design.time_s, design.offsets)
     assert MLR().fit_design(exact, range(8)).sd_um(exact, [0])[0].max() < 1e-6
-    with pytest.raises(InputError, match="family pcr: tells no predictive sd; choose one that does"):
+    with pytest.raises(InputError, match="family pcr: has no predictive standard deviation; choose one that has"):
         PCR().fit_design(design, range(8)).sd_um(design, [0])

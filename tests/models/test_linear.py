@@ -307,8 +307,8 @@ def test_too_few_rows_are_told_in_one_line(cls):
     with pytest.raises(InputError) as error:
         cls().fit_folds(design, [[0], [1, 2]])
     assert str(error.value) == (
-        f"{cls.key}: batches K2, K3 have 3 usable rows (target 'z_um' and all 6 inputs recorded and not masked), "
-        "expected at least 4; add batches, or drop the inputs that are missing"
+        f"family {cls.key}: got 3 usable rows of z_um in K2, K3, need at least 4; give more batches, drop inputs that "
+        "are missing, or overrule a check in the machine file"
     )
     with pytest.raises(InputError, match="no inputs given for z_um; name at least one channel"):
         cls().fit_design(design.subset(()), [0])

@@ -12,7 +12,7 @@ from models import promotion
 from models.promotion import choose, compare_paired, left_out, pick, sign_flip_p
 from models.protocols import PromotionRule
 from models.result import GridResult
-from tests.pipelines.toy_training import toy_batches, toy_result
+from tests.toys.training import toy_batches, toy_result
 
 RULE = PromotionRule()
 
@@ -37,8 +37,8 @@ def test_least_mean_plus_spread_wins_not_least_mean():
     assert got.cell == "fcgc|ridge|4"
     assert got.score_um == 5.0
     assert got.trusted
-    assert "S_mean 4.00 + S_std 1.00 = 5.00 µm" in got.words
-    assert "beats zero (25.00 µm)" in got.words
+    assert "S_mean 4.00 + S_std 1.00 = 5.00 µm" in got.summary
+    assert "beats zero (25.00 µm)" in got.summary
 
 
 def test_an_unstable_set_of_points_is_passed_over():
@@ -47,7 +47,7 @@ def test_an_unstable_set_of_points_is_passed_over():
     alone = choose(cells(ZERO, ("fcgc", "mlr", 2, 1.0, 1.0, 0.5, 10, 3)), RULE)
     assert alone.cell == "fcgc|mlr|2"
     assert not alone.trusted
-    assert "no set of points is stable (best 0.50, asked 0.7): do not trust" in alone.words
+    assert "no set of points is stable (best 0.50, asked 0.7): do not trust" in alone.summary
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_baseline_wins_only_where_nothing_beats_it_and_is_not_trusted():
     got = choose(cells(ZERO, ("none", "mlr", 4, 22.0, 9.0, 1.0, 10, 5)), RULE)
     assert got.family == "zero"
     assert not got.trusted
-    assert "nothing beats zero (best other: 31.00 µm): do not trust" in got.words
+    assert "nothing beats zero (best other: 31.00 µm): do not trust" in got.summary
     # A tie in the tolerance does not hand the place to a baseline.
     close = choose(cells(("none", "zero", 0, 5.05, 0.0, 1.0, 0, 0), ("none", "mlr", 4, 5.0, 0.0, 1.0, 10, 5)), RULE)
     assert close.family == "mlr"
@@ -186,7 +186,7 @@ def test_a_lucky_winner_is_not_trusted_and_a_true_one_is() -> None:
     rule = PromotionRule(tie_percent=0, score="S_mean")
     lucky = [promotion.decide(_many_lucky_cells(s, 15, 0.0), rule) for s in range(10)]
     true = [promotion.decide(_many_lucky_cells(s, 15, 6.0), rule) for s in range(10)]
-    assert sum(not c.trusted for c in lucky) >= 3 and all("do not trust" in c.words for c in lucky if not c.trusted)
+    assert sum(not c.trusted for c in lucky) >= 3 and all("do not trust" in c.summary for c in lucky if not c.trusted)
     assert all(c.trusted and c.nested_S_mean_um == pytest.approx(c.S_mean_um) for c in true)
 
 
@@ -205,4 +205,4 @@ def test_equal_points_are_one_model_and_go_by_the_plainest_name() -> None:
     table = cells(("fcgc", "mlr", 3, 2.0, 1.0, 1.0, 10, 4), ("none", "mlr", 3, 2.0, 1.0, 1.0, 10, 4), ZERO)
     got = choose(table, RULE)
     assert got.cell == "none|mlr|3"
-    assert "simplest" not in got.words
+    assert "simplest" not in got.summary

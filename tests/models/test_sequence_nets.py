@@ -268,7 +268,7 @@ def test_a_gpu_that_is_not_there_is_told_in_one_line(Net):
     design = plant(bent_law, batches=3)
     with pytest.warns(UserWarning) as told:
         asked = Net(epochs=2, device="cuda").fit_design(design, range(3))
-    line = f"family {Net.key}: device 'cuda' was asked for, but torch sees no GPU; trained on the processor"
+    line = f"family {Net.key}: device 'cuda' was requested, but torch sees no GPU; trained on the processor"
     assert {str(w.message) for w in told} == {line}
     cpu = Net(epochs=2, device="cpu").fit_design(design, range(3))
     np.testing.assert_array_equal(asked.predict_design(design, [0])[0], cpu.predict_design(design, [0])[0])

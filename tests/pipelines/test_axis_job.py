@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from report_training import settings, training
-from test_report_browser import CHROMIUM, console, open_page
 
 from data.checks import check_batch, check_machine
 from data.errors import InputError
@@ -25,12 +23,14 @@ from models.protocols import PromotionRule
 from models.result import GridResult
 from models.trust import Region
 from pipelines import model_store
-from pipelines.predict import predict_file
-from pipelines.request import TrainRequest, check_request
+from pipelines.commands.predict import predict_file
+from pipelines.training import TrainRequest, check_request
 from plants.sample.sample_axis import write_sample_axis
 from reports.comparison import figure_pngs, write_report
 from reports.comparison.figures import fan_panel
 from reports.comparison.tables import left_out_batches
+from tests.reports.test_report_browser import CHROMIUM, console, open_page
+from tests.toys.report_training import settings, training
 
 MACHINE_FILE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
 

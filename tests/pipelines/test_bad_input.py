@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from small_year import recording, write_machine, write_year
 
 from data.lake import Lake
 from pipelines import cli
+from tests.toys.small_year import recording, write_machine, write_year
 
 NAME = "small-bad"
 
@@ -174,7 +174,7 @@ def test_a_folder_without_recordings(place: Place) -> None:
     code, _, err = place.ingest(place.folder / "in")
     assert code == 2
     assert trouble(err) == (
-        f"{place.folder / 'in'}: no recording there, 1 other files; the machine file asks for *.csv, *.xlsx; give "
+        f"{place.folder / 'in'}: no recording there, 1 other files; the machine file takes *.csv, *.xlsx; give "
         "another folder or correct recording.files"
     )
 
@@ -284,9 +284,8 @@ def test_training_says_what_went_to_quarantine(place: Place) -> None:
 def test_the_recording_of_another_machine_for_a_model(
     place: Place, store: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from toy_training import machine_yaml, toy_batches, toy_model
-
     from pipelines import model_store
+    from tests.toys.training import machine_yaml, toy_batches, toy_model
 
     model, region = toy_model(toy_batches("toy-other", 4))
     model_store.save(tmp_path / "model", model, machine_yaml("toy-other"), region)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -99,8 +99,8 @@ def test_a_fit_that_fails_leaves_the_file_untouched(
     (folder / "new.yml").write_text("what stood there", encoding="utf-8")
     from twin.calibration import estimate
 
-    def impatient(*args, **kwargs):  # type: ignore[no-untyped-def]
-        return real(args[0], *args[1:3], 1, 1e-15, *args[5:])
+    def impatient(problem, options, *more):  # type: ignore[no-untyped-def]
+        return real(problem, replace(options, max_iterations=1, tolerance=1e-15), *more)
 
     real = estimate.fit
     monkeypatch.setattr(estimate, "fit", impatient)

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from command import Call, in_process
-from small_year import law_um, write_machine, write_year
 
 from pipelines import cli
-from pipelines.screen import print_findings
+from pipelines.commands.ingest import print_findings
+from tests.toys.command import Call, in_process
+from tests.toys.small_year import law_um, write_machine, write_year
 
 ROOT = Path(cli.__file__).resolve().parents[1]
 NAME = "small-cli"
@@ -109,7 +109,7 @@ def test_a_report_of_what_is_tracked(year: Path, call: Call, store_home: Path) -
     done = call("report", "--machine", NAME, "--out", year / "two.html")
     assert done.code == 0 and (year / "two.html").read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype")
     done = call("report", "--machine", NAME, "--format", "md", "--out", year / "two.html")
-    assert (done.code, lines(done.err)) == (2, [f"thermodrift: --out {year / 'two.html'}: got the ending '.html', "
+    assert (done.code, lines(done.err)) == (2, [f"thermodrift: --out {year / 'two.html'}: got suffix '.html', "
                                                 "expected .md"])  # fmt: skip
 
 
@@ -167,10 +167,10 @@ def test_describe_drafts_a_file_that_ingests(
         (["train", "--machine", "{yml}", "--protocols", "lbo"], "unknown protocol 'lbo'"),
         (["train", "--machine", "{yml}", "--channels", "zz"], "nobody: no error channel 'zz'; did you mean 'z'"),
         (["train", "--machine", "{yml}", "--recordings", "gone"], "recordings gone: no such file or folder"),
-        (["train", "--machine", "{yml}", "--report", "r.pdf"], "report r.pdf: got the ending '.pdf', expected .html"),
+        (["train", "--machine", "{yml}", "--report", "r.pdf"], "report r.pdf: got suffix '.pdf', expected .html"),
         (["train", "--machine", "{yml}", "--protocols", "train-on-one"], "promotion judges by leave-batch-out; add it"),
         (["report", "--machine", "m", "--format", "pdf"], "--format: got 'pdf', expected html or md"),
-        (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"], "--out p.xlsx: got the ending '.xlsx', expected"),
+        (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"], "--out p.xlsx: got suffix '.xlsx', expected"),
         (["predict", "f.csv", "--model", "no-such-folder"], "model 'no-such-folder': no such folder; expected"),
         (["simulate"], "got nothing to simulate; call `thermodrift simulate --sample-year"),
         (["simulate", "--sample-year", "--seed", "-1", "--out", "y"], "seed: got -1, expected 0 or more"),
@@ -228,16 +228,17 @@ def test_help_is_quick_because_it_loads_nothing_heavy() -> None:
         "try:\n"
         "    cli.main()\n"
         "finally:\n"
-        "    heavy = {'torch', 'mlflow', 'prefect', 'scipy', 'sklearn', 'plotly', 'matplotlib'}\n"
+        "    heavy = {'torch', 'mlflow', 'prefect', 'numpy', 'pandas', 'scipy', 'sklearn', 'plotly', 'matplotlib'}\n"
         "    print('loaded', sorted(heavy & set(sys.modules)), file=sys.stderr)\n"
     )
     done = in_a_process(code, "--help")
     assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
     for command in ("describe", "ingest", "train", "report", "promote", "rollback", "predict", "schedule", "status"):
         assert command in done.stdout
-    done = in_a_process(code, "train", "--help")
-    assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
-    assert "--direct" in done.stdout
+    for command, option in (("train", "--direct"), ("simulate", "--noise"), ("diagnose", "--seed")):
+        done = in_a_process(code, command, "--help")
+        assert (done.returncode, lines(done.stderr)) == (0, ["loaded []"])
+        assert option in done.stdout
 
 
 def test_what_the_checks_found_is_a_line_per_check_and_channel(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""`thermodrift describe --twin`: tables on the screen, a picture on request, one line where it cannot."""
+"""`thermodrift describe --twin`: tables on the console, a picture on request, one line where it cannot."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipelines import cli, screen
-from pipelines.describe_twin import describe_twin
+from pipelines import cli, console
+from pipelines.commands.describe import describe_twin
 from tests.twin.machines import TWO_BODIES
 
 MACHINES = Path(cli.__file__).resolve().parents[1] / "machines"
@@ -38,7 +38,7 @@ def two(tmp_path: Path) -> Path:
 
 
 def test_tables_and_picture_of_the_sample_machine(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(screen.out, "width", 220)  # whatever an earlier test has seen of the terminal
+    monkeypatch.setattr(console.out, "width", 220)  # whatever width an earlier test has set
     out = tmp_path / "network.svg"
     code, said, err = call("--twin", MACHINES / "sample_vmc.yml", "--at", "spindle_rpm=6 krpm", "--out", out)
     assert code == 0 and err == "" and out.read_text(encoding="utf-8").startswith("<?xml")

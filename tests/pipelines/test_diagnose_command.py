@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import Call, Done, in_process
-from toy_diagnoser import NOTE, PLAN, Toy, write_machine, write_recordings
-from toy_diagnosis import toy_diagnosis
 
 from data.errors import WorkError
 from data.machine import load_machine
 from diagnosis.findings.schema import read_findings
 from diagnosis.result import Diagnosis
 from pipelines import diagnosing
+from tests.toys.command import Call, Done, in_process
+from tests.toys.diagnoser import NOTE, PLAN, Toy, write_machine, write_recordings
+from tests.toys.diagnosis import toy_diagnosis
 from twin.compile import compile_network
 from twin.schema import twin_part
 
@@ -236,7 +236,7 @@ def test_what_is_not_tracked_is_told(diagnose: Diagnosed, tmp_path: Path, monkey
     def broken(*_: object, **__: object) -> str:
         raise WorkError("tracking store sqlite:///x: database is locked")
 
-    monkeypatch.setattr("pipelines.diagnosis_tracking.log_diagnosis", broken)
+    monkeypatch.setattr("pipelines.tracking.log_diagnosis", broken)
     done = diagnose("--no-report")
     out = tmp_path / "out"
     assert (done.code, one_line(done)) == (

@@ -8,14 +8,14 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from toy_diagnoser import Toy, write_machine, write_recordings
 
 from data.errors import InputError, WorkError
 from diagnosis.findings.schema import read_findings
 from models.crossing import Plan
 from pipelines import diagnosing, training
-from pipelines.diagnosis_tracking import diagnoses
-from pipelines.request import TrainRequest
+from pipelines.tracking import diagnoses
+from pipelines.training import TrainRequest
+from tests.toys.diagnoser import Toy, write_machine, write_recordings
 
 SMALL = Plan(("none",), ("zero",), ("leave-batch-out",))
 

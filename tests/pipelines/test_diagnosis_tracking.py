@@ -8,13 +8,13 @@ from typing import Any
 import mlflow
 import pytest
 from mlflow.tracking import MlflowClient
-from toy_diagnosis import toy_diagnosis
-from toy_training import toy_batches
 
 from diagnosis.result import Diagnosis
 from pipelines import tracking
-from pipelines.diagnosis_tracking import diagnoses, log_diagnosis
 from pipelines.settings import Settings
+from pipelines.tracking import diagnoses, log_diagnosis
+from tests.toys.diagnosis import toy_diagnosis
+from tests.toys.training import toy_batches
 
 MACHINE = "sample_vmc"
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_diagnoser import Toy, write_machine, write_recordings
-from toy_training import toy_batches, toy_result
 
 from data.errors import WorkError
 from data.ingest import ingest
@@ -21,9 +19,11 @@ from models.protocols import PromotionRule
 from models.result import GridResult
 from pipelines import tracking, training
 from pipelines.caller import DirectCaller
-from pipelines.diagnosis_trigger import diagnose_if_grown, greatest_growth, growth
-from pipelines.request import TrainRequest
+from pipelines.diagnosing import diagnose_if_grown, greatest_growth, growth
 from pipelines.settings import DiagnoseRule, Settings
+from pipelines.training import TrainRequest
+from tests.toys.diagnoser import Toy, write_machine, write_recordings
+from tests.toys.training import toy_batches, toy_result
 
 RULE = PromotionRule()
 
@@ -44,13 +44,13 @@ def test_growth_is_that_of_the_new_batches() -> None:
     got = growth(trained("m", twin=[1.0, 1.2, 0.8]), trained("m", twin=[1.0, 1.2, 0.8, 1.9, 2.1]), "twin", RULE)
     assert got is not None and (got.before_um, got.after_um, got.n_new) == (1.0, pytest.approx(2.0), 2)
     assert got.share == pytest.approx(1.0)
-    assert got.words == "z: left-out S of the family twin is 2.00 µm on 2 new batches, was 1.00 µm (+100 %)"
+    assert got.summary == "z: left-out S of the family twin is 2.00 µm on 2 new batches, was 1.00 µm (+100 %)"
 
 
 def test_without_new_batches_all_of_them_count() -> None:
     got = growth(trained("m", twin=[1.0, 3.0]), trained("m", twin=[2.0, 4.0]), "twin", RULE)
     assert got is not None and (got.before_um, got.after_um, got.n_new) == (2.0, 3.0, 0)
-    assert got.words.endswith("is 3.00 µm on the same batches, was 2.00 µm (+50 %)")
+    assert got.summary.endswith("is 3.00 µm on the same batches, was 2.00 µm (+50 %)")
 
 
 def test_a_family_that_was_not_trained_before_has_not_grown() -> None:
@@ -139,7 +139,7 @@ def test_training_ends_with_it(home: Path, store: Settings, tmp_path: Path, monk
         file = write_machine(tmp_path / f"{name}.yml", name, twin)
         request = TrainRequest(file, recordings, ("z",), plan, tmp_path / "r.md", promote=False)
         outcome = training.train(request, store, DirectCaller())
-        assert outcome.diagnosis_words == ("not diagnosed: this is a test" if twin else "")
+        assert outcome.diagnosis_summary == ("not diagnosed: this is a test" if twin else "")
         assert ("diagnose" in outcome.seconds) is twin
         if twin:
             assert given == [("ends-twin", {"z": "z"}, outcome.training_ids)]

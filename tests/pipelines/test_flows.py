@@ -11,13 +11,13 @@ from typing import Any
 import pandas as pd
 import pytest
 from mlflow import MlflowClient
-from small_year import write_machine, write_year
 
 from data.errors import InputError, WorkError
 from models.crossing import Plan
 from pipelines import training
 from pipelines.caller import RETRIES, DirectCaller
-from pipelines.request import TrainRequest
+from pipelines.training import TrainRequest
+from tests.toys.small_year import write_machine, write_year
 
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
 SMALL = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
@@ -43,7 +43,7 @@ def test_same_numbers_with_prefect_and_without(flows: ModuleType, store: Any, ye
     for table in ("scores", "cells", "subsets", "predictions"):
         pd.testing.assert_frame_equal(getattr(a, table), getattr(b, table), check_exact=True)
     assert flowed.promotions["z"].cell == direct.promotions["z"].cell
-    assert flowed.promotions["z"].words == direct.promotions["z"].words.replace("flow-b", "flow-a")
+    assert flowed.promotions["z"].summary == direct.promotions["z"].summary.replace("flow-b", "flow-a")
     assert flowed.report is not None and flowed.report.exists()
     assert ("grid", 3, 3) in steps and ("ingest", 1, 1) in steps and ("report", 1, 1) in steps
 

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 from data.errors import InputError
 from data.machine import parse_machine
@@ -19,8 +18,9 @@ from models.base import Family
 from models.promotion import choose
 from models.trust import Region
 from pipelines import model_store, registry, tracking
-from pipelines.predict import load_model, predict_file
+from pipelines.commands.predict import load_model, predict_file
 from tests.models.twin_year import recording, two_errors
+from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,8 @@ def promoted(store):
     model, region = toy_model(batches)
     training_id = tracking.log_training(result, store)
     choice = choose(result.cells, store.promotion)
-    return registry.promote(result, choice, model, machine_yaml("toy-predict"), training_id, store, region), training_id
+    new = registry.Newcomer(result, choice, model, machine_yaml("toy-predict"), training_id, region)
+    return registry.promote(new, store), training_id
 
 
 @pytest.fixture
@@ -69,7 +70,7 @@ def test_a_new_process_in_another_folder_finds_the_model(promoted, store, tmp_pa
     code = (
         "from pathlib import Path\n"
         "from pipelines import settings\n"
-        "from pipelines.predict import predict_file\n"
+        "from pipelines.commands.predict import predict_file\n"
         "got = predict_file('models:/toy-predict-z@champion', Path('run7.csv'), settings.load())\n"
         "print(got['predicted_um'].iloc[-1])\n"
     )

@@ -7,7 +7,6 @@ from pathlib import Path
 from threading import Event
 
 import pytest
-from command import Call, in_process
 
 from data.machine import load_machine
 from diagnosis.findings.schema import Findings, FitSummary, as_json
@@ -15,6 +14,7 @@ from evidence.proof import judging as proof_judging
 from evidence.proof.scoring.true_model import TrueModel
 from evidence.proof.sealing import running
 from evidence.proof.sealing.running import Examinee
+from tests.toys.command import Call, in_process
 
 ASKED = ("--cases", 2, "--suite", "development", "--seed", 4, "--plants", "volumes", "--workers", 1)
 
@@ -64,7 +64,7 @@ def test_step_by_step(call: Call, asked: list[str], tmp_path: Path) -> None:
     again = call("prove", "seal", *ASKED, "--out", proof)
     assert again.code == 2 and "holds a sealed proof already" in one_line(again.err)
     early = call("prove", "open", proof, "--deals", 0)
-    assert early.code == 2 and "nobody was asked yet; call `thermodrift prove run" in one_line(early.err)
+    assert early.code == 2 and "no case was answered yet; call `thermodrift prove run" in one_line(early.err)
     done = call("prove", "run", proof, "--workers", 1, "--limit", 9)
     assert done.code == 0 and "2 cases, 0 answered before, 2 now; 0 had been interrupted" in done.out
     assert asked == ["case_0001 within 9 s", "case_0002 within 9 s"]
@@ -94,7 +94,7 @@ def test_all_at_once_goes_on_where_it_stood(call: Call, asked: list[str], tmp_pa
     other = call("prove", *ASKED, "--out", proof, "--cases", 3)
     assert other.code == 2
     assert one_line(other.err).endswith(
-        "holds a development proof of 2 cases, asked for is a development one of 3; give another --out"
+        "holds a development proof of 2 cases, requested is a development one of 3; give another --out"
     )
 
 

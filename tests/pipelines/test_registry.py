@@ -6,12 +6,12 @@ import mlflow
 import numpy as np
 import pytest
 from mlflow.tracking import MlflowClient
-from toy_training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 from data.errors import InputError
 from models.promotion import Choice, choose
 from models.trust import Region
 from pipelines import registry, tracking
+from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
 def train(store, machine: str, S_um: list[float], *, batches_given: bool = False, yaml: str = "", force: bool = False):
@@ -21,10 +21,9 @@ def train(store, machine: str, S_um: list[float], *, batches_given: bool = False
     training_id = tracking.log_training(result, store)
     model, region = toy_model(batches)
     choice = choose(result.cells, store.promotion)
-    return registry.promote(
-        result, choice, model, yaml or machine_yaml(machine), training_id, store, region,
-        batches if batches_given else (), force=force,
-    )  # fmt: skip
+    text, known = yaml or machine_yaml(machine), batches if batches_given else ()
+    new = registry.Newcomer(result, choice, model, text, training_id, region, known)
+    return registry.promote(new, store, force=force)
 
 
 def aliases(store, name: str) -> dict[str, int]:
@@ -46,7 +45,7 @@ def story(store):
 
 def test_the_first_becomes_champion(story):
     assert (story[0].outcome, story[0].version, story[0].name) == ("champion", 1, "toy-story-z")
-    assert "first model of this machine and channel" in story[0].words
+    assert "first model of this machine and channel" in story[0].summary
 
 
 def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
@@ -61,7 +60,7 @@ def test_a_better_one_replaces_it_and_the_old_one_is_tagged(story, store):
 def test_a_worse_one_is_challenger_with_the_reason(story, store):
     assert (story[2].outcome, story[2].version, story[2].champion_version) == ("challenger", 3, 2)
     assert (story[2].against, story[2].obstacle, story[2].forced) == (2, "", False)
-    assert "not shown to be better, the champion stays" in story[2].words
+    assert "not shown to be better, the champion stays" in story[2].summary
     tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-story-z", "3").tags
     assert "not shown to be better" in tags["reason"]
     assert tags["simulated"] == "true"
@@ -73,7 +72,7 @@ def test_what_became_of_it_is_kept_with_the_training(story, store):
     assert table["promotion"].tolist() == ["challenger", "champion", "champion"]
     kept = tracking.load_training(table["training_id"][0], store).promotion
     assert kept["comparison"]["n_batches"] == 7
-    assert kept["words"] == story[2].words
+    assert kept["words"] == story[2].summary
 
 
 def test_status_lists_every_version(story, store):
@@ -89,7 +88,7 @@ def test_the_same_again_changes_nothing(store):
     first = train(store, "toy-same", [5.0] * 6)
     again = train(store, "toy-same", [5.0] * 6)
     assert (again.outcome, again.version) == ("unchanged", first.version)
-    assert "nothing new registered" in again.words
+    assert "nothing new registered" in again.summary
     commented = train(store, "toy-same", [5.0] * 6, yaml=machine_yaml("toy-same") + "# a remark\n")
     assert commented.outcome == "unchanged"
     other = train(store, "toy-same", [5.0] * 6, yaml=machine_yaml("toy-same") + "description: other\n")
@@ -115,7 +114,7 @@ def test_too_few_batches_in_common_keep_the_champion(store):
     train(store, "toy-few", [5.0] * 4)
     got = train(store, "toy-few", [1.0] * 9)
     assert got.outcome == "challenger"
-    assert "4 batches in common, need at least 5: the champion stays" in got.words
+    assert "4 batches in common, need at least 5: the champion stays" in got.summary
 
 
 def test_the_champions_own_prediction_counts_on_batches_new_to_it(store):
@@ -125,7 +124,7 @@ def test_the_champions_own_prediction_counts_on_batches_new_to_it(store):
     assert got.comparison.n_batches == 9
     # The toy law is exact, so the champion's S on its five new batches is 0.
     assert got.comparison.old_S_mean_um == pytest.approx(4 * 5 / 9, abs=1e-6)
-    assert "(5 of them new to the champion)" in got.words
+    assert "(5 of them new to the champion)" in got.summary
 
 
 def test_by_force(store):
@@ -180,9 +179,8 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     choice: Choice = choose(result.cells, store.promotion)
     from models.baselines import Zero
 
-    got = registry.promote(
-        result, choice, Zero().fit(batches, (), "z"), machine_yaml("toy-zero"),
-        tracking.log_training(result, store), store, Region.of([], ()),
-    )  # fmt: skip
+    zero, training_id = Zero().fit(batches, (), "z"), tracking.log_training(result, store)
+    new = registry.Newcomer(result, choice, zero, machine_yaml("toy-zero"), training_id, Region.of([], ()))
+    got = registry.promote(new, store)
     assert not got.trusted
-    assert "nothing beats zero (best other: 9.00 µm): do not trust" in got.words
+    assert "nothing beats zero (best other: 9.00 µm): do not trust" in got.summary

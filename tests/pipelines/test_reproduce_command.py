@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from command import Call, in_process
 
 from evidence.studies import STUDIES
 from evidence.studies.base import Figure, Ordering, Study
 from evidence.studies.report import FILES
+from tests.toys.command import Call, in_process
 
 
 class ToyStudy(Study):
@@ -20,7 +20,7 @@ class ToyStudy(Study):
 
     key = "toy_study"
     title = "Toy"
-    words, source, machine = "a toy & nothing else", "toy source", "toy, ±20 %"
+    summary, source, machine = "a toy & nothing else", "toy source", "toy, ±20 %"
     assumed = ("all of it",)
     remarks = ("On average {a} µm.",)
     figures = (

@@ -11,18 +11,28 @@ from data.errors import InputError
 from data.yaml_file import load_yaml
 from pipelines import settings
 
+ROOT = Path(__file__).parents[2]
 
-def test_the_projects_file_says_the_same_as_the_defaults():
-    written = load_yaml(settings.PROJECT_ROOT / "mlflow.yml", settings._File, "settings file")
+
+def test_the_projects_file_states_the_defaults():
+    written = load_yaml(ROOT / "mlflow.yml", settings._File, "settings file")
     assert written == settings._File()
 
 
-def test_home_comes_from_the_environment_else_from_the_project(monkeypatch, tmp_path):
+def test_home_comes_from_the_environment_else_from_the_working_directory(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "elsewhere"))
     assert settings.home() == tmp_path / "elsewhere"
     assert settings.load().store_file == tmp_path / "elsewhere" / "mlflow.db"
     monkeypatch.delenv("THERMODRIFT_HOME")
-    assert settings.home() == settings.PROJECT_ROOT / "var"
+    assert settings.home() == tmp_path / "var" and not settings.home().exists()
+
+
+def test_settings_come_from_the_working_directory_else_from_the_defaults(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert settings.load().model("vmc", "z") == "vmc-z"
+    (tmp_path / "mlflow.yml").write_text('names: {model: "{target}.{machine}"}\n')
+    assert settings.load().model("vmc", "z") == "z.vmc"
 
 
 def test_names_follow_the_patterns(tmp_path):

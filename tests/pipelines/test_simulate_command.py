@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from command import Call, in_process
 
 from data.batch import Batch
 from data.describe import draft_machine_file
@@ -18,9 +17,19 @@ from data.lake import Lake
 from data.machine import load_machine
 from data.recording import read_batches
 from pipelines import cli
-from pipelines.simulating import Simulated, SimulationRequest, beginning, jobs_of, simulate_job, simulate_plans
-from pipelines.simulation_screen import error_table, heat_table, hottest
+from pipelines.commands.simulate import (
+    Simulated,
+    SimulationRequest,
+    beginning,
+    error_table,
+    heat_table,
+    hottest,
+    jobs_of,
+    simulate_job,
+    simulate_plans,
+)
 from plants.sample import sample_machine
+from tests.toys.command import Call, in_process
 from tests.twin.machines import TWO_BODIES
 
 ROOT = Path(cli.__file__).resolve().parents[1]
@@ -56,7 +65,7 @@ def plain_pages(monkeypatch: pytest.MonkeyPatch) -> None:
         folder.mkdir(exist_ok=True)
         return folder / "report.html"
 
-    monkeypatch.setattr("pipelines.simulating.write_iso_report", iso)
+    monkeypatch.setattr("reports.twin.iso230_3.write_iso_report", iso)
     monkeypatch.setattr("reports.twin.figures.overview_png", lambda _: b"")
     monkeypatch.setattr("reports.twin.page.write_twin_report", lambda path, *_: path.write_bytes(b""))
 
@@ -68,7 +77,8 @@ def simulated(machine: Path, plan: Path, out: Path, **options: object) -> Batch:
 def one_plan(machine: Path, plan: Path, out: Path, **options: object) -> Simulated:
     """A plan simulated, nothing written."""
     request = SimulationRequest(machine, (plan,), out, **options)  # type: ignore[arg-type]
-    network, read, (job,) = jobs_of(request)
+    read = load_machine(machine)
+    network, (job,) = jobs_of(request, read)
     return simulate_job(job, network, read, request)
 
 
@@ -89,7 +99,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Batch]:
     folder = tmp_path_factory.mktemp("runs")
     plans = tuple(warm_up(folder, rpm, f"{{start: 20 degC, drift: {2.3 / 6} K/h}}") for rpm in (2000, 4000, 6000))
     request = SimulationRequest(SAMPLE, plans, folder / "out")
-    network, machine, jobs = jobs_of(request)
+    machine = load_machine(SAMPLE)
+    network, jobs = jobs_of(request, machine)
     batches = [simulate_job(job, network, machine, request).batch for job in jobs]
     return dict(zip((2000.0, 4000.0, 6000.0), batches, strict=True))
 

@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from command import Call, in_process
 
 from data.batch import Batch
 from data.errors import InputError
 from data.lake import Lake
 from data.lakefile import content_digest, encode
 from data.machine import load_machine
-from pipelines.thermal_tests import write_thermal_tests
+from pipelines.commands.report import write_thermal_tests
+from tests.toys.command import Call, in_process
 from tests.twin.machines import TWO_BODIES
 
 
@@ -66,7 +66,7 @@ def test_thermal_tests_refuse_in_one_line(call: Call, small: Path, tmp_path: Pat
     for args, line in {
         (): "the lake holds no batch of two_bodies; name recordings, or call `thermodrift ingest` first",
         ("run9",): "run9: no such file or folder, and no batch in the lake, it is empty",
-        ("home",): "home: no recording of two_bodies there; recording.files asks for *.csv",
+        ("home",): "home: no recording of two_bodies there; recording.files takes *.csv",
         ("two.yml", "--format", "md"): "--format: with --iso both forms are written; leave it out",
     }.items():
         (tmp_path / "home").mkdir(exist_ok=True)

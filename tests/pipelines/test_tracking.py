@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from mlflow.tracking import MlflowClient
-from toy_training import toy_batches, toy_result
 
 from data.errors import InputError, WorkError
 from models.protocols import PromotionRule
 from pipelines import tracking
 from pipelines.settings import NamesPart, Settings
+from tests.toys.training import toy_batches, toy_result
 
 S_UM = {
     "none|zero|0": [9.0, 8.0, 10.0],

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from mlflow import MlflowClient
-from small_year import NOISE_UM, law_um, write_machine, write_year
 
 from data.errors import InputError
 from data.lake import Lake
@@ -19,8 +18,10 @@ from models import FAMILIES
 from models.crossing import Plan
 from pipelines import registry, tracking
 from pipelines.caller import DirectCaller
-from pipelines.predict import predict_file
-from pipelines.training import TrainOutcome, TrainRequest, load_batches, promote_tracked, train
+from pipelines.commands.predict import predict_file
+from pipelines.recordings import load_batches
+from pipelines.training import TrainOutcome, TrainRequest, promote_tracked, train
+from tests.toys.small_year import NOISE_UM, law_um, write_machine, write_year
 
 NAME = "small-train"
 MODEL = f"{NAME}-z"
@@ -100,11 +101,11 @@ def test_the_leaderboard_says_what_the_recordings_say(story: Story) -> None:
 def test_first_model_then_nothing_new_then_a_better_one(story: Story) -> None:
     first, again, better = (story.steps[k].promotions["z"] for k in ("zero", "zero again", "better"))
     assert (first.outcome, first.version, first.trusted) == ("champion", 1, False)
-    assert "first model of this machine and channel" in first.words
+    assert "first model of this machine and channel" in first.summary
     assert (again.outcome, again.version) == ("unchanged", 1)
-    assert "nothing new registered" in again.words
+    assert "nothing new registered" in again.summary
     assert (better.outcome, better.version, better.trusted) == ("champion", 2, True)
-    assert "against version 1" in better.words and "the newcomer replaces the champion" in better.words
+    assert "against version 1" in better.summary and "the newcomer replaces the champion" in better.summary
     assert story.champion["zero again"] == 1 and story.champion["better"] == 2
 
 
@@ -120,8 +121,8 @@ def test_a_new_season_is_learned_and_judged(story: Story) -> None:
     promotion = outcome.promotions["z"]
     assert not outcome.stopped and len(outcome.results["z"].batches) == 7
     assert promotion.version == 3 and promotion.outcome in ("champion", "challenger")
-    assert "against version 2" in promotion.words and "over 7 batches" in promotion.words
-    assert "(1 of them new to the champion)" in promotion.words
+    assert "against version 2" in promotion.summary and "over 7 batches" in promotion.summary
+    assert "(1 of them new to the champion)" in promotion.summary
     assert promotion.comparison is not None and promotion.comparison.n_batches == 7
     assert story.champion["season"] == promotion.champion_version
 
@@ -129,10 +130,10 @@ def test_a_new_season_is_learned_and_judged(story: Story) -> None:
 def test_by_hand_by_force_and_back(story: Story) -> None:
     by_hand, by_force, back = (story.steps[k] for k in ("by hand", "by force", "rolled back"))
     assert (by_hand.outcome, by_hand.version) == ("challenger", 4)
-    assert "not shown to be better, the champion stays" in by_hand.words
+    assert "not shown to be better, the champion stays" in by_hand.summary
     assert story.champion["by hand"] == story.champion["season"]
     assert story.champion["by force"] == by_force.champion_version == 4
-    assert "by force" in by_force.words
+    assert "by force" in by_force.summary
     assert story.champion["rolled back"] == back.version == story.champion["season"]
 
 

@@ -30,7 +30,7 @@ def quiet(effect: str | None, size: float, has: tuple[str, ...] = (), lacks: tup
 @cache
 def brief(effect: str | None, size: float, has: tuple[str, ...] = (), lacks: tuple[str, ...] = ()) -> Case:
     """Two short batches, for what only has to be the same."""
-    return draw(SEED, effect, size, 2, has=has, lacks=lacks, hours=1.0, before_h=1.0, solver_s=50.0)
+    return draw(SEED, effect, size, batches=2, has=has, lacks=lacks, hours=1.0, before_h=1.0, solver_s=50.0)
 
 
 def plant(seed: int = SEED, *has: str) -> Plant:

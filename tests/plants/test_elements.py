@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from plant_cases import SEED, Array
 from scipy import sparse
 
-from plants.elements.convergence import slab_error_K
+from plants.convergence import slab_error_K
 from plants.elements.geometry import draw_castings
 from plants.elements.structure import Elements, integrate, total
 from plants.structure import AIR, exposures_W_per_K, links_W_per_K
+from tests.plants.plant_cases import SEED, Array
 
 
 @cache

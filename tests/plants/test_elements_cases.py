@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plant_cases import NONE, SEED
 
 from plants.drawing import PLANTS, draw_plant
 from plants.effects import EFFECTS
-from plants.effects.surfaces import Draught
+from plants.effects.heat import Draught
 from plants.elements.geometry import draw_castings
 from plants.plant import draw, posed
 from plants.runs import Now
 from plants.structure import FEATURES, Plant
+from tests.plants.plant_cases import NONE, SEED
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plant_cases import Array
 
-from plants.elements.convergence import GRIDS_STEP_S, sensed_degC
+from plants.convergence import ELEMENTS_STEP_S, sensed_degC
 from plants.elements.geometry import draw_castings
+from tests.plants.plant_cases import Array
 
 SEED, EFFECT = 4, "preload_feedback"  # friction that the temperatures change: integrated explicitly
 
@@ -27,5 +27,5 @@ def test_temperatures_at_the_sensors_converge_with_the_step_squared() -> None:
 def test_a_grid_of_eight_cells_for_each_moves_the_sensors_by_little() -> None:
     plain, finer = draw_castings(SEED, False), draw_castings(SEED, False, 2)
     assert finer.structure.size > 4 * plain.structure.size
-    one, other = (sensed_degC(d, plain, SEED, EFFECT, GRIDS_STEP_S) for d in (plain, finer))
+    one, other = (sensed_degC(d, plain, SEED, EFFECT, ELEMENTS_STEP_S) for d in (plain, finer))
     assert _rms(one - other) < 0.08  # of some 20 K

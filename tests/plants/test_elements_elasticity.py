@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plant_cases import SEED, Array
 
 from plants.elements.elasticity import Elasticity
 from plants.elements.geometry import draw_castings
@@ -12,6 +11,7 @@ from plants.elements.layout import growths, odd, tool_weights_um_per_K
 from plants.elements.mesh import Box, Mesh
 from plants.elements.structure import Contact
 from plants.structure import FEATURES
+from tests.plants.plant_cases import SEED, Array
 
 LENGTH_M, HIGH_M, WIDE_M = 0.6, 0.1, 0.12
 EXPANSION_PER_K = 10.8e-6

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plant_cases import SEED, full_speed, plant
 
 from plants.everyday import (
     EVERYDAY,
@@ -19,11 +18,12 @@ from plants.everyday import (
     radiation_factor,
     rising_factor,
 )
-from plants.options import stream
-from plants.physics import simulated
+from plants.options import Options, stream
 from plants.plant import draw
 from plants.runs import plan_runs
+from plants.simulation import simulated
 from plants.volumes.structure import Volumes
+from tests.plants.plant_cases import SEED, full_speed, plant
 from twin.compile import compile_network
 
 
@@ -99,14 +99,14 @@ def test_a_plant_without_screw_or_feed_has_no_nut() -> None:
         p = plant(seed)
         has = {piece.key for piece in everyday(p, seed)}
         assert ("nut" in has) == ("screw" in p.structure.castings and "feed" in p.features)
-        assert {"films", "joints"} <= has <= set(EVERYDAY)
+        assert {"films", "joints"} <= has <= {kind.key for kind in EVERYDAY}
 
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_steps_keep_their_second_order(seed: int) -> None:
     """Against a step of 5 s: half the step, a quarter of the error; a sensor could not see it."""
     p = plant(seed, "feed")
-    runs = plan_runs(seed, 2, 2.0, 300.0, p.rated_rpm, 0.0)
+    runs = plan_runs(seed, Options(batches=2, hours=2.0), p.rated_rpm)
     pieces = everyday(p, seed)
     steps_s = np.array([60.0, 30.0, 20.0, 10.0])
     exact = simulated(p, runs, pieces, 5.0, before_h=2.0).cells_degC
@@ -119,7 +119,7 @@ def test_the_steps_keep_their_second_order(seed: int) -> None:
 def test_it_is_moderate() -> None:
     """What the films and joints change is a small part of how far a machine warms."""
     p = plant(SEED, "feed")
-    runs = plan_runs(SEED, 3, 4.0, 300.0, p.rated_rpm, 0.0)
+    runs = plan_runs(SEED, Options(batches=3, hours=4.0), p.rated_rpm)
     plain = simulated(p, runs, [], 30.0).cells_degC
     pieces = [e for e in everyday(p, SEED) if e.key != "nut"]
     changed = simulated(p, runs, pieces, 30.0).cells_degC

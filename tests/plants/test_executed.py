@@ -7,17 +7,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from plant_cases import NONE, SEED
 
 from data.errors import InputError
 from diagnosis.next_experiment.menu import Run as MenuRun
 from plants.drawing import draw_plant
 from plants.effects import EFFECTS
 from plants.options import stream
-from plants.physics import simulated
 from plants.planned import RIPPLE_K, execute, read_plan
-from plants.recorded import shown
 from plants.runs import Block, Run, held
+from plants.simulation import shown, simulated
+from tests.plants.plant_cases import NONE, SEED
 from twin.compile import compile_network
 from twin.run_plan import load_run_plan
 from twin.run_plan.plan import Stage

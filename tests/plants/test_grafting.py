@@ -11,7 +11,7 @@ import pytest
 from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import Machine
-from plants.grafted.base import Setting, told
+from plants.grafted.base import Setting, magnitude
 from plants.grafted.faults import SensorBonding, SensorDrift, SensorLag, TimeSkew
 from plants.grafted.frame import Clockwork, Frame, Push, draw_frame, on_channels, response
 from plants.grafted.heats import CabinetHeat, FloorSink, HydraulicUnit, Sun
@@ -64,12 +64,12 @@ def steady(watts: float, clock: Clockwork) -> Push:
 
 
 def test_what_a_file_says_is_read_with_its_unit() -> None:
-    assert told({"value": "537 kJ/K", "spread": 0.5}, "x") == 537e3
-    assert told("3 mW/K", "x") == pytest.approx(3e-3) and told(0.94, "x") == 0.94
+    assert magnitude({"value": "537 kJ/K", "spread": 0.5}, "x") == 537e3
+    assert magnitude("3 mW/K", "x") == pytest.approx(3e-3) and magnitude(0.94, "x") == 0.94
     with pytest.raises(InputError, match=r"grafted: links.a-b: unit 'W/mK' is not known here; did you mean 'W/K'\?"):
-        told("5 W/mK", "links.a-b")
+        magnitude("5 W/mK", "links.a-b")
     with pytest.raises(InputError, match=r"grafted: bodies.bed: got 'heavy', expected a number with a unit"):
-        told("heavy", "bodies.bed")
+        magnitude("heavy", "bodies.bed")
 
 
 def test_the_frame_keeps_the_file_s_sums_within_its_scatter(frame: Frame) -> None:
@@ -113,7 +113,7 @@ def test_a_loss_that_grows_with_the_rise_is_a_conductance_more(frame: Frame) -> 
 def test_channels_show_cells_by_bonding_and_errors_count_from_the_start(frame: Frame) -> None:
     rise = np.arange(2.0 * frame.size).reshape(2, frame.size, 1)
     shown = on_channels(frame, rise)
-    seat = frame.seats["t_column"]
+    seat = frame.placements["t_column"]
     assert shown["t_column"] == pytest.approx(0.9 * rise[:, seat.cell])
     gain = frame.gains_um_per_K["z"]["column"]
     assert shown["z"][:, 0] == pytest.approx([0.0, gain * frame.size]) and -8.0 < gain < -3.0
@@ -144,7 +144,7 @@ def test_the_sun_shines_by_the_clock_and_not_by_the_run(setting: Setting) -> Non
     for batch, clock_h in zip(setting.batches, hours, strict=True):
         shines = graft.acting(batch)
         assert np.array_equal(shines, (clock_h > graft.rise_h) & (clock_h < graft.set_h))
-    assert {w[0] for w in graft.term()["active"]} == {"a", "b"}
+    assert {w[0] for w in graft.term().active} == {"a", "b"}
 
 
 def test_a_cycling_pump_runs_for_its_share_of_each_period(setting: Setting) -> None:

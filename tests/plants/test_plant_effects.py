@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from plant_cases import SEED, Array, driver, full_speed, moved, plant, with_and_without
 
 from plants.effects import EFFECTS
 from plants.options import stream
+from tests.plants.plant_cases import SEED, Array, driver, full_speed, moved, plant, with_and_without
 
 
 def _used(key: str, name: str) -> NDArray[np.bool_]:

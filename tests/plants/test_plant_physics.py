@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plant_cases import NONE, SEED, Array, plant
 from scipy import sparse
 
 from plants.drawing import draw_plant
 from plants.effects import EFFECTS
-from plants.options import stream
-from plants.physics import simulated
+from plants.options import Options, stream
 from plants.runs import Block, held, plan_runs
+from plants.simulation import simulated
 from plants.structure import FEATURES, exposures_W_per_K, links_W_per_K
 from plants.volumes.layout import bending
 from plants.volumes.structure import Plate, Volumes, even, integrate
+from tests.plants.plant_cases import NONE, SEED, Array, plant
 
 
 @pytest.mark.parametrize("key", [None, "preload_feedback", "draught", "rotating_convection", "natural_convection"])
@@ -24,7 +24,7 @@ def test_half_the_step_changes_no_cell_by_a_hundredth_of_a_kelvin(key: str | Non
     kinds = [EFFECTS[key]] if key else []
     p = plant()
     effects = [kind(p, 1.0, stream(SEED, "effect")) for kind in kinds]
-    runs = plan_runs(SEED, 3, 4.0, 300.0, p.rated_rpm, 0.0)
+    runs = plan_runs(SEED, Options(batches=3, hours=4.0), p.rated_rpm)
     coarse, fine = (simulated(p, runs, effects, step_s) for step_s in (15.0, 7.5))
     assert np.ptp(coarse.cells_degC) > 20.0
     assert np.abs(coarse.cells_degC - fine.cells_degC[::2]).max() < 0.01
@@ -47,7 +47,7 @@ def test_the_solver_is_of_second_order_and_meets_the_exact_solution() -> None:
 def test_a_closed_plant_keeps_every_joule_of_its_sources() -> None:
     p = plant(SEED, "motor_loss")
     closed = replace(p, structure=replace(p.structure, room_W_per_K=np.zeros(p.structure.size)))
-    runs = plan_runs(SEED, 3, 2.0, 300.0, p.rated_rpm, 0.2)
+    runs = plan_runs(SEED, Options(batches=3, hours=2.0, friction_scatter=0.2), p.rated_rpm)
     course = simulated(closed, runs, [], 15.0)
     stored_J = np.einsum("mnb,n->mb", course.cells_degC - course.cells_degC[0], p.structure.capacity_J_per_K)
     friction = np.array([r.friction for r in runs])
@@ -72,7 +72,7 @@ def test_what_the_plant_loses_is_its_exchange_with_the_room() -> None:
     np.testing.assert_allclose(at_20, 0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_machines_differ_and_are_resolved_finely(seed: int) -> None:
     p = plant(seed)
     s = p.structure
@@ -145,7 +145,7 @@ def test_every_feature_can_be_had_and_left_out() -> None:
 
 def test_seasons_protocols_and_starts_off_equilibrium_vary() -> None:
     p = plant()
-    runs = plan_runs(SEED, 12, 6.0, 300.0, p.rated_rpm, 0.0)
+    runs = plan_runs(SEED, Options(), p.rated_rpm)
     room = [float(r.room_degC(np.zeros(1))[0]) for r in runs]
     assert min(room) < 15 and max(room) > 25
     assert len({r.batch_id for r in runs}) == 12
@@ -159,7 +159,7 @@ def test_seasons_protocols_and_starts_off_equilibrium_vary() -> None:
 
 
 def test_drivers_change_on_rows_of_the_recording() -> None:
-    for run in plan_runs(SEED, 12, 6.0, 300.0, 8000.0, 0.0):
+    for run in plan_runs(SEED, Options(), 8000.0):
         for block in (*run.speed, *run.feed, *run.coolant):
             assert block.from_s % 300.0 == 0
 

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plant_cases import NONE, SEED, brief, full_speed
 
 from data.errors import InputError
 from data.machine import load_machine
 from data.recording import read_batches, recording_files
 from plants.drawing import draw_plant
 from plants.effects import EFFECTS
-from plants.physics import power_W
+from plants.options import Options
 from plants.plant import draw, write_case
 from plants.runs import plan_runs
+from plants.simulation import power_W
+from tests.plants.plant_cases import NONE, SEED, brief, full_speed
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
@@ -158,7 +159,7 @@ def test_options_shape_the_recordings() -> None:
     assert 0.1 < np.isnan(room).mean() < 0.3
     assert np.nanmax(np.abs(room * 2 - np.rint(room * 2))) < 1e-9
     assert not np.isnan(batch.values("spindle_rpm")).any()
-    runs = plan_runs(SEED, 12, 2.0, 60.0, 8000.0, 0.3)
+    runs = plan_runs(SEED, Options(batches=12, hours=2.0, step_s=60.0, friction_scatter=0.3), 8000.0)
     assert np.ptp([r.friction for r in runs]) > 0.2
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plant_cases import NONE
 
+from plants.convergence import COLUMNS, volumes_study
 from plants.drawing import draw_plant
 from plants.structure import exposures_W_per_K
-from plants.volumes.convergence import COLUMNS, study
 from plants.volumes.structure import Assembly, Plate
+from tests.plants.plant_cases import NONE
 
 
 @pytest.mark.parametrize("seed", [3, 5])
@@ -43,7 +43,7 @@ def test_a_joint_stays_where_it_is_and_as_good_as_it_is() -> None:
 
 
 def test_errors_fall_with_the_square_of_cell_and_step() -> None:
-    table = study(grids=(1, 2), steps_s=(60.0, 30.0))
+    table = volumes_study(grids=(1, 2), steps_s=(60.0, 30.0))
     assert tuple(table.columns) == COLUMNS
     assert table["order"].isna().sum() == 4
     orders = table.dropna()

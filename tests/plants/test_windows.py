@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from plant_cases import QUIET, SEED, with_and_without
 from pytest import approx
 
 from plants.effects import EFFECTS
 from plants.plant import Case, draw, stretches
+from tests.plants.plant_cases import QUIET, SEED, with_and_without
 
 ROW_S = 300.0
 

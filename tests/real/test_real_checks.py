@@ -76,4 +76,4 @@ def test_the_spindle_recording_is_clean() -> None:
         pytest.skip("no ../shared/data/spindle_fl")
     batches = known(SPINDLE, "*.csv", "spindle_fl")
     assert len(batches) == 6
-    assert [f.words for b in batches for f in b.findings] == []
+    assert [f.message for b in batches for f in b.findings] == []

@@ -131,7 +131,7 @@ def test_the_cell_lacks_its_lost_voltage_and_its_charge_and_both_hold_at_rates_l
 
 def test_two_rates_are_too_few_to_be_sure_and_it_says_so() -> None:
     found = diagnosed_cell("2C", "4C")
-    assert found.words and "2 runs only" in found.words[0]
+    assert found.remarks and "2 runs only" in found.remarks[0]
     assert all(f.probability <= 0.9 for f in found.findings.findings)
     assert found.findings.batches == ("Q30_S001_2C", "Q30_S001_4C")
 

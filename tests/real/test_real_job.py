@@ -89,7 +89,7 @@ def test_the_lathe_is_learned(lathe: Any) -> None:
 
 def test_the_lathes_champion_predicts_a_raw_file(lathe: Any) -> None:
     from pipelines import settings
-    from pipelines.predict import predict_file
+    from pipelines.commands.predict import predict_file
 
     file = DATA / "lathe_gv1203" / "20200615.csv"
     got = predict_file("models:/lathe_gv1203-disp_z@champion", file, settings.load())

@@ -15,7 +15,7 @@ from data.batch import Batch
 from data.checks import check_batch, check_machine
 from data.machine import Machine, load_machine
 from data.recording import read_batches
-from twin.calibration import calibrate
+from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import simulate
@@ -82,7 +82,7 @@ def test_a_few_runs_calibrate_it_for_the_others(machine: Machine, batches: list[
     spoilt = _spoilt(machine)
     fitted = [b for b in batches if b.batch_id in FITTED]
     others = [b for b in batches if b.batch_id not in FITTED]
-    found = calibrate(spoilt, fitted, max_iterations=30)
+    found = calibrate(spoilt, fitted, CalibrationOptions(max_iterations=30))
     before, after = (_mean(_rms_K(n, n.values, others)) for n in (compile_network(spoilt), found.network))
     assert after < 0.5 * before
     assert after < 0.5 * _mean(_rms_of_mean_K(found.network, fitted, others))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from data.batch import Batch
 from data.machine import Machine, load_machine
 from tests.real.recorded import ROOT, recorded
-from twin.calibration import calibrate
+from twin.calibration import CalibrationOptions, calibrate
 from twin.calibration.estimate import leave_batch_out
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
@@ -39,7 +39,9 @@ def left_out(machine: Machine, batches: Sequence[Batch]) -> pd.DataFrame:
 
 def predicted(machine: Machine, fitted: Batch, other: Batch) -> list[float]:
     """Rms in K of both temperatures of a run by a calibration on another alone."""
-    problem = CalibrationProblem.of(calibrate(machine, [fitted], every_s=EVERY_S).network, [other], EVERY_S)
+    problem = CalibrationProblem.of(
+        calibrate(machine, [fitted], CalibrationOptions(every_s=EVERY_S)).network, [other], EVERY_S
+    )
     (error,) = problem.free_running_errors(problem.network.values)
     return [rms(error[problem.measured[0].channel == c]) for c in range(2)]
 
@@ -81,7 +83,9 @@ def test_the_board_needs_its_shared_supply() -> None:
     part = dict(machine.twin or {})
     part["mechanisms"] = {n: m for n, m in part["mechanisms"].items() if m["law"] != "supply_sag"}
     apart = machine.model_copy(update={"twin": part})
-    shared_K, apart_K = (rms(calibrate(m, batches, every_s=EVERY_S).rms["after"]) for m in (machine, apart))
+    shared_K, apart_K = (
+        rms(calibrate(m, batches, CalibrationOptions(every_s=EVERY_S)).rms["after"]) for m in (machine, apart)
+    )
     assert shared_K < 1.1 and apart_K > 1.35 * shared_K
 
 

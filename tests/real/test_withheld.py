@@ -17,10 +17,9 @@ from diagnosis.candidates.library import candidates
 from evidence.proof.scoring.answer_key import AnswerKey
 from evidence.proof.spec import KINDS
 from plants.real import recorded
-from plants.withheld import board, build, cases, cell
-from plants.withheld.cases import CASES
+from plants.withheld import BOARD, CASES, CELL, build, cases
 from tests.real.recorded import DATA
-from twin.calibration import calibrate
+from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.schema import twin_part
 
@@ -103,10 +102,10 @@ def test_the_sag_acts_where_both_heaters_are_on() -> None:
     assert on.any() and np.array_equal(inside[:-1], on[:-1])
 
 
-@pytest.mark.parametrize(("machine", "claimed"), [("tclab_board", board.CALIBRATED), ("cell_30q", cell.CALIBRATED)])
+@pytest.mark.parametrize(("machine", "claimed"), [("tclab_board", BOARD), ("cell_30q", CELL)])
 def test_the_claimed_sizes_are_those_that_the_full_file_calibrates(machine: str, claimed: dict[str, float]) -> None:
     full, batches = recorded(machine, DATA, 1)
-    network = calibrate(full, batches, every_s=10.0).network
+    network = calibrate(full, batches, CalibrationOptions(every_s=10.0)).network
     fitted = {p.name: v for p, v in zip(network.parameters, network.values, strict=True)}
     for path, value in claimed.items():
         name = path if path in fitted else f"{path}.conductance"

@@ -12,10 +12,10 @@ from data.errors import InputError, WorkError
 from data.machine import Machine
 from tests.twin.machines import machine
 from tests.twin.recordings import drawn, empty_batches, recorded
-from twin.calibration import Calibration, calibrate
+from twin.calibration import Calibration, CalibrationOptions, calibrate
 from twin.calibration.estimate import leave_batch_out
 from twin.calibration.identifiability import intervals90
-from twin.calibration.least_squares import fit
+from twin.calibration.least_squares import FitOptions, fit
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.simulation import simulate
@@ -42,7 +42,7 @@ def batches(small: Machine, truth: np.ndarray) -> list[Batch]:
 
 @pytest.fixture(scope="module")
 def found(small: Machine, batches: list[Batch]) -> Calibration:
-    return calibrate(small, batches, leave_out=True)
+    return calibrate(small, batches, CalibrationOptions(leave_out=True))
 
 
 def test_the_truth_is_recovered(small: Machine, truth: np.ndarray, found: Calibration) -> None:
@@ -65,7 +65,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(small: Machine) -> None:
     for seed in range(60):
         values = drawn(network, np.random.default_rng(1000 + seed))
         problem = CalibrationProblem.of(network, recorded(small, empty, values, seed=seed))
-        found = intervals90(fit(problem, tolerance=1e-3, reweight=True), problem.unknowns)
+        found = intervals90(fit(problem, FitOptions(tolerance=1e-3, reweight=True)), problem.unknowns)
         held += [i.low <= values[network.index(i.name)] <= i.high for i in found]
     assert len(held) == 240
     assert 0.85 <= np.mean(held) <= 0.95
@@ -173,7 +173,7 @@ def test_what_a_left_out_batch_shows_never_reaches_its_fold(small: Machine, batc
 
 def test_processes_change_nothing(small: Machine, batches: list[Batch]) -> None:
     problem = CalibrationProblem.of(compile_network(small), batches[:2])
-    one, two = leave_batch_out(problem), leave_batch_out(problem, processes=2)
+    one, two = leave_batch_out(problem), leave_batch_out(problem, CalibrationOptions(processes=2))
     assert one.table.equals(two.table)
 
 
@@ -213,15 +213,15 @@ def test_rows_are_thinned(small: Machine, batches: list[Batch]) -> None:
 
 
 def test_several_starts_find_the_same_optimum(small: Machine, batches: list[Batch], found: Calibration) -> None:
-    fitted = calibrate(small, batches, starts=3, seed=2)
-    assert "3 of 3 starts reached this optimum" in fitted.fit.words
+    fitted = calibrate(small, batches, CalibrationOptions(starts=3, seed=2))
+    assert "3 of 3 starts reached this optimum" in fitted.fit.message
     np.testing.assert_allclose(fitted.fit.x, found.fit.x, atol=2e-3)
 
 
 def test_a_fit_that_does_not_converge_is_no_calibration(small: Machine, batches: list[Batch]) -> None:
     words = r"two_bodies: stopped after \d steps, cost still falling by [0-9.e-]+ % a step.*nothing is kept"
     with pytest.raises(WorkError, match=words):
-        calibrate(small, batches, max_iterations=1, tolerance=1e-12)
+        calibrate(small, batches, CalibrationOptions(max_iterations=1, tolerance=1e-12))
 
 
 def test_bad_input_is_one_line(small: Machine, batches: list[Batch]) -> None:
@@ -245,11 +245,11 @@ def test_bad_input_is_one_line(small: Machine, batches: list[Batch]) -> None:
             calibrate(small, given)
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="the twin has no sensor or error 't_shaf'; did you mean 't_shaft'"):
-        calibrate(small, batches, channels=["t_shaf"])
+        calibrate(small, batches, CalibrationOptions(channels=["t_shaf"]))
     with pytest.raises(InputError, match="every_s: got 0, expected seconds above 0"):
-        calibrate(small, batches, every_s=0.0)
+        calibrate(small, batches, CalibrationOptions(every_s=0.0))
     with pytest.raises(InputError, match="leave-batch-out: got 1 batch, needs 2 or more"):
-        calibrate(small, batches[:1], leave_out=True)
+        calibrate(small, batches[:1], CalibrationOptions(leave_out=True))
 
 
 def test_whiteness_has_a_sentence_per_channel(found: Calibration) -> None:

@@ -23,10 +23,10 @@ GREASE = {
 }
 
 
-def flows(net: Network, refine: int = 1, every: int | None = None, **given: Any) -> HeatFlows:
+def flows(net: Network, refine: int = 1, **given: Any) -> HeatFlows:
     given = {"rpm": STOPS, "room": 20 + TIME_S / 3600} | given
     inputs = drive(TIME_S, **given).refined(refine)
-    simulation = simulate(net, net.values, inputs, at([24.0, 19.0], net), keep_cells=True, every=every)
+    simulation = simulate(net, net.values, inputs, at([24.0, 19.0], net), keep_cells=True)
     return heat_flows(simulation, inputs)
 
 
@@ -54,7 +54,7 @@ def test_exchange_is_what_a_fine_trapezoid_of_the_cells_says() -> None:
     net = network(mechanisms=GREASE)
     coarse = flows(net, 60)
     fine = drive(TIME_S, rpm=STOPS, room=20 + TIME_S / 3600).refined(60)
-    out = simulate(net, net.values, fine, at([24.0, 19.0], net), keep_cells=True, every=1)
+    out = simulate(net, net.values, replace(fine, every=1), at([24.0, 19.0], net), keep_cells=True)
     assert out.cells_degC is not None and out.air_degC is not None
     head, room = out.cells_degC[0, 0, :, 1], out.air_degC[0, 0, :, 0]
     watts = 8 * (head - room)
@@ -74,7 +74,7 @@ def test_a_speed_that_never_stays_counts_its_exchange_too() -> None:
     shaft = 0.7 * friction - f.link_W["shaft-head"] - f.link_W["shaft-room"]
     np.testing.assert_allclose(f.storage_W["shaft"], shaft, atol=1e-9 * friction.max())
     fine = inputs.refined(20)
-    out = simulate(net, net.values, fine, at([24.0, 19.0], net), keep_cells=True, every=1)
+    out = simulate(net, net.values, replace(fine, every=1), at([24.0, 19.0], net), keep_cells=True)
     assert out.cells_degC is not None
     spin = 1 + net.values[net.index("mechanisms.spin.gain")] * (np.repeat(rpm, 20) / 6000) ** (2 / 3)
     driving = out.cells_degC[0, 0, :, 0] - 20
@@ -132,5 +132,7 @@ def test_what_cannot_be_told_is_one_line() -> None:
     with pytest.raises(InputError, match="these inputs are not the simulation's"):
         heat_flows(kept, replace(inputs, time_s=inputs.time_s * 2))
     spun = network(mechanisms=GREASE)
-    with pytest.raises(InputError, match="batch b0: conductances change between two rows; simulate with every=1"):
-        heat_flows(simulate(spun, spun.values, inputs, keep_cells=True, every=4), inputs)
+    with pytest.raises(
+        InputError, match="batch b0: conductances change between two rows; simulate with inputs of every"
+    ):
+        heat_flows(simulate(spun, spun.values, replace(inputs, every=4), keep_cells=True), inputs)

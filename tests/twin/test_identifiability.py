@@ -55,7 +55,7 @@ def test_pairs_in_words(others, weights, words):
     pair = named(CONDUCTANCE), named(CAPACITY, "J/K")
     unknowns, seen = amid(pair, weights, others) if others else (pair, np.array([weights]))
     found = undetermined(fitted(unknowns, seen), unknowns)
-    assert [u.words for u in found] == [f"shaft–housing conductance and shaft capacity: {words}"]
+    assert [u.summary for u in found] == [f"shaft–housing conductance and shaft capacity: {words}"]
     assert found[0].names == (CONDUCTANCE, CAPACITY)
     assert found[0].information < 1e-6
 
@@ -65,19 +65,19 @@ def test_pairs_in_words(others, weights, words):
 def test_signed_pairs_in_words(weights, words):
     pair = named("sensors.front.offset", "K", 0.5, "linear"), named("sensors.rear.offset", "K", 0.5, "linear")
     found = undetermined(fitted(pair, np.array([weights])), pair)
-    assert [u.words for u in found] == [f"front offset and rear offset: {words}"]
+    assert [u.summary for u in found] == [f"front offset and rear offset: {words}"]
 
 
 def test_pairs_with_unequal_spreads_are_judged_in_x():
     pair = named(CONDUCTANCE, spread=0.8), named(CAPACITY, "J/K", spread=0.4)
     found = undetermined(fitted(pair, np.array([[1, -1]])), pair)
-    assert [u.words.split(": ")[1] for u in found] == ["only their ratio"]
+    assert [u.summary.split(": ")[1] for u in found] == ["only their ratio"]
 
 
 def test_a_pair_of_different_scales_says_how_they_move():
     pair = named("bearing.share", "1", 1.0, "logit"), named(CAPACITY, "J/K", 1.0)
     found = undetermined(fitted(pair, np.array([[1, -1]])), pair)
-    assert found[0].words == (
+    assert found[0].summary == (
         "bearing share and shaft capacity: only one combination; the recordings do not see the move (in prior spreads) "
         "bearing share up 0.71, shaft capacity up 0.71"
     )
@@ -86,7 +86,7 @@ def test_a_pair_of_different_scales_says_how_they_move():
 def test_a_single_parameter_in_words():
     unknowns = (named("bearing.share", "1", scale="logit"), *(named(f"nodes.n{i}.capacity") for i in range(5)))
     found = undetermined(fitted(unknowns, np.eye(6)[1:]), unknowns)
-    assert [u.words for u in found] == ["bearing share: the recordings do not determine it; the prior does"]
+    assert [u.summary for u in found] == ["bearing share: the recordings do not determine it; the prior does"]
 
 
 def test_three_that_share_one_combination_are_told_as_one():
@@ -94,9 +94,9 @@ def test_three_that_share_one_combination_are_told_as_one():
     seen = np.vstack([np.eye(6)[3:], [1, 1, -1, 0, 0, 0]])
     found = undetermined(fitted(unknowns, seen), unknowns)
     words = "n0 capacity, n1 capacity and n2 capacity: only n0 capacity × n1 capacity / n2 capacity"
-    assert [u.words for u in found] == [words]
+    assert [u.summary for u in found] == [words]
     product = np.vstack([np.eye(6)[3:], [1, 1, 1, 0, 0, 0]])
-    assert undetermined(fitted(unknowns, product), unknowns)[0].words.endswith(": only their product")
+    assert undetermined(fitted(unknowns, product), unknowns)[0].summary.endswith(": only their product")
 
 
 def test_three_of_which_one_combination_is_unseen_are_listed_with_signs_and_weights():
@@ -104,7 +104,7 @@ def test_three_of_which_one_combination_is_unseen_are_listed_with_signs_and_weig
     unseen = np.array([2.0, -1.0, 1.0, 0, 0])
     seen = np.linalg.svd(unseen[None])[2][1:]
     found = undetermined(fitted(unknowns, seen), unknowns)
-    assert [u.words for u in found] == [
+    assert [u.summary for u in found] == [
         "n0 capacity, n1 capacity and n2 capacity: one combination is not determined; "
         "the recordings do not see the move (in prior spreads) "
         "n0 capacity up 0.82, n1 capacity down 0.41, n2 capacity up 0.41"
@@ -115,8 +115,8 @@ def test_a_long_combination_names_its_largest_parts():
     unknowns = tuple(named(f"nodes.n{i}.capacity", spread=1.0) for i in range(9))
     unseen = np.linspace(1.0, 0.6, 9)
     found = undetermined(fitted(unknowns, np.linalg.svd(unseen[None])[2][1:]), unknowns)
-    assert found[0].words.startswith("9 parameters together: one combination is not determined; ")
-    assert found[0].words.endswith("n5 capacity up 0.31, and 3 more with smaller parts")
+    assert found[0].summary.startswith("9 parameters together: one combination is not determined; ")
+    assert found[0].summary.endswith("n5 capacity up 0.31, and 3 more with smaller parts")
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -128,7 +128,7 @@ def test_mixed_directions_are_told_apart(seed):
     seen = [np.eye(14)[place[i]] for i in range(5, 14)]
     seen += [np.eye(14)[place[1]] - np.eye(14)[place[2]], np.eye(14)[place[3]] + np.eye(14)[place[4]]]
     found = undetermined(fitted(unknowns, rng.normal(size=(11, 11)) @ np.array(seen), seed=seed), unknowns)
-    told = {(u.names, u.words.split(": ")[1]) for u in found}
+    told = {(u.names, u.summary.split(": ")[1]) for u in found}
 
     def pair(a: int, b: int) -> tuple[str, ...]:
         return tuple(unknowns[i].name for i in sorted((place[a], place[b])))
@@ -147,7 +147,7 @@ def test_weakly_seen_directions_are_still_told_apart():
     seen = np.vstack([np.eye(10)[4:], [1, -1, 0, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 1, 0, 0, 0, 0, 0, 0],
                       0.005 * rng.normal(size=(10, 10))])  # fmt: skip
     found = undetermined(fitted(unknowns, seen), unknowns)
-    assert sorted(u.words for u in found) == [
+    assert sorted(u.summary for u in found) == [
         "n0 capacity and n1 capacity: only their ratio",
         "n2 capacity and n3 capacity: only their product",
     ]
@@ -160,7 +160,7 @@ def test_strong_information_elsewhere_does_not_hide_a_pair():
     seen = 1e4 * np.hstack([np.vstack([np.eye(3), np.ones((1, 3))]), [[0, 0]] * 3 + [[1, -1]]])
     unknowns = (*others, *pair)
     found = undetermined(fitted(unknowns, seen), unknowns)
-    assert [u.words for u in found] == ["a capacity and b capacity: only their ratio"]
+    assert [u.summary for u in found] == ["a capacity and b capacity: only their ratio"]
 
 
 def test_nothing_to_say_when_all_is_determined():
@@ -240,5 +240,5 @@ def test_the_order_of_parameters_changes_no_words():
     for order in itertools.permutations(range(4)):
         shuffled = tuple(unknowns[i] for i in order)
         found = undetermined(fitted(shuffled, seen[:, order]), shuffled)
-        told.add(frozenset((frozenset(u.names), u.words.split(": ")[1]) for u in found))
+        told.add(frozenset((frozenset(u.names), u.summary.split(": ")[1]) for u in found))
     assert len(told) == 1

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.views.layout import _crossings, flattened, places, resistance_distance
+from twin.views.layout import crossings, flattened, places, resistance_distance
 
 RING = {("a", "b"): 5.0, ("b", "c"): 1.0, ("c", "d"): 5.0, ("d", "a"): 1.0, ("a", "e"): 2.0, ("c", "f"): 30.0}
 PITCH = (2.0, 1.5)
 
 
-def crossings(at: dict[str, tuple[float, float]], links: dict[tuple[str, str], float]) -> int:
+def n_crossings(at: dict[str, tuple[float, float]], links: dict[tuple[str, str], float]) -> int:
     names = list(at)
     ends = np.array([(names.index(a), names.index(b)) for a, b in links])
     xy = np.array([at[n] for n in names])[None]
-    return int(_crossings(xy[:, ends[:, 0]], xy[:, ends[:, 1]], ends)[0])
+    return int(crossings(xy[:, ends[:, 0]], xy[:, ends[:, 1]], ends)[0])
 
 
 def test_a_ring_with_tails_has_no_crossing_and_every_body_its_own_place() -> None:
@@ -22,15 +22,15 @@ def test_a_ring_with_tails_has_no_crossing_and_every_body_its_own_place() -> Non
     xy = np.array(list(at.values()))
     apart = np.abs(xy[:, None] - xy[None])
     shares_a_row = apart[..., 1] < 1e-9
-    assert crossings(at, RING) == 0
+    assert n_crossings(at, RING) == 0
     assert (apart[..., 0][shares_a_row & ~np.eye(6, dtype=bool)] >= PITCH[0] - 1e-9).all()
     assert xy.min(axis=0).tolist() == [0.0, 0.0]
 
 
 def test_crossings_are_counted() -> None:
     square = {"a": (0.0, 0.0), "b": (1.0, 1.0), "c": (1.0, 0.0), "d": (0.0, 1.0)}
-    assert crossings(square, {("a", "b"): 1.0, ("c", "d"): 1.0}) == 1
-    assert crossings(square, {("a", "c"): 1.0, ("b", "d"): 1.0}) == 0
+    assert n_crossings(square, {("a", "b"): 1.0, ("c", "d"): 1.0}) == 1
+    assert n_crossings(square, {("a", "c"): 1.0, ("b", "d"): 1.0}) == 0
 
 
 def test_the_same_network_in_another_order_of_links_stands_at_the_same_places() -> None:

@@ -7,7 +7,7 @@ from toy_problems import ToyProblem, decay, linear, unknowns
 import twin.calibration.arrow
 from data.errors import InputError, WorkError
 from twin.calibration.identifiability import intervals90
-from twin.calibration.least_squares import Unknown, fit
+from twin.calibration.least_squares import FitOptions, Unknown, fit
 
 
 def linear_problem(seed: int = 0, rows: tuple[int, ...] = (40, 25, 3)) -> ToyProblem:
@@ -50,7 +50,7 @@ def test_linear_gaussian_equals_the_dense_closed_form(gram_limit, monkeypatch):
     np.testing.assert_allclose(found.information_data, np.linalg.inv(covariance[:4, :4]) - prior, rtol=1e-9)
     precision = np.concatenate([np.diag(prior), np.ones(5)])
     assert found.dof == pytest.approx(68 - (9 - np.sum(precision * np.diag(covariance))), rel=1e-10)
-    assert found.converged and found.words == "converged after 1 step"
+    assert found.converged and found.message == "converged after 1 step"
 
 
 def test_cost_is_the_sum_of_residuals_and_priors():
@@ -97,7 +97,7 @@ def test_an_exponential_recovers_the_truth_within_its_intervals():
 
 def test_the_optimum_is_stationary():
     problem = decay_problem()
-    found = fit(problem, tolerance=1e-14)
+    found = fit(problem, FitOptions(tolerance=1e-14))
     gradient = found.x.copy()  # the prior has mean 0 and spread 1
     for b, (residual, nuisance) in enumerate(
         zip(problem.residuals(found.x, found.nuisance), found.nuisance, strict=True)
@@ -125,7 +125,7 @@ def test_a_bound_is_kept_and_told():
     given = (Unknown("p0", "K", 0.0, 1.0, -5, 1.0, "linear"), Unknown("p1", "K", 0.0, 1.0, scale="linear"))
     measured = design @ [3.0, 1.0]
     found = fit(ToyProblem(given, [measured], linear([design])))
-    assert found.at_bound == ("p0",) and found.words.endswith("; at its bound: p0")
+    assert found.at_bound == ("p0",) and found.message.endswith("; at its bound: p0")
     assert found.x[0] == 1.0 and found.converged
     # The other parameter is at its optimum given the bound.
     column = design[:, 1]
@@ -146,12 +146,12 @@ def double_well(measured: list[float]) -> ToyProblem:
 def test_more_starts_find_the_better_optimum():
     problem = double_well([0.0, -1.2])
     assert fit(problem).x[0] == pytest.approx(1, abs=0.05)
-    best = fit(problem, starts=6, seed=1)
+    best = fit(problem, FitOptions(starts=6, seed=1))
     assert best.x[0] == pytest.approx(-1, abs=0.05)
-    reached = int(re.search(r"; (\d) of 6 starts reached this optimum \(cost within 0\.1 %\)", best.words).group(1))
+    reached = int(re.search(r"; (\d) of 6 starts reached this optimum \(cost within 0\.1 %\)", best.message).group(1))
     assert 1 <= reached <= 5
-    again = fit(problem, starts=6, seed=1)
-    assert again.words == best.words and again.x[0] == best.x[0]
+    again = fit(problem, FitOptions(starts=6, seed=1))
+    assert again.message == best.message and again.x[0] == best.x[0]
 
 
 def test_two_optima_of_equal_cost_are_told():
@@ -161,13 +161,13 @@ def test_two_optima_of_equal_cost_are_told():
         return np.array([5 * (x[0] ** 2 - 1)]), np.array([[10 * x[0]]])
 
     problem = ToyProblem(given, [np.zeros(1)], model)
-    assert "ended elsewhere at the same cost, so the recordings do not tell these apart" in (
-        fit(problem, starts=8, seed=0).words
+    assert "ended elsewhere at the same cost, so the recordings do not distinguish them" in (
+        fit(problem, FitOptions(starts=8, seed=0)).message
     )
 
 
 def test_one_start_says_nothing_of_starts():
-    assert "start" not in fit(decay_problem()).words
+    assert "start" not in fit(decay_problem()).message
 
 
 def test_an_overshooting_step_is_damped():
@@ -219,9 +219,9 @@ def test_further_starts_that_fail_are_counted():
     def model(x, b):
         return (np.full(3, np.nan) if abs(x[0]) > 0.5 else np.full(3, x[0])), np.ones((3, 1))
 
-    found = fit(ToyProblem(unknowns(1), [np.zeros(3)], model), starts=6, seed=0)
+    found = fit(ToyProblem(unknowns(1), [np.zeros(3)], model), FitOptions(starts=6, seed=0))
     draws = np.random.default_rng(0).standard_normal((6, 1))[1:, 0]
-    assert found.words.endswith(f"; {np.count_nonzero(np.abs(draws) > 0.5)} could not be simulated")
+    assert found.message.endswith(f"; {np.count_nonzero(np.abs(draws) > 0.5)} could not be simulated")
 
 
 def test_a_wrong_derivative_is_not_called_converged():
@@ -230,7 +230,7 @@ def test_a_wrong_derivative_is_not_called_converged():
 
     found = fit(ToyProblem((Unknown("p0", "K", 0.0, 1.0, scale="linear"),), [np.zeros(2)], model))
     assert not found.converged
-    assert "no step lowers the cost, though the linear model expects" in found.words
+    assert "no step lowers the cost, though the linear model expects" in found.message
 
 
 def test_a_model_with_noise_of_its_own_converges_as_far_as_it_is_smooth():
@@ -240,7 +240,7 @@ def test_a_model_with_noise_of_its_own_converges_as_far_as_it_is_smooth():
 
     found = fit(ToyProblem((Unknown("p0", "K", 0.0, 1.0, scale="linear"),), [np.array([7.0, 0.1])], model))
     assert found.converged
-    assert re.match(r"converged after \d+ steps? as far as the model is smooth", found.words)
+    assert re.match(r"converged after \d+ steps? as far as the model is smooth", found.message)
 
 
 def test_derivatives_a_little_off_are_told_in_standard_deviations():
@@ -250,7 +250,7 @@ def test_derivatives_a_little_off_are_told_in_standard_deviations():
 
     found = fit(ToyProblem((Unknown("p0", "K", 0.0, 1.0, scale="linear"),), [np.array([7.0, 0.1])], model))
     assert found.converged
-    told = re.search(r"as far as the derivatives are exact, to (0\.\d+) posterior standard deviations", found.words)
+    told = re.search(r"as far as the derivatives are exact, to (0\.\d+) posterior standard deviations", found.message)
     assert told and 0.03 < float(told[1]) < 0.32
 
 
@@ -266,9 +266,9 @@ def test_too_few_steps_are_told():
 
     given = tuple(Unknown(f"p{i}", "K", v, 50.0, scale="linear") for i, v in enumerate([-1.2, 1.0]))
     problem = ToyProblem(given, [np.zeros(2)], model)
-    short = fit(problem, max_iterations=4)
+    short = fit(problem, FitOptions(max_iterations=4))
     assert not short.converged
-    assert re.fullmatch(r"stopped after 4 steps, cost still falling by [\d.e+-]+ % a step", short.words)
+    assert re.fullmatch(r"stopped after 4 steps, cost still falling by [\d.e+-]+ % a step", short.message)
     whole = fit(problem)
     assert whole.converged
     np.testing.assert_allclose(whole.x, [1, 1], atol=1e-3)
@@ -326,16 +326,16 @@ def two_channel_problem(second: list[np.ndarray], seed: int = 3) -> ToyProblem:
 
 def test_white_noise_is_not_inflated():
     rng = np.random.default_rng(7)
-    found = fit(two_channel_problem([rng.normal(size=1500) for _ in range(4)]), reweight=True)
+    found = fit(two_channel_problem([rng.normal(size=1500) for _ in range(4)]), FitOptions(reweight=True))
     assert np.all((found.inflation >= 0.95) & (found.inflation <= 1.1))
     assert np.all((found.noise_factor >= 1.0) & (found.noise_factor <= 1.05))
-    assert "; noise settled in round" in found.words
+    assert "; noise settled in round" in found.message
 
 
 def test_correlated_noise_widens_its_channel_alone():
     rng = np.random.default_rng(8)
     memory = 0.9
-    found = fit(two_channel_problem([3 * ar1(rng, 3000, memory) for _ in range(6)]), reweight=True)
+    found = fit(two_channel_problem([3 * ar1(rng, 3000, memory) for _ in range(6)]), FitOptions(reweight=True))
     assert found.inflation[1] == pytest.approx((1 + memory) / (1 - memory), rel=0.15)
     assert found.noise_factor[1] == pytest.approx(3.0, rel=0.05)
     assert found.inflation[0] < 1.1 and found.noise_factor[0] < 1.05
@@ -346,7 +346,7 @@ def test_a_smooth_misfit_of_one_channel_no_longer_bends_the_parameters():
     time = np.linspace(0, 1, 2000)
     problem = two_channel_problem([rng.normal(size=2000) + 30 * np.sin(9 * time + k) for k in range(6)])
     truth = np.array([0.4, -0.2])
-    as_given, weighed = fit(problem), fit(problem, reweight=True)
+    as_given, weighed = fit(problem), fit(problem, FitOptions(reweight=True))
     assert np.abs((as_given.x - truth) / np.sqrt(np.diag(as_given.covariance))).max() > 5
     assert np.abs((weighed.x - truth) / np.sqrt(np.diag(weighed.covariance))).max() < 2
     assert weighed.inflation[1] > 100 and weighed.inflation[0] < 1.1
@@ -363,7 +363,7 @@ def test_intervals_cover_under_correlated_noise_only_with_reweighting():
         truth = rng.normal(size=2)
         problem = ToyProblem(given, [design @ truth + ar1(rng, rows, 0.8) for _ in range(3)], linear([design] * 3))
         for reweight in inside:
-            found = fit(problem, reweight=reweight)
+            found = fit(problem, FitOptions(reweight=reweight))
             inside[reweight] += sum(i.low <= t <= i.high for i, t in zip(intervals90(found, given), truth, strict=True))
     assert inside[False] / (2 * repetitions) < 0.6
     assert 0.85 <= inside[True] / (2 * repetitions) <= 0.95
@@ -371,7 +371,7 @@ def test_intervals_cover_under_correlated_noise_only_with_reweighting():
 
 def test_progress_is_told_per_start():
     said: list[str] = []
-    fit(decay_problem(), starts=2, progress=said.append)
+    fit(decay_problem(), FitOptions(starts=2), progress=said.append)
     assert [s.split(":")[0] for s in said] == ["start 1 of 2", "start 2 of 2"]
 
 
@@ -393,6 +393,6 @@ def test_a_smooth_misfit_at_the_priors_does_not_pass_for_noise():
     wave = 3 * np.sin(4 * times)  # and the model is not quite right
     measured = model(truth, 0)[0] + wave + np.random.default_rng(3).normal(size=len(times))
     given = tuple(Unknown(f"p{i}", "K", 0.0, 0.45, scale="linear") for i in range(2))
-    found = fit(ToyProblem(given, [measured], model), reweight=True)
+    found = fit(ToyProblem(given, [measured], model), FitOptions(reweight=True))
     assert found.converged
     np.testing.assert_allclose(found.x, truth, atol=0.02)

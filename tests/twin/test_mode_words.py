@@ -38,12 +38,12 @@ def test_the_sample_machine_takes_as_long_as_its_text_says(at_6000: list[ModeVie
 
 
 def test_what_moves_against_what(at_6000: list[ModeView]) -> None:
-    words = {time_words(v.time_constant_s): v.words for v in at_6000}
+    words = {time_words(v.time_constant_s): v.label for v in at_6000}
     assert words["7.7 h"] == "bed and table against the room"
     assert words["2.8 h"] == "table against bed"
     assert words["49 min"] == "column_back against head_rear and head_front"
-    assert at_6000[6].words == "fixture against table"
-    assert [v.words for v in at_6000 if max(v.weight, key=lambda b: v.weight[b]) == "air"] == ["air against the room"]
+    assert at_6000[6].label == "fixture against table"
+    assert [v.label for v in at_6000 if max(v.weight, key=lambda b: v.weight[b]) == "air"] == ["air against the room"]
 
 
 def test_shapes_are_normed_and_weights_and_shares_add_up(at_6000: list[ModeView]) -> None:
@@ -67,7 +67,7 @@ def test_one_body_in_a_room() -> None:
         "errors__z__chain": [{"body": "shaft", "gain": "2 um/K"}],
     })  # fmt: skip
     (view,) = mode_views(net, machine_modes(net), np.array([10.0]))
-    assert view.time_constant_s == pytest.approx(2500.0) and view.words == "shaft against the room"
+    assert view.time_constant_s == pytest.approx(2500.0) and view.label == "shaft against the room"
     assert view.error == pytest.approx({"z": 20.0}) and view.share == pytest.approx({"z": 1.0})
 
 
@@ -78,7 +78,7 @@ def test_a_bar_that_bends_its_temperature_moves_within() -> None:
         },
         "exposures": {"shaft-room": "1 W/K", "head-room": "8 W/K"}, "links": {"shaft-head@0": "1 W/K"},
     })  # fmt: skip
-    words = [v.words for v in mode_views(net, machine_modes(net))]
+    words = [v.label for v in mode_views(net, machine_modes(net))]
     assert words[0] == "head and shaft against the room" and "head within" in words
 
 

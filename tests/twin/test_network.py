@@ -116,10 +116,7 @@ BAD = {
         {"bodies__shaft__capcity": "5 kJ/K"},
         "unknown key 'twin.bodies.shaft.capcity'; did you mean 'capacity'?",
     ),
-    "a wrong unit": (
-        {"links__shaft-head": "12 W"},
-        "links.shaft-head.conductance: unit 'W' cannot be read as 'W/K'",
-    ),
+    "a wrong unit": ({"links__shaft-head": "12 W"}, "links.shaft-head.conductance: unit 'W' cannot be read as 'W/K'"),
     "a negative conductance": (
         {"links__shaft-head": "-12 W/K"},
         "links.shaft-head.conductance: got '-12 W/K', expected a conductance above 0 W/K",

@@ -41,7 +41,7 @@ def test_links_exposures_and_sensors() -> None:
         ("head-room", ("head", "room"), 8.0, True),
     }
     assert v.sensors == (("t_shaft", "shaft"), ("t_head", "head"))
-    assert [s.words for s in v.surroundings] == ["recorded as room"]
+    assert [s.label for s in v.surroundings] == ["recorded as room"]
 
 
 def test_heat_has_watts_only_at_a_stated_speed() -> None:
@@ -76,7 +76,7 @@ def test_the_sample_machine() -> None:
     v = overview(network, expanded(twin_part(given)), simulated=given.simulated)
     assert (len(v.bodies), sum(not t.ground for t in v.ties), sum(t.ground for t in v.ties)) == (14, 16, 17)
     assert v.free + v.fixed == len(network.parameters) and v.free == len(network.free)
-    assert {s.name: s.words for s in v.surroundings}["floor"] == ("17.65 °C + 0.5 × (first reading of room − 17.65 °C)")
+    assert {s.name: s.label for s in v.surroundings}["floor"] == ("17.65 °C + 0.5 × (first reading of room − 17.65 °C)")
     for chain in v.chains:
         assert sum(length for _, length, _ in chain.parts) == pytest.approx(0.0, abs=1e-12)
     z = next(c for c in v.chains if c.channel == "z")

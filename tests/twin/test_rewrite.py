@@ -55,9 +55,9 @@ def test_a_block_style_value_gets_lines_of_its_own() -> None:
 
 
 def test_where_it_came_from_is_written_once() -> None:
-    text = with_calibrated(TEXT, "batches: [a, b]\nwhen: 2026-01-01\n")
-    assert "  calibrated:\n    batches: [a, b]\n    when: 2026-01-01\n" in text
-    text = with_calibrated(text, "batches: [c]\nwhen: 2026-02-02\n")
+    text = with_calibrated(TEXT, {"batches": ["a", "b"], "when": "at first"})
+    assert "  calibrated:\n    batches: [a, b]\n    when: at first\n" in text
+    text = with_calibrated(text, {"batches": ["c"], "when": "again"})
     assert text.count("calibrated:") == 1 and "batches: [c]" in text
     assert "\n  surroundings:\n" in text
     parse_machine(text, "again")

@@ -125,7 +125,7 @@ def test_start_of_bodies(tmp_path: Path, machine: Machine) -> None:
         ("stages: []", "key 'stages': got []; List should have at least 1 item"),
         ("stages: [{repeat: 0, stages: [{hours: 1}]}]", "stage 1: repeat: got 0, expected a whole number from 1"),
         ("stages: [{repeat: 2}]", "stage 1: repeat needs a list of stages"),
-        ("stages: [{repeat: 2, hours: 1, stages: [{hours: 1}]}]", "unknown key 'hours' beside repeat"),
+        ("stages: [{repeat: 2, hours: 1, stages: [{hours: 1}]}]", "unknown key 'hours' next to repeat"),
         ("stages: [{repeat: 2, stages: [{hours: 1}, {hour: 1}]}]", "stage 1.2: unknown key 'hour'; did you mean"),
         ("stages: [{repeat: 999999999, stages: [{seconds: 1}]}]", "expected at most a year"),
         ("stages: &a [{repeat: 2, stages: *a}]", "more than 8 levels or 100000 stages"),
@@ -208,7 +208,7 @@ def test_short_gaps_are_held_and_a_room_file_must_reach(tmp_path: Path, machine:
 
 
 def test_other_files_and_missing_ones(tmp_path: Path, machine: Machine) -> None:
-    assert "unknown suffix '.json'" in str(_raised(tmp_path / "p.json", machine, "{}"))
+    assert "unsupported file extension '.json'" in str(_raised(tmp_path / "p.json", machine, "{}"))
     assert "no such file" in str(_raised(tmp_path / "p.csv", machine, None))
     assert "cannot be read" in str(_raised(tmp_path / "p.yml", machine, None))
 

@@ -11,12 +11,12 @@ import pytest
 from data.errors import InputError
 from data.machine import load_machine
 from tests.twin.drives import at, drive, network, one_body
-from tests.twin.test_simulation import _sample_inputs
+from tests.twin.test_simulation import sample_inputs
 from twin.compile import compile_network
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import Inputs
-from twin.simulation.sensitivity import sensitivities
+from twin.simulation.sensitivity import Selected, sensitivities
 
 SAMPLE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 
@@ -26,7 +26,7 @@ def gaps(
 ) -> np.ndarray:
     """Largest error of each parameter's derivative, relative to its largest value in readings or errors, (Q,)."""
     values = net.values if values is None else values
-    _, d_readings, d_errors = sensitivities(net, values, inputs, start, numbers, tolerance_K=1e-8)
+    _, d_readings, d_errors = sensitivities(net, values, inputs, start, Selected(numbers), tolerance_K=1e-8)
     moved = np.repeat(values[None], 2 * len(numbers), axis=0)
     for q, j in enumerate(numbers):
         p = net.parameters[j]
@@ -45,7 +45,7 @@ def test_every_free_parameter_of_the_sample_machine() -> None:
     sample = compile_network(load_machine(SAMPLE))
     time_s = np.arange(0, 7201.0, 300.0)
     rpm = np.array([6000.0] * 12 + [0.0] * 6 + [2000.0] * 6)
-    inputs = _sample_inputs(sample, time_s, rpm, 18 + time_s / 3600)
+    inputs = sample_inputs(sample, time_s, rpm, 18 + time_s / 3600)
     start = 18 + np.random.default_rng(0).normal(0, 1, (1, 1, 14))
     numbers = sample.free.tolist()
     assert len(numbers) >= 40
@@ -116,7 +116,7 @@ def test_starts_and_offsets_are_each_batchs_own() -> None:
     net = everything()
     inputs = drive(np.arange(0, 3601.0, 60.0), rpm=4000.0, n_batches=2)
     start = np.broadcast_to(np.array([25.0, 20, 21, 22, 23]), (1, 2, 5))
-    _, d_readings, d_errors = sensitivities(net, net.values, inputs, start, [], starts=True, offsets=[0, 1])
+    _, d_readings, d_errors = sensitivities(net, net.values, inputs, start, Selected([], True, [0, 1]))
     assert d_readings.shape == (4, 2, 61, 2) and d_errors.shape == (4, 2, 61, 1)
     for q in range(4):
         sides = []
@@ -126,7 +126,7 @@ def test_starts_and_offsets_are_each_batchs_own() -> None:
                 moved[:, :, list(net.bodies.values())[q]] += side
             else:
                 offsets[:, :, q - 2] = side
-            sides.append(simulate(net, net.values, inputs, moved, tolerance_K=1e-9, offsets_K=offsets))
+            sides.append(simulate(net, net.values, replace(inputs, offsets_K=offsets), moved, tolerance_K=1e-9))
         for got, name in ((d_readings[q], "readings"), (d_errors[q], "errors")):
             expected = (getattr(sides[0], name) - getattr(sides[1], name))[0] / 2e-3
             np.testing.assert_allclose(got, expected, atol=1e-5 * np.abs(expected).max())

@@ -39,7 +39,7 @@ def test_one_body_answers_a_step_of_heat_and_a_moving_room() -> None:
     expected = 20 + 12 * (1 - decay) + drift * (time_s - tau * (1 - decay))
     np.testing.assert_allclose(out.readings[0, 0, :, 0], expected, rtol=1e-13)
     np.testing.assert_allclose(out.errors[0, 0, :, 0], 2 * (expected - 20), atol=1e-11)
-    assert out.words == "linear: exact"
+    assert out.message == "linear: exact"
 
 
 def test_two_bodies_between_them_and_the_room() -> None:
@@ -117,7 +117,7 @@ def test_the_sample_machine_against_stiff_solvers(sample: Network, method: str) 
     minutes = np.arange(0, 181.0)
     rpm = np.repeat([6000.0, 0.0, 3000.0], 60)
     room = 18.0 + 0.5 * minutes / 60
-    inputs = _sample_inputs(bare, 60 * minutes, rpm, room)
+    inputs = sample_inputs(bare, 60 * minutes, rpm, room)
     out = simulate(bare, bare.values, inputs.refined(16), at(18, bare), tolerance_K=1e-6, keep_cells=True)
     start = np.full(14, 18.0)
     states = [start]
@@ -143,11 +143,11 @@ def _floor(sample: Network) -> float | None:
     from twin.simulation.air import air_of
 
     s = [g.name for g in sample.surroundings].index("floor")
-    inputs = _sample_inputs(sample, np.array([0.0, 60.0]), np.zeros(1), np.full(2, 18.0))
+    inputs = sample_inputs(sample, np.array([0.0, 60.0]), np.zeros(1), np.full(2, 18.0))
     return float(air_of(sample, sample.values[None], inputs).ends(s)[0, 0, 0, 0])
 
 
-def _sample_inputs(net: Network, time_s: np.ndarray, rpm: np.ndarray, room: np.ndarray):  # type: ignore[no-untyped-def]
+def sample_inputs(net: Network, time_s: np.ndarray, rpm: np.ndarray, room: np.ndarray):  # type: ignore[no-untyped-def]
     given = drive(time_s, rpm, room)
     first = {r.channel: np.array([room[0]]) for r in net.readings} | {"room": room[:1]}
     return replace(given, drivers={"spindle_rpm": given.drivers["rpm"]}, first=first)
@@ -203,7 +203,7 @@ def test_feedback_that_does_not_contract_is_solved_in_windows() -> None:
     exact = solve_ivp(rate, (0, 14400), [20.0, 20.0], "LSODA", t_eval=time_s, rtol=1e-10, atol=1e-9).y.T
     rise = np.abs(exact - 20).max()
     assert rise > 5
-    assert out.windows > 1 and f"in {out.windows} windows" in out.words
+    assert out.windows > 1 and f"in {out.windows} windows" in out.message
     np.testing.assert_allclose(out.readings[0, 0], exact, atol=2e-4 * rise)
 
 
@@ -244,7 +244,7 @@ def test_a_closed_network_keeps_its_energy_with_exchange_that_follows_temperatur
             "air": {"law": "natural_convection", "at": {"body": "shaft", "air": "head"}, "into": "shaft"},
             "glow": {"law": "radiation", "at": {"body": "shaft", "surrounding": "head"}, "into": "shaft"},
             "spin": {"law": "rotating_convection", "drivers": "rpm", "acts_on": "shaft-head"},
-        },
+        }
     )
     net = closed(net)
     time_s = np.arange(0, 18001.0, 100.0)
@@ -274,7 +274,7 @@ def test_a_noisy_speed_is_as_exact_as_the_same_speed_in_regimes() -> None:
     steps = np.linspace(0, 6000, 60)
     rpm = steps[np.random.default_rng(0).integers(0, 60, 120)]
     few = simulate(net, net.values, drive(time_s, rpm=rpm), at(20, net))
-    assert few.words == "linear: exact"
+    assert few.message == "linear: exact"
     many = rpm + np.linspace(0, 1e-3, 120)  # all different: no regimes
     gap = []
     for n in (1, 4):

@@ -29,7 +29,7 @@ def test_many_sets_and_batches_are_what_they_are_one_by_one() -> None:
     inputs = replace(inputs, n_intervals=np.array([60, 37, 5]))
     start = rng.uniform(15, 30, (4, 3, 2))
     offsets = rng.normal(0, 1, (4, 3, 1))
-    out = simulate(net, values, inputs, start, tolerance_K=1e-8, offsets_K=offsets)
+    out = simulate(net, values, replace(inputs, offsets_K=offsets), start, tolerance_K=1e-8)
     for p in range(4):
         for b in range(3):
             one = inputs.batch([b])
@@ -38,14 +38,8 @@ def test_many_sets_and_batches_are_what_they_are_one_by_one() -> None:
                 one, time_s=one.time_s[:, : m + 1], drivers={"rpm": one.drivers["rpm"][:, :m]},
                 recorded={"room": one.recorded["room"][:, : m + 1]},
             )  # fmt: skip
-            alone = simulate(
-                net,
-                values[p],
-                cut,
-                start[p : p + 1, b : b + 1],
-                tolerance_K=1e-8,
-                offsets_K=offsets[p : p + 1, b : b + 1],
-            )
+            cut = replace(cut, offsets_K=offsets[p : p + 1, b : b + 1])
+            alone = simulate(net, values[p], cut, start[p : p + 1, b : b + 1], tolerance_K=1e-8)
             np.testing.assert_allclose(out.readings[p, b, : m + 1], alone.readings[0, 0], atol=1e-7)
             np.testing.assert_allclose(out.errors[p, b, : m + 1], alone.errors[0, 0], atol=1e-6)
             np.testing.assert_array_equal(out.valid[b], np.arange(61) <= m)
@@ -68,7 +62,7 @@ def test_rows_may_be_fewer_than_intervals() -> None:
     net = network()
     inputs = drive(np.arange(0, 3601.0, 60.0), rpm=4000.0)
     every = simulate(net, net.values, inputs)
-    some = simulate(net, net.values, inputs, every=6)
+    some = simulate(net, net.values, replace(inputs, every=6))
     np.testing.assert_allclose(some.readings, every.readings[:, :, ::6], rtol=1e-13)
     np.testing.assert_allclose(some.time_s, every.time_s[:, ::6])
 
@@ -107,4 +101,4 @@ def test_bad_arrays_are_told_in_one_line() -> None:
     with pytest.raises(InputError, match="start is 'cold', expected 'settled' or temperatures"):
         simulate(net, net.values, inputs, "cold")
     with pytest.raises(InputError, match=r"offsets of surroundings have shape \(1, 1, 4\), expected"):
-        simulate(net, net.values, inputs, offsets_K=np.zeros((1, 1, 4)))
+        simulate(net, net.values, replace(inputs, offsets_K=np.zeros((1, 1, 4))))

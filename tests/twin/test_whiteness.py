@@ -118,7 +118,7 @@ def test_one_sentence_per_channel():
     assert words["bed"].endswith("); rms 0.98 K")
     assert words["head"].startswith("head: the residual is not white in 5 of 5 batches: lag-1 autocorrelation 0.9")
     assert " rows count as one; rms " in words["head"] and words["head"].endswith(" µm")
-    assert words["tank"].startswith("tank: too few rows in 5 batches to say whether the residual is white; rms ")
+    assert words["tank"].startswith("tank: too few rows in 5 batches to test whether the residual is white; rms ")
 
 
 def test_an_empty_table_has_its_columns_and_no_sentence():

@@ -1,5 +1,5 @@
-"""Parameters from recordings: estimation, intervals, what the recordings do not determine, the calibrated file."""
+"""Calibration from recordings: estimation, intervals, identifiability, and the calibrated machine file."""
 
-from twin.calibration.estimate import TOLERANCE, Calibration, calibrate
+from twin.calibration.estimate import TOLERANCE, Calibration, CalibrationOptions, calibrate
 
-__all__ = ["TOLERANCE", "Calibration", "calibrate"]
+__all__ = ["TOLERANCE", "Calibration", "CalibrationOptions", "calibrate"]

@@ -106,7 +106,7 @@ def assemble(
     p = len(z)
     spread = np.array([u.spread for u in unknowns])
     prior = 1.0 / np.sqrt(max(1, len(nuisance)))
-    total = np.zeros((p, p + 1))  # Gram matrices of what every batch says of the parameters, summed
+    total = np.zeros((p, p + 1))  # sum of the Gram matrices of all batches
     large = np.zeros((0, p + 1))  # and as a triangle, of those whose Gram matrices would lose the prior
     corners = []
     for block, current in zip(blocks, nuisance, strict=True):
@@ -151,9 +151,9 @@ def _without_nuisances(gram: Array, q: int) -> tuple[Corner, Array] | None:
     corner, failed = lapack.dpotrf(gram[:q, :q], lower=0, clean=1) if q else (np.zeros((0, 0)), 0)
     if failed:
         return None
-    beside = _solve(corner, gram[:q, q:], transposed=True)
-    left = gram[q:-1, q:] - beside[:, :-1].T @ beside
-    return Corner(corner, beside[:, :-1], beside[:, -1]), left
+    coupling = _solve(corner, gram[:q, q:], transposed=True)
+    left = gram[q:-1, q:] - coupling[:, :-1].T @ coupling
+    return Corner(corner, coupling[:, :-1], coupling[:, -1]), left
 
 
 def triangle(system: Array, gram: Array) -> tuple[Array, Array]:

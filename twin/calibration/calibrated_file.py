@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-
-import yaml
+from typing import Any
 
 from data.errors import InputError, WorkError
 from data.files import write_atomic
 from data.machine import parse_machine
+from data.yaml_edit import YamlText
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, own_paths
 from twin.network import Network
@@ -29,95 +29,61 @@ class Update:
 
 
 def with_values(text: str, updates: Mapping[str, Update], where: str) -> str:
-    """The machine file's text with calibrated values; each keeps its prior's centre beside it.
+    """The machine file's text with calibrated values; each keeps its prior's centre next to it.
 
     `updates` by parameter path ("links.shaft-front.conductance").
 
     Raises:
         InputError: a path that the text does not hold as a value of its own (an anchor, a mechanism's default).
     """
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    edits: list[tuple[int, int, str]] = []
+    document = YamlText(text)
+    put_values(document, updates, where)
+    return str(document)
+
+
+def put_values(document: YamlText, updates: Mapping[str, Update], where: str) -> None:
+    """`with_values` in a text that is edited further. Raises as that does."""
     for path, update in updates.items():
-        node = _find(root, ["twin", *_steps(path)])
-        if node is None:
+        steps, missing = held_steps(document, path)
+        if missing and not (missing == ["conductance"] and document.get([*steps, "value"]) is not None):
             raise InputError(
                 f"{where}: twin.{path} does not stand in the file as a value with a spread; write it there"
             )
-        edits += _edits(node, update)
-    for start, end, new in sorted(edits, reverse=True):
-        text = text[:start] + new + text[end:]
-    return text
+        p = update.parameter
+        value, prior = (v if p.unit == "1" else f"{v:g} {p.unit}" for v in map(kept, (update.value, p.prior_value)))
+        new = {"value": value, "prior": prior, "interval90": [kept(v) for v in update.interval90]}
+        if isinstance(document.get(steps), Mapping):
+            for key, given in new.items():
+                document.set(steps, key, given)
+        else:
+            document.set(steps[:-1], steps[-1], new)
 
 
-def with_calibrated(text: str, lines: str) -> str:
-    """The text with the twin part's `calibrated` entry replaced by `lines` (YAML of a mapping, not indented)."""
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    twin = _entry(root, "twin")
-    if not isinstance(twin, yaml.MappingNode):
-        return text
-    indent = " " * twin.value[0][0].start_mark.column
-    block = f"{indent}calibrated:\n" + "".join(f"{indent}  {line}\n" for line in lines.rstrip().splitlines())
-    for key, value in twin.value:
-        if key.value == "calibrated":
-            start = key.start_mark.index - key.start_mark.column
-            end = text.rfind("\n", 0, value.end_mark.index) + 1  # the mark stands behind the next key's indentation
-            return text[:start] + block + text[end:]
-    first = twin.value[0][0].start_mark
-    at = first.index - first.column
-    return text[:at] + block + text[at:]
+def with_calibrated(text: str, rows: Mapping[str, Any]) -> str:
+    """The text with the twin part's `calibrated` entry, at its beginning, replaced by `rows`."""
+    document = YamlText(text)
+    document.set(["twin"], "calibrated", dict(rows), order=["calibrated"], blocks=1)
+    return str(document)
 
 
-def _steps(path: str) -> list[str]:
-    """ "errors.z.chain[0].length" → errors, z, chain, 0, length."""
-    return path.replace("[", ".").replace("]", "").split(".")
+def held_steps(document: YamlText, path: str) -> tuple[list[str], list[str]]:
+    """The keys that lead to a parameter's path ("errors.z.chain[0].length") as far as the text holds it, and the rest.
+
+    Parameters of a mechanism stand a level deeper than their path says, a lone conductance a level higher.
+    """
+    out, left = ["twin"], path.replace("[", ".").replace("]", "").split(".")
+    while left:
+        deeper = next((d for d in (left[:1], ["parameters", left[0]]) if document.get([*out, *d]) is not None), None)
+        if deeper is None:
+            break
+        out, left = out + deeper, left[1:]
+    return out, left
 
 
-def _find(node: yaml.Node | None, steps: list[str]) -> yaml.Node | None:
-    """The node at a path; parameters stand a level deeper, a lone conductance a level higher, than their path."""
-    while steps and node is not None:
-        here = _entry(node, steps[0])
-        if here is None and steps[0] == "conductance" and _entry(node, "value") is not None:
-            here = node
-        if here is None:
-            deeper = _entry(node, "parameters")
-            here = _entry(deeper, steps[0]) if deeper is not None else None
-        node, steps = here, steps[1:]
-    return node
-
-
-def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
-    if isinstance(node, yaml.SequenceNode):
-        return node.value[int(key)] if key.isdigit() and int(key) < len(node.value) else None
-    if not isinstance(node, yaml.MappingNode):
-        return None
-    return next((v for k, v in node.value if k.value == key), None)
-
-
-def _edits(node: yaml.Node, update: Update) -> list[tuple[int, int, str]]:
-    """Replacements (start, end, new text) that turn a value into a calibrated one."""
-    p = update.parameter
-    low, high = (_number(v) for v in update.interval90)
-    value, prior = (f"{_number(v)} {p.unit}" if p.unit != "1" else _number(v) for v in (update.value, p.prior_value))
-    news = {"value": value, "prior": prior, "interval90": f"[{low}, {high}]"}
-    if not isinstance(node, yaml.MappingNode):
-        return [
-            (node.start_mark.index, node.end_mark.index, "{" + ", ".join(f"{k}: {v}" for k, v in news.items()) + "}")
-        ]
-    edits = []
-    for key, new in news.items():
-        old = _entry(node, key)
-        if old is not None:
-            edits.append((old.start_mark.index, old.end_mark.index, new))
-    missing = [f"{k}: {v}" for k, v in news.items() if _entry(node, k) is None]
-    at, column = node.value[-1][1].end_mark.index, node.value[0][0].start_mark.column
-    glue = ", " if node.flow_style else "\n" + " " * column
-    return [*edits, (at, at, "".join(glue + m for m in missing))] if missing else edits
-
-
-def _number(value: float) -> str:
+def kept(value: float) -> float:
     """Five digits: more than any calibration knows."""
-    return f"{value:.5g}"
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded.is_integer() and abs(rounded) < 1e9 else rounded
 
 
 DIGITS = 5e-5  # relative: what `twin.calibration.calibrated_file` keeps of a value
@@ -135,6 +101,14 @@ class Origin:
     simulated: bool = False
     left_out_rms: dict[str, float] = field(default_factory=dict)
     words: str = ""
+
+    @property
+    def rows(self) -> dict[str, Any]:
+        """The entry under `calibrated`."""
+        rows: dict[str, Any] = {"batches": list(self.batches), "when": self.when, "simulated": self.simulated}
+        if self.left_out_rms:
+            rows["left_out_rms"] = {k: float(f"{v:.3g}") for k, v in self.left_out_rms.items()}
+        return rows | ({"words": self.words} if self.words else {})
 
 
 def check_writable(source: Path, network: Network) -> str:
@@ -169,11 +143,14 @@ def calibrated_text(
         own.get(i.name, i.name): Update(network.parameters[network.index(i.name)], values[i.name], (i.low, i.high))
         for i in intervals
     }
-    new = with_calibrated(with_values(text, updates, where), _lines(origin))
+    new = with_calibrated(with_values(text, updates, where), origin.rows)
     try:
-        again = compile_network(parse_machine(new, where))
+        machine = parse_machine(new, where)
+        again = compile_network(machine)
     except InputError as error:
         raise WorkError(f"{where}: the calibrated file does not read back ({error}); nothing was written") from None
+    if machine.model_copy(update={"twin": None}) != parse_machine(text, where).model_copy(update={"twin": None}):
+        raise WorkError(f"{where}: writing would change more than the twin part; nothing was written")
     for name, value in values.items():
         kept = again.parameters[again.index(name)].value
         if not math.isclose(kept, value, rel_tol=DIGITS * 2, abs_tol=1e-12):
@@ -211,18 +188,3 @@ def check_target(path: Path, source: Path, overwrite: bool = False) -> None:
     same = source.exists() and path.samefile(source)
     what = "is the machine file to calibrate" if same else "exists"
     raise InputError(f"{path}: {what}; give another file, or ask to overwrite it")
-
-
-def _lines(origin: Origin) -> str:
-    """The mapping under `calibrated`, YAML."""
-    rows: dict[str, object] = {"batches": list(origin.batches), "when": origin.when, "simulated": origin.simulated}
-    if origin.left_out_rms:
-        rows["left_out_rms"] = {k: float(f"{v:.3g}") for k, v in origin.left_out_rms.items()}
-    if origin.words:
-        rows["words"] = origin.words
-    return "".join(f"{k}: {_yaml(v)}\n" for k, v in rows.items())
-
-
-def _yaml(value: object) -> str:
-    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
-    return text.removesuffix("...\n").strip()

@@ -1,26 +1,24 @@
-"""Calibration: a machine file's free parameters from recordings, with intervals, and what can be trusted of them."""
+"""Calibration of a machine file's free parameters from recordings, with intervals and left-out errors."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from multiprocessing import get_context
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from data.processes import Processes, one_thread
 from twin.calibration.fit_problem import Unknown
 from twin.calibration.identifiability import Interval, Undetermined, correlation, intervals90, undetermined
-from twin.calibration.least_squares import Fit, fit
+from twin.calibration.least_squares import Fit, FitOptions, fit
 from twin.calibration.problem import EVERY_S, CalibrationProblem
 from twin.calibration.whiteness import in_words, whiteness
 from twin.compile import compile_network
@@ -32,12 +30,12 @@ COLUMNS = ("batch", "channel", "unit", "rows", "left_out", "before", "zero")
 
 @dataclass(frozen=True)
 class Fold:
-    """One batch left out: the values (n,) fitted on all others, whether that fit converged, in words."""
+    """One batch left out: the values (n,) fitted on all others, whether that fit converged, and its message."""
 
     batch_id: str
     values: Array
     converged: bool
-    words: str
+    message: str
 
 
 @dataclass(frozen=True)
@@ -65,23 +63,44 @@ class LeftOut:
         return dict(zip(table["channel"], table["left_out"].astype(float), strict=True))
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """How many batches were left out, and which fits did not converge."""
         lost = [f.batch_id for f in self.folds if not f.converged]
-        told = f"{len(self.folds)} batches left out one by one"
-        return told + (f"; the fit did not converge without {', '.join(lost)}" if lost else "")
+        summary = f"{len(self.folds)} batches left out one by one"
+        return summary + (f"; the fit did not converge without {', '.join(lost)}" if lost else "")
+
+
+TOLERANCE = 1e-3  # of the fit: parameters within 3 % of a posterior standard deviation of their optimum
+
+
+@dataclass(frozen=True)
+class CalibrationOptions(FitOptions):
+    """How a calibration searches (`FitOptions`), and what it uses.
+
+    Rows nearer than `every_s` are left out; holes up to `max_gap_s` are bridged. `channels` takes some sensors and
+    errors alone. With `reweight` a smooth misfit does not pass for certainty. `leave_out` predicts every batch by a
+    calibration on the others, in `processes` processes; results do not depend on their number, and more than one needs
+    an importable main module.
+    """
+
+    tolerance: float = TOLERANCE
+    reweight: bool = True
+    every_s: float = EVERY_S
+    max_gap_s: float = MAX_GAP_S
+    channels: Sequence[str] | None = None
+    leave_out: bool = False
+    processes: int = 1
+
+
+_DEFAULT = CalibrationOptions()
 
 
 def leave_batch_out(
     problem: CalibrationProblem,
-    processes: int = 1,
-    max_iterations: int = 60,
-    tolerance: float = 1e-3,
-    reweight: bool = True,
+    options: CalibrationOptions = _DEFAULT,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> LeftOut:
-    """Every batch predicted by a calibration on all others, each started at the priors' mean and never at a fit that
-    saw the batch. Results do not depend on `processes`; more than one needs an importable main module.
+    """Every batch predicted by a calibration on all others, started at the priors' mean, not at a fit of all batches.
 
     Raises:
         InputError: fewer than two batches, or too few rows in a fold.
@@ -90,9 +109,9 @@ def leave_batch_out(
     n = problem.inputs.n_batches
     if n < 2:
         raise InputError(f"leave-batch-out: got {n} batch, needs 2 or more; give more recordings or leave it off")
-    work = partial(_fold, max_iterations=max_iterations, tolerance=tolerance, reweight=reweight)
+    work = partial(_fold, options=replace(options, starts=1))
     folds = []
-    for fold in _mapped(work, problem, range(n), min(processes, n)):
+    for fold in _mapped(work, problem, range(n), min(options.processes, n)):
         folds.append(fold)
         if progress:
             progress("leave a batch out", len(folds), n)
@@ -121,42 +140,28 @@ def _rows(problem: CalibrationProblem, folds: Sequence[Fold]) -> Iterator[tuple[
                    before[b][c], zero[c])  # fmt: skip
 
 
-def _fold(problem: CalibrationProblem, b: int, max_iterations: int, tolerance: float, reweight: bool) -> Fold:
+def _fold(problem: CalibrationProblem, b: int, options: FitOptions) -> Fold:
     name = problem.measured[b].batch_id
     rest = problem.only([k for k in range(problem.inputs.n_batches) if k != b])
     try:
-        done = fit(rest, max_iterations=max_iterations, tolerance=tolerance, reweight=reweight)
+        done = fit(rest, options)
     except (InputError, WorkError) as error:
         raise type(error)(f"leave-batch-out without {name}: {error}") from None
-    return Fold(name, rest.values_at(done.x), done.converged, done.words)
+    return Fold(name, rest.values_at(done.x), done.converged, done.message)
 
 
 def _mapped(
     work: Callable[[CalibrationProblem, int], Fold], problem: CalibrationProblem, items: Sequence[int], processes: int
 ) -> Iterator[Fold]:
-    if processes < 2:
-        yield from (work(problem, b) for b in items)
-        return
-    with ProcessPoolExecutor(
-        processes, get_context("spawn"), _keep, (work, problem.only(range(problem.inputs.n_batches)))
-    ) as pool:
-        yield from pool.map(_kept, items)
+    with Processes(processes, _start) as pool:
+        yield from pool.map(partial(work, problem.only(range(problem.inputs.n_batches))), items)
 
 
-_held: dict[str, Callable[[int], Fold]] = {}
+def _start() -> None:
+    """First call in a worker process: to find it here loads the twin, since only loaded libraries are limited."""
+    one_thread()
 
 
-def _keep(work: Callable[[CalibrationProblem, int], Fold], problem: CalibrationProblem) -> None:
-    """Once in every process: the problem is sent there once, not with every fold."""
-    threadpool_limits(limits=1)
-    _held["work"] = partial(work, problem)
-
-
-def _kept(b: int) -> Fold:
-    return _held["work"](b)
-
-
-TOLERANCE = 1e-3  # of the fit: parameters within 3 % of a posterior standard deviation of their optimum
 RMS_COLUMNS = ("batch", "channel", "unit", "rows", "before", "after", "fitted")
 
 
@@ -198,7 +203,7 @@ class Calibration:
 
     @cached_property
     def undetermined(self) -> list[Undetermined]:
-        """What the recordings leave to the priors, least determined first."""
+        """Combinations that the recordings do not determine, least determined first."""
         return undetermined(self.fit, self.unknowns)
 
     @cached_property
@@ -210,25 +215,10 @@ class Calibration:
 def calibrate(
     machine: Machine,
     batches: Sequence[Batch],
-    *,
-    starts: int = 1,
-    seed: int = 0,
-    every_s: float = EVERY_S,
-    channels: Sequence[str] | None = None,
-    reweight: bool = True,
-    leave_out: bool = False,
-    processes: int = 1,
-    max_iterations: int = 60,
-    tolerance: float = TOLERANCE,
-    max_gap_s: float = MAX_GAP_S,
+    options: CalibrationOptions = _DEFAULT,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Calibration:
     """The machine's free parameters from its recordings, by MAP least squares (`twin.calibration.least_squares`).
-
-    `starts` begins at the priors' means and, beyond one, at draws from the priors by `seed`. Rows nearer than
-    `every_s` are left out. `channels` takes some sensors and errors alone. With `reweight` each channel's noise and
-    its correlation are re-estimated from what remains, so that a smooth misfit does not pass for certainty.
-    `leave_out` predicts every batch by a calibration on the others, in `processes` processes.
 
     Raises:
         InputError: no twin part, nothing free, a batch that cannot be used, or fewer rows than free parameters.
@@ -237,20 +227,16 @@ def calibrate(
     begun = time.perf_counter()
     check_batches(machine, batches)
     network = compile_network(machine)
-    problem = CalibrationProblem.of(network, batches, every_s, channels, max_gap_s)
-    say = (lambda text: progress(text, 0, 0)) if progress else None
-    done = fit(problem, starts, seed, max_iterations, tolerance, say, reweight)
+    problem = CalibrationProblem.of(network, batches, options.every_s, options.channels, options.max_gap_s)
+    report = (lambda text: progress(text, 0, 0)) if progress else None
+    done = fit(problem, options, report)
     if not (done.converged and np.isfinite(done.x).all() and np.isfinite(done.covariance).all()):
         raise WorkError(
-            f"calibration of {machine.machine}: {done.words}; nothing is kept; give more starts, check the recordings "
-            "and the bounds, or fix parameters that they do not determine"
+            f"calibration of {machine.machine}: {done.message}; nothing is kept; give more starts, check the "
+            "recordings and the bounds, or fix parameters that they do not determine"
         )
     fitted = time.perf_counter()
-    left_out = None
-    if leave_out:
-        left_out = leave_batch_out(
-            problem, processes, max_iterations=max_iterations, reweight=reweight, progress=progress
-        )
+    left_out = leave_batch_out(problem, options, progress) if options.leave_out else None
     return Calibration(
         machine=machine,
         network=_calibrated(problem, done),

@@ -1,4 +1,4 @@
-"""What a calibration solves: unknowns with priors, and a problem that linearises itself batch by batch."""
+"""Interface of the least-squares fit: unknowns with priors, noise, and problems linearised batch by batch."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def estimate(
         for c in np.unique(channel):
             series[c].append(residual[channel == c])
     rows = sum(len(c) for c in channels)
-    left = max(1.0 - parameters / max(1, rows), 0.1)  # a fit that uses nearly every row says little about noise
+    left = max(1.0 - parameters / max(1, rows), 0.1)  # the noise of a nearly saturated fit is hardly determined
     factor, inflation = np.ones(n_channels), np.ones(n_channels)
     for c, parts in enumerate(series):
         n = sum(map(len, parts))

@@ -1,4 +1,4 @@
-"""What the recordings determine of a calibration and what only its prior does, in numbers and in words.
+"""Identifiability of a calibration: intervals, correlation, and combinations determined by the prior alone.
 
 In z = (x − prior) / spread the prior's information is 1 in every direction. Directions in which the data's is below
 that are the prior's (Vajda, Rabitz, Walter & Lecourtier 1989, Chem. Eng. Commun. 83, use the same eigenvectors).
@@ -46,7 +46,7 @@ class Undetermined:
     names: tuple[str, ...]
     direction: Array
     information: float
-    words: str
+    summary: str
 
 
 def intervals90(fit: Fit, unknowns: Sequence[Unknown]) -> list[Interval]:
@@ -66,12 +66,12 @@ def correlation(fit: Fit) -> Array:
 
 
 def prior_shrinkage(fit: Fit, unknowns: Sequence[Unknown]) -> Array:
-    """Posterior sd / prior sd of every parameter (p,): 1 where the recordings say nothing, near 0 where they decide."""
+    """Posterior sd / prior sd of every parameter (p,): 1 without information in the recordings, near 0 with much."""
     return np.sqrt(np.diag(fit.covariance)) / np.array([u.spread for u in unknowns])
 
 
 def undetermined(fit: Fit, unknowns: Sequence[Unknown], information_below: float = 1.0) -> list[Undetermined]:
-    """What the recordings leave to the prior, least determined first.
+    """Combinations that the recordings do not determine, least determined first.
 
     `information_below` in units of the prior's: 1 means that the posterior sd along the direction is above 0.71 of
     the prior's. Eigenvectors of near-equal information mix at will, so their span is described by sparse vectors.
@@ -86,8 +86,8 @@ def undetermined(fit: Fit, unknowns: Sequence[Unknown], information_below: float
     for support, directions in _families(sparse_basis(null)):
         weakest = directions[:, 0] if directions.shape[1] == 1 else _weakest(directions, information)
         seen = float(max(0.0, weakest @ information @ weakest))
-        words = _in_words(directions * spread[:, None], weakest, support, unknowns)
-        found.append(Undetermined(tuple(unknowns[i].name for i in support), weakest, seen, words))
+        summary = _in_words(directions * spread[:, None], weakest, support, unknowns)
+        found.append(Undetermined(tuple(unknowns[i].name for i in support), weakest, seen, summary))
     return sorted(found, key=lambda u: (round(u.information, 3), len(u.names), u.names))
 
 

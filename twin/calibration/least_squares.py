@@ -1,7 +1,7 @@
-"""MAP least squares over batches: parameters with priors, nuisances per batch, convergence told honestly.
+"""MAP least squares over batches: parameters with priors, nuisances per batch, with diagnosed convergence.
 
-Minimises ``Σ |r_b|² + Σ ((x − prior) / spread)² + Σ nuisance²`` from one or several starts (`descent`), on batches
-whose nuisances are eliminated one batch at a time (`arrow`), with the noise as given or re-estimated (`fit_noise`).
+Minimises ``Σ |r_b|² + Σ ((x − prior) / spread)² + Σ nuisance²`` from one or several starts, on batches whose
+nuisances are eliminated one batch at a time (`arrow`), with the noise as given or re-estimated.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class State:
         return sum(map(len, self.channels))
 
     def small(self, tolerance: float) -> bool:
-        """Is what a further step could gain below the tolerance?"""
+        """True if the expected gain of a further step is below the tolerance."""
         dof = max(1.0, self.rows - self.arrow.effective_parameters())
         return self.expected <= tolerance * max(1.0, self.cost / dof)
 
@@ -144,11 +144,11 @@ def _try(problem: Problem, state: State, dz: Array, share: float) -> tuple[State
 
 
 MISFIT, SMOOTH = 3.0, 5.0  # noise factor and rows that count as one: above both, a channel shows no noise but misfit
-SETTLED = 0.2  # change of a channel's weight in a round: 10 % of its sd, less than residuals of a few batches tell
+SETTLED = 0.2  # change of a channel's weight in a round: 10 % of its sd, below what a few batches determine
 
 
 def noise_left(problem: Problem, state: State) -> Noise:
-    """The noise of each channel from what a state leaves over."""
+    """The noise of each channel from the residuals of a state."""
     residuals = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
     return estimate(residuals, state.channels, len(problem.channels), state.arrow.effective_parameters())
 
@@ -228,7 +228,7 @@ class Fit:
 
     `covariance` (p, p) of x: the inverse of the data's information plus the prior's, nuisances marginalised;
     `information_data` (p, p) without the prior. `dof`: rows less the parameters and nuisances that the data determine.
-    `noise_factor` and `inflation` (c,) divide the information as `Noise` says; ones without re-estimation.
+    `noise_factor` and `inflation` (c,) divide the information, see `Noise`; ones without re-estimation.
     """
 
     x: Array
@@ -238,7 +238,7 @@ class Fit:
     cost: float
     history: tuple[Step, ...]
     converged: bool
-    words: str
+    message: str
     at_bound: tuple[str, ...]
     dof: float
     rows: int
@@ -246,59 +246,62 @@ class Fit:
     inflation: Array
 
 
-def fit(
-    problem: Problem,
-    starts: int = 1,
-    seed: int = 0,
-    max_iterations: int = 60,
-    tolerance: float = 1e-6,
-    progress: Callable[[str], None] | None = None,
-    reweight: bool = False,
-) -> Fit:
-    """The MAP estimate, best of `starts`: the prior's mean, then draws from the prior by `seed`.
+@dataclass(frozen=True)
+class FitOptions:
+    """How a fit searches.
 
-    Converged means that the linear model expects the cost to fall by less than `tolerance` times max(1, cost per
-    degree of freedom): x is within √tolerance posterior standard deviations of its optimum. With `reweight` each
-    channel's noise and its correlation are estimated on the way down from the prior's mean (`annealing`) and then from
-    the best start's residuals until they settle.
+    `starts`: the prior's mean, then draws from the prior by `seed`; the best is kept. Converged means that the linear
+    model expects the cost to fall by less than `tolerance` times max(1, cost per degree of freedom): x is within
+    √tolerance posterior standard deviations of its optimum. With `reweight` each channel's noise and its correlation
+    are estimated on the way down from the prior's mean (`annealed`) and then from the residuals of the best start until
+    they settle.
+    """
+
+    starts: int = 1
+    seed: int = 0
+    max_iterations: int = 60
+    tolerance: float = 1e-6
+    reweight: bool = False
+
+
+_DEFAULT = FitOptions()
+
+
+def fit(problem: Problem, options: FitOptions = _DEFAULT, progress: Callable[[str], None] | None = None) -> Fit:
+    """The MAP estimate.
 
     Raises:
         InputError: no free parameter, or fewer usable rows than free parameters.
         WorkError: the model is not finite at the prior's mean.
     """
-    best, notes = settled(problem, starts, seed, max_iterations, tolerance, progress, reweight)
-    return result(problem, best, tolerance, notes)
+    best, notes = settled(problem, options, progress)
+    return result(problem, best, options.tolerance, notes)
 
 
 def settled(
     problem: Problem,
-    starts: int = 1,
-    seed: int = 0,
-    max_iterations: int = 60,
-    tolerance: float = 1e-6,
+    options: FitOptions = _DEFAULT,
     progress: Callable[[str], None] | None = None,
-    reweight: bool = False,
     noise: Noise | None = None,
 ) -> tuple[State, str]:
-    """Where `fit` ends, with the linearisation there, and what is to be said of it; arguments and errors as there.
+    """Where `fit` ends, with the linearisation there, and remarks on the way; arguments and errors as there.
 
-    `noise` is what it begins with; left out, the noise as given.
+    `noise` is the initial noise, by default as given.
     """
     if not problem.unknowns:
         raise InputError("calibration: no parameter is free; give at least one a prior spread in the machine file")
-    limits = max_iterations, tolerance
     with _threads().limit(limits=1):  # small matrices: more threads cost time, and results must not depend on them
-        first = _first(problem, noise, *limits, reweight, progress)
-        best, notes = _best_start(problem, first, starts, seed, *limits, progress)
-        if reweight:
-            best, changed = _with_noise(problem, best, *limits, progress)
+        first = _first(problem, noise, options, progress)
+        best, notes = _best_start(problem, first, options, progress)
+        if options.reweight:
+            best, changed = _with_noise(problem, best, options, progress)
             notes += changed
         return best, notes
 
 
 @cache
 def _threads() -> ThreadpoolController:
-    return ThreadpoolController()  # it looks through every loaded library: once is enough
+    return ThreadpoolController()  # searches every loaded library: once is enough
 
 
 def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
@@ -308,22 +311,16 @@ def _starts(unknowns: Sequence[Unknown], starts: int, seed: int) -> Array:
     return np.clip(draws, *z_bounds(unknowns))
 
 
-def _first(
-    problem: Problem,
-    noise: Noise | None,
-    max_iterations: int,
-    tolerance: float,
-    reweight: bool,
-    progress: Callable[[str], None] | None,
-) -> State:
+def _first(problem: Problem, noise: Noise | None, options: FitOptions, progress: Callable[[str], None] | None) -> State:
     """The prior's mean, or what lies below it with the noise estimated on the way."""
     z, nuisance = _starts(problem.unknowns, 1, 0)[0], [np.zeros(q) for q in problem.nuisance_sizes]
     try:
         state = State.at(problem, z, nuisance, noise or Noise.as_given(len(problem.channels)))
     except WorkError as error:
         raise WorkError(f"calibration: the model fails at the prior's mean: {error}") from None
-    if not reweight:
+    if not options.reweight:
         return state
+    max_iterations, tolerance = options.max_iterations, options.tolerance
     down = annealed(problem, state, max_iterations, tolerance, progress)
     if len(down.history) >= max_iterations or not misfits(noise_left(problem, down)):
         return down
@@ -334,25 +331,20 @@ def _first(
 
 
 def _best_start(
-    problem: Problem,
-    first: State,
-    starts: int,
-    seed: int,
-    max_iterations: int,
-    tolerance: float,
-    progress: Callable[[str], None] | None,
+    problem: Problem, first: State, options: FitOptions, progress: Callable[[str], None] | None
 ) -> tuple[State, str]:
-    """The lowest end of all starts, and what the others did in words."""
+    """The lowest end of all starts, and remarks on the others."""
+    starts = options.starts
     ends: list[State] = []
     lost = 0
-    for number, z in enumerate(_starts(problem.unknowns, starts, seed)):
+    for number, z in enumerate(_starts(problem.unknowns, starts, options.seed)):
         try:
             nuisance = [np.zeros(q) for q in problem.nuisance_sizes]
             start = State.at(problem, z, nuisance, first.noise) if number else first
         except WorkError:
             lost += 1
             continue
-        ends.append(descend(problem, start, len(start.history) + max_iterations, tolerance))
+        ends.append(descend(problem, start, len(start.history) + options.max_iterations, options.tolerance))
         if progress:
             progress(f"start {number + 1} of {starts}: cost {ends[-1].cost:.6g} after {len(ends[-1].history)} steps")
     best = min(ends, key=lambda e: e.cost)
@@ -360,9 +352,9 @@ def _best_start(
 
 
 def _with_noise(
-    problem: Problem, state: State, max_iterations: int, tolerance: float, progress: Callable[[str], None] | None
+    problem: Problem, state: State, options: FitOptions, progress: Callable[[str], None] | None
 ) -> tuple[State, str]:
-    """The optimum under noise that is re-estimated from its own residuals, and how that went in words."""
+    """The optimum under noise that is re-estimated from its own residuals, and a remark on it."""
     change = np.inf
     for number in range(NOISE_ROUNDS):
         noise = noise_left(problem, state)
@@ -370,7 +362,7 @@ def _with_noise(
         if change < SETTLED:
             return state, f"; noise settled in round {number}"
         start = with_noise(problem, state, noise)
-        state = descend(problem, start, len(start.history) + max_iterations, tolerance)
+        state = descend(problem, start, len(start.history) + options.max_iterations, options.tolerance)
         if progress:
             progress(f"noise round {number + 1}: weights changed by up to {100 * change:.0f} %")
     return state, f"; noise not settled: weights still change by {100 * change:.0f} % a round"
@@ -384,11 +376,11 @@ def _starts_in_words(best: State, ends: Sequence[State], starts: int, lost: int)
     alike = [e for e in ends if e.cost <= best.cost * (1 + SAME_COST)]
     near = max(1.0, 4 * SAME_COST * best.cost)
     same = [e for e in alike if float(np.sum((root @ (e.z - best.z)) ** 2)) <= near]
-    words = f"; {len(same)} of {starts} starts reached this optimum (cost within {100 * SAME_COST:g} %)"
+    remark = f"; {len(same)} of {starts} starts reached this optimum (cost within {100 * SAME_COST:g} %)"
     elsewhere = len(alike) - len(same)
     if elsewhere:
-        words += f"; {elsewhere} ended elsewhere at the same cost, so the recordings do not tell these apart"
-    return words + (f"; {lost} could not be simulated" if lost else "")
+        remark += f"; {elsewhere} ended elsewhere at the same cost, so the recordings do not distinguish them"
+    return remark + (f"; {lost} could not be simulated" if lost else "")
 
 
 def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
@@ -397,21 +389,21 @@ def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
     by_noise = state.stuck and state.small(MODEL_NOISE)
     converged = by_noise or state.small(tolerance)
     if converged:
-        words = f"converged after {steps} step{'' if steps == 1 else 's'}"
+        message = f"converged after {steps} step{'' if steps == 1 else 's'}"
         if by_noise and not state.small(MODEL_NOISE / 100):
-            words += (
+            message += (
                 f" as far as the derivatives are exact, to {np.sqrt(state.expected):.2g} posterior standard deviations"
             )
         elif by_noise:
-            words += " as far as the model is smooth"
+            message += " as far as the model is smooth"
     elif state.stuck:
-        words = (
+        message = (
             f"stopped after {steps} steps: no step lowers the cost, though the linear model expects "
             f"{_percent(state.expected / state.cost)}; the derivatives do not fit the model or it is not smooth"
         )
     else:
         fall = state.expected / state.cost  # costs of the history may stand under other noise
-        words = f"stopped after {steps} steps, cost still falling by {_percent(fall)} a step"
+        message = f"stopped after {steps} steps, cost still falling by {_percent(fall)} a step"
     x = x_of(unknowns, state.z)
     low, high = z_bounds(unknowns)
     touching = (state.z <= low + 1e-9) | (state.z >= high - 1e-9)
@@ -428,7 +420,7 @@ def result(problem: Problem, state: State, tolerance: float, notes: str) -> Fit:
         cost=state.cost,
         history=tuple(state.history),
         converged=converged,
-        words=words + notes,
+        message=message + notes,
         at_bound=at_bound,
         dof=state.rows - state.arrow.effective_parameters(),
         rows=state.rows,

@@ -18,11 +18,11 @@ from twin.network import Network
 from twin.quantity import Parameter
 from twin.simulation import choose_substeps, simulate
 from twin.simulation.inputs import MAX_GAP_S, Inputs, inputs_of
-from twin.simulation.sensitivity import sensitivities
+from twin.simulation.sensitivity import Selected, sensitivities
 from twin.simulation.start import start_of
 
 # A body or a well bonded sensor moves within minutes, and neighbouring samples repeat each other's rounding: rows
-# nearer than this cost time and say next to nothing.
+# nearer than this cost time and add almost no information.
 EVERY_S = 300.0
 
 
@@ -181,7 +181,7 @@ class Nuisances:
 class CalibrationProblem:
     """Implements `twin.calibration.fit_problem.Problem`; residuals are whitened by the channels' noise.
 
-    `start_degC` (B, N) is what the first readings say at the machine file's values, the centre of every batch's own
+    `start_degC` (B, N) follows from the first readings at the machine file's values, the centre of every batch's own
     start; `inputs` already hold the substeps that keep the simulation's error there below the finest sensor's noise.
     """
 
@@ -288,10 +288,7 @@ class CalibrationProblem:
         for part in self._together(len(numbers)):
             some = self.only(part)
             own = [nuisance[b] for b in part]
-            start, offset = some.own(own)
-            _, *slopes = sensitivities(
-                self.network, self.values_at(x), some.own_heat(own), start, numbers, offsets_K=offset
-            )
+            _, *slopes = sensitivities(self.network, self.values_at(x), *some.own(own), Selected(numbers))
             slope = np.concatenate(slopes, axis=-1)
             for b, m in enumerate(some.measured):
                 yield (m.of(slope[:, b]) / self.noise[m.channel]).T
@@ -308,8 +305,7 @@ class CalibrationProblem:
         kept = self._last.get(_key(x, nuisance))
         if kept is not None:
             return [block.residual for block in kept]
-        start, offset = self.own(nuisance)
-        simulation = simulate(self.network, self.values_at(x), self.own_heat(nuisance), start, offsets_K=offset)
+        simulation = simulate(self.network, self.values_at(x), *self.own(nuisance))
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         return [self._residual(m, s, v) for m, s, v in zip(self.measured, series, nuisance, strict=True)]
 
@@ -324,15 +320,13 @@ class CalibrationProblem:
         first = self.nuisances.shared - len(self.nuisances.parameters)
         return np.array([v[first : self.nuisances.shared] for v in nuisance]) * self.nuisances.deviation
 
-    def own_heat(self, nuisance: Sequence[Array]) -> Inputs:
-        """The inputs with each batch's own size of the heats that differ from run to run."""
-        if not self._heats:
-            return self.inputs
+    def _own_times(self, nuisance: Sequence[Array]) -> dict[str, Array]:
+        """Each batch's own factor (B,) of the heats that differ from run to run, by law."""
         times: dict[str, Array] = {}
         for names, deviation in zip(self._heats, self.own_deviations(nuisance).T, strict=True):
             for name in names:
                 times[name] = times.get(name, 1.0) * np.exp(deviation)
-        return self.inputs.with_times(times)
+        return times
 
     def free_running_errors(self, values: Array) -> list[Array]:
         """Measured − simulated (n_b,) of every batch in the channels' units, started from its first readings alone."""
@@ -354,12 +348,9 @@ class CalibrationProblem:
         return out
 
     def _blocks(self, x: Array, nuisance: Sequence[Array]) -> Iterator[Block]:
-        start, offset = self.own(nuisance)
         numbers = list(dict.fromkeys([*self.network.free.tolist(), *self.nuisances.parameters.tolist()]))
-        simulation, *slopes = sensitivities(
-            self.network, self.values_at(x), self.own_heat(nuisance), start, numbers,
-            starts=len(self.nuisances.start_K) > 0, offsets=self.nuisances.surroundings.tolist(), offsets_K=offset,
-        )  # fmt: skip
+        selected = Selected(numbers, len(self.nuisances.start_K) > 0, self.nuisances.surroundings.tolist())
+        simulation, *slopes = sensitivities(self.network, self.values_at(x), *self.own(nuisance), selected)
         series = np.concatenate([simulation.readings[0], simulation.errors[0]], axis=-1)
         slope = np.concatenate(slopes, axis=-1)  # (Q, B, K, C)
         free = len(self.unknowns)
@@ -372,17 +363,18 @@ class CalibrationProblem:
                 m.batch_id, self._residual(m, series[b], nuisance[b]), whitened[:, :free], np.hstack(own), m.channel
             )
 
-    def own(self, nuisance: Sequence[Array]) -> tuple[Array, Array | None]:
-        """Start temperatures (1, B, N) and surroundings' offsets (1, B, S) that the batches' nuisances make."""
+    def own(self, nuisance: Sequence[Array]) -> tuple[Inputs, Array]:
+        """The inputs with the heats and surroundings of the batches' nuisances, and start temperatures (1, B, N)."""
         bodies = len(self.nuisances.start_K)
         shared = np.array([v[: self.nuisances.shared] for v in nuisance]).reshape(len(nuisance), -1)
         start = self.start_degC + shared[:, :bodies] @ self.nuisances.start_K
+        times = self._own_times(nuisance) or self.inputs.times
         if not len(self.nuisances.surroundings):
-            return start[None], None
+            return self.inputs.with_own(times), start[None]
         offset = np.zeros((len(nuisance), len(self.network.surroundings)))
         own = shared[:, bodies : bodies + len(self.nuisances.surroundings)]
         offset[:, self.nuisances.surroundings] = own * self.nuisances.offset_K
-        return start[None], offset[None]
+        return self.inputs.with_own(times, offset[None]), start[None]
 
     def _residual(self, m: Measured, series: Array, nuisance: Array) -> Array:
         """(n_b,) of one batch whose channels were simulated as (K, C)."""

@@ -1,4 +1,4 @@
-"""Is what a fit leaves over white? Per batch and channel, for series with gaps (NaN).
+"""Whiteness tests of residuals per batch and channel, for series with gaps (NaN).
 
 Residuals are taken about zero, not about their mean: under the model zero is what is expected, and an offset
 that stays is as much a misfit as a slope.
@@ -121,7 +121,7 @@ def _sentence(channel: str, rows: pd.DataFrame, unit: str) -> str:
     p = np.clip(rows["ljung_box_p"].dropna().to_numpy(float), 1e-300, 1.0)
     size = f"rms {rms:.2g} {unit}".rstrip()
     if len(p) == 0:
-        return f"{channel}: too few rows in {of} to say whether the residual is white; {size}"
+        return f"{channel}: too few rows in {of} to test whether the residual is white; {size}"
     lag1 = np.sum(n * rows["lag1"].fillna(0)) / n.sum()
     if float(combine_pvalues(p.tolist()).pvalue) > 0.01:
         return f"{channel}: the residual is white over {of} (lag-1 autocorrelation {lag1:.2f}); {size}"

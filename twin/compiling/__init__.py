@@ -1,1 +1,1 @@
-"""Readers of the twin part, one for each of its groups; `twin.compile` puts a network together from them."""
+"""Compilation of the twin part group by group; `twin.compile` assembles the network."""

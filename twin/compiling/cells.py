@@ -1,4 +1,4 @@
-"""Cells: bodies cut into lumps, and places in them as weights over all cells."""
+"""Discretisation of bodies into cells, and places as weights over all cells."""
 
 from __future__ import annotations
 

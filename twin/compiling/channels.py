@@ -1,4 +1,4 @@
-"""Surroundings, sensors and error chains: what is recorded, and what the network makes of it."""
+"""Compilation of surroundings, sensors and error chains."""
 
 from __future__ import annotations
 
@@ -51,10 +51,7 @@ def reading(scope: Scope, channel: str, given: Sensor) -> Reading:
         effects.append(Law(f"{channel}.{attribute}", mechanism, {mechanism.parameters[0].name: index}, {}, ports))
     noise = _noise(scope, key, channel, given.noise, "K")
     return Reading(
-        channel,
-        scope.cells.weights(given.at, f"{key}.at"),
-        (*effects, *acting(scope, "reading", channel)),
-        noise,
+        channel, scope.cells.weights(given.at, f"{key}.at"), (*effects, *acting(scope, "reading", channel)), noise
     )
 
 

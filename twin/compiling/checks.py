@@ -1,4 +1,4 @@
-"""Does a twin part make sense? Problems in words, each with its key and the remedy."""
+"""Plausibility checks of a twin part: messages with key and remedy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TYPICAL_UM_PER_M_K = 11.0
 
 
 def problems(network: Network, part: TwinPart) -> Iterator[str]:
-    """What compiles and yet cannot be meant: islands, open chains, mechanisms that act on nothing, idle bodies."""
+    """Messages on implausible parts: islands, open chains, mechanisms without effect, idle bodies."""
     yield from _islands(network)
     yield from _open_chains(part)
     yield from _pointless(part)

@@ -1,4 +1,4 @@
-"""Mechanisms at work: their parameters, drivers, ports and outlets looked up."""
+"""Compilation of mechanisms: parameters, drivers, ports and outlets."""
 
 from __future__ import annotations
 

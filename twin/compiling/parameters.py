@@ -1,4 +1,4 @@
-"""The parameter table: every value of a twin part under its path, made once, however often it is used."""
+"""Parameter table: every value of a twin part by its path, created once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MATERIAL = {
 
 
 class ParameterTable:
-    """Collects parameters by path; asking twice gives the same number."""
+    """Collects parameters by path; a repeated path gives the same number."""
 
     def __init__(self, part: TwinPart) -> None:
         self.part = part

@@ -1,4 +1,4 @@
-"""The mechanisms by key. A new one: a class in its group's file and a line here."""
+"""Registry of mechanisms. A new one is a class in the file of its group plus a line here."""
 
 from data.registry import Registry
 

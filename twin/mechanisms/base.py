@@ -1,9 +1,9 @@
-"""What every mechanism is.
+"""Base class of the mechanisms, and functions for writing their laws.
 
-To add one: a class below `Mechanism` in a file of its group and a line in `twin/mechanisms/__init__.py`. State what it
-needs (drivers, ports, parameters) and override the one or two effects that it has. Laws are written once, forward, as
-plain numpy on arrays of any shape; their derivatives come by the complex step (Squire and Trapp 1998), so a law must
-stay analytic: no abs() or comparisons on temperatures but through `real` and `numpy.where`.
+To add a mechanism, write a subclass of `Mechanism` in the file of its group and a line in
+`twin/mechanisms/__init__.py`. It declares its drivers, ports and parameters and overrides one or two effects. Laws are
+plain numpy on arrays of any shape. Derivatives are taken by complex steps (Squire and Trapp 1998), so a law must be
+analytic: use `size`, `power`, and `numpy.where` on `real` values instead of abs() and comparisons.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from data.arrays import Numeric
-from twin.quantity import Spec
+from data.errors import closest
+from twin.quantity import Spec, Value
 
 if TYPE_CHECKING:
     from twin.schema import MechanismPart, TwinPart
 
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
-# Where a diagnosis looks for a port's temperature: at the place acted at, at each surrounding, at each body linked
-# with that place (of an error, with the port before it), at any other body, at one without a link to that place (each
-# pair once), or where the heat acted on goes into.
+# Where a diagnosis places a port: at the target, at each surrounding, at each body linked with the target (of an error,
+# with the previous port), at any other body, at a body without a link to the target (each pair once), or where the
+# multiplied heat goes.
 PortRole = Literal["itself", "surrounding", "neighbour", "body", "unlinked", "outlet"]
 SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
 
 
 @dataclass(frozen=True)
 class View:
-    """What a law sees. All arrays broadcast together; time is the last axis.
+    """Inputs of a law. All arrays broadcast together; time is the last axis.
 
     degC: temperatures by port. rise_K: the same less the batch's first value. driver: driver channels by the law's
     own names for them (held during each interval). time_s from the batch's start; clock_h the time of day, nan where
@@ -51,13 +52,13 @@ class View:
 
 
 class Mechanism(ABC):
-    """A piece of physics that a machine file can use and a diagnosis can propose.
+    """A physical effect that a machine file can use and a diagnosis can propose.
 
-    parameters reach the effects as a mapping name -> value (scalar or array that broadcasts), in the units stated.
+    Parameters reach the effects as a mapping name -> value (scalar or array that broadcasts), in the units stated.
     """
 
     key: ClassVar[str]
-    words: ClassVar[str]  # "viscous friction of the bearings": the name an engineer would use
+    summary: ClassVar[str]  # "viscous friction of the bearings": the name an engineer would use
     equation: ClassVar[str]  # plain text
     source: ClassVar[str]  # author, year, equation
     signature: ClassVar[str]  # how it shows in recordings
@@ -73,23 +74,21 @@ class Mechanism(ABC):
     # What a diagnosis needs
     off: ClassVar[Mapping[str, float] | None]  # what scales the effect, at the values without one; None: nothing does
     shape: ClassVar[tuple[str, ...]] = ()  # parameters that change its form in time or over drivers, not its size
-    ghost: ClassVar[Mapping[str, float]] = {}  # values at which a structural one hardly loads its neighbours
+    ghost: ClassVar[Mapping[str, float]] = {}  # values at which a structural mechanism hardly affects its neighbours
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values of a shape at which a diagnosis looks for it
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values of a shape at which a diagnosis evaluates it
     all_errors: ClassVar[bool] = False  # True: one instrument shows all errors, so it may act on all of them together
     all_air: ClassVar[bool] = False  # True: it may act on all surroundings of one recorded channel together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
-    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour, which a finer one explains
-    of_network: ClassVar[bool] = False  # True: what it says is how the network is drawn, which no real body is
-    goes_with: ClassVar[tuple[str, ...]] = ()  # laws of which one is at its place, wherever there is such a machine
-    only_driven: ClassVar[bool] = False  # True: without its optional driver it is no news, but another value
+    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour
+    of_network: ClassVar[bool] = False  # True: a property of the network's discretisation, not of a real body
+    goes_with: ClassVar[tuple[str, ...]] = ()  # laws of which one acts at the same place in every real machine
+    only_driven: ClassVar[bool] = False  # True: proposed only with its optional driver
     proposable: ClassVar[bool] = True  # False: no use as a candidate
 
-    linear_reading: ClassVar[bool] = (
-        False  # True: `reading` is a linear map of what is seen and the ports, plus a constant
-    )
+    linear_reading: ClassVar[bool] = False  # True: `reading` is affine in the temperatures that it depends on
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Fills in the usual roles: at a node the first port is the node itself, and air is a surrounding."""
@@ -104,7 +103,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        """What the conductance of a link or exposure (drivers only), or another mechanism's heat, is multiplied by."""
+        """Factor on the conductance of a link or exposure (drivers only), or on another mechanism's heat."""
         raise NotImplementedError
 
     def displacement(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -112,7 +111,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def reading(self, seen: Numeric, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        """What a sensor or a probe shows of what it sees, in the channel's unit; time along the last axis."""
+        """Reading of a sensor or probe from the true value, in the channel's unit; time along the last axis."""
         raise NotImplementedError
 
     def surrounding_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -124,7 +123,7 @@ class Mechanism(ABC):
         raise NotImplementedError
 
     def at_work(self, view: View, p: Mapping[str, Numeric]) -> Numeric | None:
-        """How far it works, 0 to 1, where it states windows of its own; None: while its drivers run, or always."""
+        """Activity, 0 to 1, for mechanisms with time windows; None: active while its drivers run, or always."""
         return None
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
@@ -133,6 +132,24 @@ class Mechanism(ABC):
         The instance itself is removed by the caller. Default: nothing to add.
         """
         return twin
+
+    def given(self, name: str, part: MechanismPart) -> dict[str, Value]:
+        """Every parameter as the file gives it, with the value and bounds of its `Spec` where it does not.
+
+        Raises:
+            ValueError: a parameter that the mechanism does not have, with the closest.
+        """
+        specs = {s.name: s for s in self.parameters}
+        for p in part.parameters:
+            if p not in specs:
+                raise ValueError(
+                    f"mechanisms.{name}.parameters: {self.key} has no parameter {p!r}; {closest(p, specs)}"
+                )
+        out = {}
+        for key, spec in specs.items():
+            value = part.parameters.get(key) or Value(value=spec.value or 0.0, source=self.source)
+            out[key] = value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
+        return out
 
     @classmethod
     def effects(cls) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Rolling bearings: friction that grows with speed, with preload, and what temperature does to both.
+"""Mechanisms of rolling bearings: friction by speed and by preload, and the effect of temperature on both.
 
 Moments in N mm, speed n in rpm, mean diameter dm in mm: P = pi/30 * 1e-3 * n * M, rounded to 1.047e-4 as in the books.
 """
@@ -26,7 +26,7 @@ class BearingViscous(Mechanism):
     """Shearing of the lubricant. `viscosity` is that at the working temperature; see `ViscosityFeedback`."""
 
     key = "bearing_viscous"
-    words = "viscous friction of the bearings"
+    summary = "viscous friction of the bearings"
     equation = "P = count 1.047e-4 n M0; M0 = f0 1e-7 (nu n)^(2/3) dm^3 for nu n >= 2000, else 160e-7 f0 dm^3"
     source = (
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
@@ -55,7 +55,7 @@ class BearingLoad(Mechanism):
     """Rolling and sliding under preload, independent of the lubricant."""
 
     key = "bearing_load"
-    words = "friction of the bearings under load"
+    summary = "friction of the bearings under load"
     equation = "P = count 1.047e-4 n M1; M1 = z (F/C0)^y F dm"
     source = (
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
@@ -88,7 +88,7 @@ class ViscosityFeedback(Mechanism):
 
     key = "viscosity_feedback"
     multiplies = ("bearing_viscous",)
-    words = "lubricant that thins as it warms"
+    summary = "lubricant that thins as it warms"
     equation = (
         "nu = nu_ref exp(-slope (T_oil - reference)), so heat is multiplied by exp(-2/3 slope (T_oil - reference))"
     )
@@ -115,7 +115,7 @@ class PreloadFeedback(Mechanism):
 
     key = "preload_feedback"
     multiplies = ("bearing_load",)
-    words = "preload that rises with the shaft's lead over the housing"
+    summary = "preload that rises with the shaft's lead over the housing"
     equation = "F = F0 [1 + kappa (T_shaft - T_housing)], so heat is multiplied by (F/F0)^(1 + y), and by 0 where F < 0"
     source = "Stein and Tu 1994, J. Dyn. Syst. Meas. Control 116, thermally induced preload; Palmgren 1959 for 1 + y"
     signature = "overshoot 10 to 40 min after a step of the speed"

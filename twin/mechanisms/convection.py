@@ -1,4 +1,4 @@
-"""Surfaces: convection that a turning part, a temperature difference or a draught drives, and radiation."""
+"""Mechanisms of surfaces: forced and natural convection, draught, radiation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class RotatingConvection(Mechanism):
     """
 
     key = "rotating_convection"
-    words = "air dragged along by turning parts"
+    summary = "air dragged along by turning parts"
     equation = "h = h_rest [1 + gain (n / rated)^exponent]"
     source = "Becker 1963, Int. J. Heat Mass Transfer 6, 1053: Nu = 0.133 Re^(2/3) Pr^(1/3)"
     signature = "time constants are shorter running than stopped"
@@ -46,7 +46,7 @@ class NaturalConvection(Mechanism):
     """
 
     key = "natural_convection"
-    words = "natural convection that grows with the temperature difference"
+    summary = "natural convection that grows with the temperature difference"
     equation = "P = area h (T_air - T); h = max(1.42 (|dT|/height)^(1/4), 1.31 |dT|^(1/3)) W/m2K"
     source = "McAdams 1954, Heat Transmission, 3rd ed.; Holman 2010, Heat Transfer, table 7-2, vertical plane"
     signature = "time constants shorten as the difference to the air grows"
@@ -67,13 +67,13 @@ class NaturalConvection(Mechanism):
 
 
 class Radiation(Mechanism):
-    """A grey surface that sees a large or black surrounding, or a hot neighbour: the port `surrounding`.
+    """A grey surface facing a large or black surrounding, or a hot neighbour: the port `surrounding`.
 
     The heat leaves that port where it is a body. About 5 W/m²K at a workshop's temperatures.
     """
 
     key = "radiation"
-    words = "radiation to walls or from a hot neighbour"
+    summary = "radiation to walls or from a hot neighbour"
     equation = "P = emissivity sigma area (T_surrounding^4 - T^4), T in K"
     source = "Stefan 1879, Boltzmann 1884; CODATA 2018"
     signature = "follows walls or a hot neighbour that the air sensor does not see"
@@ -101,7 +101,7 @@ class Draught(Mechanism):
 
     key = "draught"
     all_air = True
-    words = "draught from an open door or gate"
+    summary = "draught from an open door or gate"
     equation = "within start <= t < start + duration: G = factor G0 and T_air = T_air0 - drop"
     source = "step model of a gate opening; h x 1.5 to 3 and 2 to 10 K for 5 to 30 min"
     signature = "short dips, thin parts first"

@@ -1,8 +1,8 @@
-"""What moves the tool against the workpiece: growth, bending, the speed itself, the screw, a joint that slips.
+"""Mechanisms of displacement: growth, bending, shift with speed, screw elongation, joint slip.
 
 Growth and bending are structural: written out as links of the error's chain, so that they stay part of its sum. Their
-one parameter is a signed gain: lengths, lever and expansion are not told apart by recordings, and neither is the side
-that a candidate acts on. A machine file whose lengths are known states them in `errors`.
+one parameter is a signed gain: recordings determine neither lengths, lever and expansion separately nor the side that a
+candidate acts on. A machine file whose lengths are known states them in `errors`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ColumnBending(Mechanism):
     """
 
     key = "column_bending"
-    words = "bending of a column"
+    summary = "bending of a column"
     equation = "error = gain · (θ_hot - θ_cold),  gain = ± α · height · lever / depth"
     source = "Mayr et al. (2012), Thermal issues in machine tools, CIRP Annals 61(2); Timoshenko (1925), one material"
     signature = "sideways error and pitch first, in step with a temperature difference; a uniform warm-up does nothing"
@@ -41,7 +41,7 @@ class ColumnBending(Mechanism):
     port_roles: ClassVar[Mapping[str, PortRole]] = {"hot": "body", "cold": "neighbour"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
-        at, given = _places(name, self, part, twin), _given(name, self, part)
+        at, given = _places(name, self, part, twin), _given(self, name, part)
         tilt = Tilt(hot=at["hot"], cold=at["cold"], gain=given["gain"], words=part.words or name)
         return _on_errors(name, self, part, twin, tilt)
 
@@ -50,7 +50,7 @@ class SpindleGrowth(Mechanism):
     """A spindle, or any length, that grows from where it is held."""
 
     key = "spindle_growth"
-    words = "growth of the spindle from its locating bearing"
+    summary = "growth of the spindle from its locating bearing"
     equation = "error = gain · θ_spindle,  gain = ± α · length"
     source = "Mayr et al. (2012), Thermal issues in machine tools, CIRP Annals 61(2): linear expansion"
     signature = (
@@ -67,19 +67,19 @@ class SpindleGrowth(Mechanism):
     port_roles: ClassVar[Mapping[str, PortRole]] = {"spindle": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
-        at, given = _places(name, self, part, twin), _given(name, self, part)
+        at, given = _places(name, self, part, twin), _given(self, name, part)
         grows = ChainLink(body=at["spindle"], gain=given["gain"], words=part.words or name)
         return _on_errors(name, self, part, twin, grows)
 
 
 class MandrelFixture(Mechanism):
-    """A test bar in the spindle, or the probe's nest on the table: a body of its own that no sensor sees.
+    """A test bar in the spindle, or the probe's fixture on the table: an additional body without a sensor.
 
     The body takes the instance's name, so that the file may expose it to the air: ``exposures: {NAME-air: 0.5 W/K}``.
     """
 
     key = "mandrel_fixture"
-    words = "growth of the test bar or of the probe's fixture"
+    summary = "growth of the test bar or of the probe's fixture"
     equation = "capacity · dT/dt = conductance · (T_seat - T),  error = gain · θ,  gain = ± α · length"
     source = "ISO 230-3 (2020), test mandrel and fixture as part of the measuring set-up; linear expansion"
     signature = "looks like spindle growth but lags the nose by 5-30 min; every temperature is predicted well"
@@ -97,10 +97,10 @@ class MandrelFixture(Mechanism):
     port_roles: ClassVar[Mapping[str, PortRole]] = {"seat": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
-        at, given = _places(name, self, part, twin), _given(name, self, part)
+        at, given = _places(name, self, part, twin), _given(self, name, part)
         if name in twin.bodies:
             raise ValueError(f"mechanisms.{name}: a body is called {name!r} already; give the mechanism another name")
-        words = part.words or self.words
+        words = part.words or self.summary
         bodies = {**twin.bodies, name: Body(capacity=given["capacity"], words=words)}
         link = Link(between=(name, at["seat"]), conductance=given["conductance"], words=words)
         links = {**twin.links, f"{name}-{at['seat']}": link}
@@ -112,7 +112,7 @@ class SpeedShift(Mechanism):
     """The shaft moves with the speed itself: the balls' centrifugal load against the preload, and a thinner shaft."""
 
     key = "speed_shift"
-    words = "axial shift of the shaft with the speed"
+    summary = "axial shift of the shaft with the speed"
     equation = "error = shift · (n / rated)²"
     source = "Harris and Kotzalas (2006), Rolling Bearing Analysis: centrifugal ball load, proportional to n²"
     signature = "step within seconds of a speed change, back at the stop, while temperatures do not move"
@@ -136,7 +136,7 @@ class ScrewElongation(Mechanism):
     """
 
     key = "screw_elongation"
-    words = "elongation of a ball screw"
+    summary = "elongation of a ball screw"
     equation = "error = expansion · (θ_screw - pretension) · (position - fixed_end)"
     source = "Slocum (1992), Precision Machine Design: thermal growth of a pretensioned lead screw"
     signature = "proportional to the position, zero at the fixed end; absent with a linear scale"
@@ -166,7 +166,7 @@ class JointSlip(Mechanism):
     """A joint that friction holds up to a limit and that then slips: one Maxwell-slip element."""
 
     key = "joint_slip"
-    words = "slip in a bolted or guided joint"
+    summary = "slip in a bolted or guided joint"
     equation = "error(t + dt) = clip(error(t) + gain · dθ, -limit, +limit)"
     source = "Iwan (1966), J. Appl. Mech. 33(4), one elastic-slip element (stop operator)"
     signature = "another path on cooling than on warming; a loop is left over after the temperatures return"
@@ -217,36 +217,22 @@ def _places(name: str, mechanism: Mechanism, part: MechanismPart, twin: TwinPart
     return out
 
 
-def _given(name: str, mechanism: Mechanism, part: MechanismPart) -> dict[str, Value]:
-    """Every parameter as the file gives it, or its usual value; bare numbers get the unit that the Spec states.
-
-    Raises:
-        ValueError: a parameter that the mechanism does not have, with the closest.
-    """
-    specs = {s.name: s for s in mechanism.parameters}
-    for p in part.parameters:
-        if p not in specs:
-            raise ValueError(
-                f"mechanisms.{name}.parameters: {mechanism.key} has no parameter {p!r}; {closest(p, specs)}"
-            )
-    out = {}
-    for spec in specs.values():
-        value = part.parameters.get(spec.name) or Value(value=f"{spec.value} {spec.unit}", source=mechanism.source)
-        out[spec.name] = _with_unit(value, spec)
-    return out
+def _given(mechanism: Mechanism, name: str, part: MechanismPart) -> dict[str, Value]:
+    """`Mechanism.given` with units: the chain may have another one (mm, nm), a bare number has the mechanism's."""
+    given = mechanism.given(name, part)
+    return {spec.name: _with_unit(given[spec.name], spec) for spec in mechanism.parameters}
 
 
 def _with_unit(value: Value, spec: Spec) -> Value:
-    """The chain's own unit may be another (mm, nm): a bare number means the mechanism's unit all the same."""
 
-    def told(v: Any) -> Any:
+    def with_unit(v: Any) -> Any:
         return f"{v} {spec.unit}" if v is not None and len(str(v).split()) == 1 else v
 
-    bounds = value.bounds or (spec.low, spec.high)
-    update: dict[str, Any] = {"value": told(value.value), "bounds": tuple(told(b) for b in bounds)}
-    update["prior"] = told(value.prior)
+    bounds = tuple(with_unit(b) for b in value.bounds or ())
+    update: dict[str, Any] = {"value": with_unit(value.value), "bounds": bounds}
+    update["prior"] = with_unit(value.prior)
     if spec.scale == "linear":
-        update["spread"] = told(value.spread)
+        update["spread"] = with_unit(value.spread)
     return value.model_copy(update=update)
 
 

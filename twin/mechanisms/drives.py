@@ -1,4 +1,4 @@
-"""Feed axes: friction of the nut, of the guides and of the screw's bearings; all vanish when the axis rests."""
+"""Mechanisms of feed axes, motor and belt: friction and losses that vanish at rest."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class NutFriction(Mechanism):
     """Preloaded ball screw: a constant moment at N = feed / lead turns a minute."""
 
     key = "nut_friction"
-    words = "friction of the ball screw's nut"
+    summary = "friction of the ball screw's nut"
     equation = "P = 2 pi N M / 60, N = feed / lead"
     source = "ISO 3408-3:2006, drag moment of preloaded ball screws; moments of 0.2 to 1 N m"
     signature = "only while the axis moves, proportional to feed; nut and the screw's travelled length"
@@ -36,7 +36,7 @@ class ScrewBearing(NutFriction):
     """The screw's axial bearings: the same law as the nut's, at the screw's fixed end."""
 
     key = "screw_bearing"
-    words = "friction of the feed screw's bearings"
+    summary = "friction of the feed screw's bearings"
     source = "Harris 2001, Rolling Bearing Analysis, ch. 14; moments of 0.2 to 1 N m"
     signature = "only while the axis moves, proportional to feed; the screw's fixed end and its housing"
     parameters = (Spec("moment", "N*m", "friction moment of the bearings", 0.3, 0.5, 0.0, 50.0), LEAD)
@@ -46,7 +46,7 @@ class GuideFriction(Mechanism):
     """Coulomb friction of slides or rolling guides."""
 
     key = "guide_friction"
-    words = "friction of the guides"
+    summary = "friction of the guides"
     equation = "P = mu F v"
     source = "Coulomb 1785; mu 0.002 to 0.01 for rolling guides, 0.05 to 0.15 for slides"
     signature = "only while the axis moves, proportional to feed; along the guides"
@@ -70,7 +70,7 @@ class MotorLoss(Mechanism):
     """Losses of a motor that turns without load. For copper losses under load add `ohmic_heat` by the current."""
 
     key = "motor_loss"
-    words = "losses of the spindle motor"
+    summary = "losses of the spindle motor"
     equation = "P = idle + linear x + quadratic x^2 with x = n / rated; 0 at rest"
     source = "Steinmetz 1892 and Bertotti 1988: hysteresis losses proportional to n, eddy currents to n^2"
     signature = "the motor leads, conducted to the head; some of it as soon as the spindle turns, whatever its speed"
@@ -93,7 +93,7 @@ class BeltLoss(Mechanism):
     """Flexing and windage of the belt and its pulleys."""
 
     key = "belt_loss"
-    words = "losses of the belt"
+    summary = "losses of the belt"
     equation = "P = power (n / rated)^exponent"
     source = "Gerbert 1999, Traction Belt Mechanics; exponent between 1 (hysteresis) and 2 to 3 (windage)"
     signature = "rear of the spindle, head and air; grows with speed as n^1.5"

@@ -1,4 +1,4 @@
-"""Electrical heat: a heater by its setting, alone or on a shared supply; a conductor or a cell by its current."""
+"""Mechanisms of electrical heat: heaters, supply sag, conductors, and the heat and growth of battery cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ElectricalHeat(Mechanism):
     """A heater: watts per unit of its driver, in the unit that the driver's channel has (per cent, or 0 and 1)."""
 
     key = "electrical_heat"
-    words = "electrical heater"
+    summary = "electrical heater"
     equation = "P = gain level"
     source = "Joule 1841, energy balance of a resistive heater at constant supply"
     signature = "in step with the heater's setting, proportional to it"
@@ -30,13 +30,13 @@ class ElectricalHeat(Mechanism):
 
 
 class SupplySag(Mechanism):
-    """Loads on one supply: while another draws current the voltage falls, and this one heats less.
+    """Loads on one supply: while another draws current the voltage drops, and this one heats less.
 
     `acts_on` names the heat that is lessened; the other load's heat, if it suffers too, has a sag of its own.
     """
 
     key = "supply_sag"
-    words = "voltage drop of a shared supply"
+    summary = "voltage drop of a shared supply"
     equation = "P = P0 (1 - sag other / rated)"
     source = "Ohm 1827: inner resistance of a source, linear in the other load's current"
     signature = "a heater warms its place less while another one is on, in step with that one's setting"
@@ -60,7 +60,7 @@ class OhmicHeat(Mechanism):
     """
 
     key = "ohmic_heat"
-    words = "heat of a current"
+    summary = "heat of a current"
     equation = "P = R I^2 exp(coefficient (T - reference)) + entropic I (T + 273.15)"
     source = "Joule 1841; Bernardi, Pawlikowski and Newman 1985, J. Electrochem. Soc. 132, 5, eq. 21"
     signature = "grows with the square of the current; a reversible part changes sign with it"
@@ -95,7 +95,7 @@ class VoltageLossHeat(Mechanism):
     """
 
     key = "voltage_loss_heat"
-    words = "heat of a cell by its loss of voltage"
+    summary = "heat of a cell by its loss of voltage"
     equation = "P = I (V - U(q)), q = start - integral of I dt; spline U through u0 at 0 … u7 at capacity"
     source = "Bernardi, Pawlikowski and Newman 1985, J. Electrochem. Soc. 132, 5, eq. 21"
     signature = "grows with the current and, at the same current, with the charge drawn; most near the end"
@@ -128,9 +128,9 @@ class ChargeStrain(Mechanism):
     """
 
     key = "charge_strain"
-    words = "growth of a cell with the charge drawn"
+    summary = "growth of a cell with the charge drawn"
     equation = "strain = f(q) + θ g(q), q = start - integral of I dt; splines through 0, f1 … f12 and g0 … g4"
-    source = "Louli, Ellis and Dahn 2019, Joule 3, 745: pressure over charge; linear thermal expansion beside it"
+    source = "Louli, Ellis and Dahn 2019, Joule 3, 745: pressure over charge; with linear thermal expansion"
     signature = "the same course over the charge at every rate, and not over time or temperature"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = {"current": "A"}

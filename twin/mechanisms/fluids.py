@@ -1,4 +1,4 @@
-"""Fluids that carry heat away: the thermostat's coolant in a jacket, and the cutting fluid."""
+"""Mechanisms of fluids: thermostat-controlled coolant in a jacket, and cutting fluid."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class JacketChiller(Mechanism):
     """
 
     key = "jacket_chiller"
-    words = "cooling jacket with a thermostat"
+    summary = "cooling jacket with a thermostat"
     equation = "P = on conductance (supply - T); on from T > set_point + hysteresis until T < set_point - hysteresis"
     source = "Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, ch. 11: UA of a stream of constant inlet"
     signature = "sawtooth of 3 to 15 min that aliases where samples are minutes apart"
@@ -68,11 +68,11 @@ class JacketChiller(Mechanism):
         return np.asarray(p["conductance"] * (p["supply"] - jacket_degC))
 
     def _states(self, jacket: Numeric, p: Mapping[str, Numeric]) -> Numeric:
-        """On or off at every time: as the last temperature outside the band said, all times at once."""
+        """On or off at every time: by the last temperature outside the band, all times at once."""
         above, below = self.switched(np.asarray(False), jacket, p), ~self.switched(np.asarray(True), jacket, p)
-        says = above | below
-        says[..., 0] = True
-        at = np.maximum.accumulate(np.where(says, np.arange(jacket.shape[-1]), 0), axis=-1)
+        outside = above | below
+        outside[..., 0] = True
+        at = np.maximum.accumulate(np.where(outside, np.arange(jacket.shape[-1]), 0), axis=-1)
         above[..., 0] |= self.starts_on(jacket[..., 0], {k: v[..., 0] for k, v in p.items()}) & ~below[..., 0]
         return np.asarray(np.take_along_axis(above, at, axis=-1))
 
@@ -81,7 +81,7 @@ class CuttingFluid(Mechanism):
     """Fluid over table, fixture or bed while the pump runs; the heat leaves the port `tank` where that is a body."""
 
     key = "cutting_fluid"
-    words = "cutting fluid over table and workpiece"
+    summary = "cutting fluid over table and workpiece"
     equation = "P = conductance flow (T_tank - T)"
     source = "Newton's law of cooling; 50 to 500 W/K to the tank, tank 3 to 10 K above the room"
     signature = "step of the rate when the flow starts or stops, the table first"

@@ -1,6 +1,6 @@
-"""What no listed mechanism explains, as a regression over one or two drivers and a temperature.
+"""Regressions over one or two drivers and a temperature, for effects that no listed mechanism explains.
 
-A diagnosis writes these when nothing of the registry fits. They hold where they were fitted, and say nothing beyond.
+A diagnosis uses them when no mechanism of the registry fits. They are valid in the fitted range only.
 """
 
 from __future__ import annotations
@@ -19,11 +19,27 @@ SECOND_ORDER = "Box and Wilson 1951, J. R. Stat. Soc. B 13, 1: second-order regr
 ANY = {"level": "1", "other": "1"}
 
 
+def _coefficients(effect: str, unit: str, spread: float, bound: float, kelvin: str) -> tuple[Spec, ...]:
+    """Coefficients of a second-order regression: of the drivers within ± bound, per kelvin within a tenth of it."""
+    of_drivers = {
+        "linear": "unit of the level",
+        "square": "unit of the level squared",
+        "cross": "unit of both drivers",
+        "square_cross": "unit of the other and the level squared",
+    }
+    of_body = {"per_K": kelvin, "product": "kelvin and unit of the level"}
+    return (
+        *(Spec(n, unit, f"{effect} per {of}", 0.0, spread, -bound, bound, "linear") for n, of in of_drivers.items()),
+        *(Spec(n, f"{unit}/K", f"{effect} per {of}", 0.0, 2.0, -bound / 10, bound / 10, "linear")
+          for n, of in of_body.items()),
+    )  # fmt: skip
+
+
 class FreeFlux(Mechanism):
     """Heat into a body; each coefficient is per unit of its driver in the unit that the channel has."""
 
     key = "free_flux"
-    words = "heat of no listed mechanism"
+    summary = "heat of no listed mechanism"
     equation = (
         "P = constant + linear u + square u^2 + (cross u + square_cross u^2) v + (per_K + product u) (T - 20 degC); "
         "u level, v other or 0"
@@ -37,12 +53,7 @@ class FreeFlux(Mechanism):
     ports = ("body",)
     parameters = (
         Spec("constant", "W", "heat at rest at 20 degC", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("linear", "W", "heat per unit of the level", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("square", "W", "heat per unit of the level squared", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("cross", "W", "heat per unit of both drivers", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("square_cross", "W", "heat per unit of the other and the level squared", 0.0, 50.0, -1e6, 1e6, "linear"),
-        Spec("per_K", "W/K", "heat per kelvin of the body above 20 degC", 0.0, 2.0, -1e5, 1e5, "linear"),
-        Spec("product", "W/K", "heat per kelvin and unit of the level", 0.0, 2.0, -1e5, 1e5, "linear"),
+        *_coefficients("heat", "W", 50.0, 1e6, "kelvin of the body above 20 degC"),
     )
     off: ClassVar[Mapping[str, float]] = {s.name: 0.0 for s in parameters}
     proposable = False  # it would explain anything
@@ -55,35 +66,19 @@ class FreeShift(Mechanism):
     """A displacement; it has no constant, since errors count from their first value."""
 
     key = "free_shift"
-    words = "displacement of no listed mechanism"
+    summary = "displacement of no listed mechanism"
     equation = (
         "error = linear u + square u^2 + (cross u + square_cross u^2) v + (per_K + product u) θ_body; "
         "u level, v other or 0"
     )
     source = SECOND_ORDER
-    signature = "whatever the error lacks beside the temperatures, as far as a driver and one body's rise tell it"
+    signature = "what the temperatures do not explain of the error, as far as a driver and the rise of one body show it"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = ANY
     optional_drivers: ClassVar[frozenset[str]] = frozenset(ANY)
     any_unit: ClassVar[frozenset[str]] = frozenset(ANY)
     ports = ("body",)
-    parameters = (
-        Spec("linear", "um", "displacement per unit of the level", 0.0, 5.0, -1e5, 1e5, "linear"),
-        Spec("square", "um", "displacement per unit of the level squared", 0.0, 5.0, -1e5, 1e5, "linear"),
-        Spec("cross", "um", "displacement per unit of both drivers", 0.0, 5.0, -1e5, 1e5, "linear"),
-        Spec(
-            "square_cross",
-            "um",
-            "displacement per unit of the other and the level squared",
-            0.0,
-            5.0,
-            -1e5,
-            1e5,
-            "linear",
-        ),
-        Spec("per_K", "um/K", "displacement per kelvin of the body's rise", 0.0, 2.0, -1e4, 1e4, "linear"),
-        Spec("product", "um/K", "displacement per kelvin and unit of the level", 0.0, 2.0, -1e4, 1e4, "linear"),
-    )
+    parameters = _coefficients("displacement", "um", 5.0, 1e5, "kelvin of the body's rise")
     off: ClassVar[Mapping[str, float]] = {s.name: 0.0 for s in parameters}
     proposable = False  # it would explain anything
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "body"}

@@ -1,4 +1,4 @@
-"""Joints: what bolting, clamping or a rail does to a link."""
+"""Mechanisms of joints: changed conductance of a link, and additional heat paths."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from data.errors import closest
 from twin.mechanisms.base import Mechanism, PortRole, View
-from twin.quantity import Spec, Value
+from twin.quantity import Spec
 from twin.schema import Link, MechanismPart, TwinPart
 
 
 class JointConductance(Mechanism):
-    """A link that conducts `ratio` times what its file says: always, or while a driver (clamp closed, 1) says so.
+    """A link that conducts `ratio` times its value in the file: always, or while a driver is 1 (clamp closed).
 
     A power, not a sum, so that no driver value makes a conductance negative; a driver between 0 and 1 lies between.
     """
@@ -23,7 +22,7 @@ class JointConductance(Mechanism):
     key = "joint_conductance"
     of_network = True
     only_driven = True
-    words = "joint that conducts better or worse than assumed"
+    summary = "joint that conducts better or worse than assumed"
     equation = "G = G0 ratio^closed; closed is 1 where no driver is named"
     source = (
         "Cooper, Mikic and Yovanovich 1969, Int. J. Heat Mass Transfer 12, 279; 500 to 1e4 W/m2K bolted, lower on rails"
@@ -43,13 +42,13 @@ class HeatBridge(Mechanism):
     """A link under the mechanism's own name: a bracket, a hose, a circuit board, or air and radiation between two.
 
     `at`: {body: …, other: …}. Two bodies that face each other exchange about 6 W/m²/K by radiation at room
-    temperature, which over tens of kelvins no recording tells from conduction.
+    temperature, which over tens of kelvins is indistinguishable from conduction.
     """
 
     key = "heat_bridge"
     far_apart = True
     of_network = True
-    words = "heat path between two bodies"
+    summary = "heat path between two bodies"
     equation = "P = conductance (T_other - T_body)"
     source = "Fourier 1822; Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, sec. 3.1, 1 to 50 W/K"
     signature = "one body follows another that no link of the file joins it with, late and by a share"
@@ -63,19 +62,9 @@ class HeatBridge(Mechanism):
         """Raises ValueError: a link of this name, not two places, unknown parameters; it starts with the key."""
         if name in twin.links:
             raise ValueError(f"mechanisms.{name}: a link is called {name!r} already; rename the mechanism")
-        for p in part.parameters:
-            if p != "conductance":
-                raise ValueError(
-                    f"mechanisms.{name}.parameters: {self.key} has no parameter {p!r}; {closest(p, ['conductance'])}"
-                )
-        link = Link(between=_ends(name, part), conductance=self._conductance(part), words=part.words or self.words)
+        words, given = part.words or self.summary, self.given(name, part)
+        link = Link(between=_ends(name, part), conductance=given["conductance"], words=words)
         return twin.model_copy(update={"links": {**twin.links, name: link}})
-
-    def _conductance(self, part: MechanismPart) -> Value:
-        """As the file gives it, with the Spec's value and bounds where it does not."""
-        (spec,) = self.parameters
-        value = part.parameters.get("conductance") or Value(value=f"{spec.value} {spec.unit}", source=self.source)
-        return value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
 
 
 def _ends(name: str, part: MechanismPart) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Heat from beside the structure or from the cut: cabinets, pumps, the sun, chips."""
+"""Mechanisms of heat near the structure or from the cut: cabinet, hydraulic unit, sun, cutting."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class CabinetHeat(Mechanism):
     """Electronics and auxiliaries that run whether or not the spindle does; with a driver, only while it is 1."""
 
     key = "cabinet_heat"
-    words = "waste heat of a control cabinet or of auxiliaries"
+    summary = "waste heat of a control cabinet or of auxiliaries"
     equation = "P = heat running; running is 1 where no driver is named"
     source = "energy balance of a steady source; 0.2 to 1 kW a cabinet"
     signature = "one side of the column or bed, also with the spindle stopped"
@@ -38,7 +38,7 @@ class HydraulicUnit(Mechanism):
     """
 
     key = "hydraulic_unit"
-    words = "waste heat of a hydraulic unit or pump that cycles"
+    summary = "waste heat of a hydraulic unit or pump that cycles"
     equation = "P = heat on running while frac(t / period) < duty, else 0; running is 1 where no driver is named"
     source = "energy balance of a cycled source; 0.2 to 1 kW a unit"
     signature = "one side of the column or bed, in cycles, also with the spindle stopped"
@@ -64,7 +64,7 @@ class Sun(Mechanism):
     """Sunlight on one face, by the clock; none where the time of day is not known."""
 
     key = "sun"
-    words = "sunlight on one face"
+    summary = "sunlight on one face"
     equation = "P = irradiance area absorptivity sin(pi (t - rise) / (set - rise)) from rise to set, else 0"
     source = "Monteith and Unsworth 2013, Principles of Environmental Physics, ch. 5: half sine of a clear day"
     signature = "one face and a sideways tilt, at the same time of day"
@@ -91,7 +91,7 @@ class CuttingHeat(Mechanism):
     """The part of the cutting power that neither chips nor coolant carry away; braking gives none back."""
 
     key = "cutting_heat"
-    words = "heat of cutting"
+    summary = "heat of cutting"
     equation = "P = share P_cut"
     source = "Loewen and Shaw 1954, Trans. ASME 76, 217, partition of cutting heat; 3 to 10 % into the spindle"
     signature = "follows load, not speed"

@@ -1,4 +1,4 @@
-"""How a temperature sensor shows what it sees: late, badly bonded, off, drifting, warmed by its own current."""
+"""Mechanisms of sensors and clocks: lag, bonding, offset, drift, self-heating, exchange, resolution, skew, place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SensorLag(Mechanism):
     """
 
     key = "sensor_lag"
-    words = "sensor that follows late"
+    summary = "sensor that follows late"
     equation = "lag · dT_m/dt = T_s - T_m,  T_m(0) = T_s(0)"
     source = "Franklin, Powell and Workman (1998), Digital Control of Dynamic Systems, pp. 204-206, first-order hold"
     signature = (
@@ -49,7 +49,7 @@ class SensorBonding(Mechanism):
     """A sensor that the air cools: it shows a temperature between the surface's and the air's."""
 
     key = "sensor_bonding"
-    words = "poorly bonded sensor"
+    summary = "poorly bonded sensor"
     equation = "T_m = T_air + bonding · (T_s - T_air)"
     source = "Michalski et al. (2001), Temperature Measurement: bonding = R_film / (R_film + R_contact)"
     signature = "gain error of one sensor that is proportional to the difference between surface and air"
@@ -69,7 +69,7 @@ class SensorOffset(Mechanism):
     """A sensor that shows the same error at every temperature."""
 
     key = "sensor_offset"
-    words = "constant error of a sensor"
+    summary = "constant error of a sensor"
     equation = "T_m = T_s + offset"
     source = "JCGM 200 (2012), instrumental bias, entry 4.20"
     signature = "sensors disagree at equilibrium; no effect on rises, only on models of absolute temperatures"
@@ -89,7 +89,7 @@ class SensorDrift(Mechanism):
     """A sensor whose error grows evenly during a run; a drift from run to run is an offset of each."""
 
     key = "sensor_drift"
-    words = "sensor that drifts"
+    summary = "sensor that drifts"
     equation = "T_m = T_s + rate · t"
     source = "JCGM 200 (2012), instrumental drift, entry 4.21"
     signature = "one sensor leaves its neighbours in a straight line, loaded or not; no displacement goes with it"
@@ -109,7 +109,7 @@ class SensorSelfHeat(Mechanism):
     """A resistance thermometer that its measuring current warms: an offset that is never negative."""
 
     key = "sensor_self_heat"
-    words = "self-heating of a sensor"
+    summary = "self-heating of a sensor"
     equation = "T_m = T_s + excess,  excess = I² R / G_contact"
     source = "IEC 60751 (2022), self-heating of resistance thermometers"
     signature = "one sensor too warm by the same amount at equilibrium; no effect on rises"
@@ -177,7 +177,7 @@ class SensorSwap(Mechanism):
     """Two sensors under each other's name: place, lag, bonding and offset go together."""
 
     key = "sensor_swap"
-    words = "two sensors exchanged"
+    summary = "two sensors exchanged"
     equation = "T_a = T_s(place b),  T_b = T_s(place a)"
     source = "a permutation of two labels; no parameter"
     signature = "order of the time constants is wrong: the sensor near the heat is late, its partner early"
@@ -202,7 +202,7 @@ class SensorStuck(Mechanism):
     """A sensor that shows its last value for good."""
 
     key = "sensor_stuck"
-    words = "sensor that hangs"
+    summary = "sensor that hangs"
     equation = "T_m(t) = T_s(min(t, start))"
     source = "Isermann (2006), Fault-Diagnosis Systems: stuck sensor"
     signature = "one sensor constant to the last digit while its neighbours move"
@@ -223,7 +223,7 @@ class SensorQuantised(Mechanism):
     """A reading in coarse steps. Its mean follows the temperature: derivatives pass as if there were no steps."""
 
     key = "sensor_quantised"
-    words = "coarse resolution of a sensor"
+    summary = "coarse resolution of a sensor"
     equation = "T_m = step · round(T_s / step)"
     source = "Widrow, Kollár and Liu (1996), statistical theory of quantization: zero-mean error, step / √12"
     signature = "stairs in one channel, no displacement with them; jumps of rates computed from it"
@@ -244,7 +244,7 @@ class TimeSkew(Mechanism):
 
     key = "time_skew"
     all_errors = True
-    words = "clock of a channel against the others"
+    summary = "clock of a channel against the others"
     equation = "y_m(t) = y(t + delay)"
     source = "Taylor expansion: residual = delay · dy/dt; linear interpolation between samples"
     signature = "residual proportional to the rate of change, of one sign while warming and the other after the stop"
@@ -293,13 +293,13 @@ def _take(a: Numeric, index: NDArray[np.int64]) -> Numeric:
 class SensorPlace(Mechanism):
     """A sensor that sits towards a neighbour of its body, or away from it, where the body is not at its mean.
 
-    Heat through the link between the two leaves a gradient in the body, nearly straight and nearly at once where the
-    body conducts better than the link: what the sensor shows beside the mean is a share of their difference. A sign
-    that the network is too coarse there, no fault of the sensor.
+    Heat through the link between the two causes a gradient in the body, nearly linear and quasi-static where the body
+    conducts better than the link: the sensor deviates from the mean by a share of their difference. It indicates that
+    the network is too coarse there, not a fault of the sensor.
     """
 
     key = "sensor_place"
-    words = "sensor off its body's mean"
+    summary = "sensor off its body's mean"
     equation = "T_m = T_s + share · (T_towards - T_s)"
     source = "Incropera et al. 2007, Fundamentals of Heat and Mass Transfer, ch. 5: lumped body of small Biot number"
     signature = "one sensor ahead of its body (behind, if negative) by a share of the difference to a linked one"

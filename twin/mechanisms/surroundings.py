@@ -1,4 +1,4 @@
-"""What stands around the machine: the enclosure's air, layers of the hall's air, the floor.
+"""Mechanisms of surroundings and start: enclosure air, stratification, floor, initial state.
 
 Enclosure air and floor are structural: they write bodies, surroundings and exposures into the twin part.
 """
@@ -14,7 +14,7 @@ from data.arrays import Numeric
 from data.errors import closest
 from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View
-from twin.quantity import Spec, Value
+from twin.quantity import Spec
 from twin.schema import Body, Exposure, MechanismPart, Surrounding, TwinPart
 
 
@@ -26,7 +26,7 @@ class EnclosureAir(Mechanism):
     """
 
     key = "enclosure_air"
-    words = "air inside the enclosure"
+    summary = "air inside the enclosure"
     equation = "capacity dT_air/dt = sum of heat from the surfaces - conductance (T_air - T_room)"
     source = "energy balance of a stirred volume; 2 to 8 K above the room, time constant 5 to 30 min"
     signature = "all surfaces share a fast mode that the room's sensor does not show"
@@ -39,7 +39,7 @@ class EnclosureAir(Mechanism):
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         """Raises ValueError: a name that is taken, unknown exposures; the message starts with the key."""
-        values = _values(self, name, part)
+        values = self.given(name, part)
         _new(name, twin)
         moved, outside = _moved(name, several(part.acts_on), twin)
         wall = f"{name}-{outside}"
@@ -47,7 +47,7 @@ class EnclosureAir(Mechanism):
             raise ValueError(f"exposures.{wall}: {self.key} adds this one; state it as mechanisms.{name}.conductance")
         exposures = {k: e.model_copy(update={"to": name}) if k in moved else e for k, e in twin.exposures.items()}
         exposures[wall] = Exposure(of=name, to=outside, conductance=values["conductance"])
-        bodies = {**twin.bodies, name: Body(capacity=values["capacity"], words=part.words or self.words)}
+        bodies = {**twin.bodies, name: Body(capacity=values["capacity"], words=part.words or self.summary)}
         return twin.model_copy(update={"bodies": bodies, "exposures": exposures})
 
 
@@ -55,7 +55,7 @@ class Stratification(Mechanism):
     """Air that is warmer higher up: added to the surroundings in `acts_on`, `height` above the air's sensor."""
 
     key = "stratification"
-    words = "layers of warm air in the hall"
+    summary = "layers of warm air in the hall"
     equation = "T_air(height) = T_sensor + gradient height"
     source = "linear profile of a heated hall's air; 0.3 to 2 K/m"
     signature = "the upper column leads; a constant offset between heights"
@@ -74,11 +74,11 @@ class FloorSink(Mechanism):
     """The foundation under a body: a surrounding under the mechanism's own name that holds through a batch.
 
     The ground follows the season, in part, and not the day: `temperature` + `follow` x (the room's first reading -
-    `temperature`). `at`: the body, or {body: …, room: …}. Beside a constant room it is `temperature` alone.
+    `temperature`). `at`: the body, or {body: …, room: …}. With a constant room it is `temperature` alone.
     """
 
     key = "floor_sink"
-    words = "heat to the floor"
+    summary = "heat to the floor"
     equation = "P = conductance (T_floor - T), T_floor = temperature + follow (T_room(0) - temperature)"
     source = (
         "Carslaw and Jaeger 1959, Conduction of Heat in Solids, ch. 2: days to months of lag in the ground; 5 to 30 W/K"
@@ -93,16 +93,16 @@ class FloorSink(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     shape = ("temperature", "follow")
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"temperature": (12.0,)}  # beside the usual one
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"temperature": (12.0,)}  # in addition to the default
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "itself", "room": "surrounding"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
         """Raises ValueError: a name that is taken, no place, no such surrounding; the message starts with the key."""
-        values, at = _values(self, name, part), _places(name, part)
+        values, at = self.given(name, part), _places(name, part)
         _new(name, twin)
         room = _room(name, at.get("room"), twin)
         first = (room.channel,) if room.channel else room.first
-        words = part.words or self.words
+        words = part.words or self.summary
         if first is None:
             floor = Surrounding(value=values["temperature"], words=words)
         else:
@@ -114,21 +114,6 @@ class FloorSink(Mechanism):
                 "exposures": {**twin.exposures, f"{at['body']}-{name}": sink},
             }
         )
-
-
-def _values(mechanism: Mechanism, name: str, part: MechanismPart) -> dict[str, Value]:
-    """Every parameter as the file gives it, with the Spec's value and bounds where it does not."""
-    specs = {s.name: s for s in mechanism.parameters}
-    for p in part.parameters:
-        if p not in specs:
-            raise ValueError(
-                f"mechanisms.{name}.parameters: {mechanism.key} has no parameter {p!r}; {closest(p, specs)}"
-            )
-    out = {}
-    for key, spec in specs.items():
-        value = part.parameters.get(key) or Value(value=spec.value or 0.0, source=mechanism.source)
-        out[key] = value if value.bounds else value.model_copy(update={"bounds": (spec.low, spec.high)})
-    return out
 
 
 def _new(name: str, twin: TwinPart) -> None:
@@ -178,10 +163,10 @@ def _recorded(name: str, key: str, twin: TwinPart) -> str:
 
 
 class InitialState(Mechanism):
-    """A body that is warmer or colder at the first sample than the first readings say."""
+    """A body that is warmer or colder at the first sample than the first readings."""
 
     key = "initial_state"
-    words = "start away from equilibrium"
+    summary = "start away from equilibrium"
     equation = "T(0) = first reading + excess"
     source = "Carslaw and Jaeger (1959), Conduction of Heat in Solids: an initial state as a sum of decaying modes"
     signature = "drift before any load that decays with the slow time constants and does not depend on the speed"

@@ -102,7 +102,7 @@ def _read(given: Mapping[str, Any], where: str, machine: Machine, depth: int, wr
     if "repeat" in given or "stages" in given:
         for key in given:
             if key not in ("repeat", "stages"):
-                raise InputError(f"{where}: unknown key {key!r} beside repeat; allowed: repeat, stages")
+                raise InputError(f"{where}: unknown key {key!r} next to repeat; allowed: repeat, stages")
         times, inner = given.get("repeat", 1), given.get("stages")
         if not isinstance(times, int) or isinstance(times, bool) or times < 1:
             raise InputError(f"{where}: repeat: got {times!r}, expected a whole number from 1")

@@ -39,7 +39,7 @@ def read_plan_table(
 
     A header may name the unit of its column, "spindle_rpm [krpm]". Time is the machine file's time column, time_s,
     time_min, time_h, or "time [unit]". A recording serves as it is: the machine's other channels are passed over,
-    and with `others` every column that is not asked for.
+    and with `others` every column that is not requested.
 
     Raises:
         InputError: no file, an unknown column (with the closest), no time column, fewer than two rows, a cell that is

@@ -1,4 +1,4 @@
-"""From a network and its inputs to temperatures, readings, displacement and their derivatives."""
+"""Simulation of a network: temperatures, readings, displacements and their derivatives."""
 
 from twin.simulation.run import TOLERANCE_K, Simulation, choose_substeps, simulate, simulation_of
 from twin.simulation.start import start_of

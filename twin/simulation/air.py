@@ -47,7 +47,7 @@ class Air:
         return out if extra_K is None else out + extra_K
 
 
-def air_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | None = None) -> Air:
+def air_of(network: Network, values: Array, inputs: Inputs) -> Air:
     """The surroundings at parameter values (P, n).
 
     Raises:
@@ -65,7 +65,7 @@ def air_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | N
         if given.offset is not None:
             steady[:, s] += values[:, given.offset]
     out = Air(recorded, moving, follow, steady, None)
-    return replace(out, extra_K=_extra(network, values, inputs, out, offsets_K))
+    return replace(out, extra_K=_extra(network, values, inputs, out))
 
 
 def recorded_degC(given: CompiledSurrounding, inputs: Inputs) -> Array | None:
@@ -121,8 +121,8 @@ def effect_K(law: Law, values: Array, inputs: Inputs, air: Air) -> Array:
     return np.moveaxis(np.broadcast_to(out, (len(values), n_batches, 2, n_intervals)), 2, 3)
 
 
-def _extra(network: Network, values: Array, inputs: Inputs, air: Air, offsets_K: Array | None) -> Array | None:
-    n_batches, n_intervals = inputs.valid.shape
+def _extra(network: Network, values: Array, inputs: Inputs, air: Air) -> Array | None:
+    offsets_K, (n_batches, n_intervals) = inputs.offsets_K, inputs.valid.shape
     n_surroundings = len(network.surroundings)
     if offsets_K is None and not any(s.effects for s in network.surroundings):
         return None

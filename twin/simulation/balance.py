@@ -1,4 +1,4 @@
-"""The heat balance of a network on given inputs: conductances by regime, surroundings, and every watt that is known."""
+"""Heat balance of a network on given inputs: conductances by regime, surroundings, known and dependent heat."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Balance:
     """``C dT/dt = -K T + q`` of P parameter sets on B batches; what depends on temperature is not in q.
 
     capacity (P, N), conductance (P, R, N, N) and into (P, R, S, N), the heat per kelvin of each surrounding. Regimes
-    tell the drivers of heats apart too, so that held_W (P, R, N) holds within one; `alike` (R,) has one number for all
-    of the same conductances, from 0. Driven heats that follow the clock or take too many values are `timed`.
+    also distinguish the drivers of heats, so that held_W (P, R, N) holds within one; `alike` (R,) has one number for
+    all of the same conductances, from 0. Driven heats that follow the clock or take too many values are `timed`.
     """
 
     network: Network
@@ -107,8 +107,8 @@ class Balance:
         return np.moveaxis(np.broadcast_to(out, (shape[0], shape[1], 2, shape[2])), 2, 3)
 
 
-def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array | None = None) -> Balance:
-    """The heat balance at parameter values (P, n); `offsets_K` (P or 1, B, S) of each batch's surroundings.
+def balance_of(network: Network, values: Array, inputs: Inputs) -> Balance:
+    """The heat balance at parameter values (P, n).
 
     Raises:
         InputError: parameter values of another length, or that are not finite.
@@ -124,7 +124,7 @@ def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array
         network.capacity_J_per_K(values),
         network.conductance_W_per_K(spread, regimes.factor),
         network.surrounding_W_per_K(spread, regimes.factor),
-        air_of(network, values, inputs, offsets_K),
+        air_of(network, values, inputs),
         held_W,
         alike,
         timed,
@@ -134,7 +134,7 @@ def balance_of(network: Network, values: Array, inputs: Inputs, offsets_K: Array
 def _finer(
     network: Network, values: Array, inputs: Inputs, regimes: Regimes
 ) -> tuple[Regimes, Array, NDArray[np.int64], tuple[Heat, ...]]:
-    """Regimes in which driven heats hold as well; their watts, the given regime of each, and the heats left over."""
+    """Regimes in which driven heats hold as well; their watts, the given regime of each, and the remaining heats."""
     driven = [h for h in network.heats if not h.temperature_dependent and not h.asleep]
     held = [h for h in driven if not _timed(h) and h.law.name not in inputs.times]
     number, first = distinct(
@@ -178,7 +178,7 @@ EVERY = slice(None)
 
 @dataclass(frozen=True)
 class Borders:
-    """Temperatures (n, P, B, M + 1) of the places that sources look at, at the interval borders."""
+    """Temperatures (n, P, B, M + 1) of the places that sources depend on, at the interval borders."""
 
     degC: Numeric
 
@@ -191,7 +191,7 @@ class Borders:
 class Source(Protocol):
     """One series of temperature-dependent heat.
 
-    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it looks at. One `along` time needs
+    `direction` (P, N) is where a watt goes, `places` the rows of `Borders` that it depends on. One `along` time needs
     the whole series from the start, and holds during an interval.
     """
 
@@ -214,11 +214,11 @@ class Source(Protocol):
         """Derivative by the temperature of each place, W/K (P, B, 2, m)."""
 
     def surrounding_slopes(self, seen: Borders, part: slice) -> dict[int, Numeric]:
-        """The same by the temperature of each surrounding that it looks at."""
+        """The same by the temperature of each surrounding that it depends on."""
 
 
 class Places:
-    """The distinct places (weights over cells) that sources, sensors and errors look at, numbered."""
+    """The distinct places (weights over cells) that sources, sensors and errors depend on, numbered."""
 
     def __init__(self) -> None:
         self._number: dict[bytes, int] = {}
@@ -374,7 +374,7 @@ class ExchangeSource:
 
 
 def sources_of(balance: Balance, places: Places) -> tuple[list[Source], list[HeatSource]]:
-    """All temperature-dependent heat of a balance, and that asleep; the places that they look at join `places`."""
+    """All temperature-dependent heat of a balance, and that asleep; their places are added to `places`."""
     awake: list[Source] = []
     asleep: list[HeatSource] = []
     for heat in balance.network.heats:

@@ -24,7 +24,7 @@ Seen = tuple[Numeric | None, Mapping[str, Numeric]]  # what a law makes somethin
 
 @dataclass(frozen=True)
 class Tangents:
-    """Derivatives by Q unknowns at the rows of the recordings, beside one parameter set.
+    """Derivatives by Q unknowns at the rows of the recordings, for one parameter set.
 
     degC (n, Q, B, K) of the places, chain (n_errors, Q, B, K) of the chains and tilts, air_K (Q, S, B, K) of the
     surroundings; `parameters` numbers Q's unknown by the parameter's number.
@@ -38,13 +38,12 @@ class Tangents:
 
 @dataclass(frozen=True)
 class Rows:
-    """What laws see at the rows of the recordings: places (n, P, B, K) degC, surroundings, drivers, time.
+    """Inputs of laws at the rows of the recordings: places (n, P, B, K) degC, surroundings, drivers, time.
 
     chain (n_errors, P, B, K) are the sums of chains and tilts less their first value, in the channels' units.
     """
 
     inputs: Inputs
-    every: int
     values: Numeric  # (P, n)
     degC: Numeric
     chain: Numeric
@@ -54,7 +53,7 @@ class Rows:
     def law(
         self, law: Law, effect: str, seen: Numeric | None, tangents: Tangents | None, d_seen: Numeric | None
     ) -> Any:
-        """A law's effect (P, B, K) on what it sees, and, with tangents, its derivative (Q, B, K), else None."""
+        """A law's effect (P, B, K) on its input `seen`, and, with tangents, its derivative (Q, B, K), else None."""
         if law.asleep and tangents is None:
             return seen if seen is not None else np.zeros((1, 1, 1)), None
         degC = {role: self._port(port) for role, port in law.ports.items()}
@@ -63,7 +62,7 @@ class Rows:
         if tangents is None:
             return out, None
         d_out = np.zeros((tangents.degC.shape[1], *self.time_s.shape))
-        if law.asleep:  # what it sees passes as it is
+        if law.asleep:  # its input passes unchanged
             out, d_out = (out, d_out) if seen is None or d_seen is None else (seen, d_seen.copy())
         else:
             self._pass_on(law, effect, (seen, degC), (d_seen, self._tangents_of(law, tangents)), d_out)
@@ -73,7 +72,7 @@ class Rows:
         return out, d_out
 
     def _pass_on(self, law: Law, effect: str, at: Seen, moved: Seen, d_out: Numeric) -> None:
-        """Write what a law makes of the derivatives of what it sees, for the unknowns that move any of it."""
+        """Write a law's derivatives by the unknowns that change any of its inputs."""
         (seen, degC), (d_seen, d_degC) = at, moved
         moving = [d for d in (d_seen, *d_degC.values()) if d is not None]
         which = np.flatnonzero(sum((d.any(axis=(1, 2)) for d in moving), np.zeros(len(d_out), bool)))
@@ -91,7 +90,7 @@ class Rows:
 
     @cached_property
     def time_s(self) -> Numeric:
-        return self.inputs.time_s[:, :: self.every]
+        return self.inputs.time_s[:, :: self.inputs.every]
 
     @cached_property
     def _clock_h(self) -> Numeric:
@@ -102,12 +101,12 @@ class Rows:
     @cached_property
     def _drivers(self) -> dict[str, Numeric]:
         """By channel in the interval that begins at each row (`intervals_at_rows`)."""
-        at = intervals_at_rows(self.inputs.time_s.shape[1] - 1, self.every)
+        at = intervals_at_rows(self.inputs.time_s.shape[1] - 1, self.inputs.every)
         return {channel: series[:, at] for channel, series in self.inputs.drivers.items()}
 
     @cached_property
     def _air(self) -> list[Numeric]:
-        return [self.air.borders(s, self.every) for s in range(self.air.steady_degC.shape[1])]
+        return [self.air.borders(s, self.inputs.every) for s in range(self.air.steady_degC.shape[1])]
 
     def _call(
         self, law: Law, effect: str, seen: Numeric | None, degC: Mapping[str, Numeric], values: Numeric
@@ -155,7 +154,7 @@ class _Rises(Mapping[str, Numeric]):
 
 
 def watch(network: Network, places: Places) -> None:
-    """Add the places that sensors and errors look at."""
+    """Add the places that sensors and errors depend on."""
     laws = [law for r in network.readings for law in r.effects]
     laws += [law for e in network.errors for law in (*e.effects, *e.readings)]
     for r in network.readings:

@@ -1,8 +1,8 @@
-"""Waveform iteration: heat that depends on temperature, found over a whole trajectory at once (Lelarasmee et al. 1982).
+"""Waveform relaxation for temperature-dependent heat (Lelarasmee et al. 1982).
 
-Each round evaluates every law on the last trajectory, at both ends of every interval, and runs the linear network on
-it. Where the feedback is strong, its mean slope moves into the conductance matrix (a chord); where a round still does
-not contract, what has converged is kept and the rest is solved in shorter windows.
+Each iteration evaluates the laws on the previous trajectory, at both ends of every interval, and solves the linear
+network with that heat. Strong feedback is linearised: its mean slope is added to the conductance matrix (a chord). If
+the iteration still does not contract, the converged part is kept and the rest is solved in shorter windows.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Mixing:
         self.last: tuple[Array, Array] | None = None
 
     def __call__(self, old: Array, new: Array) -> Array:
-        """The next trajectory (n, P, B, m + 1) from the last one and what a round made of it."""
+        """The next trajectory (n, P, B, m + 1) from the previous one and its image under an iteration."""
         if self.off:
             return new
         gap = np.where(self.valid, new - old, 0.0)
@@ -55,7 +55,7 @@ SAMPLED = 48  # intervals per batch that a mean slope is taken over
 
 @dataclass(frozen=True)
 class Chord:
-    """The part of each source's slope that sits in the conductance matrix: W/K (P, R, k) along its direction."""
+    """The part of each source's slope that is in the conductance matrix, W/K (P, R, k), along its direction."""
 
     slope_W_per_K: Array
     modes: Modes

@@ -1,4 +1,4 @@
-"""What drives a simulation: driver channels that hold, surroundings that move linearly, on one time grid per batch."""
+"""Inputs of a simulation: held drivers and linearly varying surroundings on one time grid per batch."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ EVERY = slice(None)
 class Intervals:
     """Builds views of some intervals of B batches.
 
-    A law that works point by point sees (…, B, 2, m): start and end of each interval, with the interval's drivers. A
-    law along time sees (…, B, m): the starts, so that what it does in an interval depends on nothing later.
+    A law that works point by point gets (…, B, 2, m): start and end of each interval, with the interval's drivers. A
+    law along time gets (…, B, m): the starts, so that what it does in an interval depends on nothing later.
     """
 
     inputs: Inputs
@@ -44,7 +44,7 @@ class Intervals:
         degC: Mapping[str, Numeric] | None = None,
         rise_K: Mapping[str, Numeric] | None = None,
     ) -> View:
-        """What a law sees in the intervals `part`; `along` time or at both ends. Temperatures by the law's ports."""
+        """Inputs of a law in the intervals `part`; `along` time or at both ends. Temperatures by the law's ports."""
         driver = {role: self.inputs.drivers[c][:, part] for role, c in law.drivers.items()}
         if along:
             return View(
@@ -97,7 +97,7 @@ def heat_W(heat: Heat, call: Callable[[Law, str], Numeric]) -> Numeric:
 
 
 def reads_time(law: Law, effect: str) -> bool:
-    """Whether a law without ports looks at the time or the clock; if not, its value follows from drivers alone."""
+    """Whether a law without ports reads the time or the clock; if not, its value follows from drivers alone."""
     watched = _Watched({role: np.ones(1) for role in law.drivers})
     with np.errstate(all="ignore"):
         getattr(law.mechanism, effect)(watched, {name: np.ones(1) for name in law.parameters})
@@ -131,7 +131,8 @@ class Inputs:
     in each interval; recorded surroundings by channel (B, M + 1) at the borders, linear between (a plan may also give
     one by the surrounding's own name); clock_h (B,) time of day at the start, nan if unknown; first: by channel the
     first readings (B,), nan where there is none; every: how many intervals lie between two rows of the recording, so
-    that borders ``::every`` are its rows; times: by heat law what its watts are multiplied by in each batch (B,).
+    that borders ``::every`` are its rows; times: by heat law what its watts are multiplied by in each batch (B,);
+    offsets_K (P or 1, B, S): what is added to the surroundings of each batch, per parameter set.
     """
 
     batch_ids: tuple[str, ...]
@@ -143,6 +144,7 @@ class Inputs:
     first: Mapping[str, Array]
     every: int = 1
     times: Mapping[str, Array] = field(default_factory=dict)
+    offsets_K: Array | None = None
     kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # worked out once
 
     def __getstate__(self) -> dict[str, Any]:
@@ -187,9 +189,9 @@ class Inputs:
             every=self.every * factor,
         )
 
-    def with_times(self, times: Mapping[str, Array]) -> Inputs:
-        """The same with heats of each batch's own size, (B,) by law; what is worked out once stays shared."""
-        out = replace(self, times=times)
+    def with_own(self, times: Mapping[str, Array], offsets_K: Array | None = None) -> Inputs:
+        """The same with each batch's own `times` and `offsets_K`; cached results stay shared."""
+        out = replace(self, times=times, offsets_K=offsets_K)
         object.__setattr__(out, "kept", self.kept)
         return out
 
@@ -206,6 +208,7 @@ class Inputs:
             clock_h=self.clock_h[at],
             first={n: v[at] for n, v in self.first.items()},
             times={n: v[at] for n, v in self.times.items()},
+            offsets_K=None if self.offsets_K is None else self.offsets_K[:, at],
         )
 
 

@@ -195,7 +195,7 @@ def advance(amplitude: Array, modes: Modes, pieces: Pieces, weights: Sequence[We
     """Turn modal heat per row (rows, Q, N) into modal amplitudes at the rows' ends, in place.
 
     `start_degC` (Q or 1, B, N) are node temperatures. Returns the amplitudes (pieces + 1, Q, N) that the pieces
-    would end with from zero, the last one zero: one look at them tells whether everything was finite.
+    would end with from zero, the last one zero: if they are finite, everything was.
     """
     n_sets, n_modes = amplitude.shape[1:]
     width = n_sets * n_modes

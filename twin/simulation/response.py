@@ -122,7 +122,7 @@ class Response:
         return States(self.modes, pieces, start, chunks, n_sets)
 
     def outputs(self, forcing: Forcing, start_degC: Array, matrix: Array, every: int = 1) -> Array:
-        """`run(...).at(matrix)` with bounded memory: 128 MiB of states (one set at least) beside the result."""
+        """`run(...).at(matrix)` with bounded memory: 128 MiB of states (one set at least) in addition to the result."""
         n_sets, start = self._sets(forcing, start_degC)
         matrix = _matrix(matrix, n_sets, self.modes.n_nodes)
         pieces = self.schedule.pieces(every)

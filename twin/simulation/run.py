@@ -1,4 +1,4 @@
-"""Simulation: temperatures of all cells, what the sensors show, and the displacement at the tool.
+"""Simulation: temperatures of all cells, sensor readings and displacements.
 
 The linear part is exact (modes of every regime, drivers held, surroundings linear between rows); heat that depends on
 temperature is linear within an interval and found by iteration, of second order in the interval (`twin.substeps`).
@@ -39,19 +39,13 @@ class Solved:
 
 
 def solved_balance(
-    network: Network,
-    values: Array,
-    inputs: Inputs,
-    start_degC: Array,
-    tolerance_K: float,
-    every: int = 1,
-    offsets_K: Array | None = None,
+    network: Network, values: Array, inputs: Inputs, start_degC: Array, tolerance_K: float, every: int = 1
 ) -> Solved:
     """Solve P sets, values (P, n), from start temperatures (P or 1, B, N) to which the laws of the start are added.
 
     The states of a linear network stand at every `every`-th border, of another at all of them.
     """
-    balance, places = balance_of(network, values, inputs, offsets_K), Places()
+    balance, places = balance_of(network, values, inputs), Places()
     sources, asleep = sources_of(balance, places)
     n_places = len(places.rows)
     watch(network, places)
@@ -69,13 +63,13 @@ def solved_balance(
     return Solved(balance, sources, places, start_degC, response, coupled, response.run(heat, start_degC), asleep)
 
 
-def rows_of(solved: Solved, every: int, states_every: int) -> Rows:
-    """What sensors and errors look at, at the rows; the states stand at every `states_every`-th border."""
-    b, n_places = solved.balance, len(solved.places.rows)
+def rows_of(solved: Solved, states_every: int) -> Rows:
+    """Quantities that sensors and errors depend on, at the rows; states are kept at every `states_every`-th border."""
+    b, n_places, every = solved.balance, len(solved.places.rows), solved.balance.inputs.every
     matrix = seen_matrix(b.network, b.values, solved.places)
     seen = np.moveaxis(solved.states.at(matrix, every // states_every), -1, 0)
     chain = seen[n_places:] - seen[n_places:, ..., :1]
-    return Rows(b.inputs, every, b.values, seen[:n_places], chain, b.air, solved.places)
+    return Rows(b.inputs, b.values, seen[:n_places], chain, b.air, solved.places)
 
 
 def seen_matrix(network: Network, values: Array, places: Places) -> Array:
@@ -137,7 +131,7 @@ class Simulation:
     errors: Array
     iterations: int = 0
     windows: int = 1
-    words: str = ""
+    message: str = ""
     cells_degC: Array | None = None
     air_degC: Array | None = None
     heat_W: Mapping[str, Array] = field(default_factory=dict)
@@ -151,45 +145,42 @@ def simulate(
     start_degC: Array | str | None = None,
     tolerance_K: float = TOLERANCE_K,
     keep_cells: bool = False,
-    every: int | None = None,
-    offsets_K: Array | None = None,
 ) -> Simulation:
     """Simulate B batches at P parameter sets, values (P, n) or (n,), in one array pass.
 
-    `start_degC` (P or 1, B, N), "settled" (the steady state with the surroundings) or None (`start_of`); `every` how
-    many intervals lie between two rows of the result, default the recording's rows; `offsets_K` (P or 1, B, S) adds to
-    each batch's surroundings. `tolerance_K` is the iteration's; time steps are the inputs'.
+    `start_degC` (P or 1, B, N), "settled" (the steady state with the surroundings) or None (`start_of`). `tolerance_K`
+    is that of the iteration; time steps, rows of the result (`every`) and offsets of the surroundings are the inputs'.
 
     Raises:
         InputError: arrays of a wrong shape or not finite; heat that is stiff beyond the step control.
     """
     values = np.atleast_2d(np.asarray(values, float))
     check_values(network, values)
-    every = inputs.every if every is None else every
     start = checked_start(network, values, inputs, start_degC)
-    values, start, offsets_K = _sets(network, values, start, offsets_K)
+    values = _sets(network, values, start, inputs.offsets_K)
     parts = []
     for part in _chunks(network, len(values), inputs):
         own = start if len(start) == 1 else start[part]
-        offset = offsets_K if offsets_K is None or len(offsets_K) == 1 else offsets_K[part]
-        solved = solved_balance(network, values[part], inputs, own, tolerance_K, every, offset)
-        parts.append(_simulated(solved, tolerance_K, keep_cells, every))
+        offset = inputs.offsets_K
+        given = inputs if offset is None or len(offset) == 1 else inputs.with_own(inputs.times, offset[part])
+        solved = solved_balance(network, values[part], given, own, tolerance_K, inputs.every)
+        parts.append(_simulated(solved, tolerance_K, keep_cells))
     return parts[0] if len(parts) == 1 else _joined(parts)
 
 
-def _simulated(solved: Solved, tolerance_K: float, keep_cells: bool, every: int) -> Simulation:
+def _simulated(solved: Solved, tolerance_K: float, keep_cells: bool) -> Simulation:
+    network, every = solved.balance.network, solved.balance.inputs.every
     states_every = every if solved.coupled is None else 1
-    network = solved.balance.network
-    readings, errors, _, _ = shown(rows_of(solved, every, states_every), network)
-    return simulation_of(solved, readings, errors, tolerance_K, every, states_every if keep_cells else None)
+    readings, errors, _, _ = shown(rows_of(solved, states_every), network)
+    return simulation_of(solved, readings, errors, tolerance_K, states_every if keep_cells else None)
 
 
 def simulation_of(
-    solved: Solved, readings: Array, errors: Array, tolerance_K: float, every: int, cells_every: int | None = None
+    solved: Solved, readings: Array, errors: Array, tolerance_K: float, cells_every: int | None = None
 ) -> Simulation:
-    """The result of a solved group; with cells if `cells_every` says how far its states stand apart."""
+    """The result of a solved group; with cells where `cells_every` gives the number of intervals between its states."""
     balance, coupled = solved.balance, solved.coupled
-    inputs, network = balance.inputs, balance.network
+    inputs, network, every = balance.inputs, balance.network, balance.inputs.every
     rows = np.arange(inputs.time_s.shape[1])[::every]
     kept: dict[str, Any] = {}
     if cells_every is not None:
@@ -254,12 +245,7 @@ def _heats(solved: Solved, every: int) -> tuple[dict[str, Array], dict[str, Arra
 
 
 def choose_substeps(
-    network: Network,
-    values: Array,
-    inputs: Inputs,
-    start_degC: Array | str | None = None,
-    tolerance_K: float = 0.01,
-    offsets_K: Array | None = None,
+    network: Network, values: Array, inputs: Inputs, start_degC: Array | str | None = None, tolerance_K: float = 0.01
 ) -> int:
     """Into how many parts each interval must be cut (1, 2, 4, … 32) for places and chains to be right to tolerance_K.
 
@@ -271,11 +257,11 @@ def choose_substeps(
     """
     values = np.atleast_2d(np.asarray(values, float))
     start = checked_start(network, values, inputs, start_degC)
-    values, start, offsets_K = _sets(network, values, start, offsets_K)
+    values = _sets(network, values, start, inputs.offsets_K)
 
     def cells(n: int) -> tuple[Solved, Array]:
         finer = inputs.refined(n)
-        solved = solved_balance(network, values, finer, start, tolerance_K / 10, 1, offsets_K)
+        solved = solved_balance(network, values, finer, start, tolerance_K / 10)
         return solved, solved.states.at(np.eye(network.n_cells)[None], n)
 
     solved, coarse = cells(1)
@@ -297,8 +283,8 @@ def choose_substeps(
     )
 
 
-def _sets(network: Network, values: Array, start: Array, offsets_K: Array | None) -> tuple[Array, Array, Array | None]:
-    """All with as many sets as the largest; starts and offsets shared by all stay one."""
+def _sets(network: Network, values: Array, start: Array, offsets_K: Array | None) -> Array:
+    """The values with as many sets as the largest of the three; starts and offsets shared by all stay one."""
     counts = {"parameter values": len(values), "start temperatures": len(start)}
     if offsets_K is not None:
         counts["offsets of surroundings"] = len(offsets_K)
@@ -306,7 +292,7 @@ def _sets(network: Network, values: Array, start: Array, offsets_K: Array | None
     for name, n in counts.items():
         if n not in (1, n_sets):
             raise InputError(f"machine {network.machine}: {name} come in {n} sets, expected 1 or {n_sets}")
-    return np.repeat(values, n_sets, axis=0) if len(values) < n_sets else values, start, offsets_K
+    return np.repeat(values, n_sets, axis=0) if len(values) < n_sets else values
 
 
 def _chunks(network: Network, n_sets: int, inputs: Inputs) -> Iterator[slice]:

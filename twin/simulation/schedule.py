@@ -1,4 +1,4 @@
-"""When which regime holds, and for how long: the time side of a simulation, prepared once for many runs."""
+"""Time grid of a simulation: regimes, pieces and steps, prepared once for many runs."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ _SAME_STEP = 1e-11  # of the longest: steps closer than that are one; difference
 class Schedule:
     """B batches of up to M intervals: `dt_s` (B, M), `regime` (B, M) from 0, valid for the first `n_rows` (B,).
 
-    What stands behind a batch's valid intervals is never read. Steps may differ from interval to interval; few
+    Values behind a batch's valid intervals are never read. Steps may differ from interval to interval; few
     distinct ones are fast, since each frequent one has weights of its own.
 
     Raises:
@@ -294,7 +294,7 @@ class Drive:
         return self._sorted[every]
 
     def first_bad(self) -> str | None:
-        """Where the first value stands that is not finite within the valid intervals, in words."""
+        """Where the first value stands that is not finite within the valid intervals, for messages."""
         valid = np.arange(self.schedule.n_intervals) < self.schedule.n_rows[:, None]
         bad = np.argwhere(~np.isfinite(self.series) & valid[:, :, None])
         if not len(bad):
@@ -342,7 +342,7 @@ def _check_regimes(regime: NDArray[np.generic], valid: NDArray[np.bool_]) -> Non
 
 
 MOST = 64  # distinct driver values; beyond it a driver is a noisy continuous one
-_DIGITS = 9  # to which driver values are told apart, relative to the largest
+_DIGITS = 9  # relative resolution of driver values
 
 
 @dataclass(frozen=True)
@@ -391,7 +391,7 @@ def distinct(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Distinct tuples of driver values: each interval's number (B, M), and each tuple's first interval, flattened.
 
-    `also` (B, M) are regimes that tell tuples apart. Only valid intervals count; padding gets number 0.
+    `also` (B, M) are regimes that distinguish tuples. Only valid intervals count; padding gets number 0.
     """
     names = tuple(dict.fromkeys(channels))
     key = ("distinct", names, id(also))

@@ -17,7 +17,7 @@ from twin.simulation.inputs import Inputs, heat_W, parameters_of
 
 _HOLD = 1e6  # how much stiffer a sensor holds its place than the network pulls at it
 _LOOSE = 1e-9  # and the ambient what nothing else holds
-_LEAST_GAIN = 0.2  # of a sensor in what its place does; one that follows less tells next to nothing
+_LEAST_GAIN = 0.2  # of a sensor relative to its place; below, it carries no information
 
 
 def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = False) -> Array:
@@ -43,11 +43,11 @@ def start_of(network: Network, values: Array, inputs: Inputs, settled: bool = Fa
     known = np.zeros(inputs.n_batches, bool)
     for reading in network.readings if not settled else ():
         value = inputs.first.get(reading.channel, np.full(inputs.n_batches, np.nan))
-        told = np.isfinite(value)
-        known |= told
-        hold = _HOLD * scale * told[:, None, None]
+        read = np.isfinite(value)
+        known |= read
+        hold = _HOLD * scale * read[:, None, None]
         system = system + hold * np.outer(reading.cells, reading.cells)
-        place_degC = _beneath(reading, values, first, np.where(told, value, 0.0))
+        place_degC = _beneath(reading, values, first, np.where(read, value, 0.0))
         heat = heat + hold[..., 0] * place_degC[..., None] * reading.cells
     out: Array = np.linalg.solve(np.broadcast_to(system, (*heat.shape, heat.shape[-1])), heat[..., None])[..., 0]
     if not settled:
@@ -61,7 +61,7 @@ def _beneath(reading: Reading, values: Array, air_degC: Array, shown_degC: Array
     low, high = np.zeros(shape), np.ones(shape)
     for law in reading.effects:
         if law.mechanism.along_time or any(p.cells is not None for p in law.ports.values()):
-            continue  # a lag has settled, and a swapped sensor tells nothing of this place
+            continue  # a lag has settled, and a swapped sensor reads another place
         view = View(degC={role: air_degC[:, :, p.surrounding, None] for role, p in law.ports.items()})
         low, high = (law.mechanism.reading(seen, view, parameters_of(law, values, 2)) for seen in (low, high))
     gain = (high - low)[..., 0]
@@ -76,8 +76,7 @@ def excess_K(network: Network, values: Array, inputs: Inputs) -> Array | None:
     out = np.zeros((len(values), inputs.n_batches, network.n_cells), values.dtype)
     for law, cells in network.starts:
         view = View(
-            driver={role: inputs.drivers[c][:, :1] for role, c in law.drivers.items()},
-            clock_h=inputs.clock_h[:, None],
+            driver={role: inputs.drivers[c][:, :1] for role, c in law.drivers.items()}, clock_h=inputs.clock_h[:, None]
         )
         added = law.mechanism.start_K(view, parameters_of(law, values, 2))
         out += np.broadcast_to(added, (len(values), inputs.n_batches, 1)) * cells
@@ -91,7 +90,8 @@ def checked_start(network: Network, values: Array, inputs: Inputs, start: Array 
         InputError: another word, another shape, or a temperature that is not finite.
     """
     if start is None or (isinstance(start, str) and start == "settled"):
-        return start_of(network, values, inputs, settled=start is not None)
+        own = inputs.with_own(inputs.times)  # the offsets act from the start on, not before
+        return start_of(network, values, own, settled=start is not None)
     if isinstance(start, str):
         raise InputError(f"machine {network.machine}: start is {start!r}, expected 'settled' or temperatures")
     given = np.asarray(start, float)

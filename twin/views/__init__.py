@@ -1,1 +1,1 @@
-"""What a twin shows: heat flows, modes in words, the network's overview and places."""
+"""Views of a twin: heat flows, modes, the network's overview and its layout."""

@@ -20,7 +20,7 @@ RMS_COLUMNS = ("batch", "channel", "unit", "rows", "rms")
 class Compared:
     """One batch: C channels (temperatures, then errors) at K rows; nan where nothing usable is recorded.
 
-    recorded and computed (C, K) in the channels' units, displacements from their first reading. `simulated` says that
+    recorded and computed (C, K) in the channels' units, displacements from their first reading. `simulated` marks that
     the recording itself comes from a simulation.
     """
 
@@ -47,7 +47,7 @@ class Compared:
 
 
 def compared(simulation: Simulation, batches: Sequence[Batch], which: int = 0) -> list[Compared]:
-    """Every batch of a simulation beside its recording, for one parameter set; without channels that a batch lacks.
+    """Every batch of a simulation with its recording, for one parameter set; without channels that a batch lacks.
 
     Raises:
         InputError: other batches than the simulation's, or rows that are not the recordings'.
@@ -78,7 +78,7 @@ def _one(simulation: Simulation, batch: Batch, k: int, which: int) -> Compared:
     if len(time_s) != n or not np.allclose(time_s, batch.time_s - batch.time_s[0], atol=1e-6):
         raise InputError(
             f"batch {batch.batch_id}: the simulation has {len(time_s)} rows, the recording {n}; simulate at the "
-            "recording's rows (every=None)"
+            "rows of the recording"
         )
     channels, units, recorded, computed = [], [], [], []
     for i, r in enumerate(network.readings):

@@ -1,9 +1,9 @@
-"""Where the watts go: heat of every law, storage in every body, losses to every surrounding, flow through every link.
+"""Heat flows of a simulation: heat by law, storage by body, losses by surrounding, flow through links.
 
-All are means over the intervals between two rows, so that energies add up. Heat and storage are what the simulation
-says, J exactly. Exchange needs the integral of the cells' temperatures: it follows from the balance itself,
-``K ∫T = ∫q + G_s ∫T_s - C ΔT`` with the conductances of the interval's regime, and from the trapezoid of the rows in
-what K cannot tell (a closed network). Surroundings are linear in an interval: their trapezoid is exact.
+All are means over the intervals between two rows, so that energies add up. Heat and storage follow exactly from the
+simulation, J. Exchange needs the integral of the cells' temperatures: it follows from the balance itself, ``K ∫T = ∫q +
+G_s ∫T_s - C ΔT`` with the conductances of the interval's regime, and from the trapezoid of the rows in the null space
+of K (a closed network). Surroundings are linear in an interval: their trapezoid is exact.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from twin.simulation.schedule import regimes_of
 from twin.views.overview import body_of
 
 KINDS = ("heat", "storage", "loss", "link")
-_BEYOND = " beyond its mean"  # what the simulation calls an edge's heat beyond its regime's constant
+_BEYOND = " beyond its mean"  # the simulation's name for an edge's heat beyond its regime's constant
 COLUMNS = ("batch", "start_s", "end_s", "kind", "name", "watts")
 
 
@@ -86,17 +86,16 @@ def heat_flows(
     values: Array | None = None,
     batch: int | str = 0,
     which: int = 0,
-    offsets_K: Array | None = None,
     simulated: bool = True,
 ) -> HeatFlows:
     """The flows of one batch and parameter set of a simulation with its cells kept.
 
-    `values` (P, n) or (n,) and `offsets_K` as given to `simulate`; None: the network's own, and none. `simulated` is
-    the label: true also for a recording's drivers, for every watt is computed.
+    `inputs` and `values` (P, n) or (n,) are those of the simulation; None: the network's own values. `simulated` is the
+    label: true also with recorded drivers, since every watt is computed.
 
     Raises:
         InputError: no cells kept, other inputs than the simulation's, an unknown batch, or conductances that change
-            between two rows (simulate with `every=1`).
+            between two rows (simulate with inputs of `every` 1).
     """
     network = simulation.network
     b, every = _fits(simulation, inputs, batch)
@@ -107,8 +106,9 @@ def heat_flows(
     regimes = regimes_of(network, p, one)
     regime = _regime(regimes.of[0, : (k - 1) * every].reshape(k - 1, every), simulation.batch_ids[b])
     factor = regimes.factor[0]  # (R, F)
-    offsets = None if offsets_K is None else offsets_K[[which if len(offsets_K) > 1 else 0]][:, [b]]
-    air = air_of(network, p, one, offsets)
+    if one.offsets_K is not None:
+        one = one.with_own(one.times, one.offsets_K[[which if len(one.offsets_K) > 1 else 0]])
+    air = air_of(network, p, one)
     dt_s = one.dt_s[0, : (k - 1) * every]
     grouped = (k - 1, every)
     air_Ks = np.array(
@@ -163,7 +163,7 @@ def _fits(simulation: Simulation, inputs: Inputs, batch: int | str) -> tuple[int
 
 def _regime(of: NDArray[np.int64], batch_id: str) -> NDArray[np.int64]:
     if (of != of[:, :1]).any():
-        raise InputError(f"batch {batch_id}: conductances change between two rows; simulate with every=1")
+        raise InputError(f"batch {batch_id}: conductances change between two rows; simulate with inputs of every=1")
     return of[:, 0]
 
 
@@ -217,7 +217,7 @@ def _exchange(
 
 
 def _varies(network: Network, edge: Edge, joules: dict[str, Array]) -> bool:
-    """Whether the simulation tells an edge's heat beyond its regime's constant.
+    """Whether the simulation has an edge's heat beyond its regime's constant.
 
     Raises:
         InputError: it does for several edges of one name together: whose joules are whose is not known.

@@ -182,7 +182,7 @@ def _cost(xy: Array, ends: Ints, weight: Array, pitch: tuple[float, float]) -> A
     length = np.linalg.norm(along, axis=-1)
     out = (weight * length**2).sum(axis=-1) + 0.02 * ((xy - xy.mean(axis=1, keepdims=True)) ** 2).sum(axis=(1, 2))
     out = out + _STEEP * (np.abs(along[..., 0]) < 0.25).sum(axis=-1)
-    out = out + _HIDDEN * _hidden(xy, a, along, length, ends) + _CROSSING * _crossings(a, b, ends)
+    out = out + _HIDDEN * _hidden(xy, a, along, length, ends) + _CROSSING * crossings(a, b, ends)
     return np.asarray(out)
 
 
@@ -195,7 +195,7 @@ def _hidden(xy: Array, a: Array, along: Array, length: Array, ends: Ints) -> Arr
     return np.asarray(((off < _NEAR_IN) & ~own).sum(axis=(1, 2)))
 
 
-def _crossings(a: Array, b: Array, ends: Ints) -> Array:
+def crossings(a: Array, b: Array, ends: Ints) -> Array:
     """How many pairs of links without a common body cross, (K,)."""
     i, j = np.triu_indices(len(ends), 1)
     apart = ~(ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))

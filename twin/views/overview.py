@@ -1,4 +1,4 @@
-"""A network body by body, as a person would tell it: what the picture and the tables of a machine file show."""
+"""Description of a network by bodies, links, surroundings and chains, for pictures and tables of a machine file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class BodyView:
     """A body; the time constant is its capacity by the conductance of all that touches it."""
 
     name: str
-    words: str
+    label: str
     capacity_J_per_K: float
     time_constant_s: float
     n_cells: int
@@ -44,7 +44,7 @@ class HeatView:
     """The share of a law's heat that goes into a body; watts are nan where no speed was stated."""
 
     law: str
-    words: str
+    label: str
     body: str
     share: float
     watts: float
@@ -55,7 +55,7 @@ class SurroundingView:
     """A surrounding and how its temperature is known."""
 
     name: str
-    words: str
+    label: str
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _heats(network: Network, steady: Steady | None) -> tuple[HeatView, ...]:
         for body, cells in network.bodies.items():
             part = float(share[cells].sum())
             if abs(part) > 1e-12:
-                out.append(HeatView(heat.law.name, heat.law.mechanism.words, body, part, watts * part))
+                out.append(HeatView(heat.law.name, heat.law.mechanism.summary, body, part, watts * part))
     return tuple(out)
 
 
@@ -214,11 +214,11 @@ class ModeView:
 
     `shape` has a body's mean amplitude, the greatest 1; `weight` its share of capacity × amplitude² (sum 1: the
     modes are orthogonal in this measure); `error` by channel what the mode brings to the displacement of the rise
-    that was asked for, in the channel's unit, and `share` that by the sum of all modes' magnitudes.
+    that was requested, in the channel's unit, and `share` that by the sum of all modes' magnitudes.
     """
 
     time_constant_s: float
-    words: str
+    label: str
     shape: dict[str, float]
     weight: dict[str, float]
     error: dict[str, float]
@@ -305,15 +305,11 @@ def _around(network: Network, cells: Array, named: Sequence[str]) -> str:
             to = f"the {network.surroundings[e.surrounding].name}" if held[0] > 0.5 else ""
         else:
             outer = [end for end, h in zip(ends, held, strict=True) if h <= 0.5]
-            to = _owner(network, outer[0]) if len(outer) == 1 else ""
+            to = body_of(network, outer[0]) if len(outer) == 1 else ""
         if to:
             watts = float(e.conductance(network.values)) * abs(float(e.direction @ cells))
             flow[to] = flow.get(to, 0.0) + watts
     return max(flow, key=lambda k: flow[k]) if flow else "what is around"
-
-
-def _owner(network: Network, weights: Array) -> str:
-    return max(network.bodies, key=lambda b: float(weights[network.bodies[b]].sum()))
 
 
 def _and(names: Sequence[str]) -> str:

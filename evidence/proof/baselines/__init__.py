@@ -1,5 +1,5 @@
-"""Rivals of the diagnosis on the same fits: plain methods, and the diagnosis with one of its rules taken out."""
+"""Baselines and ablations: plain methods, and the diagnosis with one of its rules taken out, on the same fits."""
 
-from evidence.proof.baselines.evaluate import rivals
+from evidence.proof.baselines.evaluate import replies
 
-__all__ = ["rivals"]
+__all__ = ["replies"]

@@ -1,7 +1,8 @@
 """The diagnosis with one of its rules taken out, at the round in which it first decides about physics.
 
-Evidence, refits and all other rules are its own. A finer network that comes first counts as no claim, as in a
-diagnosis, where it is a refinement; so an ablation is not blamed for what refinements would have caught.
+Every ablation runs the code of the diagnosis with a changed `Policy`, on the fits and the refits of that round. A finer
+network that is accepted counts as no claim, as in a diagnosis, where it is a refinement; so an ablation is not blamed
+for what refinements would have caught.
 """
 
 from __future__ import annotations
@@ -10,27 +11,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from scipy.stats import chi2
-
-from data.arrays import Array
-from diagnosis.contracts import Candidate, Tried, Where
-from diagnosis.findings.conclude import SURE, most_left, remainder, rms_of, slow_remainder
+from diagnosis.candidates.discretisation import never_reported
+from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
+from diagnosis.findings.conclude import claimed, residual_ratio, rms_of, slow_residual_ratio, verdict_of
 from diagnosis.findings.report_data import rms_table
 from diagnosis.findings.schema import Findings
 from diagnosis.fitting.fitted import left_out_rows
-from diagnosis.screening.evidence import Evidence
-from diagnosis.screening.screen import alone
-from diagnosis.search.acceptance import EVEN, flipped_threshold, trust
-from diagnosis.search.decision import Round, agreed_on, coarse_first, to_claim
-from diagnosis.search.null import structural_misfits
-from diagnosis.search.probability import Explanation, explanations, most_sure
-from diagnosis.search.refits import refit, taken_on
+from diagnosis.policy import POLICY, Policy
+from diagnosis.screening.screen import proposed, screens
+from diagnosis.search.decision import Criteria, Round, coarse_first, decided
+from diagnosis.search.null import structural_null
+from diagnosis.search.probability import explanations
+from diagnosis.search.refits import common_memory, compared, judged, optimised, refit
 from diagnosis.search.search import Search
-from evidence.proof.baselines.base import WITHIN, Claim, Reply, claimable, counted_in_full, without_nuisances
-from evidence.proof.baselines.bic import in_sample_gains, in_sample_score, null_of
+from evidence.proof.baselines.base import MIN_ALIKE_SHARE, Claim, Reply, claimable, without_nuisances
 
-COARSE = "coarse_network"
-REFITS = 10  # what gains less would not come first by any other count
+MAX_REFITS = 10  # of the round: what gains less would not come first by any other count
+UNPROJECTED_REFITS = 4  # of a screen without projection, each of another mechanism
 
 
 @dataclass(frozen=True)
@@ -42,8 +39,8 @@ class Stage:
 
     @cached_property
     def number(self) -> int:
-        names = [r.accepted and r.best is not None and r.best.candidate.mechanism for r in self.done.rounds]
-        return next((k for k, name in enumerate(names) if name != COARSE), len(names) - 1)
+        finer = [r.accepted and r.best is not None and not r.best.candidate.kind.is_physics for r in self.done.rounds]
+        return next((k for k, one in enumerate(finer) if not one), len(finer) - 1)
 
     @property
     def round(self) -> Round:
@@ -56,110 +53,68 @@ class Stage:
 
     @cached_property
     def refits(self) -> tuple[Tried, ...]:
-        """Its best full refits; one that was swapped in beside later effects is refitted as it was here."""
-        out: list[Tried] = []
-        for t in [t for t in self.round.tried if t.fitted is not None][:REFITS]:
-            again = refit(self.round.before, t.scored) if self._swapped_in(t) else t
+        """Its best full refits; one that was exchanged in a fit with later effects is refitted as it was here."""
+        now, out = self.round.before, []
+        for t in [t for t in self.round.tried if t.fitted is not None][:MAX_REFITS]:
+            again = refit(now, t.scored) if self._exchanged(t) else t
             if again is not None:
-                own = again if again is t else taken_on(self.round.before, again)
-                out.append(replace(own, cluster=t.cluster))
+                own = again if again is t else optimised(now, again)
+                out.append(replace(own, cluster=t.cluster, barred=t.barred))
         return tuple(out)
 
-    def _swapped_in(self, t: Tried) -> bool:
+    def _exchanged(self, t: Tried) -> bool:
         """Whether its fit holds more than what this round began with and itself."""
         assert t.fitted is not None
         before, after = self.round.before.part, t.fitted.part
         more = set(after.mechanisms) - set(before.mechanisms) - {t.candidate.name}
         return bool(more) or (t.candidate.part is not None and set(after.bodies) != set(before.bodies))
 
-    @cached_property
-    def before(self) -> Evidence:
-        """How the fit without any candidate predicts batches left out."""
-        return alone(self.round.before, self.round.before.memory)
+    def decided(self, policy: Policy, tried: Sequence[Tried] | None = None) -> Round:
+        """The round decided anew by a policy, on its own refits or on those given, which are judged by it."""
+        r, now = self.round, self.round.before
+        if tried is None:
+            tried = [replace(t, barred=False) for t in self.refits]
+        if (policy.counts_row_memory, policy.leaves_batches_out) == (True, True):
+            seen, null = r.screen, r.null
+        else:
+            tried = compared(now, [judged(now, t, policy=policy) for t in tried], policy)
+            (seen,) = screens(now, proposed(now), [common_memory([now], policy)])
+            null = structural_null(now, seen.evidence, self._columns, r.seed, policy=policy)
+        criteria = Criteria(now, seen, null, self._columns, r.seed, policy)
+        return decided(criteria, coarse_first(sorted(tried, key=lambda t: -t.standing(null.temperature))))
 
-    @cached_property
-    def after(self) -> list[Evidence]:
-        """The same of every refit, its rows counted as before."""
-        memory = self.round.before.memory
-        return [alone(t.fitted, memory) for t in self.refits if t.fitted is not None]
+    @property
+    def _columns(self) -> dict[str, int]:
+        now = self.round.before
+        return self.round.screen.columns(never_reported(proposed(now), now))
 
-    @cached_property
-    def misfits(self) -> list[list[Array]]:
-        """What the refined machines of the structural null show beyond the fit."""
-        return structural_misfits(self.round.before)
-
-    @cached_property
-    def rest(self) -> float:
-        """What the fit leaves, in units of what structure alone would."""
-        return remainder(replace(self.done, final=self.round.before))
-
-    @cached_property
-    def slow(self) -> float:
-        """The same of rows as they are."""
-        before = self.round.before
-        left = left_out_rows(before)
-        return slow_remainder(rms_of(rms_table(left, left, before), before), before)
-
-    def bar(self, null: float, name: str) -> float:
-        """The threshold with another structural null."""
-        names, flipped = self.round.null.names, self.round.flipped  # none where nothing was refitted
-        which = names.index(name) if name in names else None
-        return max(null, flipped_threshold(flipped, len(self.round.before.batches), which), EVEN)
-
-    def ranked(self, tried: Sequence[Tried]) -> list[Tried]:
-        """By gain and what is plausible, a finer network first where it gains nearly as much."""
-        temperature = self.round.null.temperature
-        order = sorted(tried, key=lambda t: -t.standing(temperature))
-        return coarse_first(order)
-
-    def decided(self, tried: Sequence[Tried], threshold: float) -> Reply:
-        """The reply under the rules of a diagnosis, by other gains or another threshold."""
-        ranked = self.ranked(tried)
-        best = to_claim(ranked, len(self.round.before.batches)) if ranked else None
-        ranked = [best, *(t for t in ranked if t is not best)] if best is not None else []
-        if best is None or not self.accepts(best, threshold):
-            return Reply("undecidable" if self.slow > most_left(self.round.before.runs) else "consistent")
-        if best.candidate.mechanism == COARSE:
+    def reply(self, done: Round, policy: Policy = POLICY) -> Reply:
+        """What a diagnosis would report of this round, were it the last."""
+        if not done.accepted or done.best is None or done.best.fitted is None:
+            return Reply(verdict_of([], False, *self._residual(done.before), done.before.runs, policy))
+        if not done.best.candidate.kind.is_physics:
             return Reply("consistent")  # a refinement is no finding
-        claim, told = self.claim(ranked, threshold)
-        if (claim.probability or 0.0) < SURE and any(self.ties(e, claim) for e in told):
-            return Reply("undecidable", (claim,))
-        rest = remainder(replace(self.done, final=best.fitted)) if best.fitted is not None else self.rest
-        return Reply("partly_explained" if rest > most_left(self.round.before.runs) else "explained", (claim,))
+        best, fitted = done.best.candidate, done.best.fitted
+        found = claimed(done, fitted.part, fitted)
+        verdict = verdict_of([found], False, *self._residual(fitted), fitted.runs, policy)
+        every = [(e.tried.candidate, e.probability) for e in explanations(done)[0]]
+        others = [(c, p) for c, p in every if (c.mechanism, c.where) != (best.mechanism, best.where)]
+        own = sum(p for _, p in every) - sum(p for _, p in others)
+        alike = tuple(c for c, p in others if p >= MIN_ALIKE_SHARE * own)
+        return Reply(verdict, (Claim(best, found.probability, alike),))
 
-    def accepts(self, t: Tried, threshold: float) -> bool:
-        batches = len(self.round.before.batches)
-        return t.gain > threshold and agreed_on(t, batches)
-
-    def claim(self, ranked: Sequence[Tried], threshold: float) -> tuple[Claim, list[Explanation]]:
-        """The first with its probability and its reported set, and all explanations."""
-        told, _, _ = explanations(replace(self.round, tried=tuple(ranked), threshold=threshold, accepted=True))
-        first = ranked[0].candidate
-        p = min(sum(e.probability for e in told if _same(e, first)), most_sure(self.round.before.runs))
-        alike = tuple(e.tried.candidate for e in told if not _same(e, first) and e.probability >= WITHIN * p)
-        return Claim(first, p * trust(ranked[0], len(self.round.before.batches)), alike), told
-
-    @staticmethod
-    def ties(e: Explanation, claim: Claim) -> bool:
-        return not _same(e, claim.candidate) and e.alike and e.probability >= (claim.probability or 0.0) / 2
-
-
-def _same(e: Explanation, c: Candidate) -> bool:
-    return (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)
-
-
-REFITTED = 4  # of a screen without projection, each of another mechanism
-SIGNIFICANT = 0.01  # of a chi-square test, for all candidates together (Bonferroni)
+    def _residual(self, fitted: Fitted) -> tuple[float, float]:
+        """What a fit leaves, in units of what structure alone would: of filtered rows, and of rows as they are."""
+        left = left_out_rows(fitted)
+        slow = slow_residual_ratio(rms_of(rms_table(left, left, fitted), fitted), fitted)
+        return residual_ratio(replace(self.done, final=fitted)), slow
 
 
 def reference(stage: Stage) -> Reply:
-    """The full rules. What is in no list is said where the diagnosis went no further than this round."""
-    r = stage.round
+    """The full rules. What is in no list is reported where the diagnosis went no further than this round."""
     if stage.findings is not None and stage.findings.verdict == "unlisted" and stage.alone:
         return Reply("unlisted", _unlisted(stage.findings))
-    if not r.accepted:
-        return stage.decided([], r.threshold)
-    return stage.decided(stage.refits, r.threshold)
+    return stage.reply(_as_decided(stage))
 
 
 def no_projection(stage: Stage) -> Reply:
@@ -167,66 +122,44 @@ def no_projection(stage: Stage) -> Reply:
     r = stage.round
     residuals = r.before.problem.residuals(r.before.x, r.before.state.nuisance)
     gain = without_nuisances(r.screen.evidence, residuals).scores().gain
-    order = sorted(claimable(r), key=lambda s: (gain[s.column], s.candidate.name))
-    best = list({s.candidate.mechanism: s for s in order}.values())
-    best = sorted(best, key=lambda s: (-gain[s.column], s.candidate.name))[:REFITTED]
+
+    def weakest_last(s: Scored) -> tuple[float, str]:
+        return -gain[s.column], s.candidate.name
+
+    best = list({s.candidate.mechanism: s for s in sorted(claimable(r), key=weakest_last, reverse=True)}.values())
     known = {t.candidate.name: t for t in stage.refits}
-    tried = [known.get(s.candidate.name) or refit(r.before, s) for s in best]
-    fitted = stage.ranked([replace(t, alike=None, cluster=-k) for k, t in enumerate(tried) if t is not None])
-    if fitted and fitted[0].candidate.name not in known:
-        fitted[0] = taken_on(r.before, fitted[0])
-    return stage.decided(fitted, r.threshold)
+    first = sorted(best, key=weakest_last)[:UNPROJECTED_REFITS]
+    tried = [known.get(s.candidate.name) or refit(r.before, s) for s in first]
+    fitted = [replace(t, alike=None, barred=False) for t in tried if t is not None]
+    at_optimum = [t if t.candidate.name in known else optimised(r.before, t) for t in fitted]
+    return stage.reply(stage.decided(POLICY, compared(r.before, at_optimum)))
 
 
 def independent_noise(stage: Stage) -> Reply:
-    """Every row counts in full, and a chi-square test decides."""
-
-    before = float(counted_in_full(stage.before).base_score()[0])
-    gains = [float(counted_in_full(after).base_score()[0]) - before for after in stage.after]
-    return _tested(stage, [replace(t, gain=g, alike=None) for t, g in zip(stage.refits, gains, strict=True)])
+    """Every row counts in full, as independent noise; the structural null likewise."""
+    return stage.reply(stage.decided(replace(POLICY, counts_row_memory=False)))
 
 
 def in_sample(stage: Stage) -> Reply:
-    """Gains on the recordings that were fitted; nothing is left out, the null by the same statistic."""
-    r = stage.round
-
-    columns = {s.candidate.name: s.column for s in claimable(r)}
-    null = null_of(stage.misfits, r.screen.evidence, columns, in_sample_gains, in_sample_score)
-    before = float(in_sample_score(stage.before)[0])
-    gains = [float(in_sample_score(after)[0]) - before for after in stage.after]
-    tried = [
-        replace(t, gain=gain, alike=None, improved=len(r.before.batches))
-        for t, gain in zip(stage.refits, gains, strict=True)
-    ]
-    if not tried:
-        return stage.decided([], EVEN)
-    best = stage.ranked(tried)[0]
-    name = best.candidate.name
-    return stage.decided(tried, stage.bar(null.threshold(before + best.gain, name=name), name))
+    """Gains on the recordings that were fitted; no batch is left out, in the structural null neither."""
+    return stage.reply(stage.decided(replace(POLICY, leaves_batches_out=False)))
 
 
 def no_structural_null(stage: Stage) -> Reply:
-    """Left-out gains as they are, against what a chi-square test asks of noise alone."""
-    return _tested(stage, list(stage.refits))
+    """Nothing is held against what structure alone makes of it."""
+    return stage.reply(stage.decided(replace(POLICY, uses_structural_null=False)))
 
 
 def no_floor_check(stage: Stage) -> Reply:
-    """The best listed explanation is claimed where it passes the threshold, whatever is left over."""
-    r = stage.round
-    ranked = stage.ranked(stage.refits)
-    if not ranked or ranked[0].gain <= r.threshold or r.best is None or r.best.candidate.mechanism == "coarse_network":
-        return Reply.of([])
-    return Reply.of([stage.claim(ranked, r.threshold)[0]])
+    """What is left over does not count: a claim explains all, and no claim means that nothing is missing."""
+    return stage.reply(_as_decided(stage), replace(POLICY, checks_residual=False))
 
 
-def _tested(stage: Stage, tried: list[Tried]) -> Reply:
-    """Twice a gain is chi-square with as many degrees of freedom as the candidate has parameters (Wilks 1938)."""
-    ranked = stage.ranked(tried)
-    if not ranked:
-        return stage.decided([], 0.0)
-    c = ranked[0].candidate
-    freedom = max(1, len(c.amplitudes) + len(c.shape))
-    return stage.decided(ranked, 0.5 * float(chi2.isf(SIGNIFICANT / len(claimable(stage.round)), freedom)))
+def _as_decided(stage: Stage) -> Round:
+    """The round as the diagnosis decided it, every refit as it was in this round."""
+    refits, r = stage.refits, stage.round
+    rest = [t for t in r.tried if t.fitted is None]
+    return replace(r, tried=(*refits, *rest))
 
 
 def _unlisted(findings: Findings) -> tuple[Claim, ...]:

@@ -1,4 +1,4 @@
-"""What a rival answers, in the words of a diagnosis: a verdict and findings, the best first."""
+"""Replies of baselines and ablations in the form of a diagnosis: a verdict and findings, the best first."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
-from diagnosis.candidates.discretisation import no_news, slack
+from diagnosis.candidates.discretisation import never_reported, slack
 from diagnosis.contracts import Candidate, Scored
 from diagnosis.fitting.regression import Whitened
 from diagnosis.screening.evidence import Evidence
 from diagnosis.search.decision import Round
 
-WITHIN = 0.1  # of the first explanation's probability: what is less likely is told, but is not of the reported set
+MIN_ALIKE_SHARE = 0.1  # of the first explanation's probability: what is less likely is not of the reported set
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Reply:
-    """Everything that one method says."""
+    """The reply of one method."""
 
     verdict: str
     claims: tuple[Claim, ...] = ()
@@ -43,12 +43,12 @@ class Reply:
     def as_json(self, seconds: float) -> dict[str, Any]:
         found = []
         for c in self.claims:
-            told = _place(c.candidate)
+            entry = _place(c.candidate)
             if c.probability is not None:
-                told["probability"] = round(c.probability, 4)
+                entry["probability"] = round(c.probability, 4)
             alike = [_place(a) for a in c.alike]
-            told["alternatives"] = [a for k, a in enumerate(alike) if a != _place(c.candidate) and a not in alike[:k]]
-            found.append(told)
+            entry["alternatives"] = [a for k, a in enumerate(alike) if a != _place(c.candidate) and a not in alike[:k]]
+            found.append(entry)
         return {"verdict": self.verdict, "findings": found, "seconds": round(seconds, 2)}
 
 
@@ -98,7 +98,7 @@ def plain_rows(done: Round) -> PlainRows:
 
 def claimable(done: Round) -> list[Scored]:
     """Candidates with a signature, but those that any lumped network has some of."""
-    loose = no_news([s.candidate for s in done.screen.scored], done.before)
+    loose = never_reported([s.candidate for s in done.screen.scored], done.before)
     return [s for s in done.screen.scored if s.column >= 0 and s.candidate.name not in loose]
 
 
@@ -106,7 +106,7 @@ def beyond_slack(done: Round) -> list[Scored]:
     """Those of them that are not late or off-centre readings or lengths, which every lumped network shows without a
     fault.
 
-    A diagnosis fits that slack beside everything; a method that does not would name nothing else.
+    A diagnosis fits that slack with every candidate; a method without it would name nothing else.
     """
     loose = slack([s.candidate for s in done.screen.scored], done.before)
     return [s for s in claimable(done) if s.candidate.name not in loose]

@@ -6,7 +6,6 @@ enter one at a time as long as the criterion falls, all amplitudes refitted at e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +13,9 @@ from scipy.linalg import cho_solve
 
 from data.arrays import Array
 from diagnosis.contracts import Scored
-from diagnosis.screening.evidence import ROUNDS, Evidence
-from diagnosis.search.null import SCALES, Null, recordings
-from diagnosis.search.search import MOST_EFFECTS, Search
+from diagnosis.policy import POLICY
+from diagnosis.screening.evidence import Evidence
+from diagnosis.search.search import Search
 from evidence.proof.baselines.base import Claim, Reply, beyond_slack, counted_in_full
 
 LOOKED_AT = 40  # candidates of a step whose criterion is worked out, by what they take off at the weights before it
@@ -31,7 +30,7 @@ def in_sample_bic(done: Search) -> Reply:
     chosen: list[int] = []
     claims: list[Claim] = []
     now = sums.criterion([])
-    while len(chosen) < MOST_EFFECTS:
+    while len(chosen) < POLICY.max_effects:
         tried = {j: sums.criterion([*chosen, j]) for j in sums.promising(chosen)}
         best = min(tried, key=lambda j: tried[j], default=None)
         if best is None or tried[best] >= now:
@@ -75,7 +74,7 @@ class _Sums:
         return float(self.rows[known] @ np.log(mean) + len(chosen) * np.log(self.rows.sum()))
 
     def promising(self, chosen: list[int]) -> list[int]:
-        """Candidates that take most off the weighted squares beside those chosen."""
+        """Candidates that take most off the weighted squares given those chosen."""
         total = np.tensordot(self._weight(self._fit(chosen)[0]), self.gram, 1)
         own, to = total[:-1, :-1], total[:-1, -1]
         if chosen:
@@ -105,64 +104,3 @@ class _Sums:
 
     def _weight(self, square: Array) -> Array:
         return np.asarray(self.rows / np.maximum(square, np.maximum(self.least, 1e-300)))
-
-
-def in_sample_score(evidence: Evidence, targets: Sequence[Array] | None = None) -> Array:
-    """`Evidence.base_score` (R,) with the residuals of the whole fit in place of those of batches left out."""
-    targets = evidence.targets if targets is None else targets
-    left = evidence.density(np.nan_to_num(evidence.mean_squares(evidence.left_out(targets))))
-    within = evidence.density(np.nan_to_num(evidence.mean_squares(residuals(evidence, targets))))
-    return np.asarray(evidence.base_score(targets) - left + within)
-
-
-def in_sample_gains(evidence: Evidence, targets: Sequence[Array], columns: Sequence[int]) -> Array:
-    """Rise of the density (R, C) where each column has its best amplitude within bounds, channels reweighted."""
-    at = list(columns)
-    inside = residuals(evidence, targets)
-    n, channels = inside[0].shape[1], len(evidence.rows)
-    own, cross, square = np.zeros((n, channels)), np.zeros((n, channels, len(at))), np.zeros((channels, len(at)))
-    for b, e, beyond in zip(evidence.batches, inside, evidence.beyond, strict=True):
-        for c, rows in b.slices:
-            own[:, c] += (e[rows] ** 2).sum(axis=0)
-            cross[:, c] += e[rows].T @ beyond[rows][:, at]
-            square[c] += (beyond[rows][:, at] ** 2).sum(axis=0)
-    least = np.maximum(evidence.rows * evidence.weight, 1e-300)
-    low, high = evidence.low[at], evidence.high[at]
-    g = np.clip(cross.sum(axis=1) / np.maximum(square.sum(axis=0), 1e-300), low, high)
-    for _ in range(ROUNDS):
-        weight = evidence.rows[:, None] / np.maximum(_squares(g, own, cross, square), least[:, None])
-        g = np.einsum("rkc,rkc->rc", weight, cross) / np.maximum(np.einsum("rkc,kc->rc", weight, square), 1e-300)
-        g = np.clip(g, low, high)
-    after = np.moveaxis(_squares(g, own, cross, square) / least[:, None], 1, -1)
-    return np.asarray(evidence.density(after) - evidence.density(own / least)[:, None])
-
-
-def residuals(evidence: Evidence, targets: Sequence[Array]) -> list[Array]:
-    """Of the whole fit, (n_b, R)."""
-    total = np.sum([b.jacobian.T @ t for b, t in zip(evidence.batches, targets, strict=True)], axis=0)
-    z = cho_solve(evidence.factor, total)
-    return [t - b.jacobian @ z for b, t in zip(evidence.batches, targets, strict=True)]
-
-
-def _squares(g: Array, own: Array, cross: Array, square: Array) -> Array:
-    return np.asarray(np.maximum(own[..., None] - 2.0 * g[:, None] * cross + g[:, None] ** 2 * square, 0.0))
-
-
-Gains = Callable[[Evidence, Sequence[Array], Sequence[int]], Array]  # of recordings by columns, (R, C)
-Score = Callable[[Evidence, Sequence[Array]], Array]  # of recordings without a candidate, (R,)
-
-
-def null_of(
-    misfits: Sequence[Sequence[Array]], evidence: Evidence, columns: Mapping[str, int], gains: Gains, score: Score
-) -> Null:
-    """`diagnosis.search.null.structural_null` by `gains` of these columns, numbered by candidate, and `score`."""
-    shape = (len(misfits), len(SCALES))
-    none = np.zeros((0, 0, 0))
-    if not misfits:
-        return Null(np.zeros(shape), np.zeros(shape), none, none)
-    drawn = recordings(misfits, evidence)
-    gain = gains(evidence, drawn, list(columns.values()))
-    largest, density = gain.max(axis=1, initial=0.0), score(evidence, drawn)
-    return Null(
-        largest.reshape(shape), density.reshape(shape), none, none, tuple(columns), gain.reshape(*shape, len(columns))
-    )

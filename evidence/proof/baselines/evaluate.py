@@ -1,4 +1,4 @@
-"""All rivals asked about one diagnosis, with the seconds that each took."""
+"""All baselines and ablations evaluated on one diagnosis, with the seconds that each took."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ ABLATIONS = Registry(
 
 
 @threadpool_limits.wrap(limits=1)
-def rivals(done: Diagnosis | Search) -> dict[str, Any]:
-    """What each would have answered to the same recordings, as `rivals.json` keeps it.
+def replies(done: Diagnosis | Search) -> dict[str, Any]:
+    """The reply of each to the same recordings, as `rivals.json` keeps it.
 
     Baselines start from the first fit, before anything was refined; ablations and the reference, the full rules, are of
     the round that first decided about physics. With a diagnosis, the reference can say that something is unlisted.
@@ -46,7 +46,7 @@ def rivals(done: Diagnosis | Search) -> dict[str, Any]:
     """
     search = done.search if isinstance(done, Diagnosis) else done
     if search is None or not search.rounds:
-        raise WorkError("rivals: the diagnosis kept no search; hand over one that `diagnose` has just made")
+        raise WorkError("baselines: the diagnosis kept no search; hand over one that `diagnose` has just made")
     stage = Stage(search, done.findings if isinstance(done, Diagnosis) else None)
     return {
         "baselines": {key: _timed(BASELINES[key], search) for key in BASELINES},

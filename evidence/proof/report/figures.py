@@ -1,8 +1,7 @@
-"""Rivals and ablations, reliability, detection over amplitude. Each takes tables and returns a figure."""
+"""The figures of the proof's page. Each takes tables and returns a figure."""
 
 from __future__ import annotations
 
-import base64
 import textwrap
 from collections.abc import Sequence
 
@@ -15,14 +14,11 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from data.arrays import Array
 from evidence.proof.report.labels import GROUPS, key_label, method_label, origin, plant_letter, plant_origin
 from evidence.proof.report.tables import SIZES
-from reports.diagnosis.tables import UNITS
-from reports.labels import BLUE, GREEN, INK, ORANGE, number
-from reports.twin.figures import MUTED, SIZE, _calm
-from reports.twin.network_picture import picture_bytes
-from reports.twin.page import Picture
+from reports.drawing import GREY, MUTED, SIZE, Picture, panel
+from reports.drawing import picture as drawn
+from reports.labels import BLUE, GREEN, INK, ORANGE, number, tex_escaped, unit_label
 
 WIDE_IN, HALF_IN = 10.5, 5.5
-PALE = "#c5cbd3"
 _PLANTS = {"elements": (BLUE, "o"), "volumes": (ORANGE, "s"), "grafted": (GREEN, "D"), "withheld": ("#8a4fa3", "^")}
 
 
@@ -41,13 +37,13 @@ def head(fig: Figure, title: str, plants: Sequence[str]) -> None:
 
 
 def keys(fig: Figure, entries: Sequence[tuple[str, str, str]], y_in: float) -> None:
-    """Mark, words and colour in a row, right of the origin's line, `y_in` below the top edge."""
+    """Mark, label and colour in a row, right of the origin's line, `y_in` below the top edge."""
     high, wide = fig.get_figheight(), fig.get_figwidth()
-    x = wide - 0.1 - sum(0.3 + 0.072 * len(words) for _, words, _ in entries)
-    for mark, words, color in entries:
+    x = wide - 0.1 - sum(0.3 + 0.072 * len(label) for _, label, _ in entries)
+    for mark, label, color in entries:
         fig.text(x / wide, 1 - y_in / high, mark, fontsize=9.5, color=color, va="center")
-        fig.text((x + 0.17) / wide, 1 - y_in / high, words, fontsize=8.5, color=MUTED, va="center")
-        x += 0.3 + 0.072 * len(words)
+        fig.text((x + 0.17) / wide, 1 - y_in / high, label, fontsize=8.5, color=MUTED, va="center")
+        x += 0.3 + 0.072 * len(label)
 
 
 def plant_keys(plants: Sequence[str]) -> list[tuple[str, str, str]]:
@@ -56,27 +52,18 @@ def plant_keys(plants: Sequence[str]) -> list[tuple[str, str, str]]:
     return [(marks[plant_style(p)[1]], f"plant {plant_letter(p)}", plant_style(p)[0]) for p in plants]
 
 
-def panel(fig: Figure, left_in: float, top_in: float, wide_in: float, tall_in: float) -> Axes:
-    """Axes in the report's calm look, placed in inches from the upper left corner."""
-    w, h = fig.get_figwidth(), fig.get_figheight()
-    ax = fig.add_axes((left_in / w, 1 - (top_in + tall_in) / h, wide_in / w, tall_in / h))
-    _calm(ax)
-    return ax
-
-
 def picture(figure: Figure, said: str, plants: Sequence[str]) -> Picture:
-    """The figure as a data: address; its words say what is simulated."""
-    content = base64.b64encode(picture_bytes(figure, "png")).decode("ascii")
+    """The figure as a data: address; its label states what is simulated."""
     only = {plant_origin(p) for p in plants} == {"SIMULATED"}
     mixed = "" if only else f" ({origin(plants)})"
-    return Picture(f"{said}{mixed}", f"data:image/png;base64,{content}", only)
+    return drawn(figure, f"{said}{mixed}", only)
 
 
 _GROUP_COLORS = {"diagnosis": BLUE, "baseline": ORANGE, "ablation": "#6b7682"}
 _ROW_IN, _NAMES_IN, _TOP_IN = 0.27, 2.75, 1.05
 
 
-def rivals(compared: pd.DataFrame, plants: Sequence[str]) -> Figure:
+def baselines(compared: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """A dot and its 90 % interval per method (rows) and measure (columns), grouped; the diagnosis drawn through.
 
     Args:
@@ -108,9 +95,9 @@ def rivals(compared: pd.DataFrame, plants: Sequence[str]) -> Figure:
     first, side = fig.axes[0], -_NAMES_IN / (wide - 0.55) + 0.05
     for y, (group, method) in enumerate(rows):
         if not method:
-            words = GROUPS.get(group, group)
-            first.text(side, y, words, fontsize=8.5, color=MUTED, transform=first.get_yaxis_transform(), va="center")
-    head(fig, "Against other ways, on the same recordings", plants)
+            label = GROUPS.get(group, group)
+            first.text(side, y, label, fontsize=8.5, color=MUTED, transform=first.get_yaxis_transform(), va="center")
+    head(fig, "Against other methods, on the same recordings", plants)
     return fig
 
 
@@ -141,17 +128,17 @@ def _method_rows(compared: pd.DataFrame) -> list[tuple[str, str]]:
     return out
 
 
-def reliability(table: pd.DataFrame, told: Array, error: float, plants: Sequence[str]) -> Figure:
+def reliability(table: pd.DataFrame, stated: Array, error: float, plants: Sequence[str]) -> Figure:
     """Share right against claimed probability, bin by bin with 90 % intervals; below, how often each was claimed.
 
     Args:
         table: bins from low to high: claimed (mean), right, low90, high90, n.
-        told: every probability (n,), 0..1.
+        stated: every probability (n,), 0..1.
         error: expected calibration error; nan where it is not known.
     """
     fig = Figure(figsize=(HALF_IN, 5.6))
     ax = panel(fig, 0.75, 0.75, HALF_IN - 1.0, 3.3)
-    ax.plot([0, 100], [0, 100], color=PALE, lw=1.2)
+    ax.plot([0, 100], [0, 100], color=GREY, lw=1.2)
     first, last, x, y, low, high = (
         100 * table[c].to_numpy(float) for c in ("low", "high", "claimed", "right", "low90", "high90")
     )
@@ -164,7 +151,7 @@ def reliability(table: pd.DataFrame, told: Array, error: float, plants: Sequence
     said = f"expected calibration error {error:.3f}, {said}" if np.isfinite(error) else said
     ax.set_title(said, fontsize=8.5, loc="left", color=MUTED, pad=4)
     below = panel(fig, 0.75, 4.3, HALF_IN - 1.0, 0.75)
-    below.hist(100 * told, bins=np.linspace(0, 100, 41).tolist(), color=PALE)
+    below.hist(100 * stated, bins=np.linspace(0, 100, 41).tolist(), color=GREY)
     below.set_xlim(0, 103)
     below.set_xlabel("probability claimed, %", fontsize=8, labelpad=1)
     below.set_ylabel("answers", fontsize=8)
@@ -177,7 +164,7 @@ def detection(table: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """Share found by effect (rows) and size in detection limits (columns); counts in the cells, all effects on top.
 
     Args:
-        table: `proof_extracts.detection_by_size`.
+        table: `tables.detection_by_size`.
     """
     effects = [e for e in dict.fromkeys(table["effect"]) if e != "all effects"]
     names = ["all effects", *effects]
@@ -202,7 +189,7 @@ def detection(table: pd.DataFrame, plants: Sequence[str]) -> Figure:
     ax.tick_params(axis="both", length=0)
     ax.grid(visible=False)
     ax.spines[["left", "bottom"]].set_visible(False)
-    ax.axhline(0.5, color=PALE, lw=0.8)
+    ax.axhline(0.5, color=GREY, lw=0.8)
     ax.set_title("size in detection limits", fontsize=8.5, color=MUTED, loc="left", pad=4)
     head(fig, "Found, by effect and size", plants)
     return fig
@@ -233,8 +220,8 @@ def confusion(counts: pd.DataFrame, bounds: Sequence[int], title: str, plants: S
             ax.plot([j - 0.5, j + 0.5, j + 0.5, j - 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5],
                     color=ORANGE, lw=1.0, zorder=2)  # fmt: skip
     for b in bounds:
-        ax.axhline(b - 0.5, color=PALE, lw=0.9, zorder=1.5)
-        ax.axvline(b - 0.5, color=PALE, lw=0.9, zorder=1.5)
+        ax.axhline(b - 0.5, color=GREY, lw=0.9, zorder=1.5)
+        ax.axvline(b - 0.5, color=GREY, lw=0.9, zorder=1.5)
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5))
     ax.set_xticks(range(len(columns)), [key_label(c) for c in columns], rotation=90, fontsize=7.5, color=INK)
     ax.set_yticks(range(len(rows)), [key_label(r) for r in rows], fontsize=7.5, color=INK)
@@ -245,7 +232,6 @@ def confusion(counts: pd.DataFrame, bounds: Sequence[int], title: str, plants: S
     return fig
 
 
-_TRUE = GREEN
 SHADE = "#f3ddc9"
 
 
@@ -260,9 +246,9 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
     shown = cases.sort_values("error_before", ascending=False, kind="stable")
     at = np.arange(len(shown))
     thick = min(2.5, 500 / len(shown))
-    ax.vlines(at, shown["error_after"], shown["error_before"], color=PALE, lw=thick, zorder=1)
+    ax.vlines(at, shown["error_after"], shown["error_before"], color=GREY, lw=thick, zorder=1)
     size = float(np.clip(420 / len(shown), 2.0, 5.0))
-    for column, color, mark in (("error_floor", MUTED, "_"), ("error_true", _TRUE, "_"), ("error_before", ORANGE, "o"),
+    for column, color, mark in (("error_floor", MUTED, "_"), ("error_true", GREEN, "_"), ("error_before", ORANGE, "o"),
                                 ("error_after", BLUE, "o")):  # fmt: skip
         wide = 1.6 * size if mark == "_" else size
         ax.plot(at, shown[column], mark, color=color, ms=wide, mec=color, mew=1.2 if mark == "_" else 0, zorder=2)
@@ -275,13 +261,8 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
     ax.set_ylabel("left-out error, units of the noise", fontsize=8)
     ax.set_xlabel("visible cases, largest error first", fontsize=8, labelpad=2)
     head(fig, "What the diagnosis repairs", plants)
-    entries = [
-        ("●", "before", ORANGE),
-        ("●", "after", BLUE),
-        ("━", "with the true model", _TRUE),
-        ("━", "noise", MUTED),
-    ]
-    keys(fig, entries, 0.4)
+    lines = [("━", "with the true model", GREEN), ("━", "noise", MUTED)]
+    keys(fig, [("●", "before", ORANGE), ("●", "after", BLUE), *lines], 0.4)
     return fig
 
 
@@ -289,7 +270,7 @@ def amplitudes(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """Amplitude found against true, both in detection limits, with 90 % intervals; the band is ± 40 %.
 
     Args:
-        terms: `proof_extracts.with_amplitude`.
+        terms: `tables.with_amplitude`.
     """
     fig = Figure(figsize=(HALF_IN, 5.6))
     ax = panel(fig, 0.75, 0.95, HALF_IN - 1.0, 4.1)
@@ -298,7 +279,7 @@ def amplitudes(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
     low, high = float(both.min()) / 1.4, float(both.max()) * 1.4
     line = np.array([low, high])
     ax.fill_between(line, 0.6 * line, 1.4 * line, color="#eef1f4", zorder=0)
-    ax.plot(line, line, color=PALE, lw=1.2, zorder=1)
+    ax.plot(line, line, color=GREY, lw=1.2, zorder=1)
     for plant in plants:
         own = terms[terms["plant"] == plant]
         color, mark = plant_style(plant)
@@ -323,7 +304,7 @@ def ratios(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
     fig = Figure(figsize=(HALF_IN, 0.95 + tall + 0.55))
     ax = panel(fig, 1.75, 0.95, HALF_IN - 2.45, tall)
     ax.axvspan(0.6, 1.4, color="#eef1f4", zorder=0)
-    ax.axvline(1.0, color=PALE, lw=1.2, zorder=1)
+    ax.axvline(1.0, color=GREY, lw=1.2, zorder=1)
     for y, effect in enumerate(effects):
         own = terms[terms["effect"] == effect]
         for plant, part in own.groupby("plant", sort=True):
@@ -331,9 +312,9 @@ def ratios(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
             x = part["ratio"].clip(0.25, 4)
             ax.plot(x, np.full(len(part), y), mark, color=color, ms=3.6, alpha=0.55, mec="none")
         ax.plot([own["ratio"].median()] * 2, [y - 0.36, y + 0.36], color=INK, lw=1.8, zorder=4)
-        told = own["covers"].dropna()
-        if len(told):
-            ax.text(1.03, y, f"{int(told.sum())}/{len(told)}", fontsize=7.5, color=MUTED,
+        known = own["covers"].dropna()
+        if len(known):
+            ax.text(1.03, y, f"{int(known.sum())}/{len(known)}", fontsize=7.5, color=MUTED,
                     transform=ax.get_yaxis_transform(), va="center")  # fmt: skip
     ax.text(1.03, -0.75, "interval\nholds it", fontsize=7, color=MUTED, transform=ax.get_yaxis_transform(), va="bottom")
     ax.set(xscale="log", xlim=(0.22, 4.6), ylim=(len(effects) - 0.5, -0.8))
@@ -391,12 +372,12 @@ def worst_case(series: pd.DataFrame, windows: pd.DataFrame | None, plant: str) -
         ax.plot(hours, own["recorded"] - own["after"], color=BLUE, lw=1.3)
         if len(hours) > 1:
             ax.set_xlim(hours[0], hours[-1])
-        ax.set_title(str(batch).replace("$", r"\$"), fontsize=8.5, loc="left", color=INK, pad=3)
+        ax.set_title(tex_escaped(str(batch)), fontsize=8.5, loc="left", color=INK, pad=3)
         ax.set_xlabel("time, h", fontsize=8, labelpad=1)
         ax.locator_params(axis="y", nbins=4)
     unit = str(series["unit"].iloc[0]).replace("degC", "K")  # of a difference
-    channel = str(series["channel"].iloc[0]).replace("$", r"\$")
-    head(fig, f"{channel}: recorded − simulated, {UNITS.get(unit, unit)}", (plant,))
+    channel = tex_escaped(str(series["channel"].iloc[0]))
+    head(fig, f"{channel}: recorded − simulated, {unit_label(unit)}", (plant,))
     shaded = [("■", "the effect works", "#e3b78f")] if windows is not None else []
     keys(fig, [("—", "before", ORANGE), ("—", "after", BLUE), *shaded], 0.4)
     return fig

@@ -1,9 +1,11 @@
-"""Plants, measures, methods and steps of the proof in words."""
+"""Labels of plants, measures, methods and steps of the proof, and the texts of its page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+
+import pandas as pd
 
 from reports.labels import NOTHING, number
 
@@ -42,10 +44,10 @@ METHOD = (
     "A case counts as visible when the true effect, fitted, cuts a left-out error by a tenth or more, beyond what "
     "structure alone gives. Detection, place, mechanism and amplitude are judged on visible cases.",
 )
-INFORMED = "told the truth"
+INFORMED = "truth known"
 GLOSSARY = (
     ("interval", "90 %: Clopper and Pearson for shares, bootstrap over cases for medians and quantiles."),
-    ("met", "The measured value itself reaches the goal; the interval says how sure that is."),
+    ("met", "The measured value itself reaches the goal; the interval states its uncertainty."),
     (INFORMED, "The same measure for an answer that has all concealed effects in its model, refits it, and "
      "claims what passes the bars of a claim. What it misses, these recordings do not give with such bars. Of the "
      "calibration error: what probabilities show that are exactly right, in the mean over chance."),
@@ -57,13 +59,18 @@ GLOSSARY = (
     ("error", "Of left-out runs, in units of the noise: root of the mean over channels of (rms / noise)²."),
     ("with the true model", "The twin given the concealed effects and fitted: what a perfect answer would reach."),
     ("expected calibration error", "Mean distance of claimed probability and share right, weighted by cases. Right is "
-     "the mechanism of a concealed effect at its place or beside it."),
+     "the mechanism of a concealed effect at its place or adjacent."),
 )  # fmt: skip
 
 
-def meaning(word: str) -> str:
-    """What the glossary says of it."""
-    return dict(GLOSSARY)[word]
+def meaning(term: str) -> str:
+    """Its entry in the glossary."""
+    return dict(GLOSSARY)[term]
+
+
+def stamp(utc: str) -> str:
+    """``2026-01-31 12:00 UTC``; empty where there is none."""
+    return f"{pd.Timestamp(utc):%Y-%m-%d %H:%M} UTC" if utc else ""
 
 
 def plant_label(plant: str) -> str:

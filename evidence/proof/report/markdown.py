@@ -9,8 +9,7 @@ import pandas as pd
 
 from data.errors import InputError
 from data.files import write_atomic
-from evidence.proof.report import labels as words
-from evidence.proof.report import shortfall
+from evidence.proof.report import labels, shortfall
 from evidence.proof.report.page import headline
 from evidence.proof.report.tables import Cell, ProofRun, goal_rows, shortfalls
 from reports.labels import NOTHING
@@ -40,16 +39,16 @@ def publish_proof(path: Path, run: ProofRun | None) -> None:
 
 
 def proof_markdown(run: ProofRun | None) -> str:
-    """The block between the markers; without a run it says so."""
+    """The block between the markers; without a run it states so."""
     if run is None:
         return NO_RUN + "\n"
     goals = run.table("goals")
-    lines = [f"**{headline(run)}** {words.origin(run.plants)}".rstrip(), ""]
-    lines += [f"{said}\n" for said in ([words.NOT_SEALED] if run.suite != "sealed" else [])]
-    lines += [f"{said}\n" for said in ([words.PARTIAL] if run.partial else [])]
+    lines = [f"**{headline(run)}** {labels.origin(run.plants)}".rstrip(), ""]
+    lines += [f"{labels.NOT_SEALED}\n"] if run.suite != "sealed" else []
+    lines += [f"{labels.PARTIAL}\n"] if run.partial else []
     lines += [
         f"- Sealed root: `{run.root}`",
-        f"- Sealed {_stamp(run.sealed)}, opened {_stamp(run.opened)}, thermodrift {run.version}",
+        f"- Sealed {labels.stamp(run.sealed)}, opened {labels.stamp(run.opened)}, thermodrift {run.version}",
         f"- Source that answered: `{run.source_digest}`",
         f"- Cases: {run.cases} sealed, {len(run.table('outcomes'))} count, {len(run.void)} void, "
         f"{len(run.failed)} failed (counted as wrong)",
@@ -64,14 +63,14 @@ def proof_markdown(run: ProofRun | None) -> str:
 
 
 def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
-    heads = [f"{words.plant_label(p)} ({words.plant_origin(p)})" for p in plants]
-    cells = ["measure", "goal", f"all plants ({words.origin(plants)})", "90 %", "n", "met", words.INFORMED, *heads]
+    heads = [f"{labels.plant_label(p)} ({labels.plant_origin(p)})" for p in plants]
+    cells = ["measure", "goal", f"all plants ({labels.origin(plants)})", "90 %", "n", "met", labels.INFORMED, *heads]
     out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
     for g in goal_rows(goals, plants):
         met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)
         interval, n = g.whole.interval or NOTHING, g.whole.n or NOTHING
         out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, [g.informed, *g.plants])]))
-    return [*out, "", f"{words.INFORMED.capitalize()}: {words.meaning(words.INFORMED)}"]
+    return [*out, "", f"{labels.INFORMED.capitalize()}: {labels.meaning(labels.INFORMED)}"]
 
 
 def _shortfall(run: ProofRun) -> list[str]:
@@ -81,7 +80,7 @@ def _shortfall(run: ProofRun) -> list[str]:
     for table in own:
         heads = [f"{c.title} ({c.unit})" if c.unit else c.title for c in table.columns]
         rule = ["---:" if c.kind == "number" else "---" for c in table.columns]
-        out += ["", f"{table.caption}, {words.origin(run.plants)}:", "", _line(heads), _line(rule)]
+        out += ["", f"{table.caption}, {labels.origin(run.plants)}:", "", _line(heads), _line(rule)]
         out += [_line([str(cell) for cell in row.cells]) for row in table.rows]
     return out
 
@@ -95,7 +94,7 @@ def _by_plant(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
     """Goals that are met over all plants and missed on one."""
     whole = set(goals.loc[(goals["plant"] == "all") & goals["met"].eq(False), "measure"])
     rest = goals[~goals["measure"].isin(whole)]
-    return [f"- plant {words.plant_letter(p)} alone, {said}" for p in plants for said in shortfalls(rest, p)]
+    return [f"- plant {labels.plant_letter(p)} alone, {said}" for p in plants for said in shortfalls(rest, p)]
 
 
 def _line(cells: list[str]) -> str:

@@ -12,17 +12,14 @@ from matplotlib.figure import Figure
 
 from data.errors import WorkError
 from data.files import write_atomic
-from evidence.proof.report import figures, shortfall, tables
-from evidence.proof.report import figures as by_case
-from evidence.proof.report import labels as words
-from evidence.proof.report import tables as extracts
+from evidence.proof.report import figures, labels, shortfall, tables
 from evidence.proof.report.figures import picture
 from evidence.proof.report.labels import KIND_WORDS, key_label, plant_label, plant_origin
 from evidence.proof.report.tables import GoalRow, ProofRun, counted, goal_rows, shortfalls
+from reports.drawing import Picture
 from reports.labels import count
 from reports.layout import Table
-from reports.rendering import template_environment
-from reports.twin.page import Picture
+from reports.rendering import rendered
 
 _GOAL_S = 30.0
 
@@ -56,20 +53,30 @@ class Part:
 
 def proof_parts(run: ProofRun) -> Iterator[Part]:
     """Every section, in the page's order."""
-    for make in (_rivals, _confusion, _detection, _shortfall, _improvement, _amplitude, _reliability, _worst, _cases):
+    for make in (
+        _baselines,
+        _confusion,
+        _detection,
+        _shortfall,
+        _improvement,
+        _amplitude,
+        _reliability,
+        _worst,
+        _cases,
+    ):
         yield make(run)
 
 
-def _rivals(run: ProofRun) -> Part:
-    table, own = run.table("compared"), Part("rivals", "Rivals", "Against rivals and ablations")
+def _baselines(run: ProofRun) -> Part:
+    table, own = run.table("compared"), Part("baselines", "Baselines", "Against baselines and ablations")
     if not (table["group"].ne("diagnosis") & table["value"].notna()).any():
-        return _absent(own, "Rivals and ablations were not scored in this run.")
+        return _absent(own, "Baselines and ablations were not scored in this run.")
     lead = (
         "Baselines start from the same first fit. Ablations drop one rule each in the first round; compare them with "
         "“first round, full rules”, which has no further rounds either. Ahead: of a baseline the diagnosis, of an "
         "ablation the first round with full rules, paired by case."
     )
-    figure = figures.rivals(table, run.plants)
+    figure = figures.baselines(table, run.plants)
     return replace(own, lead=lead, wide=(_shown(run, figure, own.title),))
 
 
@@ -77,8 +84,8 @@ def _confusion(run: ProofRun) -> Part:
     own = Part("confusion", "Confusion", "What was taken for what")
     shown = []
     for name, ordered, title in (
-        ("confusion_mechanism", extracts.mechanism_matrix, "Mechanism: concealed (rows) and named (columns)"),
-        ("confusion_place", extracts.place_matrix, "Place: concealed (rows) and named (columns)"),
+        ("confusion_mechanism", tables.mechanism_matrix, "Mechanism: concealed (rows) and named (columns)"),
+        ("confusion_place", tables.place_matrix, "Place: concealed (rows) and named (columns)"),
     ):
         table = run.table(name)
         if len(table):
@@ -93,7 +100,7 @@ def _confusion(run: ProofRun) -> Part:
 def _detection(run: ProofRun) -> Part:
     own = Part("detection", "By effect", "Found, by effect and size")
     terms = run.table("terms")
-    table = extracts.detection_by_size(terms) if len(terms) else terms
+    table = tables.detection_by_size(terms) if len(terms) else terms
     if table.empty:
         return _absent(own, "No concealed effect has a known detection limit in this run.")
     lead = "Sizes go from below the detection limit to ten times it, so the first column should be mostly missed."
@@ -115,19 +122,19 @@ def _improvement(run: ProofRun) -> Part:
     shown = shown[shown["visible"].eq(True) & (shown["error_before"] > 0)]
     if shown.empty:
         return _absent(own, "No visible case has its left-out errors in this run.")
-    return replace(own, wide=(_shown(run, by_case.improvement(shown, run.plants), own.title),))
+    return replace(own, wide=(_shown(run, figures.improvement(shown, run.plants), own.title),))
 
 
 def _amplitude(run: ProofRun) -> Part:
     own = Part("amplitude", "Amplitude", "Amplitude found and true")
     terms = run.table("terms")
-    table = extracts.with_amplitude(terms) if len(terms) else terms
+    table = tables.with_amplitude(terms) if len(terms) else terms
     if table.empty:
         return _absent(own, "No visible effect was found with an amplitude in this run.")
-    shown = [_shown(run, by_case.ratios(table, run.plants), "Amplitude found by true, per effect")]
+    shown = [_shown(run, figures.ratios(table, run.plants), "Amplitude found by true, per effect")]
     sized = table[table["true_limits"].notna()]
     if len(sized):
-        shown.insert(0, _shown(run, by_case.amplitudes(sized, run.plants), "Amplitude found against true"))
+        shown.insert(0, _shown(run, figures.amplitudes(sized, run.plants), "Amplitude found against true"))
     notes = ("The grey band is ± 40 %. A bar through a row is its median.",)
     return replace(own, half=tuple(shown), notes=notes)
 
@@ -137,16 +144,16 @@ def _reliability(run: ProofRun) -> Part:
     table, timed = run.table("reliability"), _numeric(run.table("outcomes"), ["seconds"])
     shown, notes = [], []
     if len(table) and table["n"].sum() > 0:
-        told = _numeric(run.table("outcomes"), ["probability"])["probability"].dropna().to_numpy()
-        figure = figures.reliability(table, told, _calibration_error(run.table("goals")), run.plants)
+        stated = _numeric(run.table("outcomes"), ["probability"])["probability"].dropna().to_numpy()
+        figure = figures.reliability(table, stated, _calibration_error(run.table("goals")), run.plants)
         shown.append(_shown(run, figure, "Share right against probability claimed"))
     else:
-        notes.append("No finding told a probability in this run.")
+        notes.append("No finding stated a probability in this run.")
     if timed["seconds"].notna().any():
         goals = run.table("goals")
         wanted = goals.loc[goals["measure"].astype(str).str.startswith("time"), "wanted"]
         goal_s = float(wanted.iloc[0]) if len(wanted) else _GOAL_S
-        shown.append(_shown(run, by_case.times(timed, goal_s, run.plants), "Time for a case"))
+        shown.append(_shown(run, figures.times(timed, goal_s, run.plants), "Time for a case"))
     else:
         notes.append("The times were not recorded in this run.")
     return replace(own, half=tuple(shown), notes=tuple(notes))
@@ -167,7 +174,7 @@ def _worst(run: ProofRun) -> Part:
         drawn = None
         if len(own_series):
             active = windows[windows["case"] == case] if names else None
-            figure = by_case.worst_case(extracts.worst_channel(own_series), active, plant)
+            figure = figures.worst_case(tables.worst_channel(own_series), active, plant)
             drawn = picture(figure, f"{case}: residual before and after", (plant,))
         kind = str(r.get("kind") or "")
         what = f"{KIND_WORDS.get(kind, key_label(kind))}{': ' if kind and effects else ''}{effects}"
@@ -197,8 +204,8 @@ def _cases(run: ProofRun) -> Part:
         else:
             notes.append(absent)
     if run.isolation:
-        told = "; ".join(f"{protection}: {count(n, 'case')}" for protection, n in sorted(run.isolation.items()))
-        notes.insert(0, f"What kept the answering process from everything but its case: {told}.")
+        protections = "; ".join(f"{protection}: {count(n, 'case')}" for protection, n in sorted(run.isolation.items()))
+        notes.insert(0, f"What kept the answering process from everything but its case: {protections}.")
     return replace(own, tables=tuple(shown), notes=tuple(notes))
 
 
@@ -251,16 +258,14 @@ class ProofPage:
 
 
 def write_proof_report(folder: Path, run: ProofRun) -> Path:
-    """Write `report.html` into the proof's folder. It needs no network; it appears whole or not at all.
+    """Write `report.html` into the proof's folder. It is self-contained; it appears whole or not at all.
 
     Raises:
         WorkError: the folder cannot be written.
     """
     path = Path(folder) / REPORT
-    written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    text = template_environment(True).get_template("proof.html.j2").render(page=proof_page(run), written=written)
     try:
-        write_atomic(path, text)
+        write_atomic(path, rendered("proof.html", proof_page(run)))
     except OSError as error:
         raise WorkError(f"report {path}: cannot be written ({error.strerror}); free the place and open again") from None
     return path
@@ -275,16 +280,16 @@ def proof_page(run: ProofRun) -> ProofPage:
         headline=headline(run),
         lead=lead(goals),
         warnings=tuple(_warnings(run)),
-        origin=words.origin(run.plants),
+        origin=labels.origin(run.plants),
         facts=tuple(_facts(run)),
         root=run.root,
         source_digest=run.source_digest,
-        plants=tuple((words.plant_label(p), words.plant_origin(p)) for p in run.plants),
+        plants=tuple((labels.plant_label(p), labels.plant_origin(p)) for p in run.plants),
         goals=goal_rows(goals, run.plants),
         shortfalls=tuple(shortfalls(goals)),
         parts=tuple(proof_parts(run)),
-        method=words.METHOD,
-        glossary=words.GLOSSARY,
+        method=labels.METHOD,
+        glossary=labels.GLOSSARY,
     )
 
 
@@ -294,12 +299,12 @@ def headline(run: ProofRun) -> str:
     cases = count(len(run.table("outcomes")), "sealed case" if run.suite == "sealed" else "development case")
     if not met + missed:
         return f"No goal could be judged on {cases}."
-    told = "Every goal" if not missed else "No goal" if not met else f"{met} of {met + missed} goals"
-    return f"{told} met on {cases}."
+    share = "Every goal" if not missed else "No goal" if not met else f"{met} of {met + missed} goals"
+    return f"{share} met on {cases}."
 
 
 def lead(goals: pd.DataFrame) -> str:
-    """What was missed, the first in words; then what could not be measured."""
+    """What was missed, the first by name; then what could not be measured."""
     _, missed, unknown = counted(goals)
     more = [f"{missed - _MOST_MISSED} more, in the table"] if missed > _MOST_MISSED else []
     parts = [f"Missed: {'; '.join([*shortfalls(goals)[:_MOST_MISSED], *more])}."] if missed else []
@@ -309,23 +314,20 @@ def lead(goals: pd.DataFrame) -> str:
 
 
 def _warnings(run: ProofRun) -> Sequence[str]:
-    return [
-        *([words.NOT_SEALED] if run.suite != "sealed" else []),
-        *([words.PARTIAL] if run.partial else []),
-    ]
+    return [*([labels.NOT_SEALED] if run.suite != "sealed" else []), *([labels.PARTIAL] if run.partial else [])]
 
 
 def _facts(run: ProofRun) -> list[tuple[str, str]]:
     counts = run.table("outcomes")["plant"].value_counts()
-    plants = ", ".join(f"{words.plant_letter(p)} {counts[p]}" for p in run.plants)
+    plants = ", ".join(f"{labels.plant_letter(p)} {counts[p]}" for p in run.plants)
     return [
         ("Cases sealed", f"{run.cases}"),
         ("Cases that count", f"{len(run.table('outcomes'))}" + (f" (plant {plants})" if plants else "")),
         ("Void, left out", f"{len(run.void)}"),
         ("Failed, counted as wrong", f"{len(run.failed)}"),
         ("Sealed root", run.root[:16]),
-        ("Sealed", _stamp(run.sealed)),
-        ("Opened", _stamp(run.opened)),
+        ("Sealed", labels.stamp(run.sealed)),
+        ("Opened", labels.stamp(run.opened)),
         ("thermodrift", run.version),
     ]
 

@@ -1,4 +1,4 @@
-"""The shortfall of a proof in sentences and tables: what was missed, what was claimed falsely, and who owes it."""
+"""The shortfall of a proof: what was missed and claimed falsely, and whether data or search limit it."""
 
 from __future__ import annotations
 
@@ -52,33 +52,33 @@ def tables(run: ProofRun, each: bool) -> list[Table]:
 
 
 def reasons(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """Why visible effects were not named, counted by plant, and whether the recordings or the search owe it."""
+    """Why visible effects were not named, counted by plant, and whether they are limited by the data or the search."""
     rows = []
     for reason in REASONS:
         own = missed[missed["reason"] == reason]
-        owes = "the recordings" if reason in OF_RECORDINGS else "the search"
-        rows.append(Row((reason, owes, *_by_plant(own, plants), f"{len(own)}")))
-    columns = (Column("why", kind="wide"), Column("who owes it"), *_plants("", plants), Column("all", kind="number"))
+        limited_by = "data" if reason in OF_RECORDINGS else "search"
+        rows.append(Row.of(reason, limited_by, *_by_plant(own, plants), f"{len(own)}"))
+    columns = (Column("why", kind="wide"), Column("limited by"), *_plants("", plants), Column("all", kind="number"))
     notes = (
-        "Gains are of the batches left out, in nats; the effect's own with all else that is true in the model. The "
-        "recordings: these, read by networks as coarse as the machine file's.",
+        "Gains are of the batches left out, in nats; the effect's own with all else that is true in the model. Data: "
+        "these recordings, read by networks as coarse as the machine file's.",
     )
     return Table("Visible effects that no claim names", columns, tuple(rows), simulated(plants), notes=notes)
 
 
 def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """Each of them: what it gains, what a claim takes, what was told instead and what that gains."""
+    """Each of them: what it gains, what a claim takes, what was reported instead and what that gains."""
     order = missed.assign(rank=missed["reason"].map(REASONS.index))
     rows = []
     for r in order.sort_values(["rank", "case"], ascending=[False, True]).to_dict("records"):
-        told = str(r["named_mechanism"])
-        named = NOTHING if told == NOT_NAMED else f"{key_label(told)} at {key_label(str(r['named_place']))}"
+        reported = str(r["named_mechanism"])
+        named = NOTHING if reported == NOT_NAMED else f"{key_label(reported)} at {key_label(str(r['named_place']))}"
         what = f"{key_label(str(r['effect']))} at {key_label(str(r['place']))}"
         gain, bar, other = (_nats(r[c]) for c in ("gain_nats", "bar_nats", "told_gain_nats"))
-        rows.append(Row((str(r["case"]), plant_letter(str(r["plant"])), what, gain, bar, named, other)))
+        rows.append(Row.of(str(r["case"]), plant_letter(str(r["plant"])), what, gain, bar, named, other))
     columns = (
         Column("case"), Column("plant"), Column("effect", kind="wide"), Column("gains", "nats", "number"),
-        Column("a claim takes", "nats", "number"), Column("told instead", kind="wide"),
+        Column("a claim takes", "nats", "number"), Column("reported instead", kind="wide"),
         Column("that gains", "nats", "number"),
     )  # fmt: skip
     return Table("Each of them", columns, tuple(rows), simulated(plants))
@@ -93,7 +93,7 @@ def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
         nothing = int(own["kind"].isin(("nothing", "decoy")).sum())
         sure = percent(float(own["probability"].median()))
         every = int((claims["mechanism"] == mechanism).sum())
-        rows.append(Row((key_label(str(mechanism)), f"{every}", *_by_plant(own, plants), f"{n}", f"{nothing}", sure)))
+        rows.append(Row.of(key_label(str(mechanism)), f"{every}", *_by_plant(own, plants), f"{n}", f"{nothing}", sure))
     columns = (
         Column("mechanism", kind="wide"), Column("claims", kind="number"), *_plants("false, ", plants),
         Column("false", kind="number"), Column("nothing was missing", kind="number"),

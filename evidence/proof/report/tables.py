@@ -1,4 +1,4 @@
-"""The tables of the proof's page: cases by kind, ledger, leak test, convergence, what does not count."""
+"""An opened proof as data of its page: the tables that it reads and shows, the extracts that it draws, its goals."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from evidence.proof.report.labels import (
     plant_origin,
     simulated,
 )
-from reports.labels import NOTHING, number, p_words, percent
+from reports.labels import NOTHING, number, p_label, percent
 from reports.layout import Column, Row, Table
 
-# The columns that the page reads; others may stand beside them, and any table may be absent or empty.
+# The columns that the page reads; others may be present, and any table may be absent or empty.
 TABLES: Mapping[str, tuple[str, ...]] = {
     "ledger": ("time", "step", "words"),
     "outcomes": ("case", "kind", "plant", "effect", "verdict", "failed", "seconds", "visible", "probability",
@@ -130,7 +130,7 @@ def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
 
 def ledger(table: pd.DataFrame) -> Table:
     """What happened when, as the chained ledger holds it."""
-    rows = [Row((_time(str(r["time"])), str(r["step"]), str(r["words"]))) for r in table.to_dict("records")]
+    rows = [Row.of(_time(str(r["time"])), str(r["step"]), str(r["words"])) for r in table.to_dict("records")]
     columns = (Column("UTC"), Column("step"), Column("what", kind="wide"))
     notes = ("Every line of the ledger holds the hash of the line before it.",)
     return Table("From sealing to opening", columns, tuple(rows), notes=notes)
@@ -138,8 +138,8 @@ def ledger(table: pd.DataFrame) -> Table:
 
 def uncounted(run: ProofRun) -> Table | None:
     """Cases that are void or failed, and why; None where there is none."""
-    rows = [Row((case, "void, left out", why)) for case, why in sorted(run.void.items())]
-    rows += [Row((case, "failed, counts as wrong", why)) for case, why in sorted(run.failed.items())]
+    rows = [Row.of(case, "void, left out", why) for case, why in sorted(run.void.items())]
+    rows += [Row.of(case, "failed, counts as wrong", why) for case, why in sorted(run.failed.items())]
     if not rows:
         return None
     columns = (Column("case"), Column("it is"), Column("why", kind="wide"))
@@ -149,20 +149,18 @@ def uncounted(run: ProofRun) -> Table | None:
 def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
     """What a classifier makes of names, sizes and inputs alone; 0.5 is chance."""
     rows = [
-        Row(
-            (
-                key_label(str(r["question"])),
-                number(_float(r["auc"]), 2),
-                _range(r["low90"], r["high90"], 2),
-                number(_float(r["chance"]), 2),
-                p_words(_float(r["p"])) if math.isfinite(_float(r["p"])) else NOTHING,
-                f"{int(r['n'])}",
-            )
+        Row.of(
+            key_label(str(r["question"])),
+            number(_float(r["auc"]), 2),
+            _range(r["low90"], r["high90"], 2),
+            number(_float(r["chance"]), 2),
+            p_label(_float(r["p"])) if math.isfinite(_float(r["p"])) else NOTHING,
+            f"{int(r['n'])}",
         )
         for r in table.to_dict("records")
     ]
     columns = (
-        Column("what the classifier is to tell", kind="wide"), Column("area under its curve", kind="number"),
+        Column("what the classifier predicts", kind="wide"), Column("area under its curve", kind="number"),
         Column("90 %", kind="number"), Column("by chance", kind="number"),
         Column("chance does as well", kind="number"), Column("cases", kind="number"),
     )  # fmt: skip
@@ -184,8 +182,8 @@ def convergence(table: pd.DataFrame) -> Table:
         sizes = " → ".join(f"{_float(v):g}" for v in own["size"])
         errors = " → ".join(f"{_float(v):.2g}" for v in own["error"])
         orders = ", ".join(number(_float(v), 2) for v in own["order"].dropna())
-        said = str(quantity).replace(", um", ", µm")
-        rows.append(Row((plant_label(str(plant)), said, str(refined), f"{sizes} {unit}", errors, orders or NOTHING)))
+        name = str(quantity).replace(", um", ", µm")
+        rows.append(Row.of(plant_label(str(plant)), name, str(refined), f"{sizes} {unit}", errors, orders or NOTHING))
     columns = (Column("plant"), Column("quantity", kind="wide"), Column("refined"), Column("size", kind="number"),
                Column("error", kind="number"), Column("observed orders", kind="number"))  # fmt: skip
     notes = ("An error is against a closed form or the finest of the study; the orders say how fast it falls.",)
@@ -239,8 +237,8 @@ def with_amplitude(terms: pd.DataFrame) -> pd.DataFrame:
     out["found_limits"] = out["ratio"] * out["limit_share"]
     ends = np.sort(np.stack([out["low90"] * scale, out["high90"] * scale]), axis=0)
     out["low_limits"], out["high_limits"] = np.maximum(ends[0], 1e-3 * out["limit_share"]), ends[1]
-    told = out["low90"].notna() & out["high90"].notna()
-    out["covers"] = ((out["low90"] <= true) & (true <= out["high90"])).where(told)
+    known = out["low90"].notna() & out["high90"].notna()
+    out["covers"] = ((out["low90"] <= true) & (true <= out["high90"])).where(known)
     order = {e: k for k, e in enumerate(_by_group(set(out["effect"])))}
     return out.sort_values("effect", key=lambda c: c.map(order), kind="stable").reset_index(drop=True)
 
@@ -338,7 +336,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value as it is shown; `met` is yes, no or empty where it cannot be said."""
+    """A value as it is shown; `met` is yes, no or empty where it is not known."""
 
     value: str
     interval: str
@@ -352,7 +350,7 @@ _NONE = Cell(NOTHING, "", "", "")
 
 @dataclass(frozen=True)
 class GoalRow:
-    """One goal: over all plants, what an answer would reach that is told the truth, and a cell for each plant."""
+    """One goal: over all plants, what an answer would reach that knows the truth, and a cell for each plant."""
 
     measure: str
     goal: str
@@ -394,22 +392,22 @@ def shortfalls(goals: pd.DataFrame, plant: str = "all") -> list[str]:
 
 
 def _cell(r: Mapping[Any, Any] | None, picture: bool) -> Cell:
-    if r is None or not math.isfinite(_number(r["value"])):
+    if r is None or not math.isfinite(_float(r["value"])):
         return _NONE
-    low, high = _number(r["low90"]), _number(r["high90"])
+    low, high = _float(r["low90"]), _float(r["high90"])
     known = math.isfinite(low) and math.isfinite(high)
-    said = _interval(r, low, high) if known else ""
+    interval = _interval(r, low, high) if known else ""
     met = "" if pd.isna(r["met"]) else "yes" if bool(r["met"]) else "no"
-    return Cell(_value(r), said, f"{int(r['n'])}", met, _bar(r, low, high) if picture else None)
+    return Cell(_value(r), interval, f"{int(r['n'])}", met, _bar(r, low, high) if picture else None)
 
 
 def _informed(r: Mapping[Any, Any] | None) -> Cell:
-    value = math.nan if r is None else _number(r["informed"])
+    value = math.nan if r is None else _float(r["informed"])
     return Cell(_value(r, value), "", f"{int(r['informed_n'])}", "") if r and math.isfinite(value) else _NONE
 
 
 def _value(r: Mapping[Any, Any], value: float | None = None) -> str:
-    return measured(_number(r["value"]) if value is None else value, str(r["goal"]), _number(r["wanted"]))
+    return measured(_float(r["value"]) if value is None else value, str(r["goal"]), _float(r["wanted"]))
 
 
 def _interval(r: Mapping[Any, Any], low: float, high: float) -> str:
@@ -420,7 +418,7 @@ def _interval(r: Mapping[Any, Any], low: float, high: float) -> str:
 
 
 def _bar(r: Mapping[Any, Any], low: float, high: float) -> Bar:
-    value, wanted = _number(r["value"]), _number(r["wanted"])
+    value, wanted = _float(r["value"]), _float(r["wanted"])
     low, high = (low, high) if math.isfinite(low) and math.isfinite(high) else (value, value)
     share = "%" in str(r["goal"]) and wanted > 0.5
     first = max(0.0, min(wanted - 3 * (1 - wanted), low - 0.02)) if share else 0.0
@@ -430,7 +428,3 @@ def _bar(r: Mapping[Any, Any], low: float, high: float) -> Bar:
         return round(_WIDTH * min(max((x - first) / (last - first), 0.0), 1.0), 1) if math.isfinite(x) else 0.0
 
     return Bar(at(low), at(high), at(value), at(wanted))
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None or pd.isna(value) else float(value)

@@ -32,8 +32,8 @@ class TrueTerm:
     """One thing that the recordings hold and the machine file does not. `mechanism` None: no listed one.
 
     `also` are places that mean the same, `neighbours` bodies that touch it, `parameters` values in the mechanism's own
-    names and units, `active` the windows (batch, start s, end s), `partners` what these recordings cannot tell from it.
-    `form` states what no list has: a parameter of `free_flux` or `free_shift` and the channels that drive it.
+    names and units, `active` the windows (batch, start s, end s), `partners` what these recordings cannot distinguish
+    from it. `form` states what no list has: a parameter of `free_flux` or `free_shift` and the channels that drive it.
     """
 
     effect: str
@@ -118,19 +118,21 @@ def _spot(raw: Any) -> Spot:
     return Spot("", raw) if isinstance(raw, str) else Spot(raw.get("kind", ""), raw["name"])
 
 
-AGAIN = "again.json"  # findings with the proposed run beside the others
+AGAIN = "again.json"  # findings with the proposed run among the others
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An answer. `findings` None: the diagnosis failed; `again` is the diagnosis once the proposed run was executed.
+    """An answer, and the `replies` of baselines and ablations.
+
+    `findings` None: the diagnosis failed; `again` is the diagnosis once the proposed run was executed.
 
     `length_s` of every batch and `body_of` every sensor are the case's own.
     """
 
     findings: Findings | None
     run: Mapping[str, Any] = field(default_factory=dict)
-    rivals: Mapping[str, Any] | None = None
+    replies: Mapping[str, Any] | None = None
     length_s: Mapping[str, float] = field(default_factory=dict)
     body_of: Mapping[str, str] = field(default_factory=dict)
     again: Findings | None = None
@@ -138,10 +140,10 @@ class Stored:
     @property
     def seconds(self) -> float | None:
         """Wall time of the diagnosis; of one that did not end, the time that it was given."""
-        told = self.run.get("seconds")
-        if told is None and self.failed and self.run.get("started") and self.run.get("ended"):
+        seconds = self.run.get("seconds")
+        if seconds is None and self.failed and self.run.get("started") and self.run.get("ended"):
             return (pd.Timestamp(self.run["ended"]) - pd.Timestamp(self.run["started"])).total_seconds()
-        return told
+        return seconds
 
     @property
     def failed(self) -> bool:
@@ -149,7 +151,7 @@ class Stored:
 
 
 def read_stored(folder: Path, machine: Machine, batches: Sequence[Batch]) -> Stored:
-    """The folder of one case's answers: `run.json` and, where there are any, findings, rivals and `again.json`.
+    """The folder of one case's answers: `run.json` and, where there are any, findings, replies and `again.json`.
 
     Raises:
         InputError: a file that cannot be read.

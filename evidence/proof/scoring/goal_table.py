@@ -18,19 +18,21 @@ RELIABILITY_COLUMNS = ("low", "high", "n", "claimed", "right", "low90", "high90"
 def reliability(outcomes: pd.DataFrame) -> tuple[pd.DataFrame, float]:
     """Bins of the first finding's probability against its being right, and the expected calibration error.
 
-    Right: the mechanism of a true term, at its place or beside it. An answer without a finding tells no probability
-    and is left out. Bins hold equal numbers of cases; the error is the mean over cases of the bins' |told − right|
+    Right: the mechanism of a true term, at its place or adjacent. An answer without a finding states no probability
+    and is left out. Bins hold equal numbers of cases; the error is the mean over cases of the bins' |stated − right|
     (Naeini, Cooper and Hauskrecht 2015), nan of no cases.
     """
-    told, right = told_and_right(outcomes)
+    stated, right = stated_and_right(outcomes)
     rows = []
-    for own in _bins(told):
+    for own in _bins(stated):
         low90, high90 = clopper_pearson(int(right[own].sum()), len(own))
-        rows.append((told[own].min(), told[own].max(), len(own), told[own].mean(), right[own].mean(), low90, high90))
-    return pd.DataFrame(rows, columns=list(RELIABILITY_COLUMNS)), calibration_error(np.column_stack([told, right]))
+        rows.append(
+            (stated[own].min(), stated[own].max(), len(own), stated[own].mean(), right[own].mean(), low90, high90)
+        )
+    return pd.DataFrame(rows, columns=list(RELIABILITY_COLUMNS)), calibration_error(np.column_stack([stated, right]))
 
 
-def told_and_right(outcomes: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def stated_and_right(outcomes: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Probabilities (n,) and whether it was right (n,), 0 or 1, of cases with a finding."""
     rows = outcomes[outcomes["probability"].notna()]
     right = rows["first_right"].fillna(False).astype(bool) & rows["place_near"].fillna(False).astype(bool)
@@ -38,26 +40,26 @@ def told_and_right(outcomes: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray
 
 
 def calibration_error(pairs: NDArray[np.float64]) -> float:
-    """Of pairs (n, 2) of what was told and whether it was right."""
+    """Of pairs (n, 2) of what was stated and whether it was right."""
     if not len(pairs):
         return float("nan")
     gaps = [len(own) * abs(float(np.mean(pairs[own, 0] - pairs[own, 1]))) for own in _bins(pairs[:, 0])]
     return float(np.sum(gaps) / len(pairs))
 
 
-def error_by_chance(told: NDArray[np.float64], seed: int = 0) -> float:
+def error_by_chance(stated: NDArray[np.float64], seed: int = 0) -> float:
     """The calibration error that these probabilities (n,) show in the mean where every one of them is exactly right.
 
     Ten bins of a dozen cases scatter about the truth: the error is never 0 (Bröcker and Smith 2007).
     """
-    if not len(told):
+    if not len(stated):
         return float("nan")
-    drawn = np.random.default_rng(seed).random((DRAWS, len(told))) < told
-    return float(np.mean([calibration_error(np.column_stack([told, right])) for right in drawn]))
+    drawn = np.random.default_rng(seed).random((DRAWS, len(stated))) < stated
+    return float(np.mean([calibration_error(np.column_stack([stated, right])) for right in drawn]))
 
 
-def _bins(told: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    return [own for own in np.array_split(np.argsort(told, kind="stable"), BINS) if len(own)]
+def _bins(stated: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    return [own for own in np.array_split(np.argsort(stated, kind="stable"), BINS) if len(own)]
 
 
 GOAL_COLUMNS: Mapping[str, str] = {
@@ -71,7 +73,7 @@ AHEAD = 0.15  # of the best baseline, in share of right answers
 
 def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFrame | None = None) -> pd.DataFrame:
     """Columns `GOAL_COLUMNS`, plant "all" first. Shares with exact intervals, the rest by a bootstrap over cases.
-    `informed` is what an answer would reach that is told the truth (`goals.Goal`).
+    `informed` is what an answer would reach that knows the truth (`goals.Goal`).
 
     `compared` (`evidence.proof.baselines.compared`) adds the lead over the best baseline, for all cases together.
     """
@@ -91,23 +93,23 @@ def _measured(outcomes: pd.DataFrame, terms: pd.DataFrame) -> Iterator[dict[str,
         statistic = goal.statistic or mean
         reached = statistic(informed.to_numpy(float)) if len(informed) else None
         yield _row(goal, goal.of(outcomes, terms)) | {"informed": reached, "informed_n": len(informed)}
-    pairs = np.column_stack(told_and_right(outcomes))
+    pairs = np.column_stack(stated_and_right(outcomes))
     low, high = (
         of_groups(list(pairs[:, None]), lambda g: calibration_error(np.vstack(g))) if len(pairs) else (None,) * 2
     )
     wanted = Wanted("probabilities: expected calibration error", CALIBRATED, "lower", unit="")
-    said = _said(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
-    yield said | {"informed": error_by_chance(pairs[:, 0]) if len(pairs) else None, "informed_n": len(pairs)}
+    row = _row_of(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
+    yield row | {"informed": error_by_chance(pairs[:, 0]) if len(pairs) else None, "informed_n": len(pairs)}
 
 
 def _row(goal: Goal, values: pd.Series) -> dict[str, Any]:
     n = len(values)
     if n == 0:
-        return _said(goal, None, None, None, 0)
+        return _row_of(goal, None, None, None, 0)
     if goal.statistic is None:
         right = int(values.astype(bool).sum())
-        return _said(goal, right / n, *clopper_pearson(right, n), n)
-    return _said(goal, goal.statistic(values.to_numpy(float)), *bootstrap(values, goal.statistic), n)
+        return _row_of(goal, right / n, *clopper_pearson(right, n), n)
+    return _row_of(goal, goal.statistic(values.to_numpy(float)), *bootstrap(values, goal.statistic), n)
 
 
 def _lead(compared: pd.DataFrame) -> dict[str, Any]:
@@ -115,16 +117,16 @@ def _lead(compared: pd.DataFrame) -> dict[str, Any]:
     wanted = Wanted("right answers: lead over the best baseline", AHEAD, "higher")
     baselines = compared[(compared["group"] == "baseline") & compared["lead"].notna()]
     if baselines.empty:
-        return _said(wanted, None, None, None, 0)
+        return _row_of(wanted, None, None, None, 0)
     best = baselines.sort_values(["lead", "method"]).iloc[0]
     lead, low, high = (float(best[c]) for c in ("lead", "lead_low90", "lead_high90"))
-    return _said(wanted, lead, low, high, int(best["n"]))
+    return _row_of(wanted, lead, low, high, int(best["n"]))
 
 
-def _said(wanted: Wanted, value: float | None, low: float | None, high: float | None, n: int) -> dict[str, Any]:
+def _row_of(wanted: Wanted, value: float | None, low: float | None, high: float | None, n: int) -> dict[str, Any]:
     return {
         "measure": wanted.measure,
-        "goal": wanted.words,
+        "goal": wanted.label,
         "wanted": wanted.wanted,
         "better": wanted.better,
         "value": value,

@@ -1,4 +1,8 @@
-"""The goals, one entry each: what is measured, over which cases, and what was wanted before any case was drawn."""
+"""The goals of the proof, stated before any case is drawn, and the intervals of what is measured.
+
+Each entry of `GOALS` names a measure, the cases over which it is taken, and the value wanted. Shares have exact
+binomial intervals, other statistics bootstrap intervals over whole cases.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy import stats
 
 from evidence.proof.scoring.outcomes import visible_physics
 
@@ -20,10 +24,10 @@ Statistic = Callable[[NDArray[np.float64]], float]
 
 def clopper_pearson(right: int, n: int) -> tuple[float, float]:
     """Exact interval of a share (Clopper and Pearson 1934); 0 and 1 of no cases."""
-    tail = (1.0 - LEVEL) / 2.0
-    low = float(beta.ppf(tail, right, n - right + 1)) if right > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, right + 1, n - right)) if right < n else 1.0
-    return low, high
+    if n == 0:
+        return 0.0, 1.0
+    low, high = stats.binomtest(right, n).proportion_ci(LEVEL, method="exact")
+    return float(low), float(high)
 
 
 def bootstrap(values: pd.Series, statistic: Statistic, seed: int = 0) -> tuple[float, float]:
@@ -44,11 +48,19 @@ def of_groups(
     """The same of any statistic of groups that are drawn whole."""
     if not groups:
         raise ValueError("bootstrap: no values")
-    rng = np.random.default_rng(seed)
-    drawn = [statistic([groups[k] for k in rng.integers(len(groups), size=len(groups))]) for _ in range(DRAWS)]
-    tail = (1.0 - LEVEL) / 2.0
-    low, high = np.quantile(drawn, [tail, 1.0 - tail])
-    return float(low), float(high)
+    if len(groups) == 1:
+        only = float(statistic(groups))
+        return only, only
+    found = stats.bootstrap(
+        (np.arange(len(groups)),),
+        lambda drawn: statistic([groups[k] for k in drawn]),
+        n_resamples=DRAWS,
+        vectorized=False,
+        confidence_level=LEVEL,
+        method="percentile",
+        rng=seed,
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 Select = Callable[[pd.DataFrame, pd.DataFrame], pd.Series]
@@ -58,7 +70,7 @@ Better = Literal["higher", "lower"]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What was wanted of a measure: a share, or a number with its unit."""
+    """The value wanted of a measure: a share, or a number with its unit."""
 
     measure: str
     wanted: float
@@ -66,7 +78,8 @@ class Wanted:
     unit: str | None = field(default=None, kw_only=True)
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
+        """``≥ 97 %``"""
         sign = "≥" if self.better == "higher" else "≤"
         wanted = f"{100 * self.wanted:g} %" if self.unit is None else f"{self.wanted:g} {self.unit}".strip()
         return f"{sign} {wanted}"
@@ -77,10 +90,10 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Goal(Wanted):
-    """`of` gives the values from outcomes and terms, indexed by case; `statistic` None: they are yes or no, a share.
+    """One goal. `of` gives the values from outcomes and terms, indexed by case; `statistic` None: a share of yes or no.
 
-    `informed` gives those of an answer that has all that is true in its model, refitted, and claims of it what is held
-    to pass the same bars: what it misses, these recordings do not give with such bars. None where that says nothing.
+    `informed` gives the same values for an answer whose refitted model holds all true terms and that claims those that
+    pass the bars of a claim: what it misses, these recordings cannot give under such bars. None: not defined.
     """
 
     of: Select
@@ -114,10 +127,6 @@ def _known(rows: pd.DataFrame, column: str) -> pd.Series:
 
 def _false_alarms(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
     return _cases("false_claims", "nothing", "decoy")(outcomes, terms) > 0
-
-
-def _detected(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    return _cases("detected", visible=True)(outcomes, terms)
 
 
 def _all_visible(kind: str) -> Select:
@@ -201,92 +210,48 @@ def _informed_sizes(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame
     return _both_stated(rows[rows["passes"]])
 
 
-def _flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
-    return _cases("flagged_unlisted", "unlisted", visible=True)(outcomes, terms)
-
-
 def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
     return _known(outcomes[outcomes["kind"] != "unlisted"], "flagged_unlisted")
 
 
-ONE = ("one", "invisible")  # of one listed effect each; which can be seen the true model says
+ONE = ("one", "invisible")  # of one listed effect each; which of them can be seen, the true model decides
+
+
+def _one(column: str) -> Select:
+    """A column of the cases with one visible effect."""
+    return _cases(column, *ONE, visible=True)
+
+
 _ERROR, _INFORMED_ERROR = _amplitude_error(_sized), _amplitude_error(_informed_sizes)
 _COVERED, _INFORMED_COVERED = _covered(_sized), _covered(_informed_sizes)
+_CLOSED = _cases("closed", "one", visible=True)
+_BY_ONE, _BY_UNLISTED = _informed(*ONE), _informed("unlisted")
+_FLAGGED = _cases("flagged_unlisted", "unlisted", visible=True)
+_DRIVEN = _cases("driver_right", "unlisted", visible=True)
+_SETTLED, _HOLDS = (_cases(column, "confounded", visible=True) for column in ("settled", "set_holds_truth"))
 GOALS: tuple[Goal, ...] = (
     Goal("false alarms, nothing missing", 0.01, "lower", _false_alarms),
-    Goal("detection, visible", 0.97, "higher", _detected, informed=_informed()),
-    Goal(
-        "place exact, one visible effect",
-        0.92,
-        "higher",
-        _cases("place_exact", *ONE, visible=True),
-        informed=_informed(*ONE),
-    ),
-    Goal(
-        "place exact or neighbour, one visible effect",
-        0.99,
-        "higher",
-        _cases("place_near", *ONE, visible=True),
-        informed=_informed(*ONE),
-    ),
-    Goal(
-        "mechanism first, one visible effect",
-        0.95,
-        "higher",
-        _cases("first_right", *ONE, visible=True),
-        informed=_informed(*ONE),
-    ),
-    Goal(
-        "mechanism within the reported set",
-        0.98,
-        "higher",
-        _cases("in_set", *ONE, visible=True),
-        informed=_informed(*ONE),
-    ),
-    Goal(
-        "mean size of the reported set", 2.0, "lower", _cases("set_size", *ONE, visible=True), mean, unit="explanations"
-    ),
-    Goal("when: overlap in time, mean", 0.8, "higher", _cases("overlap", *ONE, visible=True), mean, unit=""),
+    Goal("detection, visible", 0.97, "higher", _cases("detected", visible=True), informed=_informed()),
+    Goal("place exact, one visible effect", 0.92, "higher", _one("place_exact"), informed=_BY_ONE),
+    Goal("place exact or neighbour, one visible effect", 0.99, "higher", _one("place_near"), informed=_BY_ONE),
+    Goal("mechanism first, one visible effect", 0.95, "higher", _one("first_right"), informed=_BY_ONE),
+    Goal("mechanism within the reported set", 0.98, "higher", _one("in_set"), informed=_BY_ONE),
+    Goal("mean size of the reported set", 2.0, "lower", _one("set_size"), mean, unit="explanations"),
+    Goal("when: overlap in time, mean", 0.8, "higher", _one("overlap"), mean, unit=""),
     Goal("amplitude error, median", 0.12, "lower", _ERROR, quantile(0.5), informed=_INFORMED_ERROR),
     Goal("amplitude error, 90 % quantile", 0.40, "lower", _ERROR, quantile(0.9), informed=_INFORMED_ERROR),
     Goal("90 % intervals that cover, at least", 0.85, "higher", _COVERED, informed=_INFORMED_COVERED),
     Goal("90 % intervals that cover, at most", 0.95, "lower", _COVERED, informed=_INFORMED_COVERED),
-    Goal(
-        "left-out error closed, median",
-        0.95,
-        "higher",
-        _cases("closed", "one", visible=True),
-        quantile(0.5),
-        informed=_informed("one"),
-    ),
-    Goal(
-        "left-out error closed, worst tenth",
-        0.80,
-        "higher",
-        _cases("closed", "one", visible=True),
-        quantile(0.1),
-        informed=_informed("one"),
-    ),
+    Goal("left-out error closed, median", 0.95, "higher", _CLOSED, quantile(0.5), informed=_informed("one")),
+    Goal("left-out error closed, worst tenth", 0.80, "higher", _CLOSED, quantile(0.1), informed=_informed("one")),
     Goal("two visible effects: both named", 0.85, "higher", _all_visible("two"), informed=_informed_all("two")),
     Goal("two effects: claims that are true", 0.97, "higher", _claims_of_two),
     Goal("three visible effects: all named", 0.65, "higher", _all_visible("three"), informed=_informed_all("three")),
-    Goal(
-        "confounded: the set holds the truth",
-        0.97,
-        "higher",
-        _cases("set_holds_truth", "confounded", visible=True),
-        informed=_informed("confounded"),
-    ),
-    Goal("confounded: the proposed run settles it", 0.90, "higher", _cases("settled", "confounded", visible=True)),
-    Goal("unlisted: flagged", 0.95, "higher", _flagged, informed=_informed("unlisted")),
+    Goal("confounded: the set holds the truth", 0.97, "higher", _HOLDS, informed=_informed("confounded")),
+    Goal("confounded: the proposed run settles it", 0.90, "higher", _SETTLED),
+    Goal("unlisted: flagged", 0.95, "higher", _FLAGGED, informed=_BY_UNLISTED),
     Goal("listed or nothing: falsely flagged as unlisted", 0.03, "lower", _falsely_flagged),
-    Goal(
-        "unlisted: driver found",
-        0.85,
-        "higher",
-        _cases("driver_right", "unlisted", visible=True),
-        informed=_informed("unlisted"),
-    ),
+    Goal("unlisted: driver found", 0.85, "higher", _DRIVEN, informed=_BY_UNLISTED),
     Goal("time of one case, median", 30.0, "lower", _cases("seconds"), quantile(0.5), unit="s"),
     Goal("time of one case, 90 % quantile", 30.0, "lower", _cases("seconds"), quantile(0.9), unit="s"),
 )

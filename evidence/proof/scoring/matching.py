@@ -1,8 +1,8 @@
 """Which finding is which true term, and which claims are false.
 
-A finding is a term's when the mechanism is the same (`names`) and the place is the true one or beside it. One finding
+A finding is a term's when the mechanism is the same (`names`) and the place is the true one or adjacent. One finding
 claims one term: a second name for the same thing is a false claim. Under the verdict "undecidable" a finding claims
-its whole reported set; in confounded cases a partner is as true as the term. Rivals and sensor faults are claims too.
+its whole reported set; in confounded cases a partner is as true as the term. Alternatives and faults are claims too.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import pi
 
 from diagnosis.findings.schema import Finding, Findings
-from evidence.proof.baselines.base import WITHIN
+from evidence.proof.baselines.base import MIN_ALIKE_SHARE
 from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from twin.mechanisms import MECHANISMS
 
@@ -34,7 +34,7 @@ def counted_as(mechanism: str | None) -> str:
 
 
 def means(named: str | None, term: TrueTerm) -> bool:
-    """Whether a name that is told means the term's mechanism."""
+    """Whether a reported name means the term's mechanism."""
     pair = {counted_as(named), counted_as(term.mechanism)}
     groups = SAME + (SAME_IF_SWITCHED if term.driver else ())
     return len(pair) == 1 or any(pair <= group for group in groups)
@@ -46,7 +46,7 @@ def exact(named: Spot, term: TrueTerm) -> bool:
 
 
 def near(named: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
-    """Exact, or beside it: a touching body, a link that ends at the true place, an end of the true link.
+    """Exact, or adjacent: a touching body, a link that ends at the true place, an end of the true link.
 
     A sensor stands for its body (`body_of`). Error channels and other sensors' faults have no neighbours.
     """
@@ -59,7 +59,7 @@ def near(named: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
 
 
 def same_place(one: Spot, other: Spot) -> bool:
-    """Of one name and, where both are told, of one kind."""
+    """Of one name and, where both are stated, of one kind."""
     kinds = not one.kind or not other.kind or one.kind == other.kind
     return kinds and (one.name == other.name or _parted(one) == _parted(other))
 
@@ -79,7 +79,7 @@ def _ends(spot: Spot, body_of: Mapping[str, str]) -> set[str]:
 
 def reported_set(finding: Finding) -> list[tuple[str, Spot]]:
     """Mechanism and place of all that the finding reports, itself first."""
-    least = WITHIN * finding.probability
+    least = MIN_ALIKE_SHARE * finding.probability
     own = [(finding.mechanism, Spot(finding.where.kind, finding.where.name))]
     others = [(a.mechanism, Spot(a.where.kind, a.where.name)) for a in finding.alternatives if a.probability >= least]
     return list(dict.fromkeys([*own, *others]))
@@ -89,12 +89,12 @@ def reported_set(finding: Finding) -> list[tuple[str, Spot]]:
 class Matches:
     """Findings numbered best first; `of_term` the number that claims a term, or None; `false` those of no term.
 
-    `beside` is, for a term that none claims, the finding that took its stead: at its place, else the next that is left.
+    `instead` is, for a term that none claims, the finding that took its place: at its place, else the next remaining.
     """
 
     findings: tuple[Finding, ...]
     of_term: tuple[int | None, ...]
-    beside: tuple[int | None, ...]
+    instead: tuple[int | None, ...]
     false: tuple[int, ...]
 
 
@@ -103,12 +103,12 @@ def spot(finding: Finding) -> Spot:
 
 
 def names_term(mechanism: str, place: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
-    """Same mechanism, and at the place or beside it."""
+    """Same mechanism, and at the place or adjacent."""
     return means(mechanism, term) and near(place, term, body_of)
 
 
 def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str]) -> Matches:
-    """Each finding, best first, to a term that none has yet; the right place before one beside it."""
+    """Each finding, best first, to a term that none has yet; the right place before an adjacent one."""
     given = tuple(findings.findings) if findings is not None else ()
     of_term: list[int | None] = [None] * len(key.terms)
     free = set(range(len(given)))
@@ -125,17 +125,17 @@ def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str
     undecidable = findings is not None and findings.verdict == "undecidable"
     true_too = {n for n in free if _partner(given[n], key.terms) or (undecidable and _ties(given[n], key, body_of))}
     left = sorted(free)
-    beside: list[int | None] = []
+    instead: list[int | None] = []
     for t, own in zip(key.terms, of_term, strict=True):
         at_place = [n for n in left if near(spot(given[n]), t, body_of)]
         stead = next(iter(at_place or left), None) if own is None else None
-        beside.append(stead)
+        instead.append(stead)
         left = [n for n in left if n != stead]
-    return Matches(given, tuple(of_term), tuple(beside), tuple(sorted(free - true_too)))
+    return Matches(given, tuple(of_term), tuple(instead), tuple(sorted(free - true_too)))
 
 
 def _partner(finding: Finding, terms: Sequence[TrueTerm]) -> bool:
-    """Whether these recordings cannot tell it from a true term, by the key."""
+    """Whether these recordings cannot distinguish it from a true term, by the key."""
     return any(
         finding.mechanism == mechanism and same_place(place, spot(finding))
         for t in terms
@@ -150,7 +150,7 @@ def _ties(finding: Finding, key: AnswerKey, body_of: Mapping[str, str]) -> bool:
 RATED_RPM = 6000.0  # at which what follows the speed is compared
 Values = Mapping[str, float]
 Sized = tuple[float | None, float | None, float | None]  # a value, and low and high of its 90 % interval
-Told = Mapping[str, tuple[float | None, tuple[float | None, float | None] | None]]  # by parameter the same
+Reported = Mapping[str, tuple[float | None, tuple[float | None, float | None] | None]]  # by parameter the same
 
 
 def _sun_W(p: Values) -> float:
@@ -185,7 +185,7 @@ PRODUCTS: Mapping[str, Callable[[Values], float]] = {
 
 
 def amplitude(mechanism: str, values: Values) -> float | None:
-    """The one number; None where these values do not tell it. Of several amplitudes one that is not told is off."""
+    """The one number; None where these values do not give it. Of several amplitudes one that is not stated is off."""
     if mechanism not in MECHANISMS:
         return None
     off = dict(MECHANISMS[mechanism].off or {})
@@ -206,22 +206,22 @@ def true_amplitude(term: TrueTerm) -> float | None:
 
 def found_amplitude(finding: Finding, scale_of: TrueTerm) -> Sized:
     """`sized` of a finding."""
-    told = {name: (p.value, p.interval90) for name, p in finding.parameters.items()}
-    return sized(finding.mechanism, told, scale_of)
+    reported = {name: (p.value, p.interval90) for name, p in finding.parameters.items()}
+    return sized(finding.mechanism, reported, scale_of)
 
 
-def sized(mechanism: str, parameters: Told, scale_of: TrueTerm) -> Sized:
-    """Value, low and high of the 90 % interval, in what the key states; the interval None where none is told.
+def sized(mechanism: str, parameters: Reported, scale_of: TrueTerm) -> Sized:
+    """Value, low and high of the 90 % interval, in what the key states; the interval None where none is stated.
 
     Of the key only what sets the scale is taken (a rated speed), never a size. A product's interval is that of its
     first amplitude, the other values held; several amplitudes have none.
     """
     given = {name: v for name, (v, _) in (scale_of.parameters or {}).items()}
-    told = {name: value for name, (value, _) in parameters.items() if value is not None}
-    fixed = {name: v for name, v in given.items() if name in _beside(mechanism) and name not in told}
-    values = {**fixed, **told}
+    stated = {name: value for name, (value, _) in parameters.items() if value is not None}
+    fixed = {name: v for name, v in given.items() if name in _others(mechanism) and name not in stated}
+    values = {**fixed, **stated}
     value = amplitude(mechanism, values)
-    free = [name for name in _amplitudes(mechanism) if name in told]
+    free = [name for name in _amplitudes(mechanism) if name in stated]
     interval = parameters[free[0]][1] if len(free) == 1 else None
     if value is None or interval is None or interval[0] is None or interval[1] is None:
         return value, None, None
@@ -234,8 +234,8 @@ def _amplitudes(mechanism: str) -> tuple[str, ...]:
     return tuple(MECHANISMS[mechanism].off or {}) if mechanism in MECHANISMS else ()
 
 
-def _beside(mechanism: str) -> set[str]:
-    """A law's parameters beside its amplitudes."""
+def _others(mechanism: str) -> set[str]:
+    """A law's parameters other than its amplitudes."""
     if mechanism not in MECHANISMS:
         return set()
     return {s.name for s in MECHANISMS[mechanism].parameters} - set(_amplitudes(mechanism))
@@ -244,9 +244,9 @@ def _beside(mechanism: str) -> set[str]:
 Windows = Sequence[tuple[str, float, float]]
 
 
-def overlap(told: Windows, true: Windows, length_s: Mapping[str, float]) -> float:
+def overlap(reported: Windows, true: Windows, length_s: Mapping[str, float]) -> float:
     """Intersection over union of both in time, over all batches; 0 where neither has any time (Jaccard 1912)."""
-    one, other = _by_batch(told, length_s), _by_batch(true, length_s)
+    one, other = _by_batch(reported, length_s), _by_batch(true, length_s)
     both = sum(_length(_common(one[b], other[b])) for b in length_s)
     either = sum(_length(one[b]) + _length(other[b]) for b in length_s) - both
     return both / either if either > 0 else 0.0
@@ -283,19 +283,19 @@ JOINING = {"and", "times", "with", "x"}
 
 
 def flagged(findings: Findings) -> bool:
-    """Whether the verdict or a finding says that something is in no list."""
+    """Whether the verdict or a finding states that something is in no list."""
     return findings.verdict == "unlisted" or any(counted_as(f.mechanism) == UNLISTED for f in findings.findings)
 
 
 def driver_right(findings: Findings, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
-    """Whether an unlisted finding at the place or beside it names every channel that drives the term."""
+    """Whether an unlisted finding at the place or adjacent names every channel that drives the term."""
     drivers = set(re.findall(r"[A-Za-z_]\w*", term.driver or "")) - JOINING
     return any(
-        counted_as(f.mechanism) == UNLISTED and near(spot(f), term, body_of) and drivers <= _words(f)
+        counted_as(f.mechanism) == UNLISTED and near(spot(f), term, body_of) and drivers <= _terms(f)
         for f in findings.findings
     )
 
 
-def _words(finding: Finding) -> set[str]:
-    told = [finding.statement, finding.equation, finding.when.regime, str(finding.evidence.get("follows", ""))]
-    return set(re.findall(r"[A-Za-z_]\w*", " ".join([*told, *finding.parameters])))
+def _terms(finding: Finding) -> set[str]:
+    texts = [finding.statement, finding.equation, finding.when.regime, str(finding.evidence.get("follows", ""))]
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join([*texts, *finding.parameters])))

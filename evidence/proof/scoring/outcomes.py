@@ -152,7 +152,7 @@ def outcome(
 
 
 def _first(key: AnswerKey, stored: Stored, first: Finding | None) -> dict[str, Any]:
-    """What the first finding says, against the term that it comes nearest to."""
+    """The first finding, compared with the term that it comes nearest to."""
     if first is None:
         lost = dict.fromkeys(("first_right", "in_set", "place_exact", "place_near"), False)
         return lost if key.physics else {}
@@ -176,12 +176,12 @@ def _matched(key: AnswerKey, stored: Stored, found: Matches) -> dict[str, Any]:
             continue
         finding = found.findings[n]
         whole = always(stored.length_s)
-        told = list(finding.when.windows) or whole
+        reported = list(finding.when.windows) or whole
         true = whole if term.active == "always" else list(term.active)
         size = true_amplitude(term)
         value, low, high = found_amplitude(finding, term)
         return {
-            "overlap": overlap(told, true, stored.length_s) if stored.length_s else None,
+            "overlap": overlap(reported, true, stored.length_s) if stored.length_s else None,
             "amplitude_error": abs(value - size) / abs(size) if size and value is not None else None,
             "interval_covers": low <= size <= high if size and low is not None and high is not None else None,
         }
@@ -216,7 +216,7 @@ def _holds(findings: Findings, key: AnswerKey, stored: Stored) -> bool:
 def _settled(key: AnswerKey, stored: Stored, findings: Findings) -> bool | None:
     """Whether the proposed run left the truth alone in the reported set; no run was needed where it stood alone.
 
-    What is one law under several names counts as one: no run could tell it apart.
+    What is one law under several names counts as one: no run could distinguish them.
     """
     if not any(_tied(f, key) for f in findings.findings):
         return None
@@ -240,8 +240,8 @@ def _tied(finding: Finding, key: AnswerKey) -> bool:
 def _right(key: AnswerKey, out: Mapping[str, Any], seen: list[dict[str, Any]], found: Matches) -> bool:
     """The whole answer: every visible term by its mechanism at its place, and no false claim.
 
-    Confounded: the reported set holds the truth. Unlisted: it says so, at the place or beside it. Of what cannot be
-    seen, or is no physics, nothing need be said.
+    Confounded: the reported set holds the truth. Unlisted: it states so, at the place or adjacent. What cannot be seen,
+    or is no physics, need not be reported.
     """
     if out["false_claims"]:
         return False
@@ -262,8 +262,8 @@ def _right(key: AnswerKey, out: Mapping[str, Any], seen: list[dict[str, Any]], f
 def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -> dict[str, Any]:
     term = key.terms[k]
     n = found.of_term[k]
-    told = n if n is not None else found.beside[k]
-    finding = found.findings[told] if told is not None else None
+    nearest = n if n is not None else found.instead[k]
+    finding = found.findings[nearest] if nearest is not None else None
     value, low, high = found_amplitude(found.findings[n], term) if n is not None else (None, None, None)
     informed = truth.sizes[k] if truth is not None else (None, None, None)
     return {
@@ -294,7 +294,7 @@ def _term_row(key: AnswerKey, k: int, found: Matches, truth: TrueModel | None) -
 
 
 def _named(finding: Finding, term: TrueTerm) -> str:
-    """By the key's own word where both mean the same."""
+    """By the key's own name where both mean the same."""
     return (term.mechanism or UNLISTED) if means(finding.mechanism, term) else counted_as(finding.mechanism)
 
 

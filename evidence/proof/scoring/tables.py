@@ -1,4 +1,4 @@
-"""Other views of the outcomes: by a column, who is taken for whom, and the worst cases with a sentence why."""
+"""Views of the outcomes: by a column, confusion, worst cases, methods compared, missed effects and claims."""
 
 from __future__ import annotations
 
@@ -87,12 +87,12 @@ def _why(row: pd.Series) -> str:
         return f"{what} was visible and overlooked."
     if false and row["kind"] != "unlisted" and _true(row["flagged_unlisted"]) and not _true(row["first_right"]):
         there = ", at the right place" if _true(row["place_exact"]) else ""
-        return f"{what} is listed and was said to be in no list{there}."
+        return f"{what} is listed and was reported as in no list{there}."
     if false and not _true(row["first_right"]):
         held = "; the truth was in the reported set" if _true(row["in_set"]) else ""
         return f"{what} was taken for something else{sure}{held}."
     if false:
-        return f"{what} was named, and beside it {_claims(false)}."
+        return f"{what} was named, and in addition {_claims(false)}."
     if row["kind"] == "unlisted" and not _true(row["flagged_unlisted"]):
         return f"{what} is in no list, and the answer does not say so."
     if _true(row["first_right"]) and not _true(row["place_exact"]):
@@ -131,19 +131,19 @@ RIGHT, FIRST, ALARMS = "right answers", "mechanism first, one visible effect", "
 def compared(
     answers: Mapping[str, Mapping[str, Any]], stored: Mapping[str, Stored], truths: Mapping[str, TrueModel]
 ) -> pd.DataFrame:
-    """One row a method and measure, over the cases that have rivals; shares with exact 90 % intervals.
+    """One row a method and measure, over the cases that have replies of baselines; shares with exact 90 % intervals.
 
     `group` is diagnosis, baseline or ablation. `lead`, of right answers only, is paired by case with a bootstrap
     interval: of the diagnosis over a baseline, of the full rules in the first round (reference) over an ablation.
 
     Raises:
-        InputError: an answer key or a rival's reply that cannot be read.
+        InputError: an answer key or a reply that cannot be read.
     """
-    known = {name: own for name, own in stored.items() if own.rivals is not None and name in answers}
+    known = {name: own for name, own in stored.items() if own.replies is not None and name in answers}
     keys = {name: answers[name] for name in known}
     replies: dict[str, str] = {"diagnosis": "diagnosis"}
     for own in known.values():
-        given = own.rivals or {}
+        given = own.replies or {}
         replies |= {"reference": "ablation"} if "reference" in given else {}
         replies |= dict.fromkeys(given.get("baselines", {}), "baseline")
         replies |= dict.fromkeys(given.get("ablations", {}), "ablation")
@@ -164,7 +164,7 @@ def compared(
 
 
 def as_findings(reply: Mapping[str, Any], like: Findings) -> Findings:
-    """A rival's reply as a diagnosis would have written it; what it cannot tell apart is equally probable.
+    """A reply as a diagnosis would have written it; what it cannot distinguish is equally probable.
 
     Raises:
         InputError: a reply that lacks something.
@@ -183,18 +183,18 @@ def as_findings(reply: Mapping[str, Any], like: Findings) -> Findings:
         "findings": found, "fit": {"batches_improved": 0, "batches": len(like.batches)},
         "seconds": reply.get("seconds"),
     }  # fmt: skip
-    return Findings.from_json(raw, "rivals file")
+    return Findings.from_json(raw, "replies of baselines")
 
 
 def _answered(known: Mapping[str, Stored], method: str) -> dict[str, Stored]:
-    """What was stored, with this rival's reply in place of the diagnosis'; without one it has failed."""
+    """What was stored, with this method's reply in place of the diagnosis'; without one it has failed."""
     out = {}
     for name, own in known.items():
-        given = own.rivals or {}
+        given = own.replies or {}
         every = {**given.get("baselines", {}), **given.get("ablations", {}), "reference": given.get("reference")}
         reply = every.get(method)
         if reply is not None and own.findings is None:
-            raise InputError(f"rivals of {name}: there are replies, but no findings; run the case again")
+            raise InputError(f"baselines of {name}: there are replies, but no findings; run the case again")
         found = as_findings(reply, own.findings) if reply is not None and own.findings is not None else None
         out[name] = replace(own, findings=found, run={}, again=None)
     return out
@@ -223,9 +223,9 @@ def _lead(better: pd.DataFrame, other: pd.DataFrame) -> dict[str, float]:
 
 
 LITTLE = "the effect itself gains less than a claim takes"
-ALIKE = "what was told instead gains as much as the effect"
-PREFERRED = "something that gains less was told instead"
-SILENT = "the effect gains enough, and nothing was told"
+ALIKE = "what was reported instead gains as much as the effect"
+PREFERRED = "something that gains less was reported instead"
+SILENT = "the effect gains enough, and nothing was reported"
 OF_RECORDINGS = (LITTLE, ALIKE)  # the others are the search's
 REASONS = (*OF_RECORDINGS, PREFERRED, SILENT)
 
@@ -268,9 +268,9 @@ def claims(answers: Mapping[str, Mapping[str, Any]], stored: Mapping[str, Stored
 
 def _reason(row: pd.Series) -> str:
     numbers = (row[c] for c in ("gain_nats", "bar_nats", "told_gain_nats"))
-    gain, bar, told = (float("nan") if pd.isna(value) else float(value) for value in numbers)
+    gain, bar, reported = (float("nan") if pd.isna(value) else float(value) for value in numbers)
     if gain <= bar:
         return LITTLE
     if row["named_mechanism"] == NOTHING:
         return SILENT
-    return ALIKE if told >= gain else PREFERRED
+    return ALIKE if reported >= gain else PREFERRED

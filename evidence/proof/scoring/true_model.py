@@ -19,19 +19,20 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.candidates.discretisation import no_news
-from diagnosis.candidates.free_forms import OF_BODY, Form, Level, candidate_of
+from diagnosis.candidates.discretisation import never_reported
+from diagnosis.candidates.free_forms import BODY_PARAMETERS, Form, Level, candidate_of
 from diagnosis.candidates.priors import start_values
 from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
 from diagnosis.drafting.draft import drafted_part
-from diagnosis.findings.conclude import parameters_told
+from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import BASELINE_TOLERANCE, baseline, left_out_rows, refitted, settle
+from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, settle
 from diagnosis.fitting.regression import Memory, whiter
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, alone, proposed, screen
 from diagnosis.search.acceptance import least_gain
-from diagnosis.search.null import MARGIN, Null, null_beside, structural_null
-from diagnosis.search.refits import SMALLER, improved
+from diagnosis.search.null import Null, null_with, structural_null
+from diagnosis.search.refits import improved
 from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from evidence.proof.scoring.matching import Sized, counted_as, exact, sized
 from twin.calibration.identifiability import Interval, intervals90
@@ -45,7 +46,7 @@ from twin.schema import TwinPart, twin_part
 def true_candidates(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> list[Scored]:
     """The candidates at the term's place with its mechanism, best first in the screen.
 
-    The key does not say by which channel the twin would drive it, or which bodies it would look at besides.
+    The key does not state by which channel the twin would drive it, or which other bodies it would involve.
     """
     own = [s for s in seen.scored if _is(term, s.candidate)]
     own = [s for s in own if s.candidate.where.name == term.where.name] or own
@@ -63,13 +64,13 @@ def open_shape(term: TrueTerm, s: Scored) -> bool:
 def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
     """The law of a heat that no list has, as the key states it; None where it states none or a driver is not recorded.
 
-    It is the one of no list that `true_candidates` looks for among the candidates.
+    `true_candidates` finds it among the candidates.
     """
     role, *drivers = term.form or ("",)
     if not role or not all(name in b.table.columns for name in drivers for b in fit.batches):
         return None
     level, other, *_ = (*(Level(name, "", 1.0, False) for name in drivers), None, None)
-    body = term.where.name if role in OF_BODY else ""
+    body = term.where.name if role in BODY_PARAMETERS else ""
     return candidate_of([Form(Where("node", term.where.name), role, level, other, body)])
 
 
@@ -96,8 +97,8 @@ def begun_at_truth(
         return start_values(s, now)
     mechanism = MECHANISMS[c.mechanism]
     known = {n: v for n, (v, _) in (term.parameters or {}).items() if n in {p.name for p in mechanism.parameters}}
-    told = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
-    amplitudes = {a: share * v for a, v in {**s.amplitudes, **told}.items()}
+    stated = {a: known[a] - off for a, off in (mechanism.off or {}).items() if a in known}
+    amplitudes = {a: share * v for a, v in {**s.amplitudes, **stated}.items()}
     values, at = start_values(replace(s, amplitudes=amplitudes), now)
     shaped = {
         name: given.model_copy(update={"value": _said(known[name], mechanism.spec(name).unit), "prior": given.value})
@@ -145,9 +146,9 @@ Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
 @dataclass(frozen=True)
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
-    of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis asks of such a gain before it claims it; nan where
+    of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis requires of a gain before it claims it; nan where
     nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval
-    as a diagnosis would tell them (`amplitude.sized`).
+    as a diagnosis would state them (`amplitude.sized`).
 
     `visible` None: not known, as no candidate states the term and the case could not be redrawn.
     """
@@ -164,11 +165,7 @@ class TrueModel:
 
 @threadpool_limits.wrap(limits=1)
 def true_model(
-    machine: Machine,
-    batches: Sequence[Batch],
-    answer: Mapping[str, Any],
-    redraw: Redraw | None = None,
-    seed: int = 0,
+    machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any], redraw: Redraw | None = None, seed: int = 0
 ) -> TrueModel:
     """The true model of a case whose key is open.
 
@@ -186,7 +183,7 @@ def true_model(
         return TrueModel(level, level, 1.0, (), (), (), (), ())
     every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
     seen = screen(fit, every)
-    found, full = _chosen(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
+    found, full = best_candidates(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
     stated = [k for k, s in enumerate(found) if s is not None]
     if full is None:
         full, stated = fit, []
@@ -222,16 +219,14 @@ def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
 def _null(fit: Fitted, seed: int) -> Null:
     every = proposed(fit)
     seen = screen(fit, every)
-    return structural_null(fit, seen.evidence, seen.columns(no_news(every, fit)), seed)
+    return structural_null(fit, seen.evidence, seen.columns(never_reported(every, fit)), seed)
 
 
-def _chosen(
+def best_candidates(
     fit: Fitted, terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]
 ) -> tuple[list[Scored | None], Fitted | None]:
     """By term the candidate that states it best, by the screen, or by refits where that saw one shape of many; and the
     fit with all of them.
-
-    A test bar's growth gained 152 nats from the shaft, which the screen had preferred, and 539 from the front bearing.
     """
     found = each_its_own(terms, choices)
     several = [k for k, own in enumerate(choices) if len(own) > 1 and open_shape(terms[k], own[0])]
@@ -253,7 +248,7 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
     values are off.
     """
     own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
-    for share in (1.0, *SMALLER):
+    for share in (1.0, *POLICY.start_amplitude_shares):
         try:
             part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
             return settle(refitted(fit, part, at))
@@ -265,14 +260,9 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
 
 
 def _judged(
-    fit: Fitted,
-    full: Fitted,
-    terms: Sequence[TrueTerm],
-    found: Sequence[Scored | None],
-    which: int,
-    stated: Sequence[int],
-    seed: int,
-) -> _Judged:
+    fit: Fitted, full: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int,
+    stated: Sequence[int], seed: int,
+) -> _Judged:  # fmt: skip
     """One term with the others in: the better of two fits without it is what it must beat."""
     others = [k for k in stated if k != which]
     own = [(terms[k], s) for k in others if (s := found[k]) is not None]
@@ -288,28 +278,31 @@ def _judged(
     best = int(np.argmax(scores))
     s = found[which]
     assert s is not None
-    beside = null_beside(without[best], full, s.candidate, seed)
-    if beside is None:  # a value that is doubted, labels that are swapped
-        beside = _null(without[best], seed), _score(full, memory)
-    structure = beside[0].threshold(beside[1], name=s.candidate.name, margin=1.0)
+    nulls = null_with(without[best], full, s.candidate, seed)
+    if nulls is None:  # a value that is doubted, labels that are swapped
+        nulls = _null(without[best], seed), _score(full, memory)
+    structure = nulls[0].threshold(nulls[1], name=s.candidate.name, margin=1.0)
     out = _beyond(without[best], full, memory, structure)
     better = improved(alone(without[best], memory), alone(full, memory))
-    least = least_gain(Tried(s, out.gain, better, 0, 0.0, full), len(full.batches))
-    size = _size(full, s, terms[which], beside[0].scatter(s.candidate.name, beside[1]))
-    return replace(out, bar=max(least, MARGIN * structure), size=size)
+    least = least_gain(Tried(s, out.gain, better, s.candidate.name, 0.0, full), len(full.batches))
+    size = _size(full, s, terms[which], nulls[0].scatter(s.candidate.name, nulls[1]))
+    return replace(out, bar=max(least, POLICY.null_margin * structure), size=size)
 
 
 @lru_cache(maxsize=1)
 def _known(full: Fitted) -> dict[str, Interval]:
-    """The intervals of a fit's parameters, by name; the last fit's are kept: each of its terms asks."""
+    """The intervals of a fit's parameters, by name; the last fit's are kept, since each of its terms needs them."""
     state = replace(full.state, noise=full.noise)
-    return {i.name: i for i in intervals90(result(full.problem, state, BASELINE_TOLERANCE, ""), full.problem.unknowns)}
+    return {
+        i.name: i
+        for i in intervals90(result(full.problem, state, POLICY.baseline_tolerance, ""), full.problem.unknowns)
+    }
 
 
 def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
-    """The term's amplitude in the true model, told as a diagnosis tells it."""
-    told, _ = parameters_told(full, s.candidate, _known(full), scatter)
-    parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in told.items()}
+    """The term's amplitude in the true model, stated as a diagnosis states it."""
+    stated, _ = reported_parameters(full, s.candidate, _known(full), scatter)
+    parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in stated.items()}
     return sized(s.candidate.mechanism, parameters, term)
 
 

@@ -1,4 +1,4 @@
-"""The process that answers one case: it shuts itself in, then diagnoses what lies in its place, and writes there.
+"""The process that answers one case: it confines itself, then diagnoses what lies in its place, and writes there.
 
 Started by `evidence.proof.sealing.running` with its task as JSON on standard input. Its place holds `case` (machine
 file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
@@ -17,32 +17,32 @@ from typing import Any
 import data  # noqa: F401 - found before the walls stand, since the folder around it cannot be listed behind them
 from evidence.proof.sealing.isolation import allowed, confine
 
-TOLD, FINDINGS, RIVALS = "told.json", "findings.json", "rivals.json"
+STATUS, FINDINGS, REPLIES = "status.json", "findings.json", "rivals.json"
 PLAN, SERIES = "next_run.yml", "series.csv"
 
 
 def main() -> None:
-    """Answer the case; `told.json` says how far it came, under which protection, and what went wrong."""
+    """Answer the case; `status.json` states how far it came, under which protection, and what went wrong."""
     task = json.loads(sys.stdin.read())
     place = Path(task["place"])
     import_from = [Path(p) for p in task["import_from"]]
-    told: dict[str, Any] = {"stage": "shut in", "isolation": confine(allowed(place, import_from), place / "witness")}
+    status: dict[str, Any] = {"stage": "shut in", "isolation": confine(allowed(place, import_from), place / "witness")}
     sys.path[:0] = task["import_from"]
     diagnose = _function(task["diagnose"])
-    rivals = _function(task["rivals"]) if task["rivals"] else None
-    _tell(place, told)
+    baselines = _function(task["baselines"]) if task["baselines"] else None
+    _report(place, status)
     try:
         begun, begun_cpu = perf_counter(), process_time()
         diagnosis = diagnose(*read_case(place / "case", place / "answer" / "lake"), seed=0, processes=1, cache=None)
-        told |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
-        told["processor_seconds"] = round(process_time() - begun_cpu, 2)
+        status |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
+        status["processor_seconds"] = round(process_time() - begun_cpu, 2)
         _write_diagnosis(place, diagnosis)
-        _tell(place, told)
-        if rivals is not None:
-            _write(place, RIVALS, _json(rivals(diagnosis)))
-        _tell(place, told | {"stage": "done"})
+        _report(place, status)
+        if baselines is not None:
+            _write(place, REPLIES, _json(baselines(diagnosis)))
+        _report(place, status | {"stage": "done"})
     except Exception as error:  # whatever it is, it is the answer to this case
-        _tell(place, told | {"error": _one_line(error)})
+        _report(place, status | {"error": _one_line(error)})
 
 
 def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
@@ -62,7 +62,7 @@ def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
     report = ingest([case / "recordings"], machine, held)
     if not report.batches:
         reasons = [r.reason for r in report.quarantined]
-        raise InputError(reasons[0] if reasons else "recordings: no recording that the machine file asks for")
+        raise InputError(reasons[0] if reasons else "recordings: none that the machine file describes")
     return machine, check_machine(held.load_all(machine.machine), machine)
 
 
@@ -96,10 +96,10 @@ def _write(place: Path, name: str, text: str) -> None:
     scratch.replace(place / "answer" / name)
 
 
-def _tell(place: Path, told: dict[str, Any]) -> None:
-    _write(place, TOLD, _json(told))
+def _report(place: Path, status: dict[str, Any]) -> None:
+    _write(place, STATUS, _json(status))
 
 
 def _one_line(error: Exception) -> str:
-    words = " ".join(str(error).split())
-    return words if type(error).__name__ in ("InputError", "WorkError") else f"{type(error).__name__}: {words}"
+    message = " ".join(str(error).split())
+    return message if type(error).__name__ in ("InputError", "WorkError") else f"{type(error).__name__}: {message}"

@@ -79,7 +79,7 @@ class Entry:
         return {"at": self.at, "step": self.step, "details": dict(self.details), "before": self.before}
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """``case case_0001, answer 3f2a…``: its details in one line."""
         return ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in self.details.items())
 
@@ -154,7 +154,7 @@ def _entry(text: bytes) -> Entry | None:
 
 @dataclass(frozen=True)
 class ProofFolder:
-    """PROOF: `cases` are all that an answering process gets of, `vault` holds the answers, `answers` what was said."""
+    """PROOF: an answering process gets one of `cases`; `vault` holds the keys, `answers` what was answered."""
 
     path: Path
 
@@ -187,7 +187,7 @@ class ProofFolder:
         return Ledger(self.path / "ledger.jsonl")
 
     def committed(self) -> dict[str, Any]:
-        """What `commitment.json` says.
+        """The content of `commitment.json`.
 
         Raises:
             InputError: there is none, or it cannot be read.
@@ -242,7 +242,7 @@ class State:
     """`answered`: digest of each case's answer since the last restart; `void`: why a case does not count.
 
     `begun`: cases that a process was started for and that were not finished. `source`: digest of the source that
-    answers, as it was sealed or, after a restart, begun anew; `ran` says whether anybody was asked.
+    answers, as it was sealed or, after a restart, begun anew; `ran`: whether a run has begun.
     """
 
     root: str

@@ -1,8 +1,8 @@
-"""A process shut in: it reads the interpreter, the libraries, the diagnosis' source and one place, and nothing else.
+"""A confined process: it reads the interpreter, the libraries, the diagnosis' source and one place, and nothing else.
 
 Two walls. Landlock (Linux 5.13; Salaün, "Landlock: unprivileged access control", kernel documentation) binds the
 process in the kernel, root and native code as well, and cannot be lifted. Python's audit hook stands everywhere; it
-stops Python code, and says in words what was refused, but native code could pass it.
+stops Python code and states what was refused, but native code could pass it.
 Only the standard library is imported here: the walls stand before anything else is loaded.
 """
 
@@ -78,11 +78,11 @@ def confine(to: Allowed, witness: Path) -> str:
     """
     landlocked = _landlock(to)
     refused = not _native_read(witness)
-    sys.addaudithook(_hook(to))
+    sys.addaudithook(audit_hook(to))
     return "landlock and audit hook" if landlocked and refused else "audit hook"
 
 
-def _hook(to: Allowed) -> Any:
+def audit_hook(to: Allowed) -> Any:
     """Refuses what the walls forbid by PermissionError; an audit hook cannot be removed."""
     read = tuple(str(p) for p in (*to.read, *to.write))
     listed = (*read, *(str(p) for p in to.listed))
@@ -134,9 +134,9 @@ def _landlock(to: Allowed) -> bool:
     if version < 1:
         return False
     every = (1 << RIGHTS.get(version, 16)) - 1
-    asked = _Ruleset(every, 0b11 if version >= 4 else 0, 0b11 if version >= 6 else 0)
+    ruleset = _Ruleset(every, 0b11 if version >= 4 else 0, 0b11 if version >= 6 else 0)
     size = 8 if version < 4 else 16 if version < 6 else 24
-    rules = int(libc.syscall(CREATE_RULESET, ctypes.byref(asked), ctypes.c_size_t(size), 0))
+    rules = int(libc.syscall(CREATE_RULESET, ctypes.byref(ruleset), ctypes.c_size_t(size), 0))
     if rules < 0:
         return False
     wanted = [(p, READ_FILE | READ_DIR) for p in to.read] + [(p, READ_DIR) for p in to.listed]

@@ -1,9 +1,9 @@
-"""The leak test: can a classifier that sees no temperature and no error tell what a case conceals? It must not.
+"""The leak test: whether a classifier that sees no temperature and no error can predict what a case conceals.
 
 Two learners of different kinds, shrunk linear discriminants (Ledoit and Wolf 2004) and extremely randomised trees
 (Geurts, Ernst and Wehenkel 2006), answer for cases left out; their mean is judged by the area under the ROC curve.
 Chance is what the same learners reach after the answers were dealt anew (Ojala and Garriga 2010, test 1), within each
-plant, since a plant may be told from another.
+plant, since plants may be distinguishable.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from threadpoolctl import threadpool_limits
 
-RARE = 0.03  # of the cases; a word of the machine file that stands in fewer, or lacks in fewer, tells nothing
+RARE = 0.03  # of the cases; a word of the machine file that is present or absent in fewer carries no information
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?$", re.IGNORECASE)
 
 
@@ -148,7 +148,7 @@ Labels = NDArray[np.int64]
 class Question:
     """Features (n, F), classes (n,) from 0, and the group (n,) within which classes could be dealt anew."""
 
-    words: str
+    label: str
     features: Features
     classes: Labels
     group: Labels
@@ -165,7 +165,7 @@ def leak_table(
 ) -> pd.DataFrame:
     """Columns `COLUMNS`: area under the curve with a bootstrap interval, chance, and the share of deals as good.
 
-    Asked are: is physics missing, of which kind is the case, and which effect is it among those that the case's
+    Questions: is physics missing, of which kind is the case, and which effect is it among those that the case's
     machine could have. A question with too few cases is left out.
 
     Args:
@@ -177,22 +177,22 @@ def leak_table(
         return pd.DataFrame(columns=list(COLUMNS))
     features = _filled(leak_features([cases / n for n in names]))
     keys = [answers[n] for n in names]
-    asked = [*_kinds(features, keys), *_effects(features, keys, possible)]
+    questions = [*kind_questions(features, keys), *effect_questions(features, keys, possible)]
     rows = []
-    for number, part in enumerate(asked):
+    for number, part in enumerate(questions):
         rows.append(_row(part, deals, np.random.default_rng([seed, number])))
         if done is not None:
-            done("leak test", number + 1, len(asked))
+            done("leak test", number + 1, len(questions))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def _filled(features: pd.DataFrame) -> Features:
-    """Features that differ between cases; what a case lacks is told by a value far off."""
+    """Features that differ between cases; what a case lacks gets a value far off."""
     known = features.fillna(features.min() - features.std().fillna(1.0) - 1.0).fillna(0.0).to_numpy(float)
     return np.asarray(known[:, np.ptp(known, axis=0) > 0])
 
 
-def _kinds(features: Features, keys: Sequence[Mapping[str, Any]]) -> list[Question]:
+def kind_questions(features: Features, keys: Sequence[Mapping[str, Any]]) -> list[Question]:
     plant = np.array([PLANTS.index(k["plant"]) for k in keys])
     kinds = pd.Series([str(k["kind"]) for k in keys])
     missing = np.array([k not in SOUND for k in kinds], dtype=np.int64)
@@ -204,7 +204,9 @@ def _kinds(features: Features, keys: Sequence[Mapping[str, Any]]) -> list[Questi
     return [q for q in out if np.bincount(q.classes, minlength=2).min() >= LEAST]
 
 
-def _effects(features: Features, keys: Sequence[Mapping[str, Any]], possible: Possible | None) -> list[Question]:
+def effect_questions(
+    features: Features, keys: Sequence[Mapping[str, Any]], possible: Possible | None
+) -> list[Question]:
     """For each effect: cases that have it against those that could have it and have another."""
     single = [k for k, key in enumerate(keys) if key["kind"] == "one"]
     effect = {k: str(keys[k]["terms"][0]["effect"]) for k in single}
@@ -222,20 +224,22 @@ def _could(possible: Possible, effect: str, key: Mapping[str, Any]) -> bool:
     return possible(effect, key["redraw"]["options"])
 
 
-def _row(asked: Question, deals: int, rng: np.random.Generator) -> tuple[str, float, float, float, float, float, int]:
-    told = _told(asked.features, asked.classes)
-    auc = _area(asked.classes, told)
+def _row(
+    question: Question, deals: int, rng: np.random.Generator
+) -> tuple[str, float, float, float, float, float, int]:
+    probability = predicted(question.features, question.classes)
+    auc = area_under_curve(question.classes, probability)
     dealt: list[float] = []
     while len(dealt) < deals and sum(d >= auc for d in dealt) < ENOUGH:
-        classes = _dealt(asked.classes, asked.group, rng)
-        dealt.append(_area(classes, _told(asked.features, classes)))
+        classes = _dealt(question.classes, question.group, rng)
+        dealt.append(area_under_curve(classes, predicted(question.features, classes)))
     as_good = sum(d >= auc for d in dealt)
     p = as_good / len(dealt) if as_good == ENOUGH else (1 + as_good) / (1 + len(dealt))
-    low, high = _interval(asked.classes, told, rng)
-    return asked.words, auc, low, high, float(np.mean(dealt)), p, len(asked.classes)
+    low, high = _interval(question.classes, probability, rng)
+    return question.label, auc, low, high, float(np.mean(dealt)), p, len(question.classes)
 
 
-def _told(features: Features, classes: Labels) -> Features:
+def predicted(features: Features, classes: Labels) -> Features:
     """Probability of each class (n, C) by learners that have not seen the case."""
     linear = make_pipeline(StandardScaler(), LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"))
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=3, class_weight="balanced", random_state=0)
@@ -244,11 +248,11 @@ def _told(features: Features, classes: Labels) -> Features:
     return np.asarray(np.mean(both, axis=0))
 
 
-def _area(classes: Labels, told: Features) -> float:
+def area_under_curve(classes: Labels, probability: Features) -> float:
     """Under the ROC curve, by ranks (Mann and Whitney 1947); of several classes the mean of each against the rest."""
-    own = classes[:, None] == np.arange(told.shape[1])
+    own = classes[:, None] == np.arange(probability.shape[1])
     has = own.sum(axis=0)
-    ranks = np.where(own, rankdata(told, axis=0), 0.0).sum(axis=0)
+    ranks = np.where(own, rankdata(probability, axis=0), 0.0).sum(axis=0)
     return float(np.mean((ranks - has * (has + 1) / 2) / (has * (len(classes) - has))))
 
 
@@ -259,12 +263,12 @@ def _dealt(classes: Labels, group: Labels, rng: np.random.Generator) -> Labels:
     return out
 
 
-def _interval(classes: Labels, told: Features, rng: np.random.Generator) -> tuple[float, float]:
+def _interval(classes: Labels, probability: Features, rng: np.random.Generator) -> tuple[float, float]:
     """90 %, cases of each class drawn anew."""
-    members = [np.flatnonzero(classes == c) for c in range(told.shape[1])]
+    members = [np.flatnonzero(classes == c) for c in range(probability.shape[1])]
     areas = []
     for _ in range(RESAMPLED):
         drawn = np.concatenate([rng.choice(m, len(m)) for m in members])
-        areas.append(_area(classes[drawn], told[drawn]))
+        areas.append(area_under_curve(classes[drawn], probability[drawn]))
     low, high = np.quantile(areas, [0.05, 0.95])
     return float(low), float(high)

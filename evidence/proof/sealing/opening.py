@@ -60,7 +60,7 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
     state = state_of(ledger.entries, str(folder.path))
     _check_commitment(folder, commitment, state)
     if not state.ran:
-        raise InputError(f"{folder.path}: nobody was asked yet; call `thermodrift prove run {folder.path}` first")
+        raise InputError(f"{folder.path}: no case was answered yet; call `thermodrift prove run {folder.path}` first")
     names = list(names_of(commitment))
     missing = [n for n in names if n not in state.answered and n not in state.void]
     if missing and not partial and state.opened is None:
@@ -96,11 +96,11 @@ def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
 
 def _check_commitment(folder: ProofFolder, commitment: Mapping[str, Any], state: State) -> None:
     found = digest_of({k: v for k, v in commitment.items() if k != "root"})
-    for told, where in ((commitment.get("root"), "itself"), (state.root, "the ledger")):
-        if found != told:
+    for stated, where in ((commitment.get("root"), "itself"), (state.root, "the ledger")):
+        if found != stated:
             raise InputError(
-                f"{folder.commitment}: is not as it was sealed, its root is {found[:12]}, {where} says "
-                f"{str(told)[:12]}; put it back or seal a new proof"
+                f"{folder.commitment}: is not as it was sealed, its root is {found[:12]}, {where} states "
+                f"{str(stated)[:12]}; put it back or seal a new proof"
             )
 
 

@@ -10,15 +10,16 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from threading import Event
 from typing import Any
 from uuid import uuid4
 
 from data.errors import InputError, WorkError
-from evidence.proof.sealing.examinee import FINDINGS, PLAN, RIVALS, SERIES, TOLD
+from evidence.proof.sealing.examinee import FINDINGS, PLAN, REPLIES, SERIES, STATUS
 from evidence.proof.sealing.folder import Ledger, ProofFolder, State, folder_digest, now, source_digest, state_of
 from evidence.proof.sealing.isolation import own_source
 from evidence.proof.sealing.seal import Done, names_of
@@ -27,20 +28,20 @@ RUN = "run.json"
 LIMIT_S = 300.0
 BEGIN = "import sys; sys.path.insert(0, sys.argv[1]); from evidence.proof.sealing.examinee import main; main()"
 START_S = 120.0  # for imports, which are no part of a case
-LOOK_S = 0.05
+POLL_S = 0.05
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Examinee:
-    """Who answers: functions as ``module:function``, called as `diagnose` is and as ``rivals(diagnosis)``.
+    """Who answers: functions as ``module:function``, called as `diagnose` is and as ``replies(diagnosis)``.
 
-    `limit_s` is the longest that a diagnosis may take, and again the longest that its rivals may. `import_from` are
-    folders that modules may be read from beside the package itself.
+    `limit_s` is the longest that a diagnosis may take, and again the longest that the baselines may. `import_from` are
+    folders other than the package itself that modules may be read from.
     """
 
     diagnose: str = "diagnosis.diagnose:diagnose"
-    rivals: str | None = "evidence.proof.baselines:rivals"
+    baselines: str | None = "evidence.proof.baselines:replies"
     limit_s: float = LIMIT_S
     import_from: tuple[str, ...] = ()
 
@@ -52,7 +53,7 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
 
     Args:
         source: digest of the source, for `run.json`.
-        stop: set by whoever wants no answer any more.
+        stop: set once no answer is wanted any more.
 
     Raises:
         WorkError: the process could not be started or shut in, or was stopped; nothing was answered.
@@ -62,21 +63,21 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
         place = Path(scratch).resolve()
         shutil.copytree(case, place / "case")
         for path in (place / "case").rglob("*"):
-            os.utime(path, (0, 0))  # when a case was built is nobody's business
+            os.utime(path, (0, 0))  # the time at which a case was built is no part of it
         (place / "answer").mkdir()
         (place / "witness").write_text("not to be read\n", encoding="utf-8")
         error = _watched(place, by, stop or Event())
-        told = _told(place)
-        if "isolation" not in told:
-            raise WorkError(f"the answering process did not start: {error or _last_words(place)}")
-        written = [place / "answer" / name for name in (FINDINGS, PLAN, SERIES, RIVALS)]
+        status = _status(place)
+        if "isolation" not in status:
+            raise WorkError(f"the answering process did not start: {error or _last_line(place)}")
+        written = [place / "answer" / name for name in (FINDINGS, PLAN, SERIES, REPLIES)]
         files = {p.name: p.read_bytes() for p in written if p.exists()}
-        error = told.get("error") or error
-        if not error and told["stage"] != "done":
-            error = f"the process ended while {'rivals were asked' if FINDINGS in files else 'it diagnosed'}"
+        error = status.get("error") or error
+        if not error and status["stage"] != "done":
+            error = f"the process ended during the {'baselines' if FINDINGS in files else 'diagnosis'}"
     run: dict[str, Any] = {
-        "seconds": told.get("seconds"), "processor_seconds": told.get("processor_seconds"), "cores": 1,
-        "source_digest": source, "isolation": told["isolation"],
+        "seconds": status.get("seconds"), "processor_seconds": status.get("processor_seconds"), "cores": 1,
+        "source_digest": source, "isolation": status["isolation"],
         "error": None if FINDINGS in files else error, "started": started, "ended": now(),
         "rivals_error": error if FINDINGS in files else None,
     }  # fmt: skip
@@ -85,11 +86,11 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
 
 def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
     """Wait for the process; the reason why it was ended, if it was."""
-    task = {"place": str(place), "diagnose": by.diagnose, "rivals": by.rivals, "import_from": by.import_from}
+    task = {"place": str(place), "diagnose": by.diagnose, "baselines": by.baselines, "import_from": by.import_from}
     command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
-    with (place / "said").open("wb") as said:
+    with (place / "output").open("wb") as output:
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=said, stderr=said, cwd=place / "case", env=_environment(place)
+            command, stdin=subprocess.PIPE, stdout=output, stderr=output, cwd=place / "case", env=_environment(place)
         )
         try:
             assert process.stdin is not None
@@ -97,9 +98,9 @@ def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
             process.stdin.close()
             stage, since = "", time.monotonic()
             while process.poll() is None:
-                if stop.wait(LOOK_S):
+                if stop.wait(POLL_S):
                     raise WorkError("the answering process was stopped")
-                if (reached := str(_told(place).get("stage", ""))) != stage:
+                if (reached := str(_status(place).get("stage", ""))) != stage:
                     stage, since = reached, time.monotonic()
                 limit_s = by.limit_s if stage else START_S
                 if time.monotonic() - since > limit_s:
@@ -116,14 +117,18 @@ def _environment(place: Path) -> Mapping[str, str]:
     return dict.fromkeys(THREADS, "1") | {"HOME": own, "TMPDIR": own, "LANG": "C.UTF-8", "TZ": "UTC"}
 
 
-def _told(place: Path) -> dict[str, Any]:
-    file = place / "answer" / TOLD
+def _status(place: Path) -> dict[str, Any]:
+    file = place / "answer" / STATUS
     return dict(json.loads(file.read_bytes())) if file.exists() else {}
 
 
-def _last_words(place: Path) -> str:
-    lines = (place / "said").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it ended without a word; run the case again"
+def _last_line(place: Path) -> str:
+    lines = (place / "output").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else "it ended without a message; run the case again"
+
+
+Answerer = Callable[[str, Event], dict[str, bytes]]
+Answered = Callable[[str, dict[str, bytes]], None]
 
 
 @dataclass(frozen=True)
@@ -163,14 +168,14 @@ def run(
         names = list(names_of(commitment))
         waiting = [n for n in names if n not in state.answered and n not in state.void]
         ledger.add("run", source=source, cases=len(waiting), workers=workers)
-        told = len(names) - len(waiting)
+        finished = len(names) - len(waiting)
 
         def answered(case: str, files: dict[str, bytes]) -> None:
-            nonlocal told
+            nonlocal finished
             ledger.add("answered", case=case, answer=_store(folder.answers / case, files))
-            told += 1
+            finished += 1
             if done is not None:
-                done("run", told, len(names))
+                done("run", finished, len(names))
 
         def answer(case: str, stop: Event) -> dict[str, bytes]:
             check_case(folder, case, commitment["cases"][case]["case"])
@@ -179,36 +184,22 @@ def run(
             _check_source(folder, source)
             return files
 
-        _side_by_side(waiting, answer, answered, workers)
+        _in_parallel(waiting, answer, answered, workers)
     return RunOutcome(len(names), len(state.answered), len(waiting), len(state.begun), len(state.void))
 
 
-def _side_by_side(
-    cases: list[str],
-    answer: Callable[[str, Event], dict[str, bytes]],
-    answered: Callable[[str, dict[str, bytes]], None],
-    workers: int,
-) -> None:
+def _in_parallel(cases: list[str], answer: Answerer, answered: Answered, workers: int) -> None:
     """At most `workers` cases under way; the first failure stops the others."""
-    stop, left = Event(), iter(cases)
+    stop, waiting = Event(), iter(cases)
     with ThreadPoolExecutor(workers) as pool:
-        under_way: dict[Future[dict[str, bytes]], str] = {}
         try:
-            for case in left:
-                under_way[pool.submit(answer, case, stop)] = case
-                if len(under_way) == workers:
-                    _take(under_way, answered)
+            under_way = {pool.submit(answer, case, stop): case for case in islice(waiting, workers)}
             while under_way:
-                _take(under_way, answered)
+                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    answered(under_way.pop(future), future.result())
+                    under_way |= {pool.submit(answer, case, stop): case for case in islice(waiting, 1)}
         finally:
             stop.set()
-
-
-def _take(
-    under_way: dict[Future[dict[str, bytes]], str], answered: Callable[[str, dict[str, bytes]], None]
-) -> None:  # fmt: skip
-    for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-        answered(under_way.pop(future), future.result())
 
 
 def _resumed(folder: ProofFolder, ledger: Ledger, state: State, source: str, restart: bool) -> State:

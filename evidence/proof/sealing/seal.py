@@ -1,19 +1,17 @@
-"""Sealing: cases without their answers, answers in a vault, and what is published before anybody is asked."""
+"""Sealing: cases without their answers, answers in a vault, and what is published before any case is answered."""
 
 from __future__ import annotations
 
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Protocol
 
 from data.errors import InputError
+from data.processes import Processes
 from evidence.proof.sealing.folder import (
     ProofFolder,
     canonical,
@@ -31,7 +29,7 @@ Done = Callable[[str, int, int], None]
 
 
 class Spec(Protocol):
-    """A case that is asked for; the name says nothing about it."""
+    """A case to be made; the name reveals nothing about it."""
 
     @property
     def name(self) -> str: ...
@@ -54,7 +52,7 @@ class Suite:
 def seal(folder: ProofFolder, suite: Suite, make: Make, workers: int = 1, done: Done | None = None) -> str:
     """Build and seal a suite; returns the root, which commits to every case and answer and can be published.
 
-    A seal that was broken off is begun anew. `make` is a function of a module where there are several `workers`.
+    A seal that was interrupted is begun anew. `make` is a function of a module where there are several `workers`.
 
     Raises:
         InputError: the folder holds a sealed proof, or something else; no case; a name twice.
@@ -107,22 +105,8 @@ def _made(specs: Sequence[Spec], make: Make, cases: Path, workers: int) -> Itera
     """Name and answer of every case once it is written, as they come."""
     for spec in specs:
         (cases / spec.name).mkdir()
-    if workers == 1:
-        yield from ((s.name, make(s, cases / s.name)) for s in specs)
-        return
-    with _pool(workers) as pool:
-        waiting = {pool.submit(make, s, cases / s.name): s.name for s in specs}
-        yield from ((waiting[f], f.result()) for f in as_completed(waiting))
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Ended early, it begins nothing that waits."""
-    pool = ProcessPoolExecutor(workers, get_context("spawn"))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with Processes(workers) as pool:
+        yield from ((specs[k].name, key) for k, key in pool.completed(make, [(s, cases / s.name) for s in specs]))
 
 
 def _lock_away(path: Path, value: Any) -> None:

@@ -1,4 +1,4 @@
-"""Suites of cases for the proof: what each is asked to be, and how it is built."""
+"""Suites of cases for the proof: their specifications, and how each is built."""
 
 from evidence.proof.suite.build import Built, batches_of, build, real_suite, without, write_built
 from evidence.proof.suite.suite import small_suite, suite

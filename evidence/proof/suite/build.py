@@ -1,4 +1,4 @@
-"""From what a case is asked to be to what a diagnosis sees, and to the answer that it does not see."""
+"""From a specification to what a diagnosis sees of the case, and to the answer key that it does not see."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from data.machine import Machine
 from data.recording import read_batches
 from evidence.proof.spec import CaseSpec, PlantKind
 from evidence.proof.suite.sizes import limit
-from evidence.proof.suite.suite import Which, digits, number, rivals_of
+from evidence.proof.suite.suite import Which, alternatives_of, digits, number
 from plants.effects import EFFECTS
 from plants.options import stream
 from plants.plant import Case, draw, machine_text, recording_texts
+from plants.real import SCHEMA
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,15 @@ def real_suite(
     known = [(plant, name, _cases(plant).CASES[name]) for plant in plants for name in _cases(plant).cases(data)]
     order = stream(number(seed, which, "real order"), "order").permutation(len(known))
     wide = digits(first + len(known))
-    told = {known[int(n)][:2]: f"case_{first + k:0{wide}d}" for k, n in enumerate(order)}
+    names = {known[int(n)][:2]: f"case_{first + k:0{wide}d}" for k, n in enumerate(order)}
     out = []
     for n in order:
         plant, name, case = known[int(n)]
         options = {"case": name}
         if getattr(case, "reference", name) != name:
-            options["reference"] = told[plant, case.reference]
+            options["reference"] = names[plant, case.reference]
         own = number(seed, which, f"{plant} {case.machine}")
-        out.append(CaseSpec(told[plant, name], case.kind, plant, own, options=options, suite=which))
+        out.append(CaseSpec(names[plant, name], case.kind, plant, own, options=options, suite=which))
     return out
 
 
@@ -96,10 +97,9 @@ def build_real(spec: CaseSpec, data: Path) -> Built:
 
 
 def _cases(plant: str) -> Any:
-    return import_module(f"plants.{plant}.cases")
+    return import_module(f"plants.{plant}")
 
 
-SCHEMA = "thermodrift.proof_answer/1"
 # Heat that grows with itself, and more exchange with a little air than a plant's explicit part is stable at: drawn
 # weaker until the machine survives.
 RUNS_AWAY, WEAKER = ("preload_feedback", "rotating_convection"), 0.7
@@ -160,7 +160,7 @@ def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
         "plant": spec.plant,
         "suite": spec.suite,
         "simulated": True,
-        "words": _words(case.truth["terms"]),
+        "words": _summary(case.truth["terms"]),
         "machine": case.machine.machine,
         "seed": spec.seed,
         "terms": terms,
@@ -179,7 +179,7 @@ def _idle(machine: Machine, terms: list[dict[str, Any]]) -> list[str]:
 
 def _term(spec: CaseSpec, term: Mapping[str, Any]) -> dict[str, Any]:
     key = term["effect"]
-    partners = rivals_of(key, spec.options)
+    partners = alternatives_of(key, spec.options)
     kind = EFFECTS[key]
     return {
         **term,
@@ -190,6 +190,6 @@ def _term(spec: CaseSpec, term: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _words(terms: list[dict[str, Any]]) -> str:
-    said = [f"{t['effect']} at {t['where']['name']} ({t['words']})" if t["words"] else t["effect"] for t in terms]
-    return "; ".join(said) or "nothing is missing"
+def _summary(terms: list[dict[str, Any]]) -> str:
+    labels = [f"{t['effect']} at {t['where']['name']} ({t['words']})" if t["words"] else t["effect"] for t in terms]
+    return "; ".join(labels) or "nothing is missing"

@@ -3,9 +3,10 @@
     python -m evidence.proof.suite.limits --plant volumes [--seeds 3] [--effects sun,draught]
 
 renews `limits.yml`. A plant that lacks nothing is drawn and the machine file's twin fitted to its recordings. What an
-effect adds is the difference of two simulations without noise. It is at the limit where its very own signature, beside
-all that is recalibrated, gains more on batches left out than structure alone gives once in a hundred cases, improves
-three of four batches, and cuts the left-out error of some channel by a tenth: where a perfect answer could be seen.
+effect adds is the difference of two simulations without noise. It is at the limit where its own signature, with all
+that is recalibrated projected out, gains more on batches left out than structure alone gives once in a hundred cases,
+improves three of four batches, and cuts the left-out error of some channel by a tenth: where a perfect answer could be
+seen.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from threadpoolctl import threadpool_limits
 from data.arrays import Array
 from data.batch import Batch
 from data.files import write_atomic
-from diagnosis.candidates.discretisation import no_news
+from diagnosis.candidates.discretisation import never_reported
 from diagnosis.contracts import Fitted
 from diagnosis.fitting.fitted import baseline
+from diagnosis.policy import POLICY
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import alone, proposed, screen
-from diagnosis.search.decision import IMPROVED
 from diagnosis.search.null import structural_null
 from evidence.proof.suite.setting import setting
 from evidence.proof.suite.sizes import ALL_OR_NOTHING, most
@@ -55,7 +56,7 @@ STEP_S = 60.0  # of the solver
 
 @dataclass(frozen=True)
 class Bench:
-    """A fitted plant that lacks nothing, what can be told on it, and how to draw it again."""
+    """A fitted plant that lacks nothing, what its recordings can show, and how to draw it again."""
 
     seed: int
     plant: str
@@ -73,7 +74,7 @@ class Bench:
         fitted = baseline(case.machine, twin_part(case.machine), case.batches, None, len(case.batches))
         every = proposed(fitted)
         seen = screen(fitted, every)
-        loose = no_news(every, fitted)
+        loose = never_reported(every, fitted)
         columns = seen.columns(loose)
         null = structural_null(fitted, seen.evidence, columns)
         evidence = alone(fitted, fitted.memory)
@@ -118,7 +119,7 @@ class Bench:
         with_it = evidence.mean_squares(evidence.left_out(targets))
         cut = np.nanmax(1.0 - np.sqrt(np.maximum(base, 1.0) / np.maximum(with_it, 1.0)), axis=1)
         improved = np.mean(falls[:, :, 0] > 0, axis=1)
-        seen = (gain[:, 0] > self.threshold) & (cut > CUT) & (improved >= IMPROVED)
+        seen = (gain[:, 0] > self.threshold) & (cut > CUT) & (improved >= POLICY.min_improved_share)
         return float(SIZES[np.argmax(seen)] if seen.any() else SIZES[-1])
 
     def _plant(self) -> Plant:

@@ -32,7 +32,7 @@ BOUNDS: Mapping[str, float] = MappingProxyType(
 
 @cache
 def table() -> Mapping[str, Any]:
-    """What `limits.yml` says: how it was measured, and by plant and effect the size at the detection limit."""
+    """The content of `limits.yml`: how it was measured, and by plant and effect the size at the detection limit."""
     text = files("evidence.proof.suite").joinpath("limits.yml").read_text(encoding="utf-8")
     return MappingProxyType(yaml.safe_load(text))
 

@@ -38,10 +38,10 @@ Which = Literal["development", "sealed"]
 
 
 def number(seed: bytes | int, which: str, what: str) -> int:
-    """256 bits for one purpose that nobody can tell without the whole seed; development and sealed share none."""
+    """256 bits for one purpose that nobody can derive without the whole seed; development and sealed share none."""
     root = seed if isinstance(seed, bytes) else str(seed).encode()
-    told = b"\0".join([b"thermodrift proof", which.encode(), what.encode(), root])
-    return int.from_bytes(hashlib.sha256(told).digest(), "big")
+    message = b"\0".join([b"thermodrift proof", which.encode(), what.encode(), root])
+    return int.from_bytes(hashlib.sha256(message).digest(), "big")
 
 
 def digits(cases: int) -> int:
@@ -88,18 +88,18 @@ ALWAYS: Mapping[str, tuple[str, ...]] = MappingProxyType({
 
 @dataclass(frozen=True)
 class Pair:
-    """`rivals` are, by what a case may lack, the mechanisms that mean the same at its place where the shop has this
-    `habit` (None: any) and the machine file states `stated` and not `unstated`.
+    """`alternatives` are, by what a case may lack, the mechanisms that mean the same at its place where the shop has
+    this `habit` (None: any) and the machine file states `stated` and not `unstated`.
     """
 
-    rivals: Mapping[str, tuple[str, ...]]
+    alternatives: Mapping[str, tuple[str, ...]]
     habit: str | None = None
     stated: frozenset[str] = frozenset()
     unstated: frozenset[str] = frozenset()
 
     @property
     def truths(self) -> tuple[str, ...]:
-        return tuple(self.rivals)
+        return tuple(self.alternatives)
 
     def holds(self, options: Mapping[str, Any]) -> bool:
         """Whether a case of these options has the pair."""
@@ -132,10 +132,10 @@ PAIRS: Mapping[str, Pair] = MappingProxyType({
 })  # fmt: skip
 
 
-def rivals_of(effect: str, options: Mapping[str, Any]) -> list[str]:
+def alternatives_of(effect: str, options: Mapping[str, Any]) -> list[str]:
     """Mechanisms that mean the same as an effect where these options hold, sorted."""
-    here = [pair.rivals.get(effect, ()) for pair in PAIRS.values() if pair.holds(options)]
-    return sorted({*ALWAYS.get(effect, ()), *(mechanism for rivals in here for mechanism in rivals)})
+    here = [pair.alternatives.get(effect, ()) for pair in PAIRS.values() if pair.holds(options)]
+    return sorted({*ALWAYS.get(effect, ()), *(mechanism for named in here for mechanism in named)})
 
 
 def ambiguous(options: Mapping[str, Any]) -> set[str]:
@@ -232,4 +232,4 @@ def _check(seed: bytes | int, cases: int, which: str, plants: Sequence[Any]) -> 
         if plant not in SIMULATED:
             raise InputError(f"suite: plants: got {plant}, expected {' or '.join(SIMULATED)}; name those")
     if cases < 1:
-        raise InputError(f"suite: cases: got {cases}, expected 1 or more; ask for more")
+        raise InputError(f"suite: cases: got {cases}, expected 1 or more; request more")

@@ -8,11 +8,11 @@ import socket
 from pathlib import Path
 
 import pytest
-from toy_suite import HERE, make, sealed, specs
 
 from data.errors import InputError, WorkError
-from evidence.proof.sealing.isolation import _hook, allowed, own_source
+from evidence.proof.sealing.isolation import allowed, audit_hook, own_source
 from evidence.proof.sealing.running import RUN, Examinee, examine
+from tests.evidence.proof.toy_suite import HERE, make, sealed, specs
 
 CURIOUS = Examinee("toy_examinee:curious", None, import_from=(HERE,))
 
@@ -58,7 +58,7 @@ def test_the_hook_alone_refuses_too(tmp_path: Path) -> None:
     (tmp_path / "case").mkdir()
     (tmp_path / "answer").mkdir()
     (tmp_path / "case" / "way_out").symlink_to(tmp_path / "vault")
-    hook = _hook(allowed(tmp_path))
+    hook = audit_hook(allowed(tmp_path))
     own, vault = tmp_path / "case" / "machine.yml", tmp_path / "vault" / "a.json"
     hook("open", (str(own), "r", os.O_RDONLY))
     hook("open", (3, "r", os.O_RDONLY))

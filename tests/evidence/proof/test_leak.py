@@ -11,7 +11,14 @@ import yaml
 from sklearn.metrics import roc_auc_score
 
 from evidence.proof.sealing import leak
-from evidence.proof.sealing.leak import COLUMNS, _area, _effects, _told, leak_features, leak_table
+from evidence.proof.sealing.leak import (
+    COLUMNS,
+    area_under_curve,
+    effect_questions,
+    leak_features,
+    leak_table,
+    predicted,
+)
 from evidence.proof.spec import CaseSpec
 from evidence.proof.suite import build, small_suite, write_built
 
@@ -79,8 +86,8 @@ def test_real_recordings_and_few_cases_are_not_asked(tmp_path: Path) -> None:
 def test_an_effect_is_sought_among_cases_that_could_have_it() -> None:
     twice = [*keys().values(), *keys().values()]
     answers = [{**k, "redraw": {"options": {"sunny": n % 3 > 0}}} for n, k in enumerate(twice)]
-    asked = _effects(np.zeros((88, 1)), answers, lambda effect, options: effect != "sun" or options["sunny"])
-    sun = next(q for q in asked if q.words.startswith("is it sun"))
+    asked = effect_questions(np.zeros((88, 1)), answers, lambda effect, options: effect != "sun" or options["sunny"])
+    sun = next(q for q in asked if q.label.startswith("is it sun"))
     others = sum(k["terms"] == [{"effect": "floor_sink"}] and k["redraw"]["options"]["sunny"] for k in answers)
     assert sun.classes.sum() == 22 and len(sun.classes) == 22 + others < 44
 
@@ -88,7 +95,7 @@ def test_an_effect_is_sought_among_cases_that_could_have_it() -> None:
 def test_a_learner_answers_for_cases_it_has_not_seen() -> None:
     rng = np.random.default_rng(0)
     classes = rng.integers(0, 2, 80)
-    told = _told(rng.normal(size=(80, 30)), classes)
+    told = predicted(rng.normal(size=(80, 30)), classes)
     np.testing.assert_allclose(told.sum(axis=1), 1.0)
     assert np.mean(told.argmax(axis=1) == classes) < 0.75  # a learner that had seen them would be right
 
@@ -99,7 +106,7 @@ def test_the_area_is_that_under_the_curve(kinds: int) -> None:
     classes = rng.integers(0, kinds, 60)
     told = np.round(rng.dirichlet(np.ones(kinds), 60) + 0.3 * np.eye(kinds)[classes], 1)  # with ties
     areas = [roc_auc_score(classes == k, told[:, k]) for k in range(kinds)]
-    assert _area(classes, told) == pytest.approx(np.mean(areas))
+    assert area_under_curve(classes, told) == pytest.approx(np.mean(areas))
 
 
 def test_features_tell_nothing_of_temperatures_and_errors(tmp_path: Path) -> None:

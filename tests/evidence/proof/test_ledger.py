@@ -37,7 +37,7 @@ def test_what_is_read_back_can_be_added_to(path: Path) -> None:
     ledger = Ledger(path)
     ledger.add("opened", answered=1)
     assert [e.step for e in Ledger(path).entries] == ["sealed", "run", "started", "answered", "opened"]
-    assert Ledger(path).entries[3].words == "case case_0001, answer ef"
+    assert Ledger(path).entries[3].summary == "case case_0001, answer ef"
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,14 @@ import pytest
 from data.errors import WorkError
 from diagnosis.candidates.priors import start_values
 from diagnosis.fitting.regression import Memory
+from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from diagnosis.screening.linearisation import difference
 from diagnosis.screening.screen import alone
-from diagnosis.search.null import structural_misfits
 from diagnosis.search.search import Search, search
-from evidence.proof.baselines import rivals
+from evidence.proof.baselines import replies
 from evidence.proof.baselines.ablations import Stage
 from evidence.proof.baselines.base import claimable, counted_in_full, plain_rows, without_nuisances
-from evidence.proof.baselines.bic import in_sample_gains, in_sample_score, null_of
 from evidence.proof.baselines.evaluate import ABLATIONS, BASELINES
 from tests.diagnosis.small_cases import cold_floor, consistent
 from twin.mechanisms import MECHANISMS
@@ -38,8 +37,8 @@ def nothing() -> Search:
 
 
 @cache
-def asked() -> dict[str, Any]:
-    return rivals(floor())
+def replied() -> dict[str, Any]:
+    return replies(floor())
 
 
 def named(reply: dict[str, Any]) -> list[tuple[str, str]]:
@@ -47,7 +46,7 @@ def named(reply: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def test_a_reply_has_the_agreed_form() -> None:
-    out = asked()
+    out = replied()
     assert set(out) == {"baselines", "ablations", "reference"}
     assert set(out["baselines"]) == set(BASELINES)
     assert set(out["ablations"]) == set(ABLATIONS) - {"reference"}
@@ -60,7 +59,7 @@ def test_a_reply_has_the_agreed_form() -> None:
 
 @pytest.mark.parametrize("key", ["sparse_regression", "in_sample_bic"])
 def test_regression_sees_a_strong_effect_of_the_twins_own_law(key: str) -> None:
-    assert ("floor_sink", "head") in named(asked()["baselines"][key])
+    assert ("floor_sink", "head") in named(replied()["baselines"][key])
 
 
 def test_the_largest_correlation_is_named() -> None:
@@ -69,19 +68,19 @@ def test_the_largest_correlation_is_named() -> None:
     allowed = [(k, v) for k, v in enumerate(r) if (v > 0 and rows.high[k] > 0) or (v < 0 and rows.low[k] < 0)]
     best, _ = max(allowed, key=lambda kv: abs(kv[1]))
     c = rows.scored[best].candidate
-    assert named(asked()["baselines"]["raw_correlation"]) == [(c.mechanism, c.where.name)]
+    assert named(replied()["baselines"]["raw_correlation"]) == [(c.mechanism, c.where.name)]
 
 
 @pytest.mark.parametrize("key", ["independent_noise", "in_sample", "no_structural_null", "no_floor_check"])
 def test_an_ablation_keeps_what_all_its_other_rules_find(key: str) -> None:
-    assert named(asked()["ablations"][key])[:1] == [("floor_sink", "head")]
+    assert named(replied()["ablations"][key])[:1] == [("floor_sink", "head")]
 
 
 def test_the_reference_is_what_the_search_itself_accepted() -> None:
     first = floor().accepted[0].best
     assert first is not None
-    assert named(asked()["reference"]) == [(first.candidate.mechanism, first.candidate.where.name)]
-    assert rivals(nothing())["reference"]["findings"] == []
+    assert named(replied()["reference"]) == [(first.candidate.mechanism, first.candidate.where.name)]
+    assert replies(nothing())["reference"]["findings"] == []
 
 
 def test_rows_become_what_they_were_before_the_nuisances_were_integrated_out() -> None:
@@ -129,29 +128,35 @@ def test_without_nuisances_the_targets_are_the_residuals() -> None:
 
 def test_in_sample_a_fit_never_looks_worse_than_on_batches_left_out() -> None:
     evidence = floor().rounds[0].screen.evidence
-    assert in_sample_score(evidence)[0] >= evidence.base_score()[0]
+    assert evidence.base_score(left_out=False)[0] >= evidence.base_score()[0]
     columns = [s.column for s in claimable(floor().rounds[0])]
-    inside = in_sample_gains(evidence, evidence.targets, columns)[0]
+    inside = evidence.gains(left_out=False)[0][0, columns]
     left_out = evidence.gains()[0][0, columns]
     assert (inside >= -1e-6).all()
     assert np.argmax(inside) == np.argmax(left_out)
 
 
-def test_the_null_of_left_out_gains_is_the_diagnosis_own() -> None:
-    stage = Stage(nothing())
-    done = stage.round
-    columns = {s.candidate.name: s.column for s in claimable(done)}
-    again = null_of(
-        structural_misfits(done.before),
-        done.screen.evidence,
-        columns,
-        lambda e, targets, at: e.gains(targets)[0][:, list(at)],
-        lambda e, targets: e.base_score(targets),
-    )
-    np.testing.assert_allclose(again.gain, done.null.gain, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(again.density, done.null.density, rtol=1e-6)
-    name = max(columns, key=lambda n: again.gains[:, -1, again.names.index(n)].mean())
-    assert again.threshold(-np.inf, name=name) == pytest.approx(done.null.threshold(-np.inf, name=name), rel=1e-6)
+def test_with_the_policy_of_a_diagnosis_the_round_is_decided_as_it_was() -> None:
+    for done in (floor(), nothing()):
+        stage = Stage(done)
+        r, again = stage.round, stage.decided(POLICY)
+        assert again.accepted is r.accepted
+        assert again.threshold == pytest.approx(r.threshold, rel=1e-6)
+        assert [t.candidate.name for t in again.tried[:1]] == [t.candidate.name for t in r.tried[:1]]
+
+
+def test_an_ablation_changes_the_rule_that_it_takes_out_and_no_other() -> None:
+    stage = Stage(floor())
+    full = stage.decided(POLICY)
+    without = stage.decided(replace(POLICY, uses_structural_null=False))
+    assert full.best is not None and without.best is not None
+    assert without.best.gain == full.best.gain  # the same refits
+    assert POLICY.even_odds_gain_nats <= without.threshold <= full.threshold  # and the other bars stay
+    inside = stage.decided(replace(POLICY, leaves_batches_out=False))
+    in_full = stage.decided(replace(POLICY, counts_row_memory=False))
+    assert inside.best is not None and inside.best.gain != full.best.gain
+    assert in_full.best is not None and in_full.best.gain != full.best.gain
+    assert not np.allclose(inside.null.gain, full.null.gain) and not np.allclose(in_full.null.gain, full.null.gain)
 
 
 def test_a_fit_that_was_swapped_in_beside_later_effects_is_fitted_alone_again() -> None:
@@ -173,6 +178,6 @@ def test_a_diagnosis_without_its_search_is_refused() -> None:
     empty = object.__new__(Diagnosis)
     object.__setattr__(empty, "search", None)
     with pytest.raises(
-        WorkError, match=r"rivals: the diagnosis kept no search; hand over one that `diagnose` has just"
+        WorkError, match=r"baselines: the diagnosis kept no search; hand over one that `diagnose` has just"
     ):
-        rivals(empty)
+        replies(empty)

@@ -28,14 +28,14 @@ def proof() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     for k in range(8):
         name = f"case_{k:04d}"
         raw = reply("cabinet_heat") if k < 2 else CONSISTENT if k == 7 else reply("sun")
-        rivals = {
+        replies = {
             "baselines": {"raw_correlation": raw, "sparse_regression": CONSISTENT},
             "ablations": {"in_sample": reply("cabinet_heat") if k else reply("sun")},
             "reference": reply("cabinet_heat") if k < 6 else CONSISTENT,
         }
         keys[name] = answer("one", term(), case=name) if k < 6 else answer("nothing", case=name)
         own = stored("explained", finding()) if k < 6 else stored("consistent")
-        given[name] = replace(own, rivals=rivals)
+        given[name] = replace(own, replies=replies)
         true[name] = truth(True) if k < 6 else truth()
     return keys, given, true
 
@@ -69,21 +69,21 @@ def test_what_a_rival_cannot_tell_apart_is_its_reported_set() -> None:
     other = {"mechanism": "cabinet_heat", "where": {"kind": "node", "name": "column"}}
     partner = {"mechanism": "sun", "where": {"kind": "node", "name": "column"}}
     key = answer("confounded", term(same_as=[partner]))
-    own = replace(stored("explained", finding()), rivals={"baselines": {"raw": reply("sun", alternatives=[other])}})
+    own = replace(stored("explained", finding()), replies={"baselines": {"raw": reply("sun", alternatives=[other])}})
     table = compared({"case_0001": key}, {"case_0001": own}, {"case_0001": truth(True)}).set_index("method")
     assert table.loc["raw"].set_index("measure").loc[RIGHT, "value"] == 1.0
 
 
 def test_cases_without_rivals_are_left_out() -> None:
     keys, given, true = proof()
-    given["case_0000"] = replace(given["case_0000"], rivals=None)
+    given["case_0000"] = replace(given["case_0000"], replies=None)
     assert set(compared(keys, given, true).query("measure == @RIGHT")["n"]) == {7}
-    none = {name: replace(own, rivals=None) for name, own in given.items()}
+    none = {name: replace(own, replies=None) for name, own in given.items()}
     assert set(compared(keys, none, true)["n"]) == {0}
 
 
 def test_a_reply_that_lacks_its_verdict_is_refused() -> None:
     like = stored("consistent").findings
     assert like is not None
-    with pytest.raises(InputError, match=r"rivals file.*verdict"):
+    with pytest.raises(InputError, match=r"replies of baselines.*verdict"):
         as_findings({"findings": [], "seconds": 1.0}, like)

@@ -16,6 +16,7 @@ from evidence.proof.scoring.goals import bootstrap, clopper_pearson
 from evidence.proof.scoring.outcomes import OUTCOMES, outcomes
 from evidence.proof.scoring.tables import by, confusion, worst
 from tests.evidence.proof.answered import answer, finding, stored, term, truth
+from tests.snapshots import check_snapshot
 
 HEATS_W = (100.0, 105.0, 110.0, 120.0, 150.0, 90.0, 100.0, 100.0)  # of 100; intervals 90 to 130
 
@@ -163,18 +164,14 @@ def test_the_worst_come_first_with_a_reason() -> None:
     cases, _ = examined()
     table = worst(cases)
     assert table["case"].tolist() == ["case_0019", "case_0009", "case_0008"]
-    assert table["why"].tolist() == [
-        "No physics was missing, yet one thing was claimed that is not so, 60 % sure.",
-        "cabinet_heat in plant volumes was taken for something else, 60 % sure.",
-        "cabinet_heat in plant elements was visible and overlooked.",
-    ]
+    check_snapshot(__file__, "worst", "".join(f"{why}\n" for why in table["why"]))
     assert list(table.columns) == [*OUTCOMES, "why"]
 
 
-def test_a_listed_effect_that_is_called_unlisted_is_told_so() -> None:
+def test_a_listed_effect_that_is_called_unlisted_is_reported_so() -> None:
     own = stored("unlisted", finding("free_flux", parameters={}))
     cases, _ = outcomes({"case_0001": answer("one", term())}, {"case_0001": own}, {"case_0001": truth(True)})
-    why = "cabinet_heat in plant volumes is listed and was said to be in no list, at the right place."
+    why = "cabinet_heat in plant volumes is listed and was reported as in no list, at the right place."
     assert worst(cases)["why"].tolist() == [why]
 
 

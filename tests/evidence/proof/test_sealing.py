@@ -9,7 +9,6 @@ from pathlib import Path
 from threading import Event
 
 import pytest
-from toy_suite import EXAMINEE, make, sealed, specs
 
 from data.errors import InputError, WorkError
 from evidence.proof.sealing import running
@@ -17,6 +16,7 @@ from evidence.proof.sealing.folder import ProofFolder
 from evidence.proof.sealing.opening import LOST, UNANSWERED, Opened, unseal
 from evidence.proof.sealing.running import Examinee, RunOutcome, run
 from evidence.proof.sealing.seal import Suite, seal
+from tests.evidence.proof.toy_suite import EXAMINEE, make, sealed, specs
 
 Asked = list[str]
 
@@ -116,7 +116,7 @@ def test_the_order_is_kept(tmp_path: Path, asked: Asked) -> None:
     with pytest.raises(InputError, match="empty: is no sealed proof; call `thermodrift prove seal --out"):
         run(ProofFolder(tmp_path / "empty"), EXAMINEE)
     folder = sealed(tmp_path / "proof")
-    with pytest.raises(InputError, match="proof: nobody was asked yet; call `thermodrift prove run"):
+    with pytest.raises(InputError, match="proof: no case was answered yet; call `thermodrift prove run"):
         unseal(folder)
     assert run(folder, EXAMINEE) == RunOutcome(3, 0, 3, 0, 0)
     assert unseal(folder).counting == ("case_0001", "case_0002", "case_0003")

@@ -10,12 +10,11 @@ import pytest
 
 from data.arrays import Array
 from evidence.proof.suite.setting import setting
-from evidence.proof.suite.suite import ALWAYS, PAIRS, rivals_of
+from evidence.proof.suite.suite import ALWAYS, PAIRS, alternatives_of
 from plants.effects.base import Effect
-from plants.physics import simulated
 from plants.plant import Posed, posed, with_amounts
-from plants.recorded import shown
 from plants.runs import Now
+from plants.simulation import shown, simulated
 from plants.structure import Plant
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
@@ -80,7 +79,7 @@ def alike(name: str, truth: str, rival: str, habit: str | None = None) -> float:
 CLAIMED = [
     (name, truth, rival)
     for name, pair in PAIRS.items()
-    for truth, rivals in pair.rivals.items()
+    for truth, rivals in pair.alternatives.items()
     for rival in rivals
     if rival not in MEANS
 ]
@@ -114,13 +113,13 @@ def test_a_pair_holds_where_it_is_imposed_and_not_elsewhere() -> None:
         options = pair.imposed(plain)
         assert pair.holds(options)
         assert sorted(options["has"] + options["lacks"]) == sorted(plain["has"] + plain["lacks"])
-        for truth, rivals in pair.rivals.items():
-            assert set(rivals) <= set(rivals_of(truth, options)), name
+        for truth, rivals in pair.alternatives.items():
+            assert set(rivals) <= set(alternatives_of(truth, options)), name
         if pair.habit:
             assert not pair.holds({**options, "habit": "ordinary"})
 
 
 def test_what_is_always_the_same_equation_is_told_in_every_case() -> None:
     for effect, mechanisms in ALWAYS.items():
-        assert set(mechanisms) <= set(rivals_of(effect, setting(SEED, "development")))
+        assert set(mechanisms) <= set(alternatives_of(effect, setting(SEED, "development")))
         assert set(mechanisms) <= set(MECHANISMS)

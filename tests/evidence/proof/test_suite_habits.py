@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from plants.drawing import HABITS
+from plants.options import Options
 from plants.runs import Run, earlier, held, plan_runs
 
 RATED_RPM = 8000.0
@@ -19,7 +20,11 @@ TOUCHED = {
 
 
 def runs() -> list[Run]:
-    return plan_runs(2**128 + 3, 12, 6.0, 300.0, RATED_RPM, 0.0, (5.0, 25.0), (7.0, 9.0), ("lamp",))
+    return plan_runs(
+        2**128 + 3,
+        Options(coldest_degC=5.0, warmest_degC=25.0, earliest_h=7.0, latest_h=9.0, idle=("lamp",)),
+        RATED_RPM,
+    )
 
 
 @pytest.mark.parametrize("habit", HABITS)

@@ -15,11 +15,10 @@ from data.errors import InputError
 from data.machine import Machine
 from diagnosis.contracts import Scored
 from diagnosis.fitting.fitted import baseline, refitted
+from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed, screen
-from diagnosis.search.acceptance import EVEN
-from diagnosis.search.null import MARGIN
 from evidence.proof.scoring.answer_key import AnswerKey
-from evidence.proof.scoring.true_model import TrueModel, _chosen, true_candidates, true_model
+from evidence.proof.scoring.true_model import TrueModel, best_candidates, true_candidates, true_model
 from plants.plant import draw
 from tests.diagnosis.concealed import case, flux
 from tests.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
@@ -47,7 +46,9 @@ def test_a_floor_of_the_twins_own_law_is_explained_down_to_the_noise() -> None:
     assert got.error_before > 2.0 * got.error_true
     assert 0.7 < got.error_true < 1.3
     assert got.error_floor == 1.0
-    assert got.gain_nats[0] > got.bar_nats[0] >= MARGIN * got.threshold_nats[0] > 0  # to be seen takes no margin
+    assert (
+        got.gain_nats[0] > got.bar_nats[0] >= POLICY.null_margin * got.threshold_nats[0] > 0
+    )  # to be seen takes no margin
     ((size, low, high),) = got.sizes
     assert size == pytest.approx(8.0, rel=0.1) and low is not None and high is not None and low < 8.0 < high
 
@@ -56,7 +57,7 @@ def test_a_floor_that_hardly_conducts_cannot_be_seen() -> None:
     got = cold(0.02)
     assert got.visible == (False,)
     assert got.error_before == pytest.approx(got.error_true, rel=0.05)
-    assert got.gain_nats[0] < EVEN <= got.bar_nats[0]  # a diagnosis would not claim it
+    assert got.gain_nats[0] < POLICY.even_odds_gain_nats <= got.bar_nats[0]  # a diagnosis would not claim it
 
 
 def test_where_the_file_has_no_twin_it_stands_in_the_draft() -> None:
@@ -102,7 +103,7 @@ def test_what_no_list_has_is_fitted_by_its_own_law(hidden: dict[str, str]) -> No
     got = true_model(given.machine, batches, answer("unlisted", own))
     assert got.visible == (True,)
     assert 0.7 < got.error_true < 1.3 < got.error_before
-    assert got.gain_nats[0] > got.bar_nats[0] >= EVEN
+    assert got.gain_nats[0] > got.bar_nats[0] >= POLICY.even_odds_gain_nats
     unrecorded = term("unlisted", mechanism=None, where=where, form=["linear", "vacuum"])
     assert true_model(given.machine, batches, answer("unlisted", unrecorded)).visible == (None,)
 
@@ -125,10 +126,10 @@ def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
     key = AnswerKey.from_json(answer("one", z))
     fit = baseline(given.machine, twin_part(given.machine), given.batches, None, len(given.batches))
     own = true_candidates(key.terms[0], screen(fit, proposed(fit)), [])
-    last = sorted(own, key=lambda s: _seat(s) == "spindle")  # as if the screen had seen it least
-    (chosen,), full = _chosen(fit, key.terms, [last])
-    assert len(own) > 3 and chosen is not None and _seat(chosen) == "spindle"
-    assert full is not None and chosen.candidate.name in full.part.mechanisms
+    last = sorted(own, key=lambda s: _place(s) == "spindle")  # as if the screen had seen it least
+    (picked,), full = best_candidates(fit, key.terms, [last])
+    assert len(own) > 3 and picked is not None and _place(picked) == "spindle"
+    assert full is not None and picked.candidate.name in full.part.mechanisms
 
 
 def test_two_heats_of_one_mechanism_at_one_body_are_two_terms() -> None:
@@ -164,6 +165,6 @@ def test_it_begins_with_less_where_all_of_it_cannot_be_simulated(monkeypatch: py
     assert got.visible == (True,) and got.error_true == pytest.approx(cold(8.0).error_true, rel=0.05)
 
 
-def _seat(s: Scored) -> str:
+def _place(s: Scored) -> str:
     assert s.candidate.part is not None and isinstance(s.candidate.part.at, dict)
     return str(s.candidate.part.at["seat"])

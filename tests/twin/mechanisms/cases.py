@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from twin.quantity import unit_registry
+from data.units import unit_registry
 
 U = unit_registry()
 K = U.kelvin

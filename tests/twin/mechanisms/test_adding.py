@@ -57,7 +57,7 @@ def test_a_diagnosis_considers_it(example):
     part = twin_part(machine)
     proposed = candidates(machine, part, [KEY])
     assert [c.name for c in proposed] == [f"{KEY}_{body}_feed_driver" for body in sorted(BODIES[1:])]
-    assert [c.words for c in proposed[:1]] == [f"friction of the wipers: {sorted(BODIES[1:])[0]} (feed_driver)"]
+    assert [c.label for c in proposed[:1]] == [f"friction of the wipers: {sorted(BODIES[1:])[0]} (feed_driver)"]
     found = asleep(machine, part, proposed)
     assert not found.left_out and set(found.amplitudes) == {c.name for c in proposed}
     every = candidates(machine, part)

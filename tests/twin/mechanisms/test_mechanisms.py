@@ -46,7 +46,7 @@ def made(key: str) -> Mechanism:
 def test_it_says_what_it_is(key):
     m = made(key)
     assert m.key == key
-    assert m.__doc__ and 8 <= len(m.words) <= 70
+    assert m.__doc__ and 8 <= len(m.summary) <= 70
     assert "=" in m.equation and len(m.equation) <= 130
     assert 20 <= len(m.source) <= 140
     assert 20 <= len(m.signature) <= 140
@@ -55,7 +55,7 @@ def test_it_says_what_it_is(key):
 
 
 def test_no_two_read_alike():
-    for said in ("words", "signature"):
+    for said in ("summary", "signature"):
         texts = [getattr(made(key), said) for key in MECHANISMS]
         assert len(set(texts)) == len(texts)
 

@@ -77,8 +77,7 @@ def test_enclosure_air_keeps_names_values_and_priors() -> None:
 
 
 @pytest.mark.parametrize(
-    "acts_on, moved",
-    [(None, {"head", "table", "bed"}), ("room", {"head", "table", "bed"}), ("table-room", {"table"})],
+    "acts_on, moved", [(None, {"head", "table", "bed"}), ("room", {"head", "table", "bed"}), ("table-room", {"table"})]
 )
 def test_which_exposures_are_moved(acts_on: str | None, moved: set[str]) -> None:
     given = {"law": "enclosure_air"} | ({"acts_on": acts_on} if acts_on else {})

@@ -1,0 +1,89 @@
+"""Every threshold of the diagnosis stands in its policy, with a unit, a reason and its evidence."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+
+import pytest
+
+from diagnosis.policy import POLICY, STAGES, Policy, markdown
+
+ROOT = Path(__file__).parents[2]
+# Numerics and presentation: grids, guards against division by zero, digits, widths, axes of tables.
+NO_DECISION = {
+    "export/machine_file.py": {"PRIOR_SAME", "SAME"},
+    "export/yaml_text.py": {"WIDTH", "DIGITS"},
+    "drafting/first_guess.py": {"LAWS"},  # the powers in which laws state their drivers
+    "drafting/groups.py": {"DIFFERENCE_ORDERS", "NORMAL_MEDIAN"},
+    "findings/report_data.py": {"ACF_LAGS"},
+    "findings/schema.py": {"DIGITS", "LARGEST_PROBABILITY"},
+    "findings/statement.py": {"_DIGITS", "_MAX_NAMED"},
+    "fitting/regression.py": {
+        "MATRIX_FILTER_ROWS", "MEMORY_REACHES_ROWS", "MEMORY_SHARES", "MIN_DIRECTION_SQUARE",
+    },
+    "localisation/free_series.py": {"STEP_HALVINGS", "UNUSED_CORNER"},
+    "localisation/linearised.py": {"MAX_MODAL_VALUES"},
+    "localisation/where_when.py": {"CLOCK_EDGES_H", "MAX_DRIVER_LEVELS", "SINCE_START_EDGES_MIN"},
+    "screening/evidence.py": {"TINY"},
+    "screening/linearisation.py": {"NEARLY_OFF"},
+    "screening/screen.py": {"NO_TRACE_SD"},
+    "search/null.py": {"CACHED_NULLS", "TINY"},
+}  # fmt: skip
+
+
+def numeric(node: ast.expr) -> bool:
+    """Whether an expression holds numbers and nothing else that is named."""
+    kinds = {type(n.value) for n in ast.walk(node) if isinstance(n, ast.Constant)}
+    return bool(kinds & {int, float}) and not any(isinstance(n, ast.Call) for n in ast.walk(node))
+
+
+def constants(text: str) -> set[str]:
+    """Module-level upper-case names that are assigned numbers."""
+    found: set[str] = set()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [n for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+            values = (
+                node.value.elts if isinstance(node.value, ast.Tuple) and len(names) > 1 else [node.value] * len(names)
+            )
+            found |= {n.id for n, v in zip(names, values, strict=True) if n.id.isupper() and numeric(v)}
+    return found
+
+
+def test_no_other_module_assigns_a_threshold() -> None:
+    room = ROOT / "diagnosis"
+    found = {
+        path.relative_to(room).as_posix(): names
+        for path in sorted(room.rglob("*.py"))
+        if path.name != "policy.py" and (names := constants(path.read_text(encoding="utf-8")))
+    }
+    beyond = {name: sorted(own - NO_DECISION.get(name, set())) for name, own in found.items()}
+    assert {name: own for name, own in beyond.items() if own} == {}, "put it into diagnosis/policy.py"
+
+
+def test_numbers_are_seen_however_they_are_assigned() -> None:
+    text = "A, B = 1.0, 'b'\nC: float = 2\nD = (1, 2)\nE = {'um': 0.1}\nF = 'text'\nG = len('abc')\nh = 3\n_I = -4\n"
+    assert constants(text) == {"A", "C", "D", "E", "_I"}
+
+
+@pytest.mark.parametrize("field", fields(Policy), ids=lambda f: f.name)
+def test_every_threshold_has_a_unit_a_reason_and_its_evidence(field: object) -> None:
+    metadata = field.metadata  # type: ignore[attr-defined]
+    assert metadata["unit"] and len(metadata["reason"]) > 10
+    known = ("analytic", "physical", "development plants", "computing time", "convention")
+    assert metadata["evidence"] in known
+
+
+def test_a_policy_is_not_changed_in_place() -> None:
+    with pytest.raises(FrozenInstanceError):
+        POLICY.max_effects = 9  # type: ignore[misc]
+    assert Policy() == POLICY and set(STAGES) <= {f.name for f in fields(Policy)}
+    assert POLICY.null_scales[POLICY.null_own_scale] == 1.0
+
+
+def test_the_documentation_shows_the_policy() -> None:
+    """After a change: ``python -m diagnosis.policy > docs/policy.md``."""
+    assert (ROOT / "docs" / "policy.md").read_text(encoding="utf-8") == "\n".join(markdown()) + "\n"

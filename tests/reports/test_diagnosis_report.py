@@ -1,0 +1,245 @@
+"""The report of a diagnosis: what it says for each verdict, what it leaves out, and that simulated is called so."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from data.errors import InputError
+from diagnosis.contracts import COLUMNS
+from diagnosis.findings.schema import Findings
+from diagnosis.result import Diagnosis
+from reports.diagnosis import tables as diagnosis_tables
+from reports.diagnosis.page import diagnosis_page, write_diagnosis_report
+from reports.diagnosis.tables import CHIPS, GLOSSARY, METHOD, headline, likelihood, probability_label
+from tests.snapshots import check_snapshot
+from tests.toys.diagnosis import BATCHES, toy_diagnosis
+
+VERDICTS = ("consistent", "explained", "partly_explained", "unlisted", "undecidable")
+
+
+def changed(d: Diagnosis, **findings: Any) -> Diagnosis:
+    return replace(d, findings=d.findings.model_copy(update=findings))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("diagnosis")
+
+
+@pytest.fixture(scope="module")
+def full(folder: Path) -> str:
+    """The page of a diagnosis with every section but a next experiment, pictures and all."""
+    path = folder / "deep" / "report.html"
+    write_diagnosis_report(path, toy_diagnosis("unlisted"))
+    return path.read_text(encoding="utf-8")
+
+
+# the page
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_page_says_the_verdict_and_every_statement(verdict: str, folder: Path) -> None:
+    d = toy_diagnosis(verdict)
+    path = folder / f"{verdict}.html"
+    write_diagnosis_report(path, d, pictures=False)
+    text = path.read_text(encoding="utf-8")
+    page = diagnosis_page(d, False)
+    assert f'<span class="chip {verdict}">{page.chip}</span>' in text and f"<h1>{page.headline}</h1>" in text
+    for f in d.findings.findings:
+        assert f.statement.replace("'", "&#39;") in text and f.equation.replace(">", "&gt;") in text
+    assert text.count('<p class="said">') == len(d.findings.findings)
+    assert all(said in text for said in METHOD) and all(f"<dt>{word}</dt>" in text for word, _ in GLOSSARY)
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and not re.findall(r"https?://|<script", text)
+
+
+def test_a_finding_is_told_with_place_time_probability_and_what_else_it_may_be() -> None:
+    (found,) = diagnosis_page(toy_diagnosis("explained"), False).found
+    assert (found.what, found.where, found.when) == ("heat to the floor", "bed", "always")
+    assert (found.probability, found.likelihood, found.percent) == ("97\u202f%", "extremely likely", 97.0)
+    assert found.others == "radiation to walls or from a hot neighbour at bed (2\u202f%)"
+    second = diagnosis_page(toy_diagnosis("partly_explained"), False).found[1]
+    assert (second.number, second.where, second.others) == (2, "sensor column_front", "")
+    (free,) = diagnosis_page(toy_diagnosis("unlisted"), False).found
+    assert (free.what, free.when) == ("missing heat of no listed mechanism", "spindle_rpm > 0")
+
+
+def test_no_headline_or_probability_is_more_certain_than_the_finding() -> None:
+    cases = [(v, [x.probability for x in toy_diagnosis(v).findings.findings]) for v in VERDICTS]
+    cases += [("explained", [0.97, 0.7]), ("explained", [0.8, 0.7]), ("partly_explained", [0.4])]
+    lines = [f"{CHIPS[v]} {probabilities}: {headline(v, probabilities)}\n" for v, probabilities in cases]
+    check_snapshot(__file__, "headlines", "".join(lines))
+    assert [likelihood(p) for p in (1.0, 0.95, 0.9, 0.66, 0.5, 0.33, 0.1, 0.0)] == [
+        "virtually certain", "extremely likely", "very likely", "likely", "more likely than not",
+        "about as likely as not", "unlikely", "very unlikely",
+    ]  # fmt: skip
+    assert [probability_label(p).replace("\u202f", " ") for p in (1.0, 0.994, 0.52, 0.004)] == [
+        "> 99 %", "> 99 %", "52 %", "< 1 %",
+    ]  # fmt: skip
+
+
+def test_the_key_figures_are_before_after_and_noise_with_their_units() -> None:
+    d = toy_diagnosis("explained")
+    rms = d.findings.fit.left_out_rms
+    figures = {k.label: k for k in diagnosis_page(d, False).figures}
+    z = figures["z, left-out rms"]
+    assert (z.before, z.after, z.unit, z.small) == (
+        f"{rms.before['z_um']:.1f}", f"{rms.after['z_um']:.1f}", "µm", "noise 1.2 µm",
+    )  # fmt: skip
+    assert figures["left-out runs that improve"].after == "11 of 12"
+    assert "x, left-out rms" not in figures  # it did not change by a tenth of its noise
+    quiet = diagnosis_page(toy_diagnosis("consistent"), False)
+    assert [k.before for k in quiet.figures] == [""] * 4 and quiet.figures[-1].after == "12"
+    assert quiet.lead.startswith(
+        "In 12 left-out runs the simulation misses no more than noise and a coarse network leave; an effect"
+    )
+
+
+def test_tied_causes_name_the_run_that_settles_them() -> None:
+    page = diagnosis_page(toy_diagnosis("undecidable"), False)
+    assert page.settle.startswith("Night stop: 3 h of spindle") and page.settle.endswith("; 12 h in all.")
+    part = next(p for p in page.parts if p.anchor == "next")
+    assert part.lead == page.settle and ("Distinguishes", "floor sink bed from radiation bed room") in part.facts
+    assert "Fewer than 4 batches: no probability above 80 % is stated." in page.remarks
+    assert diagnosis_page(toy_diagnosis("explained"), False).settle == ""
+
+
+def test_simulated_and_drafted_are_said(full: str, folder: Path) -> None:
+    assert "not in the library (SIMULATED)</title>" in full and '<span class="badge">SIMULATED</span></p>' in full
+    pictures = re.findall(r'<img[^>]* alt="([^"]*)"', full)
+    assert len(pictures) == 9 and all(p.endswith("(SIMULATED)") for p in pictures)
+    assert full.count('<p class="caption">') == full.count(
+        '<span class="badge">SIMULATED</span></p>\n<div class="scroll"'
+    )
+    real = replace(toy_diagnosis("explained"), simulated=False, drafted=True)
+    write_diagnosis_report(folder / "real.html", real, pictures=False)
+    text = (folder / "real.html").read_text(encoding="utf-8")
+    assert "SIMULATED</" not in text and "network that was drafted from the recordings" in text
+    assert "drafted from the recordings" not in full
+
+
+def test_every_picture_can_be_read(full: str) -> None:
+    sources = re.findall(r'src="data:image/([^;]+);base64,([^"]+)"', full)
+    kinds = [kind for kind, _ in sources]
+    assert kinds.count("svg+xml") == 1 and kinds.count("png") == 8
+    for kind, content in sources:
+        raw = base64.b64decode(content)
+        if kind == "png":
+            assert imread(io.BytesIO(raw)).shape[1] == 1680
+        else:
+            assert ElementTree.fromstring(raw).tag.endswith("svg")
+
+
+def test_sections_come_in_order_and_without_data_not_at_all(full: str) -> None:
+    assert re.findall(r'<section class="part" id="(\w+)">', full) == [
+        "where", "better", "runs", "evidence", "flux", "limits", "equation", "how",
+    ]  # fmt: skip
+    d = toy_diagnosis("consistent")
+    bare = replace(d, tables={k: pd.DataFrame(columns=list(c)) for k, c in COLUMNS.items()})
+    page = diagnosis_page(bare)
+    assert page.parts == () and [k.label for k in page.figures] == ["left-out runs"]
+    assert page.lead == "In 12 left-out runs the simulation misses no more than noise and a coarse network leave."
+    for name, anchor in {"map": "where", "rms": "better", "limits": "limits", "flux": "flux"}.items():
+        tables = {**toy_diagnosis("unlisted").tables, name: bare.tables[name]}
+        parts = diagnosis_page(replace(toy_diagnosis("unlisted"), tables=tables), False).parts
+        assert anchor not in [p.anchor for p in parts]
+
+
+def test_words_from_the_findings_are_text_and_no_markup(folder: Path) -> None:
+    d = toy_diagnosis("explained")
+    odd = d.findings.findings[0].model_copy(update={"statement": "a <b>bold</b> & $ claim"})
+    d = replace(changed(d, findings=(odd,)), remarks=("<script>alert(1)</script>",))
+    write_diagnosis_report(folder / "odd.html", d, pictures=False)
+    text = (folder / "odd.html").read_text(encoding="utf-8")
+    assert "a &lt;b&gt;bold&lt;/b&gt; &amp; $ claim" in text
+    assert "<script" not in text
+    quiet = changed(toy_diagnosis("consistent"), statement="Why <i>so</i>.")
+    write_diagnosis_report(folder / "quiet.html", quiet, pictures=False)
+    said = '<p class="lead">Why &lt;i&gt;so&lt;/i&gt;.</p>'
+    assert said in (folder / "quiet.html").read_text(encoding="utf-8")
+
+
+def test_a_wrong_place_is_told_in_one_line(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"report .*x.pdf: unsupported file extension '.pdf'; give .html"):
+        write_diagnosis_report(folder / "x.pdf", toy_diagnosis("explained"))
+    (folder / "file").write_text("")
+    with pytest.raises(InputError, match=r"report .*x.html: cannot be written \(.+\); give another place"):
+        write_diagnosis_report(folder / "file" / "x.html", toy_diagnosis("explained"), pictures=False)
+
+
+# tables
+
+
+def test_candidates_are_ranked_in_words_and_the_accepted_is_marked() -> None:
+    d = toy_diagnosis("explained")
+    table = diagnosis_tables.candidates(d.tables["candidates"], True, frozenset({("floor_sink", "bed")}))
+    assert table.rows[0].mark == "found" and [r.mark for r in table.rows[1:]] == [""] * 8
+    assert table.rows[0].cells == (
+        "heat to the floor, bed", "+412", "11 of 12", "10.2 W/K", "63 %", "97\u202f%", "1",
+    )  # fmt: skip
+    assert table.rows[-1].cells[:2] == ("a joint that slips, z", "+2.0")
+    assert table.rows[-1].cells[3] == "0.8 µm"
+    many = pd.concat([d.tables["candidates"]] * 3).assign(rank=range(27), probability=np.nan)
+    table = diagnosis_tables.candidates(many, True)
+    assert len(table.rows) == 12 and table.rows[0].cells[5] == "–"
+    assert table.notes[1] == "Shown: the best 12 of 27 that were refitted."
+
+
+def test_a_place_is_found_in_a_candidates_unique_name() -> None:
+    assert diagnosis_tables.place({"mechanism": "floor_sink", "name": "floor_sink_bed"}) == "bed"
+    assert diagnosis_tables.place({"mechanism": "floor_sink", "name": "bed-air"}) == "bed-air"
+
+
+def test_parameters_have_units_and_intervals_where_they_are_known() -> None:
+    findings = Findings.from_json(
+        {
+            "schema": "thermodrift.findings/1", "machine": "m", "batches": ["a"], "verdict": "explained",
+            "seconds": 1.0,
+            "fit": {"batches_improved": 1, "batches": 1},
+            "findings": [
+                {
+                    "mechanism": "floor_sink", "where": {"kind": "node", "name": "bed"}, "probability": 0.9,
+                    "statement": "s",
+                    "parameters": {
+                        "conductance": {"value": 1234.5, "unit": "W/K", "interval90": [1100.0, 1400.2]},
+                        "start_up": {"value": -0.0456, "unit": "um", "interval90": None},
+                        "gain": {"value": None, "unit": "1"},
+                    },
+                }
+            ],
+        }
+    )  # fmt: skip
+    table = diagnosis_tables.parameters(findings.findings[0].parameters, False, "Parameters")
+    assert [r.cells for r in table.rows] == [
+        ("conductance", "1234 W/K", "1100 to 1400 W/K"), ("start up", "−0.0456 µm", "–"), ("gain", "–", "–"),
+    ]  # fmt: skip
+
+
+def test_limits_and_steps_have_their_units() -> None:
+    t = toy_diagnosis("explained").tables
+    limits = diagnosis_tables.limits(t["limits"], True)
+    assert limits.rows[2].cells == (
+        "air that moves", "1.1 W/K", "88 %", "exposures.column_front-air",
+    )  # fmt: skip
+    assert limits.rows[3].cells[1:] == ("0.04 K/h", "20 %", "–")
+    assert [r.cells[-1] for r in diagnosis_tables.steps(t["steps"], True).rows] == ["accepted", "rejected"]
+
+
+def test_the_runs_of_every_channel_are_in_a_table() -> None:
+    rms = toy_diagnosis("explained").tables["rms"]
+    table = diagnosis_tables.runs(rms, ["z", "bed"], True, False)
+    first = rms[(rms["batch"] == BATCHES[0]) & (rms["channel"] == "z")].iloc[0]
+    assert table.rows[0].cells[:2] == (BATCHES[0], f"{first['before']:.1f} → {first['after']:.1f}")
+    assert [(c.title, c.unit) for c in table.columns] == [("run", ""), ("z", "µm"), ("bed", "K")]
+    alone = diagnosis_tables.runs(rms[rms["batch"] == BATCHES[0]], ["z"], False, True)
+    assert alone.rows[0].cells == (BATCHES[0], f"{first['after']:.1f}")

@@ -1,0 +1,68 @@
+"""The outcome of a training in sentences."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from models.promotion import choose, score_of_choice
+from models.protocols import PromotionRule
+from reports.comparison.story import promoted_cell, verdict
+from tests.snapshots import check_snapshot
+from tests.toys.report_training import COMPARISON, Maker, promotion, results, training
+
+RULE = PromotionRule()
+WORSE = COMPARISON | {"better": False, "difference_um": -0.1, "low_um": -0.31, "high_um": 0.11, "p_value": 0.71}
+FORCED = COMPARISON | {"better": False, "difference_um": -0.6, "low_um": -1.0, "high_um": -0.2}
+FEW = COMPARISON | {"n_batches": 3, "words": "3 batches in common, need at least 5: the champion stays"}
+OUTCOMES: dict[str, dict[str, object]] = {
+    "first": {"version": 1, "champion_version": 1, "against": None},
+    "better": {"comparison": COMPARISON},
+    "forced": {"comparison": FORCED, "forced": True},
+    "not better": {"outcome": "challenger", "champion_version": 2, "comparison": WORSE},
+    "too few batches": {"outcome": "challenger", "champion_version": 2, "comparison": FEW},
+    "not comparable": {"outcome": "challenger", "champion_version": 2, "obstacle": "gone"},
+    "unchanged": {"outcome": "unchanged", "champion_version": 2},
+}
+
+
+def test_the_outcome_of_a_training_in_one_sentence(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    choice = choose(result.cells, RULE)
+    shown = {k: verdict("z", training(result, promotion(choice.cell, **c)), choice) for k, c in OUTCOMES.items()}
+    assert all(v.caution == "" for v in shown.values())
+    check_snapshot(__file__, "outcomes", "".join(f"{k}: {v.summary}\n" for k, v in shown.items()))
+
+
+def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    rule_cell = choose(result.cells, RULE)
+    nested = score_of_choice(result, RULE)["S_um"]
+    computed = promoted_cell(training(result), RULE, "leave-batch-out", nested=True)
+    assert computed.nested_S_mean_um == pytest.approx(nested.mean())
+    assert computed.nested_S_std_um == pytest.approx(nested.std())
+    recorded = promotion(rule_cell.cell, nested_S_mean_um=9.44, nested_S_std_um=7.31)
+    choice = promoted_cell(training(result, recorded), RULE, "leave-batch-out", nested=True)
+    assert (choice.cell, choice.nested_S_mean_um, choice.nested_S_std_um) == (rule_cell.cell, 9.44, 7.31)
+    said = verdict("z", training(result, recorded), choice).summary
+    assert re.search(
+        r"6 batches; 9\.4\d? ± 7\.31? µm when a batch has no say in the choice of its model either\)", said
+    )
+
+
+def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    reason = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean_curve (8.10 µm)"
+    recorded = promotion(choose(result.cells, RULE).cell, caution=reason)
+    said = verdict("z", training(result, recorded), choose(result.cells, RULE))
+    assert said.caution == f"Do not trust this model: {reason}."
+
+
+def test_nothing_promoted_and_nothing_to_trust_are_said(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    only = result.cells["family"].isin(["zero", "mean_curve"])
+    choice = choose(result.cells[only], RULE)
+    said = verdict("z", training(result), choice)
+    assert said.summary.startswith("Nothing was promoted. The rule would take mean curve: ")
+    assert said.caution == "Do not trust this model: nothing beats mean_curve."

@@ -1,0 +1,265 @@
+"""The functions of the public API; each calls the function that the command of the same name calls.
+
+A machine is its machine file or what `load_machine` made of it. Progress is logged to the logger ``thermodrift`` at
+level INFO. Everything that is kept between calls goes below the home: ``var/`` in the working directory, or the folder
+that THERMODRIFT_HOME names.
+
+Functions with `processes` start worker processes where it is more than 1. These import the main module again, so a
+script needs the usual ``if __name__ == "__main__":`` then. Results do not depend on their number.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import Machine, load_machine
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from data.ingest import IngestReport
+    from data.lake import Lake
+    from diagnosis.result import Diagnosis
+    from models.crossing import Plan
+    from pipelines.commands.simulate import Simulated
+    from pipelines.model_store import StoredModel
+    from pipelines.training import TrainOutcome
+    from twin.calibration import Calibration, CalibrationOptions
+
+AnyMachine = Machine | Path | str
+Paths = Path | str | Sequence[Path | str]
+_log = logging.getLogger("thermodrift").info
+
+
+def read(recordings: Paths, machine: AnyMachine, *, need_error: bool = True) -> list[Batch]:
+    """Read recordings into batches, with the findings of all checks; nothing is stored.
+
+    Args:
+        recordings: files, or folders whose files match `recording.files` of the machine file.
+        need_error: refuse a file without an error channel.
+
+    Raises:
+        InputError: no recording there, or one that cannot be used.
+    """
+    from data.checks import check_batch, check_machine
+    from pipelines.recordings import read_files
+
+    known = _machine(machine)
+    batches = [b for path in _paths(recordings) for b in read_files(known, path, need_error)]
+    return check_machine([b.with_findings(check_batch(b, known)) for b in batches], known)
+
+
+def ingest(recordings: Paths, machine: AnyMachine, lake: Lake | None = None) -> IngestReport:
+    """Read, check and store recordings in the lake; what cannot be used goes to quarantine with the reason.
+
+    Args:
+        lake: default: the lake in the home.
+
+    Raises:
+        InputError: a path does not exist, or a channel's unit cannot be kept; nothing has been read then.
+        WorkError: the lake cannot be written; what was stored before stays.
+    """
+    from data.ingest import ingest
+    from pipelines.recordings import home_lake
+
+    return ingest(_paths(recordings), _machine(machine), lake or home_lake(), progress=_log)
+
+
+def train(
+    machine_file: Path | str,
+    recordings: Paths = (),
+    *,
+    channels: Sequence[str] = (),
+    plan: Plan | None = None,
+    promote: bool = True,
+    processes: int = 1,
+) -> TrainOutcome:
+    """Ingest, cross selectors with families, track in MLflow, promote the best cell and write the report.
+
+    Args:
+        recordings: files and folders to ingest first; default: what the lake holds.
+        channels: error channels to learn; default: all.
+        plan: selectors, families, protocols and effort; default: ``Plan()``.
+        promote: register the best cell, as champion or challenger.
+
+    Returns:
+        The results by channel, ids of trainings, promotions, and the path of the report.
+
+    Raises:
+        InputError: a file, channel or plan that cannot be used, or too few batches.
+        WorkError: lake or tracking store do not answer.
+    """
+    from models.crossing import Plan
+    from pipelines import settings, training
+    from pipelines.caller import DirectCaller
+
+    settings.configure_environment()
+    request = training.TrainRequest(
+        Path(machine_file), tuple(_paths(recordings)), tuple(channels), plan or Plan(), promote=promote,
+        workers=processes,
+    )  # fmt: skip
+    return training.train(request, settings.load(), DirectCaller(), _log)
+
+
+def load_model(uri: Path | str) -> StoredModel:
+    """The model behind ``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/RUN/model`` or a local folder.
+
+    Raises:
+        InputError: unknown name, alias, version, run or folder, with the closest.
+        WorkError: the tracking store does not answer.
+    """
+    from pipelines import settings
+    from pipelines.commands.predict import load_model
+
+    settings.configure_environment()
+    return load_model(str(uri), settings.load())
+
+
+def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> pd.DataFrame:
+    """Predicted error of a batch, or of every batch in a raw recording.
+
+    Args:
+        model: a loaded model, or what `load_model` takes.
+
+    Returns:
+        batch_id, time_s (s), predicted_um (µm, relative to the batch's start), outside_region, outside_of, distance,
+        expected_S_um, simulated; for an error along an axis position_mm as well.
+
+    Raises:
+        InputError: a model or file that cannot be used, or a missing input.
+    """
+    from pipelines.commands.predict import predict_batches
+    from pipelines.recordings import read_files
+
+    known = load_model(model) if isinstance(model, Path | str) else model
+    batches = [recording] if isinstance(recording, Batch) else read_files(known.machine, Path(recording), False)
+    table = predict_batches(known, batches)
+    if table is None:
+        raise InputError(f"recording {recording}: no batch in it that machine {known.machine.machine} can read")
+    return table
+
+
+def simulate(
+    machine: AnyMachine,
+    plan: Path | str,
+    *,
+    step_s: float | None = None,
+    noise: bool = False,
+    seed: int = 0,
+    begins: str = "",
+) -> Simulated:
+    """Simulate a run plan by the machine's twin; nothing is written.
+
+    Args:
+        plan: stages (.yml) or a table over time.
+        step_s: from row to row (s); default: the plan's step.
+        noise: add noise and resolution of sensors and probes, drawn with `seed`.
+        begins: local date and time of the first row; sunlight needs it.
+
+    Returns:
+        The simulation, and `batch`: the plan as it would have been recorded.
+
+    Raises:
+        InputError: no twin part, a plan or option that cannot be used, heat that is stiff beyond the step control.
+    """
+    from pipelines.commands.simulate import SimulationRequest, beginning, jobs_of, simulate_job
+
+    known = _machine(machine)
+    file = Path(known.machine) if isinstance(machine, Machine) else Path(machine)
+    request = SimulationRequest(file, (Path(plan),), Path(), step_s, noise, seed, beginning(begins))
+    network, (job,) = jobs_of(request, known)
+    return simulate_job(job, network, known, request)
+
+
+def calibrate(
+    machine: AnyMachine,
+    batches: Sequence[Batch],
+    options: CalibrationOptions | None = None,
+    *,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+) -> Calibration:
+    """Fit the machine file's free parameters to batches: values with 90 % intervals.
+
+    Args:
+        options: of the fit; default: ``CalibrationOptions()``.
+        out: write the calibrated machine file there; `machine` is a file then.
+
+    Raises:
+        InputError: no twin part, a batch that cannot be used, fewer rows than free parameters, or `out` that exists.
+        WorkError: the fit did not converge, or the file cannot be written.
+    """
+    from pipelines.commands.calibrate import check_calibrated, write_calibrated
+    from twin.calibration import CalibrationOptions, calibrate
+
+    chosen = options or CalibrationOptions()
+    if out is None:
+        return calibrate(_machine(machine), batches, chosen, _progress)
+    file, to = _machine_file(machine), Path(out)
+    known, text = check_calibrated(file, to, overwrite)
+    found = calibrate(known, batches, chosen, _progress)
+    write_calibrated(found, text, file, to, overwrite)
+    return found
+
+
+def diagnose(
+    machine: AnyMachine,
+    batches: Sequence[Batch],
+    *,
+    out: Path | str | None = None,
+    seed: int = 0,
+    processes: int = 1,
+    overwrite: bool = False,
+) -> Diagnosis:
+    """Name the physics that the machine's twin lacks: what, where, when, how sure, and how much better it fits.
+
+    A machine file without a twin part is diagnosed against the simplest network that the batches support.
+
+    Args:
+        out: a folder for report.html, findings.json, machine.yml and next_run.yml; `machine` is a file then.
+        seed: of all random draws.
+        overwrite: replace an earlier diagnosis of this machine in `out`.
+
+    Returns:
+        The diagnosis; `findings` holds the verdict and the findings.
+
+    Raises:
+        InputError: a machine file, batch or folder that cannot be used.
+        WorkError: the model fails at the priors' means, or `out` cannot be written.
+    """
+    from diagnosis.diagnose import diagnose
+    from pipelines.diagnosing import DiagnosisRequest, check_diagnosis, write_diagnosis
+
+    if out is None:
+        return diagnose(_machine(machine), batches, seed=seed, processes=processes, progress=_progress)
+    folder = Path(out)
+    request = DiagnosisRequest(_machine_file(machine), folder, seed=seed, overwrite=overwrite)
+    known, text = check_diagnosis(request)
+    found = diagnose(known, batches, seed=seed, processes=processes, progress=_progress)
+    _, trouble = write_diagnosis(found, folder, text)
+    if trouble:
+        logging.getLogger("thermodrift").warning("%s; the findings stand in %s", trouble, folder)
+    return found
+
+
+def _machine(machine: AnyMachine) -> Machine:
+    return machine if isinstance(machine, Machine) else load_machine(machine)
+
+
+def _machine_file(machine: AnyMachine) -> Path:
+    if isinstance(machine, Machine):
+        raise InputError(f"machine {machine.machine}: with `out` give the path of the machine file, whose text is kept")
+    return Path(machine)
+
+
+def _paths(recordings: Paths) -> list[Path]:
+    return [Path(p) for p in ([recordings] if isinstance(recordings, Path | str) else recordings)]
+
+
+def _progress(step: str, n: int, of: int) -> None:
+    _log(f"{step} {n}/{of}" if of else step)
