@@ -52,7 +52,9 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
         most = POLICY.start_max_log_factor
         factor = float(np.exp(np.clip(s.amplitudes.get("factor", 0.0), -most, most)))
         p = c.change.parameter
-        return {}, {name: float(np.clip(value * factor, p.low, p.high))} if c.change.spread else {}
+        margin = POLICY.start_share_margin if p.scale == "logit" else 0.0  # no share begins at 0 or 1: its logit is ∞
+        begin = float(np.clip(value * factor, p.low + margin, p.high - margin))
+        return {}, {name: begin} if c.change.spread else {}
     if c.parts:
         return {}, {}
     mechanism = MECHANISMS[c.mechanism]
