@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 
@@ -37,3 +38,11 @@ def one_of(given: str, allowed: Iterable[T], option: str) -> T:
         if value == given:
             return value
     raise InputError(f"{option}: unknown value {given!r}: {closest(given, known)}")
+
+
+def check_suffix(what: str, path: Path, allowed: Sequence[str]) -> None:
+    """Raises InputError where a file's suffix is none of `allowed`."""
+    if path.suffix not in allowed:
+        *first, last = allowed
+        known = f"{', '.join(first)} or {last}" if first else last
+        raise InputError(f"{what} {path}: unsupported file extension {path.suffix!r}; give {known}")

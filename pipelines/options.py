@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -33,12 +33,6 @@ def names(given: str, allowed: Iterable[str], kind: str) -> tuple[str, ...]:
         if n not in known:
             raise InputError(f"unknown {kind} {n!r}: {closest(n, known)}")
     return chosen or known
-
-
-def check_suffix(what: str, path: Path, allowed: Sequence[str]) -> None:
-    """Raises InputError where a file's suffix is none of `allowed`."""
-    if path.suffix not in allowed:
-        raise InputError(f"{what} {path}: got suffix {path.suffix!r}, expected {' or '.join(allowed)}")
 
 
 def processes(workers: int | None) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from data.batch import Batch
 from data.checks import check_machine
-from data.errors import InputError, closest
+from data.errors import InputError, check_suffix, closest
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
 from models import FAMILIES, promotion
@@ -26,7 +26,6 @@ from pipelines import registry, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint
 from pipelines.diagnosing import DiagnosisOutcome, diagnose_if_grown
-from pipelines.options import check_suffix
 from pipelines.recordings import home_lake, load_batches
 from pipelines.settings import Settings, home
 from reports.comparison import figure_pngs, write_report

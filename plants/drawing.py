@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -98,9 +98,6 @@ def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
         far = [int(cells[k]) for k in order if 0.35 <= off[k] <= 1.05 and cells[k] not in joined]
         out.append(Sensor(f"t_{body}", body, (far or [int(cells[order[0]])])[0], lag_s, offset_K))
     return tuple(out)
-
-
-Habit = Callable[[Sequence[Run], float], list[Run]]  # runs, rated speed in rpm
 
 
 def ordinary(runs: Sequence[Run], rated_rpm: float) -> list[Run]:

@@ -12,9 +12,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from data.errors import InputError
+from data.errors import InputError, check_suffix
 from data.files import write_atomic
-from reports.labels import listed
 from reports.layout import Strip
 
 FORMATS = (".html", ".md")
@@ -32,21 +31,13 @@ def write_page(path: Path, template: str, page: object, formats: Sequence[str] =
     Raises:
         InputError: another suffix, or a place that cannot be written.
     """
-    check_suffix(path, formats)
+    check_suffix("report", path, formats)
     text = rendered(f"{template}{path.suffix}", page)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, text)
     except OSError as error:
         raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
-
-
-def check_suffix(path: Path, formats: Sequence[str], what: str = "report") -> None:
-    """Raises InputError where the suffix is none of `formats`."""
-    if path.suffix not in formats:
-        raise InputError(
-            f"{what} {path}: unsupported file extension {path.suffix!r}; give {listed(formats, last='or')}"
-        )
 
 
 def rendered(name: str, page: object, **more: object) -> str:

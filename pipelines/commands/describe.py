@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from data.errors import InputError, closest
+from data.errors import InputError, check_suffix, closest
 from pipelines import console
 
 if TYPE_CHECKING:
@@ -49,10 +49,10 @@ def describe_twin(machine_file: Path, out: Path | None = None, at: Sequence[str]
     from twin.schema import twin_part
     from twin.views.overview import machine_modes, mode_views, overview
 
-    if out is not None and out.suffix not in PICTURES:
-        raise InputError(f"--out {out}: got suffix {out.suffix!r}, expected {', '.join(PICTURES)}")
-    if out is not None and out.exists():
-        raise InputError(f"{out} exists; give another --out or remove it first")
+    if out is not None:
+        check_suffix("--out", out, PICTURES)
+        if out.exists():
+            raise InputError(f"{out} exists; give another --out or remove it first")
     where = f"machine file {machine_file}"
     machine = load_machine(machine_file)
     part = expanded(twin_part(machine, where))

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data.errors import InputError
-from pipelines.options import check_suffix
+from data.errors import InputError, check_suffix
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data.errors import InputError, closest
+from data.errors import InputError, check_suffix, closest
 from pipelines import console
 from pipelines.caller import Say
-from pipelines.options import check_suffix
 
 if TYPE_CHECKING:
     from data.batch import Batch

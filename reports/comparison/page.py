@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from data.errors import InputError
+from data.errors import InputError, check_suffix
 from data.registry import Registry
 from features.selectors import SELECTORS
 from models import FAMILIES
@@ -23,7 +23,7 @@ from reports.comparison.story import Verdict, promoted_cell, verdict
 from reports.comparison.tables import protocols_of, scored
 from reports.labels import count, decimals, family_label, listed, number, selector_label
 from reports.layout import Table
-from reports.rendering import FORMATS, check_suffix, write_page
+from reports.rendering import FORMATS, write_page
 
 _FEW_FINDINGS = 12
 
@@ -166,6 +166,6 @@ def write_report(trainings: Sequence[Training], path: Path, rule: PromotionRule)
         InputError: no training given, one without a judged cell, another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    check_suffix(path, FORMATS)
+    check_suffix("report", path, FORMATS)
     write_page(path, "report", page(trainings, rule))
     return path

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, check_suffix
 from data.machine import Machine
 from reports.drawing import Picture, picture, picture_bytes
 from reports.layout import Table
-from reports.rendering import check_suffix, write_page
+from reports.rendering import write_page
 from reports.twin import tables
 from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
 from reports.twin.flows import flow_picture, heat_stack
@@ -101,7 +101,7 @@ def write_picture(path: Path | str, view: Overview) -> Path:
         InputError: another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    check_suffix(path, PICTURES, "picture")
+    check_suffix("picture", path, PICTURES)
     if path.suffix == ".html":
         return write_twin_report(path, TwinData(view, ()))
     try:

@@ -109,8 +109,8 @@ def test_a_report_of_what_is_tracked(year: Path, call: Call, store_home: Path) -
     done = call("report", "--machine", NAME, "--out", year / "two.html")
     assert done.code == 0 and (year / "two.html").read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype")
     done = call("report", "--machine", NAME, "--format", "md", "--out", year / "two.html")
-    assert (done.code, lines(done.err)) == (2, [f"thermodrift: --out {year / 'two.html'}: got suffix '.html', "
-                                                "expected .md"])  # fmt: skip
+    assert (done.code, lines(done.err)) == (2, [f"thermodrift: --out {year / 'two.html'}: unsupported file extension "
+                                                "'.html'; give .md"])  # fmt: skip
 
 
 def test_predict_from_another_folder(year: Path, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,10 +167,12 @@ def test_describe_drafts_a_file_that_ingests(
         (["train", "--machine", "{yml}", "--protocols", "lbo"], "unknown protocol 'lbo'"),
         (["train", "--machine", "{yml}", "--channels", "zz"], "nobody: no error channel 'zz'; did you mean 'z'"),
         (["train", "--machine", "{yml}", "--recordings", "gone"], "recordings gone: no such file or folder"),
-        (["train", "--machine", "{yml}", "--report", "r.pdf"], "report r.pdf: got suffix '.pdf', expected .html"),
+        (["train", "--machine", "{yml}", "--report", "r.pdf"],
+         "report r.pdf: unsupported file extension '.pdf'; give .html"),
         (["train", "--machine", "{yml}", "--protocols", "train-on-one"], "promotion judges by leave-batch-out; add it"),
         (["report", "--machine", "m", "--format", "pdf"], "--format: got 'pdf', expected html or md"),
-        (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"], "--out p.xlsx: got suffix '.xlsx', expected"),
+        (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"],
+         "--out p.xlsx: unsupported file extension '.xlsx'; give .csv or .parquet"),
         (["predict", "f.csv", "--model", "no-such-folder"], "model 'no-such-folder': no such folder; expected"),
         (["simulate"], "got nothing to simulate; call `thermodrift simulate --sample-year"),
         (["simulate", "--sample-year", "--seed", "-1", "--out", "y"], "seed: got -1, expected 0 or more"),

@@ -69,7 +69,10 @@ def test_the_html_holds_parameters_and_modes(two: Path, tmp_path: Path) -> None:
         (("--twin", MACHINES / "spindle_fl.yml"), "spindle_fl.yml: key 'twin' is missing; add bodies"),
         (("--twin", "gone.yml"), "gone.yml"),
         (("--twin", "TWO", "a.csv"), "reads no recordings; leave out a.csv"),
-        (("--twin", "TWO", "--out", "x.pdf"), "--out x.pdf: got suffix '.pdf', expected .svg, .png, .html"),
+        (
+            ("--twin", "TWO", "--out", "x.pdf"),
+            "--out x.pdf: unsupported file extension '.pdf'; give .svg, .png or .html",
+        ),
         (("--twin", "TWO", "--out", "TWO.svg"), "exists; give another --out or remove it first"),
         (
             ("--twin", "TWO", "--at", "rmp=3"),
