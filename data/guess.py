@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,16 @@ from data.arrays import Array
 from data.readers.csv import normalise
 from data.rows import Rows
 from data.sweeps import position_bins
-from data.units import known_unit, quantity
+from data.units import TIME_UNITS_S, known_unit, quantity
 
-_TIME = re.compile(r"time|zeit|时间|時間|時刻|日時|timestamp|elapsed|datum|date|^t$|^t ?[\[(]")
+_TIME = re.compile(
+    r"time|zeit|时间|時間|时刻|時刻|日時|日期|elapsed|datum|date|^t$|^t ?[\[(/]|\btemps\b(?! ?\d)|heure|horodat|tiempo|"
+    r"fecha|\bhora\b|\btempo\b|\bora\b|\bdata\b"
+)
+_COUNTER = re.compile(
+    r"^(unnamed: 0|#|no|nr|n°|nº|num|number|nummer|numero|numéro|número|index|idx|indice|índice|id|row|zeile|ligne|"
+    r"fila|riga|lfd|count|counter|zähler|record|sample|scan|point|序号|序號|编号|編號|番号|行)?[ ._]*(no|nr)?\.?$"
+)
 _SETPOINT = re.compile(r"set ?point|sollwert|\bset\b|command")
 _AMBIENT = re.compile(r"amb|room|hall|umgebung|raum|环境|環境|室温|雰囲気|\bair\b|luft")
 _ERROR = re.compile(r"disp|err|drift|deviat|\bweg|位移|変位|変形|误差|誤差|\bgap\b|probe|^d[xyz]\b|strain|dehnung")
@@ -24,8 +32,27 @@ _DRIVER = re.compile(
 )
 _TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
 _POSITION = re.compile(r"\bpos|axis|achse")
-_LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%"}
+_LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%", "°", "℃"}
+_TIME_OF_DAY = {"ora", "hora", "heure"}  # also the word for an hour
+_LONE_TIMES = {"s", "h", "d"}  # as the unit of a clock only
+# where a header holds its unit, the likeliest first: in brackets; behind "in", a separator or CJK text; all of it
+_UNIT_PLACES = tuple(
+    re.compile(pattern)
+    for pattern in (
+        r"[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$",
+        r"\b(?:in|en)\s+(\S.*)$",
+        r"(?<=\w)[_ /,;:]\s*([^_\s]+)$",
+        r"(?<=[\u3040-\u30ff\u3400-\u9fff])([^\u3040-\u9fff\s_]{2,})$",
+        r"(?<=[\u3040-\u9fff])([\u3040-\u9fff]{2})$",
+        r"(?<=[\u3040-\u9fff])([\u3040-\u9fff]{3})$",
+        r"^(\D{3,}|[\u3040-\u9fff]+)$",
+    )
+)
+_LENGTH_S = (500.0, 30 * 86400.0)  # a thermal test lasts ten minutes to weeks
+_SAMPLE_S = (0.01, 600.0)  # slower than 10 min misses a warm-up, faster than 100 Hz is no temperature record
+_RATE_K_PER_MIN = 8.0  # 1 kW into the smallest instrumented body, about 7.5 kJ/K
 NICE_STEPS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1800, 3600)
+_FAR_SPANS = 3.0  # times the span of the others: a lone value there is no reading
 
 
 @dataclass(frozen=True)
@@ -37,18 +64,51 @@ class Guess:
 
 
 def is_time_name(name: str) -> bool:
-    return bool(_TIME.search(normalise(name)))
+    """Whether a header says that the column is a clock: a word for time, or a unit of time."""
+    if quantity(unit_in_name(name) or "s") != "time":
+        return False
+    return bool(_TIME.search(normalise(name))) or time_unit_in_name(name) is not None
 
 
-def unit_in_name(name: str) -> str | None:
-    """A unit in brackets, or behind the last underscore or blank, by its known name: ``"ch1_um"`` -> ``um``."""
-    if m := re.search(r"[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$", name):
-        return known_unit(m[1])
-    if m := re.search(r"(?<=\w)[_ /]([^_\s]+)$", name.strip()):
-        tail = m[1]
-        if len(tail) > 1 or tail in _LONE_LETTERS or tail in "°℃":
-            return known_unit(tail)
+def is_counter_name(name: str) -> bool:
+    """Whether a header is one of a column that numbers the rows (also none, or the one that pandas gives)."""
+    return bool(_COUNTER.match(normalise(name)))
+
+
+def is_other_name(name: str) -> bool:
+    """Whether a header says that the column is a channel and no clock."""
+    folded = normalise(name.replace("_", " "))
+    names = any(p.search(folded) for p in (_SETPOINT, _AMBIENT, _ERROR, _DRIVER, _TEMPERATURE, _POSITION))
+    return names or quantity(unit_in_name(name) or "s") != "time"
+
+
+def unit_in_name(name: str, lone: Collection[str] = _LONE_LETTERS) -> str | None:
+    """A unit in a header, by its known name: ``"ch1_um"`` and ``"Weg in Mikrometer"`` -> ``um``.
+
+    `lone` are the single letters that count as a unit outside brackets.
+    """
+    text = unicodedata.normalize("NFKC", name).strip()
+    for place, pattern in enumerate(_UNIT_PLACES):
+        found = pattern.search(text)
+        counts = found is not None and (place == 0 or len(found[1]) > 1 or found[1] in lone)
+        if found is not None and counts and (unit := known_unit(found[1])):
+            return unit
     return None
+
+
+def channel_unit_in_name(name: str) -> str | None:
+    """The unit in a channel's header, which is none of time: the "min" of "T_min" is a minimum."""
+    unit = unit_in_name(name)
+    return None if quantity(unit or "") == "time" else unit
+
+
+def time_unit_in_name(name: str) -> str | None:
+    """The unit of time in a clock's header: as `unit_in_name`, or any word of it ("Minuten seit Start")."""
+    words = re.findall(r"[^\W\d_]{3,}", normalise(name))
+    if set(words) & _TIME_OF_DAY and len(words) == 1:
+        return None
+    texts = (unit_in_name(name, _LONE_TIMES), *(known_unit(w) for w in words))
+    return next((u for u in texts if u in TIME_UNITS_S), None)
 
 
 def role(name: str, unit: str | None, values: Array) -> Guess:
@@ -91,7 +151,7 @@ def _role_of_values(values: Array) -> Guess:
 
 def unit(of_role: str, name: str, values: Array) -> Guess:
     """Unit in the file for a channel of that role."""
-    written = unit_in_name(name)
+    written = channel_unit_in_name(name)
     if written:
         return Guess(written, "named so in the header")
     v = values[np.isfinite(values)]
@@ -102,6 +162,8 @@ def unit(of_role: str, name: str, values: Array) -> Guess:
             return Guess("K", f"values around {middle:.4g}")
         return Guess("degC", f"values around {middle:.3g}; may be degF")
     if of_role == "error":
+        if size < 0.002:  # in mm it would never exceed 2 µm
+            return Guess("m", f"never above {size:.2g}; may be a strain")
         if size < 0.5:
             return Guess("mm", f"never above {size:.2g}")
         return Guess("um", f"up to {size:.3g}")
@@ -121,7 +183,7 @@ def resolution(values: Array) -> float | None:
     if len(v) < 3:
         return None
     steps = np.diff(v)
-    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(v).max()))]
+    steps = steps[steps > 1e-9 * max(1.0, float(np.median(np.abs(v))))]
     if len(steps) == 0:
         return None
     smallest = float(f"{steps.min():.3g}")
@@ -151,18 +213,66 @@ def _nice(x: float, up: bool) -> float:
     return float(f"{(np.ceil if up else np.floor)(x / unit_of_digit) * unit_of_digit:.6g}")
 
 
-def time_unit(name: str, step: float, length: float) -> Guess:
-    """s, min or h of a numeric time column with that median step and length."""
-    written = unit_in_name(name)
-    if written is None and (m := re.search(r"(?:^|[_ ])(s|min|h)$", normalise(name))):
-        written = m[1]
-    if written in ("s", "min", "h"):
-        return Guess(written, "named so in the header")
-    if step < 0.02 and length < 200:
-        return Guess("h", f"steps of {step:.3g} over {length:.4g} fit hours")
-    if step < 1.0 and length >= 20 and step * length > 10:
-        return Guess("min", f"steps of {step:.3g} over {length:.4g} fit minutes")
-    return Guess("s", f"steps of {step:.3g} over {length:.4g} fit seconds")
+def time_unit(written: str | None, step: float, length: float, rate_K: float) -> tuple[Guess, str]:
+    """Unit of a numeric clock, and what speaks against it or leaves it open ("" where nothing does).
+
+    `written` is the unit in the header; `step` and `length` are the median step and the length in the file's unit,
+    `rate_K` the fastest sustained change of a temperature in K per that unit. The unit must make a length, a step and
+    a rate that a thermal test of a machine can have; without a written one the first of s, min, h, d, ms does.
+    """
+    doubts = {u: _doubts(step * s, length * s, rate_K / s) for u, s in TIME_UNITS_S.items()}
+    fits = [u for u, d in doubts.items() if not d]
+    if written is not None:
+        if not doubts[written] or not fits:
+            return Guess(written, "named so in the header"), ""
+        return Guess(written, "named so in the header, but implausible"), (
+            f"the header's unit of time {written} gives {' and '.join(doubts[written])}, unusual for a machine; "
+            f"{fits[0]} would be plausible"
+        )
+    value = min(doubts, key=lambda u: len(doubts[u]))
+    seen = f"steps of {step:.3g} over {length:.4g}"
+    note = f"no header gives the unit of time; {seen} are taken for {value}"
+    if doubts[value]:
+        note += f", although that gives {' and '.join(doubts[value])}, unusual for a machine"
+    elif doubts["s"]:
+        note += f"; s would give {' and '.join(doubts['s'])}, unusual for a machine"
+    if len(fits) > 1:
+        note += f"; {' and '.join(fits[1:])} would be plausible as well"
+    return Guess(value, f"{seen} fit {value}"), note
+
+
+def _doubts(step_s: float, length_s: float, rate_K_per_s: float) -> list[str]:
+    """What no thermal test of a machine would have."""
+    out = []
+    if not _SAMPLE_S[0] <= step_s <= _SAMPLE_S[1]:
+        out.append(f"samples {step_s:.3g} s apart")
+    if not _LENGTH_S[0] <= length_s <= _LENGTH_S[1]:
+        out.append(f"a recording of {length_s / 3600:.3g} h")
+    if rate_K_per_s * 60 > _RATE_K_PER_MIN:
+        out.append(f"temperatures that change by {rate_K_per_s * 60:.3g} K/min")
+    return out
+
+
+def sustained_rate(time: Array, values: Array) -> float:
+    """The 95th percentile of |change| per unit of time over a fiftieth of the recording (5 samples at least)."""
+    there = np.isfinite(values) & np.isfinite(time)
+    t, v = time[there], values[there]
+    lag = max(5, len(v) // 50)
+    if len(v) <= 2 * lag:
+        return 0.0
+    change, between = np.abs(v[lag:] - v[:-lag]), t[lag:] - t[:-lag]
+    return float(np.quantile(change[between > 0] / between[between > 0], 0.95)) if (between > 0).any() else 0.0
+
+
+def seen_range(values: Array) -> tuple[float, float]:
+    """Smallest and largest value (n,), without outermost ones (a thousandth) far from all others; NaN without any."""
+    v = np.sort(values[np.isfinite(values)])
+    k = max(1, len(v) // 1000)
+    if len(v) <= 2 * k:
+        return (float(v[0]), float(v[-1])) if len(v) else (np.nan, np.nan)
+    far = _FAR_SPANS * (v[-1 - k] - v[k]) or np.inf
+    inside = v[(v >= v[k] - far) & (v <= v[-1 - k] + far)]
+    return float(inside[0]), float(inside[-1])
 
 
 def grid_step_s(interval_s: float) -> float:

@@ -1,11 +1,15 @@
-"""Ingest: read recordings, check them and store them in the lake; unusable files go to quarantine with the reason."""
+"""Ingest: read recordings, check them and store them in the lake; unusable files go to quarantine with the reason.
+
+A batch from a file in a subfolder of the given folder is named by its path there (``2025/run1``), so that files of the
+same name do not meet; otherwise by the file's name alone. The same measured values under two names are one batch.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import pandas as pd
@@ -15,24 +19,39 @@ import pyarrow.parquet as pq
 from data.batch import Batch, Finding
 from data.checks import check_batch, overruled
 from data.errors import InputError, WorkError
-from data.lake import Lake, Staged
+from data.lake import Lake
 from data.lakefile import content_digest
 from data.machine import Machine
+from data.manifest import Staged, Stored
 from data.recording import read_batches, recording_files
 from data.units import check_canonical
 
 COMMIT_EVERY_S = 1.0
-COLUMNS = ("file", "batch_id", "status", "version", "rows_in", "rows_stored", "rows_dropped", "findings", "reason")
+RECENT_S = 5.0  # a file that was changed later than this may still grow: copies and data loggers write more often
+LOOK_AGAIN_S = 1.0  # time between the two looks at such a file
+COLUMNS = (
+    "file", "batch_id", "status", "version", "rows_in", "rows_stored", "rows_dropped", "findings", "reason",
+    "stored_as",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time, s since 1970, and waiting."""
+
+    now: Callable[[], float] = time.time
+    wait: Callable[[float], None] = time.sleep
 
 
 @dataclass
 class Ingested:
-    """One batch of one file, or one file in quarantine (`batch_id` "").
+    """One batch of one file, or one file without a usable batch (`batch_id` "").
 
-    `status`: new, unchanged, refreshed, new_version (see `data.lake`); conflict: left out because another file
-    of the same ingest gave other content under this id; quarantined: the file, or what was left of it, cannot be
-    used. Rows are rows of the recording: `rows_in` = `rows_stored` + `rows_dropped`; None if unknown.
-    `found`: what the checks of one batch found, with the machine file's overrules.
+    `status`: new, unchanged, refreshed, new_version, duplicate, withdrawn (see `data.manifest.Stored`); conflict: left
+    out because another file of the same ingest gave other content under this id; quarantined: the file, or what was
+    left of it, cannot be used; waiting: the file is still being written, the next ingest takes it. `stored_as` is the
+    batch's id in the lake, "" if it is not there. Rows are rows of the recording: `rows_in` = `rows_stored` +
+    `rows_dropped`; None if unknown. `found`: what the checks of one batch found, with the machine file's overrules.
     """
 
     file: str
@@ -44,16 +63,17 @@ class Ingested:
     rows_dropped: int | None
     findings: int
     reason: str = ""
+    stored_as: str = ""
     found: tuple[Finding, ...] = ()
 
 
 @dataclass
 class IngestReport:
-    """What an ingest did, file by file in the order read; `ignored` are files that match no pattern."""
+    """The outcome of an ingest, file by file in the order read; `ignored` are other files of the folders, and why."""
 
     machine: str
     rows: list[Ingested] = field(default_factory=list)
-    ignored: list[Path] = field(default_factory=list)
+    ignored: list[tuple[Path, str]] = field(default_factory=list)
 
     @property
     def batches(self) -> list[Ingested]:
@@ -62,6 +82,10 @@ class IngestReport:
     @property
     def quarantined(self) -> list[Ingested]:
         return [r for r in self.rows if r.status in ("quarantined", "conflict")]
+
+    @property
+    def waiting(self) -> list[Ingested]:
+        return [r for r in self.rows if r.status == "waiting"]
 
     @property
     def rows_in(self) -> int:
@@ -78,19 +102,26 @@ class IngestReport:
         return sum(r.rows_dropped or 0 for r in self.rows)
 
     def as_frame(self) -> pd.DataFrame:
-        """One row per batch or quarantined file, columns `COLUMNS`."""
-        frame = pd.DataFrame([asdict(r) for r in self.rows], columns=list(COLUMNS))
+        """One row per batch or file without one, ignored files last; columns `COLUMNS`."""
+        ignored = [Ingested(str(f), "", "ignored", None, None, 0, None, 0, reason) for f, reason in self.ignored]
+        frame = pd.DataFrame([asdict(r) for r in (*self.rows, *ignored)], columns=list(COLUMNS))
         return frame.astype({"version": "Int64", "rows_in": "Int64", "rows_dropped": "Int64"})
 
 
 def ingest(
-    paths: Sequence[Path], machine: Machine, lake: Lake, progress: Callable[[str], None] | None = None
+    paths: Sequence[Path],
+    machine: Machine,
+    lake: Lake,
+    progress: Callable[[str], None] | None = None,
+    clock: Clock | None = None,
 ) -> IngestReport:
     """Bring files and directories into the lake, in memory bounded by one batch.
 
-    A directory gives the files that match `machine.recording.files`, in sorted order; a file is read whatever its name.
-    A batch id that comes twice with different content is a conflict: the first one is stored, the second one is left
-    out and its file goes to quarantine. `progress` gets one line per file.
+    A directory gives the files that `recording_files` finds; a file is read whatever its name. Files of the folder
+    itself and with short names come first, so that ``run1.csv`` is stored and ``run1 (copy).csv`` is its duplicate. A
+    file that grows between two looks, or while it is read, waits for the next ingest. A batch id that comes twice
+    with different content is a conflict: the first one is stored, the second one is left out and its file goes to
+    quarantine. `progress` gets one line per file.
 
     Raises:
         InputError: a path does not exist, or a channel's unit cannot be kept; nothing has been read then.
@@ -98,13 +129,34 @@ def ingest(
     """
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
     files, ignored = _collect(paths, machine)
+    growing = _growing(files, clock or Clock())
     run = _Run(machine, lake, IngestReport(machine.machine, ignored=ignored))
-    for number, file in enumerate(files, 1):
+    for number, (file, folder) in enumerate(files.items(), 1):
         if progress:
             progress(f"{number}/{len(files)} {file.name}")
-        run.take(file)
+        if file in growing:
+            run.wait_for(file)
+        else:
+            run.take(file, folder)
     run.commit()
     return run.report
+
+
+def _look(file: Path) -> tuple[int, int] | None:
+    """Size in bytes and time of the last change in ns; None where the file is gone."""
+    try:
+        seen = file.stat()
+    except OSError:
+        return None
+    return seen.st_size, seen.st_mtime_ns
+
+
+def _growing(files: Iterable[Path], clock: Clock) -> set[Path]:
+    """Files that were changed lately and change again between two looks."""
+    seen = {f: look for f in files if (look := _look(f)) and clock.now() - look[1] / 1e9 < RECENT_S}
+    if seen:
+        clock.wait(LOOK_AGAIN_S)
+    return {f for f, look in seen.items() if _look(f) != look}
 
 
 class _Run:
@@ -113,27 +165,43 @@ class _Run:
     def __init__(self, machine: Machine, lake: Lake, report: IngestReport) -> None:
         self.machine, self.lake, self.report = machine, lake, report
         self._first: dict[str, tuple[Path, str]] = {}  # batch id -> file and digest
-        self._waiting: list[tuple[Staged, Ingested]] = []
+        self._staged: list[tuple[Staged, Ingested]] = []
         self._committed_at = time.monotonic()
 
-    def take(self, file: Path) -> None:
-        """One file: every batch that can be used goes in, the first problem ends the file."""
-        before = len(self.report.rows)
-        conflicts = []
+    def wait_for(self, file: Path) -> None:
+        reason = f"{file}: still being written; ingest it again when it is complete"
+        self.report.rows.append(Ingested(str(file), "", "waiting", None, None, 0, None, 0, reason))
+
+    def take(self, file: Path, folder: str = "") -> None:
+        """One file: every batch that can be used goes in, the first problem ends the file.
+
+        `folder` comes before the ids of its batches.
+        """
+        before, staged_before, seen = len(self.report.rows), len(self._staged), _look(file)
+        refused: list[str] = []
         try:
-            for batch in _ahead(_checked(file, self.machine)):
+            for batch in _ahead(_checked(file, folder, self.machine)):
                 if conflict := self._store(file, batch):
-                    conflicts.append(conflict)
+                    refused.append(conflict)
             if len(self.report.rows) == before:
                 raise InputError(f"{file}: no batch in it; expected a recording of at least two rows")
         except InputError as error:
-            seen = sum(r.rows_in or 0 for r in self.report.rows[before:])
+            read = sum(r.rows_in or 0 for r in self.report.rows[before:])
             rows = _count_rows(file, self.machine)
-            left = None if rows is None else max(0, rows - seen)
+            left = None if rows is None else max(0, rows - read)
             self.report.rows.append(Ingested(str(file), "", "quarantined", None, left, 0, left, 0, str(error)))
-            self.lake.quarantine(file, self.machine.machine, str(error))
-        for reason in conflicts:
+            refused.insert(0, str(error))
+        if _look(file) != seen:
+            del self.report.rows[before:]
+            self.lake.discard([s for s, _ in self._staged[staged_before:]])
+            del self._staged[staged_before:]
+            self._first = {i: first for i, first in self._first.items() if first[0] != file}
+            self.wait_for(file)
+            return
+        for reason in refused:
             self.lake.quarantine(file, self.machine.machine, reason)
+        if time.monotonic() - self._committed_at > COMMIT_EVERY_S:
+            self.commit()
 
     def _store(self, file: Path, batch: Batch) -> str | None:
         """Stage a batch; gives the reason if it contradicts an earlier one of this ingest."""
@@ -157,35 +225,60 @@ class _Run:
             found=overruled(batch, self.machine.overrule).findings,
         )  # fmt: skip
         self.report.rows.append(row)
-        self._waiting.append((staged, row))
-        if time.monotonic() - self._committed_at > COMMIT_EVERY_S:
-            self.commit()
+        self._staged.append((staged, row))
         return None
 
     def commit(self) -> None:
-        stored = self.lake.commit([s for s, _ in self._waiting])
-        for (_, row), result in zip(self._waiting, stored, strict=True):
-            row.status, row.version = result.status, result.version
-            if Path(result.replaces).name != Path(row.file).name and result.replaces:
-                row.reason = f"follows the version from {result.replaces}, which stays in the lake"
-        self._waiting.clear()
+        stored = self.lake.commit([s for s, _ in self._staged], distinct=True)
+        for (_, row), result in zip(self._staged, stored, strict=True):
+            _note(row, result)
+        self._staged.clear()
         self._committed_at = time.monotonic()
 
 
-def _collect(paths: Sequence[Path], machine: Machine) -> tuple[list[Path], list[Path]]:
-    """Files to read, each once, and files to ignore."""
+def _note(row: Ingested, result: Stored) -> None:
+    """What the lake did with a staged batch."""
+    row.status, row.version, row.stored_as = result.status, result.version, result.batch_id
+    if result.left_out:
+        row.version, row.rows_stored, row.rows_dropped, row.found, row.findings = None, 0, row.rows_in, (), 0
+    if result.status == "duplicate":
+        row.reason = f"the same measured values as batch {result.batch_id}, which is stored"
+    elif result.status == "withdrawn":
+        row.stored_as = ""
+        row.reason = (
+            f"withdrawn: {result.reason}; restore with `thermodrift lake restore {result.machine} {result.batch_id}`"
+        )
+    elif result.replaces and Path(result.replaces).name != Path(row.file).name:
+        row.reason = f"follows the version from {result.replaces}, which stays in the lake"
+
+
+def _collect(paths: Sequence[Path], machine: Machine) -> tuple[dict[Path, str], list[tuple[Path, str]]]:
+    """Files to read, each once, with what comes before the ids of their batches, and files to ignore."""
     missing = [str(p) for p in paths if not Path(p).exists()]
     if missing:
         raise InputError(
             f"{', '.join(missing)}: no such file or directory; nothing was read, give existing recordings or folders"
         )
-    files: dict[Path, Path] = {}
-    ignored: dict[Path, Path] = {}
+    files: dict[Path, tuple[Path, str]] = {}
+    ignored: dict[Path, tuple[Path, str]] = {}
     for path in map(Path, paths):
         wanted, others = recording_files(path, machine) if path.is_dir() else ([path], [])
-        files |= {f.resolve(): f for f in wanted if f.resolve() not in files}
-        ignored |= {f.resolve(): f for f in others}
-    return list(files.values()), [f for key, f in ignored.items() if key not in files]
+        for file in wanted:
+            files.setdefault(file.resolve(), (file, id_prefix(file, path)))
+        ignored |= {f.resolve(): (f, reason) for f, reason in others}
+    ordered = sorted(files.values(), key=lambda f: (f[1].count("/"), len(f[0].stem)))
+    return dict(ordered), [f for key, f in ignored.items() if key not in files]
+
+
+def id_prefix(file: Path, given: Path) -> str:
+    """What comes before the id of a batch: the file's folder inside the given folder, with a slash, or nothing.
+
+    Partitions of a lake (``year=2025``) do not count, so that its files keep their ids.
+    """
+    if file == given:
+        return ""
+    parts = file.parent.relative_to(given).parts
+    return "".join(f"{part}/" for part in parts if "=" not in part)
 
 
 def _ahead(batches: Generator[Batch, None, None]) -> Generator[Batch, None, None]:
@@ -200,11 +293,12 @@ def _ahead(batches: Generator[Batch, None, None]) -> Generator[Batch, None, None
         batches.close()
 
 
-def _checked(file: Path, machine: Machine) -> Generator[Batch, None, None]:
+def _checked(file: Path, folder: str, machine: Machine) -> Generator[Batch, None, None]:
     """The file's batches with their findings; whatever goes wrong in the file's reading is an InputError."""
     try:
         for batch in read_batches(file, machine):
-            yield batch.with_findings((*batch.findings, *check_batch(batch, machine)))
+            named = replace(batch, batch_id=folder + batch.batch_id)
+            yield named.with_findings((*named.findings, *check_batch(named, machine)))
     except (InputError, WorkError):
         raise
     except Exception as error:  # an unforeseen kind of damage must not stop the other files

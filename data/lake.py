@@ -13,6 +13,9 @@ for the same content *refresh* the version: number and digest stay, a new file h
 file is kept. Replacing `_manifest.json` commits a write: `load` gives the old state before it and the new state after.
 The current file is replaced next. If the process is killed in between, plain readers see the old version until the
 next write, which finds the batch under `pending`.
+
+A withdrawn batch keeps its versions but has no current file, and nothing loads it; `restore` brings it back, `purge`
+deletes its content. Withdrawn content is not stored again.
 """
 
 from __future__ import annotations
@@ -22,18 +25,20 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from filelock import FileLock, Timeout
 
+from data import manifest as listing
 from data.batch import Batch
 from data.errors import InputError, WorkError, closest
-from data.lakefile import content_digest, decode, encode, remarks_digest, safe_name
+from data.lakefile import content_digest, decode, encode, measured_digest, remarks_digest, safe_name
+from data.manifest import Entry, Staged, Stored, Version
 
 LOG = "reasons.jsonl"
 
@@ -75,8 +80,7 @@ def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) ->
         copy = folder / f"{sha256[:12]}-{name}"
     except OSError as error:
         reason = f"{reason} (no copy kept: its bytes cannot be read, {error.strerror})"
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    return Quarantined(machine, path.name, str(path), sha256, reason, now, copy)
+    return Quarantined(machine, path.name, str(path), sha256, reason, _now(), copy)
 
 
 def copy_bytes(source: Path, target: Path) -> None:
@@ -90,50 +94,7 @@ def ascii_if_broken(name: str) -> str:
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-SCHEMA = "thermodrift.lake/1"
 LOCK_WAIT_S = 600.0
-Status = Literal["new", "unchanged", "refreshed", "new_version"]
-
-
-@dataclass(frozen=True)
-class Stored:
-    """What `put` did with a batch; `replaces` is the source of the version before a new one."""
-
-    status: Status
-    version: int
-    digest: str
-    machine: str
-    batch_id: str
-    replaces: str = ""
-
-
-@dataclass(frozen=True)
-class Version:
-    """One version of a batch. `files`: its files under the root, oldest remarks first, the last one in use."""
-
-    version: int
-    digest: str
-    source: str
-    stored_at: str
-    rows: int
-    year: int
-    simulated: bool
-    current: bool
-    files: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Staged:
-    """A batch whose file is written and waits for a commit."""
-
-    machine: str
-    batch_id: str
-    digest: str
-    file: str
-    source: str
-    rows: int
-    year: int
-    simulated: bool
 
 
 class Lake:
@@ -166,22 +127,108 @@ class Lake:
             with self._writing():
                 self._replace(self.root / file, body)
         year = batch.start.year if batch.start is not None else 0
-        return Staged(batch.machine, batch.batch_id, digest, file, batch.source, batch.n_rows, year, batch.simulated)
+        return Staged(
+            batch.machine, batch.batch_id, digest, measured_digest(batch), file, batch.source, batch.n_rows, year,
+            batch.simulated,
+        )  # fmt: skip
 
-    def commit(self, staged: Sequence[Staged]) -> list[Stored]:
-        """Make staged batches visible, all at once, in their order."""
+    def commit(self, staged: Sequence[Staged], distinct: bool = False) -> list[Stored]:
+        """Make staged batches visible, all at once, in their order, except withdrawn content.
+
+        With `distinct`, the measured values of a batch are stored under one id only (see `manifest.enter`).
+        """
         if not staged:
             return []
-        with self._writing():
-            manifest = self._manifest()
-            self._publish(manifest, manifest["pending"])
-            stored = [_enter(manifest, s) for s in staged]
-            touched = sorted({(s.machine, s.batch_id) for s in stored})
-            if any(s.status != "unchanged" for s in stored):
-                manifest["pending"] = touched
-                self._replace(self._manifest_path, json.dumps(manifest).encode())
-            self._publish(manifest, touched)
+        with self._changing() as (manifest, touch):
+            copies = {m: self._copies(manifest, m) for m in {s.machine for s in staged}} if distinct else {}
+            stored = [listing.enter(manifest, s, _now(), copies.get(s.machine)) for s in staged]
+            entered = [s for s, done in zip(staged, stored, strict=True) if not done.left_out]
+            gone = [s.file for s in entered if not (self.root / s.file).exists()]
+            if gone:
+                raise WorkError(f"lake {self.root}: {gone[0]} was deleted during the ingest; ingest again")
+            for s in entered:
+                touch(s.machine, s.batch_id)
+        self.discard([s for s, done in zip(staged, stored, strict=True) if done.left_out])
         return stored
+
+    def discard(self, staged: Sequence[Staged]) -> None:
+        """Delete the files of staged batches that no version uses."""
+        if not staged:
+            return
+        with self._writing():
+            machines = self._manifest()["machines"]
+            for s in staged:
+                if s.file not in listing.files_kept(machines.get(s.machine, {}).get(s.batch_id, [])):
+                    self._delete(self.root / s.file)
+
+    def withdraw(self, machine: str, batch_ids: Sequence[str], reason: str) -> list[str]:
+        """Take batches out of use, with all their versions, until `restore`; their content stays in the lake.
+
+        The same content is not stored again, whatever its name. Returns the ids.
+
+        Args:
+            batch_ids: ids, or patterns such as ``2025*``.
+
+        Raises:
+            InputError: no reason, an unknown machine, or no batch in use fits one of `batch_ids`.
+            WorkError: see `put`.
+        """
+        if not reason.strip():
+            raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
+        with self._changing() as (manifest, touch):
+            batches = self._batches(machine, manifest)
+            where = f"lake {self.root}: {machine} has no batch in use that fits"
+            ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
+            listing.withdraw(batches, ids, reason.strip(), _now())
+            for batch_id in ids:
+                touch(machine, batch_id)
+        return ids
+
+    def forget_machine(self, machine: str, reason: str) -> list[str]:
+        """Withdraw every batch of a machine; see `withdraw`."""
+        return self.withdraw(machine, ["*"], reason)
+
+    def restore(self, machine: str, batch_ids: Sequence[str]) -> list[str]:
+        """Bring withdrawn batches back into use; purged ones are forgotten, so that they can be ingested again.
+
+        Returns the ids.
+
+        Raises:
+            InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
+            WorkError: see `put`.
+        """
+        with self._changing() as (manifest, touch):
+            batches, ids = self._withdrawn(manifest, machine, batch_ids)
+            listing.restore(batches, ids)
+            if not batches:
+                del manifest["machines"][machine]
+            for batch_id in ids:
+                touch(machine, batch_id)
+        return ids
+
+    def purge(self, machine: str, batch_ids: Sequence[str], quarantined: bool = False) -> list[str]:
+        """Delete the content of withdrawn batches for good; reason, source and digest stay, and keep them out.
+
+        Args:
+            quarantined: also delete the machine's quarantined files.
+
+        Returns the ids.
+
+        Raises:
+            InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
+            WorkError: see `put`.
+        """
+        with self._changing() as (manifest, touch):
+            self._copies(manifest, machine)  # states the digests of measured values, which outlive the content
+            batches, ids = self._withdrawn(manifest, machine, batch_ids)
+            listing.purge(batches, ids, _now())
+            for batch_id in ids:
+                touch(machine, batch_id)
+        if quarantined:
+            with self._writing():
+                for file in sorted(self._quarantine(machine).glob("*"), key=lambda f: f.name == LOG):
+                    self._delete(file)
+        return ids
 
     def load(self, machine: str, batch_id: str, version: int | None = None) -> Batch:
         """One batch, by default its current version.
@@ -192,37 +239,57 @@ class Lake:
         """
         entries = self._entries(machine, batch_id)
         by_number = {e["version"]: e for e in entries}
-        if version is not None and version not in by_number:
+        number = entries[-1]["version"] if version is None else version
+        if number not in by_number:
             raise InputError(
                 f"lake {self.root}: batch {batch_id} of {machine} has no version {version}; "
-                f"expected 1 to {len(entries)}"
+                f"expected {', '.join(map(str, by_number))}"
             )
-        return self._read(entries[-1] if version is None else by_number[version])
+        gone = listing.withdrawal(by_number[number])
+        if gone is not None:
+            raise InputError(
+                f"lake {self.root}: batch {batch_id} of {machine} is withdrawn ({gone.reason}); "
+                f"`thermodrift lake restore {machine} {batch_id}` brings it back"
+            )
+        return self._read(by_number[number])
 
     def load_all(self, machine: str) -> list[Batch]:
-        """Current version of every batch, by start (unknown last), then id.
+        """Current version of every batch in use, by start (unknown last), then id.
 
         Raises:
-            InputError: the lake holds nothing of this machine.
+            InputError: the lake holds nothing of this machine, or all of it is withdrawn.
         """
-        batches = [self._read(entries[-1]) for entries in self._batches(machine).values()]
+        held = listing.active(self._batches(machine))
+        if not held:
+            raise InputError(
+                f"lake {self.root}: every batch of machine {machine!r} is withdrawn; "
+                f"`thermodrift lake restore {machine} '*'` brings them back"
+            )
+        batches = [self._read(entries[-1]) for entries in held.values()]
         return sorted(
             batches, key=lambda b: (b.start is None, "" if b.start is None else b.start.isoformat(), b.batch_id)
         )
 
-    def machines(self) -> list[str]:
-        """Names of machines with at least one batch."""
-        return sorted(self._manifest()["machines"])
+    def machines(self, withdrawn: bool = False) -> list[str]:
+        """Names of machines with at least one batch in use; with `withdrawn` also those with withdrawn ones alone."""
+        machines = self._manifest()["machines"]
+        return sorted(m for m, batches in machines.items() if withdrawn or listing.active(batches))
 
     def batch_ids(self, machine: str) -> list[str]:
-        """Ids of a machine's batches, sorted; empty for an unknown machine."""
-        return sorted(self._manifest()["machines"].get(machine, {}))
+        """Ids of a machine's batches in use, sorted; empty for an unknown machine."""
+        return sorted(listing.active(self._manifest()["machines"].get(machine, {})))
+
+    def contents(self, machine: str) -> dict[str, list[Version]]:
+        """Every version of every batch of a machine by id, oldest first, withdrawn ones included.
+
+        Raises:
+            InputError: the lake holds nothing of this machine.
+        """
+        return {i: [listing.version_of(e) for e in entries] for i, entries in sorted(self._batches(machine).items())}
 
     def versions(self, machine: str, batch_id: str) -> list[Version]:
-        """Every version of a batch, oldest first."""
-        entries = self._entries(machine, batch_id)
-        keys = ("version", "digest", "source", "stored_at", "rows", "year", "simulated", "current")
-        return [Version(**{k: e[k] for k in keys}, files=(*e["earlier"], e["file"])) for e in entries]
+        """Every version of a batch, oldest first, withdrawn ones included."""
+        return [listing.version_of(e) for e in self._entries(machine, batch_id)]
 
     def quarantine(self, path: Path, machine: str, reason: str) -> Path:
         """Keep an unusable file's bytes and the reason; the file itself stays where it is.
@@ -230,7 +297,7 @@ class Lake:
         Returns the copy's path (the log's, where the file cannot be read). The same bytes under the same name
         with the same reason are entered once.
         """
-        folder = self.root / "_quarantine" / f"machine={safe_name(machine)}"
+        folder = self._quarantine(machine)
         with self._writing():
             entry = entry_for(path, machine, reason, folder, safe_name(ascii_if_broken(path.name)))
             entries = read_log(folder)
@@ -242,7 +309,10 @@ class Lake:
 
     def quarantined(self, machine: str) -> list[Quarantined]:
         """Quarantined files of a machine, oldest first."""
-        return read_log(self.root / "_quarantine" / f"machine={safe_name(machine)}")
+        return read_log(self._quarantine(machine))
+
+    def _quarantine(self, machine: str) -> Path:
+        return self.root / "_quarantine" / f"machine={safe_name(machine)}"
 
     @property
     def _manifest_path(self) -> Path:
@@ -252,32 +322,66 @@ class Lake:
         try:
             manifest: dict[str, Any] = json.loads(self._manifest_path.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            return {"schema": SCHEMA, "pending": [], "machines": {}}
+            return listing.empty()
         except (OSError, ValueError) as error:
             raise WorkError(f"lake {self._manifest_path}: cannot be read ({error}); restore it from a backup") from None
-        if manifest.get("schema") != SCHEMA:
+        if manifest.get("schema") != listing.SCHEMA:
             raise WorkError(
-                f"lake {self._manifest_path}: got schema {manifest.get('schema')!r}, expected {SCHEMA!r}; "
+                f"lake {self._manifest_path}: got schema {manifest.get('schema')!r}, expected {listing.SCHEMA!r}; "
                 "use another lake folder"
             )
         return manifest
 
-    def _batches(self, machine: str) -> dict[str, list[dict[str, Any]]]:
-        machines = self._manifest()["machines"]
+    def _batches(self, machine: str, manifest: dict[str, Any] | None = None) -> dict[str, list[Entry]]:
+        machines = (manifest or self._manifest())["machines"]
         if machine not in machines:
             hint = closest(machine, machines) if machines else "it is empty"
             raise InputError(f"lake {self.root}: no batch of machine {machine!r}; {hint}. Run thermodrift ingest first")
-        batches: dict[str, list[dict[str, Any]]] = machines[machine]
+        batches: dict[str, list[Entry]] = machines[machine]
         return batches
 
-    def _entries(self, machine: str, batch_id: str) -> list[dict[str, Any]]:
+    def _entries(self, machine: str, batch_id: str) -> list[Entry]:
         batches = self._batches(machine)
         if batch_id not in batches:
             raise InputError(f"lake {self.root}: {machine} has no batch {batch_id!r}; {closest(batch_id, batches)}")
         return batches[batch_id]
 
-    def _read(self, entry: dict[str, Any]) -> Batch:
+    def _read(self, entry: Entry) -> Batch:
         return replace(decode(self.root / entry["file"], entry["version"]), source=entry["source"])
+
+    def _withdrawn(
+        self, manifest: dict[str, Any], machine: str, batch_ids: Sequence[str]
+    ) -> tuple[dict[str, list[Entry]], list[str]]:
+        """A machine's batches, and the ids with withdrawn versions among those wanted."""
+        batches = self._batches(machine, manifest)
+        gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
+        return batches, listing.chosen(gone, batch_ids, f"lake {self.root}: {machine} has no withdrawn batch that fits")
+
+    def _copies(self, manifest: dict[str, Any], machine: str) -> listing.Copies:
+        """Versions by their measured values; a lake of an earlier program gets the digests."""
+        batches = manifest["machines"].get(machine, {})
+        for entry in (e for entries in batches.values() for e in entries if "measured" not in e):
+            try:
+                entry["measured"] = measured_digest(self._read(entry))
+            except WorkError:
+                continue  # a damaged file has no values to compare; `load` reports it
+        return listing.copies_of(batches)
+
+    @contextmanager
+    def _changing(self) -> Iterator[tuple[dict[str, Any], Callable[[str, str], None]]]:
+        """Exclusive access to the manifest and a function that names the batches touched.
+
+        Changes are committed when the block ends, then the current files of these batches follow.
+        """
+        with self._writing():
+            manifest = self._manifest()
+            self._publish(manifest, manifest["pending"])
+            before, touched = json.dumps(manifest), set[tuple[str, str]]()
+            yield manifest, lambda machine, batch_id: touched.add((machine, batch_id))
+            if json.dumps(manifest) != before:
+                manifest["pending"] = sorted(touched)
+                self._replace(self._manifest_path, json.dumps(manifest).encode())
+            self._publish(manifest, touched)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -311,14 +415,21 @@ class Lake:
         _sync(target.parent)
 
     def _publish(self, manifest: dict[str, Any], batches: Iterable[Sequence[str]]) -> None:
-        """Replace the current files of these batches by those that the manifest names."""
+        """Replace the current files of these batches by those that the manifest names; delete purged files."""
         folders = set()
         for machine, batch_id in batches:
-            entries = manifest["machines"][machine][batch_id]
+            entries: list[Entry] = manifest["machines"].get(machine, {}).get(batch_id, [])
+            purged = {f for e in entries for f in (*e["earlier"], e["file"])} - listing.files_kept(entries)
+            for file in purged:
+                self._delete(self.root / file)
             folder, name = self.root / f"machine={safe_name(machine)}", f"{safe_name(batch_id)}.parquet"
+            elsewhere = [folder / f"year={year}" / name for year in {e["year"] for e in entries}]
+            if not entries or "withdrawn" in entries[-1]:
+                for gone in elsewhere:
+                    self._delete(gone)
+                continue
             version = self.root / entries[-1]["file"]
             target = folder / f"year={entries[-1]['year']}" / name
-            elsewhere = [folder / f"year={year}" / name for year in {e["year"] for e in entries}]
             standing = [p for p in elsewhere if p != target and p.exists()]
             # a batch that changed its year is first replaced where it stands, then moved: never absent, never double
             at = standing[0] if standing and not target.exists() else target
@@ -341,37 +452,17 @@ class Lake:
         for changed in folders:
             _sync(changed)
 
+    def _delete(self, file: Path) -> None:
+        """Delete a file and the folders below the root that it leaves empty."""
+        file.unlink(missing_ok=True)
+        for folder in file.parents:
+            if folder == self.root or not folder.exists() or any(folder.iterdir()):
+                break
+            folder.rmdir()
 
-def _enter(manifest: dict[str, Any], s: Staged) -> Stored:
-    """Write a staged batch into the manifest; content equal to the current version makes no new one."""
-    entries = manifest["machines"].setdefault(s.machine, {}).setdefault(s.batch_id, [])
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    status: Status = "new_version" if entries else "new"
-    replaces = ""
-    if entries and entries[-1]["digest"] == s.digest:
-        last = entries[-1]
-        status = "unchanged" if last["file"] == s.file else "refreshed"
-        if status == "refreshed":
-            last["earlier"] = [f for f in (*last["earlier"], last["file"]) if f != s.file]
-            last["file"] = s.file
-    else:
-        for entry in entries:
-            entry["current"], replaces = False, entry["source"]
-        entries.append(
-            {
-                "version": len(entries) + 1,
-                "digest": s.digest,
-                "source": s.source,
-                "stored_at": now,
-                "rows": s.rows,
-                "year": s.year,
-                "simulated": s.simulated,
-                "current": True,
-                "file": s.file,
-                "earlier": [],
-            }
-        )
-    return Stored(status, entries[-1]["version"], s.digest, s.machine, s.batch_id, replaces)
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _same(current: Path, version: Path) -> bool:

@@ -29,6 +29,7 @@ from data.machine import Machine, Recording, TimeColumn
 SCHEMA = "thermodrift.batch/1"
 META_KEY = b"thermodrift"
 RESERVED = ("batch", "simulated", "machine", "year")  # columns that the lake adds, and its partition keys
+MEASURED = ("temperature", "ambient", "error")  # roles whose noise tells recordings apart
 PARALLEL_VALUES = 500_000
 
 
@@ -57,6 +58,20 @@ def content_digest(batch: Batch) -> str:
         "simulated": batch.simulated,
     }
     return hashlib.sha256(_canonical(head)).hexdigest()
+
+
+def measured_digest(batch: Batch) -> str:
+    """SHA-256 (hex) of the measured values alone, so that copies of a recording are equal under any name.
+
+    The batch's id and start, labels, names of channels, and drivers (a schedule may give all of these by the file's
+    name) do not count; channels without a value neither. A batch of drivers alone is identified by those.
+
+    Raises:
+        InputError: see `content_digest`.
+    """
+    columns = {n: v for n, v in _columns(batch).items() if n != "time_s" and not np.isnan(v).all()}
+    measured = [v for n, v in columns.items() if batch.channels[n].role in MEASURED] or list(columns.values())
+    return hashlib.sha256("".join(sorted(_hash_floats(v) for v in measured)).encode()).hexdigest()
 
 
 def remarks_digest(batch: Batch) -> str:
@@ -210,7 +225,7 @@ def _plain(value: Any, where: str) -> Any:
 
 @dataclass(frozen=True)
 class NativeParquet:
-    """Metadata of a Parquet file written by thermodrift: machine, whether simulated, start, labels."""
+    """Metadata of a Parquet file written by thermodrift: machine, batch id, channels, if simulated, start, labels."""
 
     name: str
     note: Mapping[str, Any]
@@ -227,8 +242,11 @@ class NativeParquet:
                 f"{machine.machine!r}; take the machine file of this recording"
             )
         own = Recording(time=TimeColumn(), step_s=machine.recording.step_s, max_gap_s=machine.recording.max_gap_s)
+        units = {c["name"]: c["unit"] for c in self.note["channels"]}
         channels = {
-            n: c.model_copy(update={"column": n, "columns": None, "unit_in_file": c.unit, "source": "file"})
+            n: c.model_copy(
+                update={"column": n, "columns": None, "unit_in_file": units.get(n, c.unit), "source": "file"}
+            )
             for n, c in machine.channels.items()
         }
         simulated = machine.simulated or bool(self.note["simulated"])
@@ -238,9 +256,12 @@ class NativeParquet:
         )
 
     def marked(self, batch: Batch) -> Batch:
-        """The batch with the start and the labels of the metadata."""
-        start = self.note["start"]
-        return replace(batch, start=None if start is None else pd.Timestamp(start), labels=self.note["labels"])
+        """The batch with the start and the labels of the metadata, and its id where the file has the lake's name."""
+        start, batch_id = self.note["start"], self.note["batch_id"]
+        if self.name != f"{safe_name(batch_id)}.parquet":
+            batch_id = batch.batch_id
+        start = None if start is None else pd.Timestamp(start)
+        return replace(batch, batch_id=batch_id, start=start, labels=self.note["labels"])
 
 
 def native_parquet(path: Path) -> NativeParquet | None:
@@ -251,6 +272,7 @@ def native_parquet(path: Path) -> NativeParquet | None:
         note = json.loads((pq.read_schema(path).metadata or {})[META_KEY])
         if note["schema"] != SCHEMA:
             return None
-        return NativeParquet(path.name, {k: note[k] for k in ("machine", "simulated", "start", "labels")})
+        keys = ("machine", "batch_id", "channels", "simulated", "start", "labels")
+        return NativeParquet(path.name, {k: note[k] for k in keys})
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError):
         return None

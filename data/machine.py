@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from data.batch import Channel, Role
 from data.errors import InputError, closest
+from data.units import seconds
 from data.yaml_file import load_yaml, parse_yaml
 
 
@@ -19,11 +20,36 @@ class Section(BaseModel):
 
 
 class TimeColumn(Section):
-    """Which column is time. `unit` is s, min, h, or timestamp (then `format` may name a strptime pattern)."""
+    """Which column is time. `unit` is s, min, h, d, ms, or timestamp (then `format` may name a strptime pattern).
+
+    `date` names the column of the dates where `column` holds times of day; `format` is then of both with a blank
+    between them. `step` instead of all these: the recordings have no clock, and their rows follow each other by that
+    much ("60 s").
+    """
 
     column: str | int = "time_s"  # a header, or a 0-based position where the file has none
-    unit: Literal["s", "min", "h", "timestamp"] = "s"
+    unit: Literal["s", "min", "h", "d", "ms", "timestamp"] = "s"
     format: str | None = None
+    date: str | int | None = None
+    step: str | None = None
+
+    @model_validator(mode="after")
+    def _one_clock(self) -> TimeColumn:
+        if self.step is not None:
+            try:
+                seconds(self.step)
+            except ValueError as error:
+                raise ValueError(f"step, the time between two rows of a recording without a clock: {error}") from None
+            if (self.column, self.unit, self.format, self.date) != ("time_s", "s", None, None):
+                raise ValueError("step means that no column is a clock; give either step or column, unit and format")
+        if self.date is not None and self.unit != "timestamp":
+            raise ValueError("date goes with time stamps; give unit: timestamp")
+        return self
+
+    @property
+    def row_step_s(self) -> float | None:
+        """The time between two rows where they are the clock."""
+        return None if self.step is None else seconds(self.step)
 
 
 class Stage(Section):
@@ -49,6 +75,28 @@ class Split(Section):
     min_run_s: Annotated[float, Field(gt=0)] = 600.0
 
 
+class Joined(Section):
+    """Other files, or other sheets, that hold further channels of the same runs (channels with this `source`).
+
+    `file` is a name or pattern next to the recording; its * stands for what the * of `recording.files` stands for in
+    the recording's name, or else for that name without suffix. Without `file` it is the recording's own workbook.
+    Of several sheets that one is taken which `sheet` (a name or pattern) names, or which is called as the recording's
+    sheet or run. `by: time` takes the rows of all matching files and sheets that have the recording's times.
+    """
+
+    file: str | None = None
+    sheet: str | None = None
+    by: Literal["name", "time"] = "name"
+    header: bool = True
+    time: TimeColumn = TimeColumn()
+
+    @model_validator(mode="after")
+    def _time_stamps(self) -> Joined:
+        if self.by == "time" and self.time.unit != "timestamp":
+            raise ValueError("by: time compares time stamps; give time: {column: …, unit: timestamp}")
+        return self
+
+
 class Recording(Section):
     """How a recording file becomes batches."""
 
@@ -57,25 +105,27 @@ class Recording(Section):
     time: TimeColumn = TimeColumn()
     step_s: Annotated[float, Field(gt=0)] = 60.0
     max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
-    start_from_name: str | None = None  # strptime pattern over the file's stem, e.g. "%Y%m%d"
+    start_from_name: str | None = None  # strptime pattern of the file's stem or its sheet, e.g. "%Y%m%d"
     split: Split | None = None
     schedule: Schedule | None = None
+    joined: dict[str, Joined] = {}
 
 
 class ChannelPart(Section):
     """One channel: role, canonical unit, where it stands in the file, resolution and plausible range in that unit.
 
     `column` defaults to the channel's name; `unit_in_file` to `unit`. A driver that only the schedule gives has
-    `column: null` and `source: schedule`. An error channel that is measured at positions along an axis names the
-    position channel in `position`. Where the file has one column for each position, `columns` gives them, and the
-    position channel needs no column: a pattern whose * is the position (``"x=*"``), or column -> position.
+    `column: null` and `source: schedule`; a channel from another file has that file's name in `recording.joined` as its
+    source. An error channel that is measured at positions along an axis names the position channel in `position`.
+    Where the file has one column for each position, `columns` gives them, and the position channel needs no column: a
+    pattern whose * is the position (``"x=*"``), or column -> position.
     """
 
     role: Role
     unit: str
     column: str | int | None = None
     unit_in_file: str | None = None
-    source: Literal["file", "schedule"] = "file"
+    source: str = "file"  # or "schedule", or a key of recording.joined
     resolution: Annotated[float, Field(gt=0)] | None = None
     range: tuple[float, float] | None = None
     position: str | None = None
@@ -150,9 +200,12 @@ def parse_machine(text: str, where: str) -> Machine:
 
 
 def _axes_checked(machine: Machine, where: str) -> Machine:
-    """The machine, if its error channels along axes and their position channels fit together."""
+    """The machine, if its channels' sources are known and errors along axes and position channels fit together."""
     for name, part in machine.channels.items():
         here = f"{where}: channel {name!r}"
+        sources = ("file", "schedule", *machine.recording.joined)
+        if part.source not in sources:
+            raise InputError(f"{here}: unknown source {part.source!r}; {closest(part.source, sources)}")
         if part.fixed_end is not None and part.role != "position":
             raise InputError(f"{here} is a {part.role} and has a fixed_end; give that to the axis' position channel")
         if part.position is None and part.columns is not None:

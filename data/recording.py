@@ -20,15 +20,18 @@
 | `missing_channels`, `unknown_columns` | channels without a column, columns without a channel |
 | `preamble_rows`, `unit_rows`, `skipped_sheets` | title lines, lines between header and data, sheets of other content |
 | `readings` | along axes (see `data.sweeps`): that were read, of errors at a position |
+| `joined_rows` | rows of other files or sheets (`recording.joined`) that were read as well, in no count above |
+| `skipped_sources` | other files that could not be read and hold no channel that is needed |
 | `readings_without_position` | errors along an axis whose row has no position: nowhere in the grid |
-| `start_unreadable` | 1 if the file's name does not fit start_from_name |
+| `start_unreadable` | 1 if neither the file's name nor its sheet's fits start_from_name |
 """
 
 from __future__ import annotations
 
 import datetime as dt
 import fnmatch
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,8 +40,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from data.batch import Batch
+from data.arrays import Array
+from data.batch import Batch, Finding
+from data.checks.invalid import take_invalid
 from data.errors import InputError
+from data.joined import Place, read_joined
 from data.lakefile import native_parquet
 from data.machine import Machine, Schedule
 from data.readers import has_reader, reader_for
@@ -48,7 +54,7 @@ from data.readers.csv import read_text_table
 from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, cut_runs, gather, stream
 from data.sweeps import Columns, take_readings
-from data.timegrid import repair_time, to_grid
+from data.timegrid import check_reduction, repair_time, to_grid
 from data.units import check_canonical, convert
 
 _LONGER_SHARE = 0.05
@@ -126,37 +132,83 @@ def _value(text: str) -> Any:
 _FIRST_STAMP_S = 3.0e8  # mid-1979: an earlier stamp is a clock without a date
 
 
-def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list[Path]]:
-    """(recordings, other files) of a directory, both sorted; the patterns are `recording.files`, case does not matter.
+def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """(recordings, ignored files and folders with the reason) of a directory and its subfolders, both sorted.
 
-    The schedule file and hidden files are neither.
+    A pattern of `recording.files` without a slash is that of a file's name, one with a slash that of its path in the
+    directory; ``./*.csv`` takes no file of a subfolder. Case does not matter. Files that are read with the recordings
+    (the schedule, `recording.joined`) are neither. Hidden folders, lakes and links to folders are not entered; the
+    lake's folder of this machine, given as the directory, gives its files whatever the patterns.
 
     Raises:
         InputError: no such directory.
     """
     if not directory.is_dir():
         raise InputError(f"{directory}: no such directory; give the folder of the recordings")
-    schedule = machine.recording.schedule
-    deep = any("/" in pattern for pattern in machine.recording.files)
+    part = machine.recording
+    side = [*([part.schedule.file] if part.schedule else []), *(j.file for j in part.joined.values() if j.file)]
     recordings: list[Path] = []
-    others: list[Path] = []
-    for path in sorted(directory.rglob("*") if deep else directory.iterdir()):
-        relative = path.relative_to(directory).as_posix()
-        if not path.is_file() or path.name.startswith(".") or (schedule and relative == schedule.file):
-            continue
-        patterns = (p.lower().removeprefix("./").replace("**/", "*") for p in machine.recording.files)
-        fits = any(fnmatch.fnmatchcase(relative.lower(), p) for p in patterns)
-        known = has_reader(path) and not path.name.startswith("~$")
-        (recordings if fits and known else others).append(path)
-    return recordings, others
+    ignored: list[tuple[Path, str]] = []
+    unreadable: list[OSError] = []
+    for folder, subfolders, names in os.walk(directory, onerror=unreadable.append):
+        for name in list(subfolders):
+            if reason := _folder_ignored(Path(folder, name)):
+                subfolders.remove(name)
+                ignored.append((Path(folder, name), reason))
+        for path in (Path(folder, name) for name in names):
+            relative = path.relative_to(directory).as_posix()
+            reason = _file_ignored(path)
+            if not reason and any(_fits(relative, p) or _fits(path.name, p) for p in side):
+                continue
+            own = path.suffix == ".parquet" and f"machine={machine.machine}" in path.parts
+            if not reason and not own and not any(_fits(relative, p) for p in part.files):
+                reason = f"not in recording.files ({', '.join(part.files)})"
+            if not reason and not has_reader(path):
+                reason = f"no reader for {path.suffix or 'a file without suffix'}"
+            if reason:
+                ignored.append((path, reason))
+            else:
+                recordings.append(path)
+    ignored += [(Path(e.filename), f"cannot be read ({e.strerror})") for e in unreadable]
+    return sorted(recordings), sorted(ignored)
 
 
-def read_batches(path: Path, machine: Machine, need_error: bool = True) -> Iterator[Batch]:
-    """The batches of one file, without findings, one at a time.
+def _fits(relative: str, pattern: str) -> bool:
+    """Whether a file's path in the directory has the pattern (see `recording_files`)."""
+    relative, pattern = relative.lower(), pattern.lower().replace("**/", "*")
+    if pattern.startswith("./"):
+        return "/" not in relative and fnmatch.fnmatchcase(relative, pattern[2:])
+    return fnmatch.fnmatchcase(relative if "/" in pattern else relative.rpartition("/")[2], pattern)
+
+
+def _folder_ignored(folder: Path) -> str:
+    """Why a folder is not entered; empty where it is."""
+    if folder.name.startswith("."):
+        return "hidden"
+    if folder.is_symlink():
+        return "link to a folder"
+    return "a lake" if (folder / "_manifest.json").is_file() else ""
+
+
+def _file_ignored(path: Path) -> str:
+    """Why a file is no recording whatever the patterns; empty where it may be one."""
+    if path.name.startswith(("~$", ".~")):
+        return "lock file of an open document"
+    if path.name.startswith("."):
+        return "hidden"
+    return "" if path.is_file() else "not a file"
+
+
+def read_batches(
+    path: Path, machine: Machine, need_error: bool = True, channels: Collection[str] | None = None
+) -> Iterator[Batch]:
+    """The batches of one file, one at a time, with findings of cells that hold no value and none of other checks.
 
     Several where a workbook has several sheets of recordings (`stem-sheet`) or where `recording.split` cuts a long
     one (`stem-01`, `stem-02`, …). A bad sheet or stretch does not hold back the good ones: its error comes last.
-    With `need_error=False` a file without error channels is good as well (to predict from it). A Parquet file that
+    With `need_error=False` a file without error channels is good as well (to predict from it). `channels` are those
+    that are needed, None: all. A schedule or joined file that gives none of them may be missing or lack the run: its
+    channels are then empty. The recording itself is read as a whole. A Parquet file that
     thermodrift wrote is read by its own note, not by the machine file's columns (`data.lakefile`).
 
     Raises:
@@ -164,15 +216,18 @@ def read_batches(path: Path, machine: Machine, need_error: bool = True) -> Itera
     """
     _check_file(path)
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
+    needed = set(machine.channels if channels is None else channels)
+    if not need_error:
+        needed -= set(machine.names("error"))
     own = native_parquet(path)
     if own is None:
-        yield from _file_batches(path, machine, need_error)
+        yield from _file_batches(path, machine, need_error, needed)
         return
-    for batch in _file_batches(path, own.layout(machine), need_error):
+    for batch in _file_batches(path, own.layout(machine), need_error, needed):
         yield own.marked(batch)
 
 
-def _file_batches(path: Path, machine: Machine, need_error: bool) -> Iterator[Batch]:
+def _file_batches(path: Path, machine: Machine, need_error: bool, needed: Collection[str]) -> Iterator[Batch]:
     with reader_for(path).open(path, hints(machine)) as sheets:
         tables: list[tuple[Sheet, Layout]] = []
         errors: list[InputError] = []
@@ -193,7 +248,9 @@ def _file_batches(path: Path, machine: Machine, need_error: bool) -> Iterator[Ba
             batch_id = f"{path.stem}-{sheet.name}" if len(tables) + len(errors) > 1 else path.stem
             where = f"{path.name} sheet {sheet.name!r}" if several else path.name
             try:
-                source = _Source(machine, path, batch_id, where, need_error, layout.sweeps)
+                name = sheet.name if len(tables) + len(errors) > 1 else ""
+                place = Place(path, name, batch_id)
+                source = _Source(machine, place, where, need_error, needed, layout.sweeps)
                 yield from _sheet_batches(sheet, layout, source, extra, errors)
             except InputError as error:
                 errors.append(error)
@@ -219,11 +276,16 @@ class _Source:
     """Origin of a batch: `where` names it in messages; `sweeps` are the columns of errors along axes."""
 
     machine: Machine
-    path: Path
-    batch_id: str
+    place: Place
     where: str
     need_error: bool
+    needed: Collection[str]
     sweeps: Columns
+
+    def needs(self, source: str) -> bool:
+        """Whether a needed channel comes from there."""
+        channels = self.machine.channels
+        return any(channels[n].source == source for n in self.needed if n in channels)
 
 
 def _sheet_batches(
@@ -248,7 +310,8 @@ def _sheet_batches(
             yield rows
 
     for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
-        part = replace(source, batch_id=f"{source.batch_id}-{k + 1:02d}", where=f"{where} part {k + 1:02d}")
+        place = replace(source.place, batch_id=f"{source.place.batch_id}-{k + 1:02d}")
+        part = replace(source, place=place, where=f"{where} part {k + 1:02d}")
         try:
             yield _batch(rows, part, extra, first[0])
         except InputError as error:
@@ -256,76 +319,165 @@ def _sheet_batches(
         extra = {}
 
 
+@dataclass(frozen=True)
+class _Samples:
+    """Rows of one file or sheet in order of time, with codes and text as missing values; not yet on the grid."""
+
+    machine: Machine  # describes this file
+    where: str
+    sweeps: Columns
+    time_s: Array  # (n,) from the first row
+    start: float  # time of the first row as the file gives it
+    values: dict[str, Array]
+    invalid: dict[str, NDArray[np.bool_]]
+    filled: NDArray[np.bool_]  # (n,) rows with a value
+    findings: tuple[Finding, ...]
+    unreadable: int
+    counts: dict[str, int]
+
+    @classmethod
+    def of(cls, rows: Rows, machine: Machine, where: str, sweeps: Columns, batch_id: str) -> _Samples:
+        """Raises InputError where fewer than two rows have a time. The rows are emptied."""
+        repaired = repair_time(rows.time_s, machine.recording.max_gap_s)
+        if len(repaired.order) < 2:
+            raise _too_few(rows, len(repaired.order), machine, where)
+        if machine.recording.split is None:
+            check_reduction(repaired.time_s, machine.recording.step_s, machine.recording.time.unit, where)
+        untouched = len(repaired.order) == len(rows) and bool((np.diff(repaired.order) == 1).all())
+        keep = slice(None) if untouched else repaired.order
+        unreadable = sum(len(at) for at, _ in rows.texts.values())
+        invalid, findings = take_invalid(rows, machine, batch_id, where)
+        values = {n: v[keep] for n, v in rows.columns.items()}
+        filled = np.zeros(len(repaired.order), bool)
+        for v in values.values():
+            if not filled.all():
+                filled |= ~np.isnan(v)
+        counts = {
+            "rows_in": len(rows) + rows.ragged + rows.before_run,
+            "ragged_rows": rows.ragged,
+            "rows_before_run": rows.before_run,
+            **{"time_outliers": 0, "clock_restarts": 0, **repaired.counts},
+            "rows_empty": int((~filled).sum()),
+        }
+        rows.columns.clear()
+        return cls(
+            machine, where, sweeps, repaired.time_s, repaired.start, values, {n: v[keep] for n, v in invalid.items()},
+            filled, findings, unreadable, counts,
+        )  # fmt: skip
+
+    def on_grid(self, origin_s: float = 0.0) -> tuple[dict[str, Array], dict[str, int]]:
+        """Columns (m,) on the grid t = 0, step_s, …, in the file's units, and the counts of rows.
+
+        The grid begins `origin_s` after this file's first row.
+        """
+        recording = self.machine.recording
+        time_s = self.time_s - origin_s
+        readings, read_counts = take_readings(self.values, time_s, self.machine, self.sweeps, self.where)
+        grid = to_grid(
+            time_s, self.values, set(self.machine.names("driver")), recording.step_s, recording.max_gap_s, self.where,
+            recording.time.unit, self.invalid,
+        )  # fmt: skip
+        is_reading = np.zeros(len(self.filled), bool)
+        for r in readings:
+            r = r.since(-0.5 * recording.step_s)
+            grid.columns.update(r.on_grid(recording.step_s, len(grid.time_s), recording.max_gap_s, self.where))
+            is_reading[r.row] = True
+        counts = dict(self.counts)
+        if readings:  # rows of a sweep under one time stamp repeat no time
+            repeats = np.diff(self.time_s, prepend=-1.0) == 0
+            counts["duplicates"] -= int((repeats & is_reading).sum())
+        used = (grid.used | is_reading) & self.filled
+        counts |= {
+            "rows_used": int(used.sum()),
+            "rows_out": len(grid.time_s),
+            "rows_between": int((self.filled & ~used).sum()),
+            "channel_gaps": grid.channel_gaps,
+            "unparsable_values": self.unreadable,
+            **read_counts,
+        }
+        reasons = ("ragged_rows", "unparsable_time", "time_outliers", "rows_before_run", "rows_empty", "rows_between")
+        return {"time_s": grid.time_s, **grid.columns}, counts | {"rows_dropped": sum(counts[r] for r in reasons)}
+
+
 def _batch(rows: Rows, source: _Source, extra: dict[str, int], file_start: float) -> Batch:
     """`file_start` is the file's first time in s, needed where its name gives the start and the file is cut."""
-    machine, path, where, recording = source.machine, source.path, source.where, source.machine.recording
-    repaired = repair_time(rows.time_s, recording.max_gap_s)
-    n_rows = len(rows)
-    if len(repaired.order) < 2:
-        raise _too_few(rows, len(repaired.order), machine, where)
-    held = set(machine.names("driver"))
-    untouched = len(repaired.order) == n_rows and bool((np.diff(repaired.order) == 1).all())
-    keep = slice(None) if untouched else repaired.order
-    values = {n: v[keep] for n, v in rows.columns.items()}
-    unreadable = int(rows.unreadable.sum())
-    filled = np.zeros(len(repaired.order), bool)
-    for v in values.values():
-        if not filled.all():
-            filled |= ~np.isnan(v)
-    rows.columns.clear()
-    readings, read_counts = take_readings(values, repaired.time_s, machine, source.sweeps, where)
-    grid = to_grid(repaired.time_s, values, held, recording.step_s, recording.max_gap_s, where)
-    is_reading = np.zeros(len(filled), bool)
-    for r in readings:
-        grid.columns.update(r.on_grid(recording.step_s, len(grid.time_s), recording.max_gap_s, where))
-        is_reading[r.row] = True
-    if readings:  # rows of a sweep under one time stamp repeat no time
-        repeats = np.diff(repaired.time_s, prepend=-1.0) == 0
-        repaired.counts["duplicates"] -= int((repeats & is_reading).sum())
-    used = (grid.used | is_reading) & filled
-    repairs = {
-        "rows_in": n_rows + rows.ragged + rows.before_run,
-        "rows_used": int(used.sum()),
-        "rows_out": len(grid.time_s),
-        "ragged_rows": rows.ragged,
-        "rows_before_run": rows.before_run,
-        **{"time_outliers": 0, "clock_restarts": 0, **repaired.counts},
-        "rows_empty": int((~filled).sum()),
-        "rows_between": int((filled & ~used).sum()),
-        "channel_gaps": grid.channel_gaps,
-        "unparsable_values": unreadable,
-        **read_counts,
-        **extra,
-    }
-    reasons = ("ragged_rows", "unparsable_time", "time_outliers", "rows_before_run", "rows_empty", "rows_between")
-    repairs["rows_dropped"] = sum(repairs[r] for r in reasons)
-
-    columns = {"time_s": grid.time_s}
+    machine, place, where = source.machine, source.place, source.where
+    main = _Samples.of(rows, machine, where, source.sweeps, place.batch_id)
+    others, skipped = _others(main, source)
+    origin_s = max([0.0, *(later_s for _, later_s in others)])
+    found, repairs = main.on_grid(origin_s)
+    n_rows = len(found["time_s"])
+    for samples, later_s in others:
+        columns, counts = samples.on_grid(origin_s - later_s)
+        found |= {n: _of_length(v, n_rows) for n, v in columns.items() if n != "time_s"}
+        repairs["joined_rows"] = repairs.get("joined_rows", 0) + counts["rows_in"]
+        repairs["unparsable_values"] += counts["unparsable_values"]
+    repairs |= extra
     labels: dict[str, object] = {}
-    from_schedule: dict[str, np.ndarray] = {}
-    if recording.schedule:
-        from_schedule, labels = scheduled(recording.schedule, path.parent, (source.batch_id, path.stem), grid.time_s)
+    schedule = machine.recording.schedule
+    if schedule:
+        try:
+            drivers, labels = scheduled(schedule, place.path.parent, (place.batch_id, place.path.stem), found["time_s"])
+            found |= drivers
+        except InputError:
+            if source.needs("schedule"):
+                raise
+            skipped += 1
+    repairs |= {"skipped_sources": skipped} if skipped else {}
+    columns = _in_canonical_units(found, machine, skipped > 0)
+    _check_filled(columns, machine, where, source.need_error, repairs["unparsable_values"])
+    start = _start(place, machine, main.start + origin_s, file_start)
+    if start is None and machine.recording.start_from_name:
+        repairs["start_unreadable"] = 1
+    return Batch(
+        machine=machine.machine, batch_id=place.batch_id, table=pd.DataFrame(columns, copy=False),
+        channels=machine.batch_channels(), start=start, simulated=machine.simulated, source=place.path.name,
+        repairs=repairs, findings=sum((s.findings for s, _ in others), main.findings), labels=labels,
+    )  # fmt: skip
+
+
+def _others(main: _Samples, source: _Source) -> tuple[list[tuple[_Samples, float]], int]:
+    """Samples of joined files, each with its start in s after that of the recording; how many were passed over.
+
+    Where one clock is of stamps and the other is not, both files begin together.
+    """
+    stamped = main.machine.recording.time.unit == "timestamp"
+    found, skipped = [], 0
+    for key, part in main.machine.recording.joined.items():
+        try:
+            of_time = (main.start, main.start + float(main.time_s[-1]))
+            joined = read_joined(main.machine, key, source.place, of_time)
+            samples = _Samples.of(joined.rows, joined.machine, joined.where, joined.sweeps, source.place.batch_id)
+        except InputError:
+            if source.needs(key):
+                raise
+            skipped += 1
+            continue
+        together = stamped != (part.time.unit == "timestamp")
+        found.append((samples, 0.0 if together else samples.start - main.start))
+    return found, skipped
+
+
+def _of_length(column: Array, n_rows: int) -> Array:
+    """The column cut to that length, or with NaN behind it."""
+    return np.concatenate([column[:n_rows], np.full(max(0, n_rows - len(column)), np.nan)])
+
+
+def _in_canonical_units(found: Mapping[str, Array], machine: Machine, passed_over: bool) -> dict[str, Array]:
+    """A column (m,) for every channel, NaN where there is none."""
+    columns = {"time_s": found["time_s"]}
     for name, part in machine.channels.items():
-        column = (from_schedule if part.source == "schedule" else grid.columns).get(name)
-        if column is None and part.source == "schedule":
+        if name in found:
+            here = f"machine file {machine.machine}: channel {name!r}"
+            columns[name] = convert(found[name], part.unit_in_file or part.unit, part.unit, here)
+        elif part.source == "schedule" and not passed_over:
             raise InputError(
                 f"machine file {machine.machine}: channel {name!r} has source: schedule, but no stage of"
                 " recording.schedule gives it; add it there"
             )
-        if column is None:
-            columns[name] = np.full(len(grid.time_s), np.nan)
         else:
-            here = f"machine file {machine.machine}: channel {name!r}"
-            columns[name] = convert(column, part.unit_in_file or part.unit, part.unit, here)
-    _check_filled(columns, machine, where, source.need_error, unreadable)
-    start = _start(path, machine, repaired.start, file_start)
-    if start is None and recording.start_from_name:
-        repairs["start_unreadable"] = 1
-    return Batch(
-        machine=machine.machine, batch_id=source.batch_id, table=pd.DataFrame(columns, copy=False),
-        channels=machine.batch_channels(), start=start,
-        simulated=machine.simulated, source=path.name, repairs=repairs, labels=labels,
-    )  # fmt: skip
+            columns[name] = np.full(len(found["time_s"]), np.nan)
+    return columns
 
 
 def _too_few(rows: Rows, usable: int, machine: Machine, where: str) -> InputError:
@@ -353,12 +505,12 @@ def _check_filled(columns: dict[str, np.ndarray], machine: Machine, where: str, 
         )
 
 
-def _start(path: Path, machine: Machine, batch_start: float, file_start: float) -> pd.Timestamp | None:
+def _start(place: Place, machine: Machine, batch_start: float, file_start: float) -> pd.Timestamp | None:
     pattern = machine.recording.start_from_name
     stamped = machine.recording.time.unit == "timestamp" and batch_start > _FIRST_STAMP_S
-    if pattern:
+    for name in (place.path.stem, place.sheet) if pattern else ():
         try:
-            named = pd.Timestamp(dt.datetime.strptime(path.stem, pattern))
+            named = pd.Timestamp(dt.datetime.strptime(name, pattern or ""))
             return named + pd.Timedelta(seconds=batch_start - file_start) if machine.recording.split else named
         except ValueError:
             pass  # counted as start_unreadable; a time column may still give the start

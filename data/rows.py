@@ -9,28 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data.arrays import Array
+from data.arrays import Array, Index
 from data.errors import InputError
 from data.machine import Machine
 from data.readers.base import Sheet
-from data.readers.cells import stamp_format, to_float, to_seconds
+from data.readers.cells import cell_texts, stamp_format, to_float, to_seconds, with_date
 from data.readers.header import Layout
+
+Texts = dict[str, tuple[Index, NDArray[Any]]]
 
 
 @dataclass
 class Rows:
     """Consecutive source rows: time_s (n,) as the file gives it, columns name -> (n,) in the file's units.
 
-    `unreadable` (n,) counts unreadable cells a row; `ragged` rows could not be split into columns and `before_run`
-    rows stand before the first run: both are in no array, but belong to this stretch.
+    `texts`: column -> rows whose cells are no number, and their texts. `ragged` rows could not be split into columns
+    and `before_run` rows stand before the first run: both are in no array, but belong to this stretch.
     """
 
     time_s: Array
     columns: dict[str, Array]
-    unreadable: NDArray[np.uint16]
+    texts: Texts = field(default_factory=dict)
     ragged: int = 0
     before_run: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -39,32 +40,59 @@ class Rows:
         """Rows begin..end; ragged rows stay with the stretch that holds the first row."""
         cut = slice(begin, end)
         values = {n: v[cut] for n, v in self.columns.items()}
-        return Rows(self.time_s[cut], values, self.unreadable[cut], self.ragged if begin == 0 else 0)
+        texts = {}
+        for name, (rows, text) in self.texts.items():
+            inside = (rows >= begin) & (rows < end)
+            if inside.any():
+                texts[name] = rows[inside] - begin, text[inside]
+        return Rows(self.time_s[cut], values, texts, self.ragged if begin == 0 else 0)
+
+
+def _joined(parts: Sequence[tuple[int, Texts]]) -> Texts:
+    """Texts of consecutive rows as one; each part with the number of rows."""
+    out: Texts = {}
+    before = 0
+    for n, texts in parts:
+        for name, (rows, text) in texts.items():
+            first = out.get(name, (np.zeros(0, np.int64), np.zeros(0, object)))
+            out[name] = np.concatenate([first[0], rows + before]), np.concatenate([first[1], text])
+        before += n
+    return out
 
 
 def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterator[Rows]:
     """The sheet's data rows, block by block."""
     time = machine.recording.time
     pattern = time.format
+    clock = () if layout.time is None else (layout.time,) if layout.date is None else (layout.date, layout.time)
     if time.unit == "timestamp" and pattern is None:
-        samples = [row[layout.time] for row in sheet.head[layout.first_row :][:200] if layout.time < len(row)]
-        pattern = stamp_format([s for s in samples if isinstance(s, str) and not _is_number(s)], where)
-    positions = sorted({layout.time, *layout.positions.values()})
-    text = (layout.time,) if time.unit == "timestamp" else ()
+        head = [row for row in sheet.head[layout.first_row :][:200] if max(clock, default=0) < len(row)]
+        texts_of_time = [[row[i] for i in clock if isinstance(row[i], str) and not _is_number(row[i])] for row in head]
+        pattern = stamp_format([" ".join(t) for t in texts_of_time if len(t) == len(clock)], where)
+    positions = sorted({*clock, *layout.positions.values()})
+    text = clock if time.unit == "timestamp" else ()
     no_date = pattern is not None and not any(d in pattern for d in ("%d", "%j", "8601"))
     late = np.nan
+    done = 0
     for block in sheet.blocks(layout.first_row, positions, text):
-        time_s = to_seconds(block.columns[layout.time], time.unit, pattern, sheet.decimal)
+        if layout.time is None:  # a row that could not be split is somewhere in its block
+            n = len(block.columns[positions[0]])
+            time_s: Array = (done + np.arange(n, dtype=np.float64)) * (time.row_step_s or np.nan)
+            done += n + block.ragged_rows
+        else:
+            stamps = block.columns[layout.time]
+            stamps = stamps if layout.date is None else with_date(block.columns[layout.date], stamps)
+            time_s = to_seconds(stamps, time.unit, pattern, sheet.decimal)
         if no_date and len(time_s):
             time_s = _past_midnight(time_s, late)
             late = float(_filled(time_s, late)[-1])
-        unreadable = np.zeros(len(time_s), np.uint16)
         values: dict[str, Array] = {}
+        texts: Texts = {}
         for name, position in layout.positions.items():
             values[name], bad = to_float(block.columns[position], sheet.decimal)
             if bad is not None:
-                unreadable += bad
-        yield Rows(time_s, values, unreadable, block.ragged_rows)
+                texts[name] = np.flatnonzero(bad), cell_texts(block.columns[position], bad)
+        yield Rows(time_s, values, texts, block.ragged_rows)
 
 
 def _past_midnight(time_s: Array, before: float) -> Array:
@@ -86,9 +114,10 @@ def gather(blocks: Iterator[Rows], sheet: Sheet) -> Rows:
     room, n, ragged = 0, 0, 0
     names: tuple[str, ...] = ()
     whole: list[NDArray[Any]] = []
+    texts: list[tuple[int, Texts]] = []
     for rows in blocks:
         names = tuple(rows.columns)
-        arrays: list[NDArray[Any]] = [rows.time_s, rows.unreadable, *rows.columns.values()]
+        arrays: list[NDArray[Any]] = [rows.time_s, *rows.columns.values()]
         if not whole or n + len(rows) > room:
             room = max(n + len(rows), int(1.02 * (n + len(rows)) / max(sheet.share_read, 1e-4)))
             for i, array in enumerate(arrays):
@@ -102,10 +131,11 @@ def gather(blocks: Iterator[Rows], sheet: Sheet) -> Rows:
             to[n : n + len(rows)] = array
         n += len(rows)
         ragged += rows.ragged
+        texts.append((len(rows), rows.texts))
     if not whole:
-        return Rows(np.zeros(0), {}, np.zeros(0, np.uint16), ragged)
-    time_s, unreadable, *columns = (array[:n] for array in whole)
-    return Rows(time_s, dict(zip(names, columns, strict=True)), unreadable, ragged)
+        return Rows(np.zeros(0), {}, ragged=ragged)
+    time_s, *columns = (array[:n] for array in whole)
+    return Rows(time_s, dict(zip(names, columns, strict=True)), _joined(texts), ragged)
 
 
 def join(parts: Sequence[Rows]) -> Rows:
@@ -118,7 +148,7 @@ def join(parts: Sequence[Rows]) -> Rows:
     return Rows(
         np.concatenate([p.time_s for p in parts]) if parts else np.zeros(0),
         values,
-        np.concatenate([p.unreadable for p in parts]) if parts else np.zeros(0, np.uint16),
+        _joined([(len(p), p.texts) for p in parts]),
         sum(p.ragged for p in parts),
         sum(p.before_run for p in parts),
     )

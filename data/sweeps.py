@@ -8,7 +8,7 @@ sweep there and back under one stamp becomes its mean. Rows between readings hav
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import isotonic_regression
@@ -57,6 +57,16 @@ class Readings:
     position: Array
     errors: Mapping[str, Array]
     row: Index
+
+    def since(self, first_s: float) -> Readings:
+        """The readings from that time on."""
+        later = self.time_s >= first_s
+        if later.all():
+            return self
+        errors = {n: v[later] for n, v in self.errors.items()}
+        return replace(
+            self, time_s=self.time_s[later], position=self.position[later], errors=errors, row=self.row[later]
+        )
 
     def on_grid(self, step_s: float, n_rows: int, most_s: float, where: str) -> dict[str, Array]:
         """Position and error channels on the rows t = 0, step_s, …, shape (n_rows,), NaN between the readings.

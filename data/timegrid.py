@@ -12,7 +12,8 @@ Repair of the time column, in this order
 Grid: t = 0, step, 2·step, … from the first sample to the last. Where the grid is at least twice as coarse as the
 samples, a value is the mean of the samples within ± step/2; the first value takes only samples before the first
 source interval has passed, so that the zero is the true start. Where it is finer, values are interpolated linearly.
-Drivers are commanded and hold the last value. Inside a hole longer than `max_gap_s` there is nothing (NaN).
+Drivers are commanded and hold the last value. Inside a hole longer than `max_gap_s` there is nothing (NaN), and none
+where the instrument stated that it had no value: a grid row with such a sample, and no other, within ± step/2 is empty.
 """
 
 from __future__ import annotations
@@ -25,12 +26,16 @@ from numpy.typing import NDArray
 
 from data.arrays import Array, Index
 from data.errors import InputError
+from data.units import TIME_UNITS_S
 
 _FAR_INTERVALS = 5.0
 _END_SPANS = 10.0
 _MANY_JUMPS = 1000
 _ENDLESS_S = 1e13  # no clock shows this; keeps differences finite
 _EPS = 1e-6  # of a step: 60 s reached by minutes × 60
+_LEAST_ROWS = 12  # of a grid on which the checks find a step
+_SQUEEZED = 10.0  # samples in a grid row
+_NEAR_STEP = 7.5  # times; units of time are 60 apart
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,20 @@ def _carry_on(t: Array, step: Array, max_gap_s: float) -> tuple[Array, int]:
     return t, restarts
 
 
+def check_reduction(time_s: Array, step_s: float, unit: str, where: str) -> None:
+    """Refuse a grid that throws most samples of a short recording away: its time unit is probably another one.
+
+    Raises:
+        InputError: fewer than 12 grid rows, each of more than 10 samples; with the likely unit.
+    """
+    rows, interval = int(time_s[-1] / step_s + _EPS) + 1, _interval(time_s)
+    if 2 <= rows < _LEAST_ROWS and step_s > _SQUEEZED * interval:
+        raise InputError(
+            f"{where}: {len(time_s)} rows, {interval:.3g} s apart, span {time_s[-1]:.3g} s and leave only {rows} grid"
+            f" rows of {step_s:g} s; {_other_unit(interval, step_s, unit)}, or lower recording.step_s"
+        )
+
+
 @dataclass(frozen=True)
 class Gridded:
     """`time_s` (m,), `columns` name -> (m,), `used` (n,) rows that went into at least one value, `channel_gaps`."""
@@ -116,12 +135,20 @@ class Gridded:
 
 
 def to_grid(
-    time_s: Array, values: Mapping[str, Array], held: Collection[str], step_s: float, max_gap_s: float, where: str = ""
+    time_s: Array,
+    values: Mapping[str, Array],
+    held: Collection[str],
+    step_s: float,
+    max_gap_s: float,
+    where: str = "",
+    unit: str = "",
+    invalid: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> Gridded:
     """Put samples on the grid t = 0, step_s, …
 
     time_s (n,) from 0 and never falling, as `repair_time` gives it; values name -> (n,), NaN where nothing; `held`
-    names the drivers.
+    names the drivers. `unit` is the one in which the file gives time; `invalid` name -> (n,) marks samples that the
+    instrument gave as no value: no value is interpolated there.
 
     Raises:
         InputError: fewer than 2 grid rows; every hole longer than max_gap_s; a grid out of all proportion.
@@ -137,7 +164,7 @@ def to_grid(
     if interval > max_gap_s * (1 + 1e-9):
         raise InputError(
             f"{where}: samples are {interval:g} s apart but recording.max_gap_s is {max_gap_s:g} s: all would be hole;"
-            " correct recording.time.unit or raise max_gap_s"
+            f" {_other_unit(interval, step_s, unit)} or raise max_gap_s"
         )
     ratio = time_s[-1] / step_s
     if ratio > 100.0 * len(time_s) + 100_000:
@@ -165,7 +192,31 @@ def to_grid(
         channel_gaps += max(0, part.gaps - full_gaps)
         used[there[part.used]] = True
     used |= full.used
+    half_s = 0.5 * max(step_s, interval)
+    for name, bad in (invalid or {}).items():
+        if name in result and name not in held:
+            good = ~np.isnan(values[name])
+            result[name][_near(grid, time_s[bad], half_s) & ~_near(grid, time_s[good], half_s)] = np.nan
     return Gridded(grid, result, used, channel_gaps)
+
+
+def _near(grid: Array, t: Array, half_s: float) -> NDArray[np.bool_]:
+    """Grid points with a sample of t (n,) within ± half_s, shape (m,)."""
+    slack = _EPS * half_s
+    return np.searchsorted(t, grid + half_s - slack) > np.searchsorted(t, grid - half_s + slack)
+
+
+def _other_unit(interval_s: float, step_s: float, unit: str) -> str:
+    """What to do about a time unit: the one in which the samples are nearest to a grid step apart, if that is near."""
+    known = TIME_UNITS_S if unit in TIME_UNITS_S else {}
+    apart_s = {u: interval_s * s / TIME_UNITS_S[unit] for u, s in known.items() if u != unit}
+    near = min(apart_s, key=lambda u: abs(np.log(apart_s[u] / step_s)), default="")
+    if not near or not step_s / _NEAR_STEP <= apart_s[near] <= step_s * _NEAR_STEP:
+        return "correct recording.time.unit"
+    return (
+        f"if the time column is in {near} (samples {apart_s[near]:.3g} s apart), set recording.time.unit: {near} in"
+        f" place of {unit}"
+    )
 
 
 class _Sampled:

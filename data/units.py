@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Mapping
 from functools import lru_cache
@@ -18,7 +19,7 @@ _QUANTITIES: dict[str, tuple[str, ...]] = {
     "length": ("um", "nm", "mm", "cm", "m", "in", "mil"),
     "rotation": ("rpm", "krpm", "rev/s", "rad/s"),
     "feed": ("mm/min", "m/min", "mm/s", "m/s", "in/min"),
-    "time": ("s", "ms", "min", "h"),
+    "time": ("s", "ms", "min", "h", "d"),
     "power": ("W", "mW", "kW"),
     "current": ("A", "mA"),
     "voltage": ("V", "mV"),
@@ -33,21 +34,41 @@ _UNITS = {unit: kind for kind, units in _QUANTITIES.items() for unit in units}
 _OFFSET_UNITS = ("degC", "degF")  # their zero is not that of K: a difference needs pint's delta units
 _PINT = {"": "dimensionless", "1": "dimensionless", "%": "percent", "Nm": "N*m", "rev/s": "revolution/s", "mil": "thou"}
 
-# spellings found in recordings, folded by `_fold`
+# spellings and words found in recordings (English, German, French, Spanish, Italian, Chinese, Japanese), as `_fold`
+# leaves them: without case and accents
 _SPELLINGS: dict[str, str] = {
-    "°c": "degC", "℃": "degC", "c": "degC", "deg c": "degC", "celsius": "degC", "grad c": "degC", "kelvin": "K",
-    "°f": "degF", "℉": "degF", "f": "degF", "deg f": "degF", "fahrenheit": "degF", "micron": "um", "microns": "um",
-    "mym": "um", "inch": "in", "thou": "mil", "1/min": "rpm", "min-1": "rpm", "u/min": "rpm", "r/min": "rpm",
-    "rev/min": "rpm", "1/s": "rev/s", "hz": "rev/s", "ipm": "in/min", "sec": "s", "second": "s", "seconds": "s",
-    "minute": "min", "minutes": "min", "hour": "h", "hours": "h", "hr": "h", "watt": "W", "volt": "V", "amp": "A",
-    "n*m": "Nm", "percent": "%", "l/m": "l/min", "-": "1",
+    word: unit
+    for unit, words in {
+        "degC": "°c|c|deg c|celsius|grad c|摄氏度|攝氏度|度",
+        "K": "kelvin", "degF": "°f|f|deg f|fahrenheit",
+        "um": "micron|microns|mym|mikron|micrometer|micrometers|micrometre|micrometres|mikrometer|micrometro"
+        "|micrometros|micrometri|micra|micras|微米|マイクロメートル|ミクロン",
+        "mm": "millimeter|millimeters|millimetre|millimetres|milimetro|milimetros|millimetri|毫米|ミリ|ミリメートル",
+        "in": "inch|inches", "mil": "thou",
+        "rpm": "1/min|min-1|u/min|upm|r/min|rev/min|tr/min|giri/min|转/分|轉/分|回転/分", "rev/s": "1/s|hz",
+        "in/min": "ipm", "s": "sec|secs|sek|second|seconds|sekunde|sekunden|seconde|secondes|seg|segundo|segundos"
+        "|secondo|secondi|秒|秒数|秒間", "ms": "millisecond|milliseconds|millisekunden|毫秒|ミリ秒",
+        "min": "mins|minute|minutes|minuten|minuto|minutos|minuti|分|分钟|分鐘|分間",
+        "h": "hr|hrs|hour|hours|std|stunde|stunden|heure|heures|hora|horas|ora|ore|小时|小時",
+        "d": "day|days|tag|tage|jour|jours|dia|dias|giorno|giorni|天|日",
+        "W": "watt|watts", "V": "volt|volts", "A": "amp|amps|ampere", "N": "newton", "Nm": "n*m",
+        "%": "percent|prozent|pourcent|百分比", "l/min": "l/m", "1": "-",
+    }.items()
+    for word in words.split("|")
 }  # fmt: skip
+TIME_UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3}  # the usual ones first
 
+_DISPLACEMENT = ("length", "angle", "ratio")  # what an error channel can measure
 _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
 
 
 def _fold(text: str) -> str:
     folded = unicodedata.normalize("NFKC", text).strip().strip("[]()").strip()
+    if not folded.isascii():
+        folded = "".join(
+            c for c in unicodedata.normalize("NFD", folded) if c == "\u3099" or not unicodedata.combining(c)
+        )
+        folded = unicodedata.normalize("NFC", folded)
     return folded.replace("μ", "u").replace("\N{MINUS SIGN}", "-").casefold()
 
 
@@ -58,6 +79,19 @@ def known_unit(text: str) -> str | None:
     """The name under which a spelling is known (``"°C"`` -> ``"degC"``, ``"µm"`` -> ``"um"``), or None."""
     stripped = text.strip()
     return stripped if stripped in _UNITS else _BY_FOLD.get(_fold(text))
+
+
+def seconds(text: str) -> float:
+    """The duration in s that a number with a unit of time stands for, such as ``"60 s"`` or ``"0.5min"``.
+
+    Raises:
+        ValueError: anything else, or no duration above 0; the message says what is expected.
+    """
+    match = re.fullmatch(r"\s*(\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\d\s]+)\s*", text)
+    unit_s = TIME_UNITS_S.get(known_unit(match[2]) or "") if match else None
+    if match is None or unit_s is None or float(match[1]) <= 0:
+        raise ValueError(f"expected a duration above 0 with its unit, such as '60 s' or '1 min', got {text!r}")
+    return float(match[1]) * unit_s
 
 
 def quantity(unit: str) -> str | None:
@@ -128,6 +162,11 @@ def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> N
             raise InputError(f"{where}: channel {name!r} ({role}) has the unknown unit {unit!r}; write unit: {kept}")
         if kept == "degC" and quantity(unit) != "temperature":
             raise InputError(f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r}; correct it")
+        if role == "error" and quantity(unit) not in _DISPLACEMENT:
+            raise InputError(
+                f"{where}: channel {name!r} (error) has unit {unit!r}, a {quantity(unit)}; expected a length, an angle"
+                f" or a ratio such as um/m: correct unit, or role if it is no displacement"
+            )
         if kept and unit != kept and quantity(unit) == quantity(kept):
             raise InputError(
                 f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r};"

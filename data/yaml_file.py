@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from data.errors import InputError, closest
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -23,14 +26,17 @@ def load_yaml(path: Path, model: type[M], what: str) -> M:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{what} {path}: cannot be read ({error}); give the path of a .yml file") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{what} {path}: cannot be read ({reason}); give the path of a .yml file") from None
     return parse_yaml(text, model, f"{what} {path}")
 
 
 def parse_yaml(text: str, model: type[M], where: str) -> M:
     """The same from text; an empty text is an empty mapping."""
     try:
-        raw = _OnceOnly(text).get_single_data()
+        loader = _OnceOnly(text)
+        node = loader.get_single_node()
+        raw = {} if node is None else loader.construct_document(node)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         at = f" line {mark.line + 1}" if mark else ""
@@ -40,7 +46,7 @@ def parse_yaml(text: str, model: type[M], where: str) -> M:
     if not isinstance(raw, dict):
         needed = [k for k, f in model.model_fields.items() if f.is_required()] or list(model.model_fields)
         raise InputError(f"{where}: expected a mapping with the keys {' and '.join(needed)}, got {type(raw).__name__}")
-    return parse_part(raw, model, where)
+    return _checked(raw, model, where, "", node)
 
 
 def parse_part(raw: Any, model: type[M], where: str, key: str = "") -> M:
@@ -49,10 +55,19 @@ def parse_part(raw: Any, model: type[M], where: str, key: str = "") -> M:
     Raises:
         InputError: as `parse_yaml`.
     """
+    return _checked(raw, model, where, key, None)
+
+
+def _checked(raw: Any, model: type[M], where: str, above: str, node: yaml.Node | None) -> M:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(error, model, key)}") from None
+        # a misspelt key also leaves the right one missing: the misspelling is what the user corrects
+        problems = sorted(error.errors(), key=lambda p: p["type"] != "extra_forbidden")
+        line = _line(node, problems[0]["loc"])
+        at = f" line {line}" if line else ""
+        more = f" (and {len(problems) - 1} more problem{'s' * (len(problems) > 2)})" if len(problems) > 1 else ""
+        raise InputError(f"{where}{at}: {_in_words(problems[0], model, above)}{more}") from None
 
 
 class _OnceOnly(yaml.SafeLoader):
@@ -67,29 +82,39 @@ class _OnceOnly(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _first_problem(error: ValidationError, model: type[BaseModel], above: str) -> str:
-    """The first problem in words, and how many more follow; keys stand below `above`."""
-    problems = error.errors()
-    first = problems[0]
-    key = ".".join([above] * bool(above) + [str(p) for p in first["loc"]])
-    if first["type"] == "extra_forbidden":
-        text = f"unknown key {key!r}; {closest(str(first['loc'][-1]), _allowed_keys(model, first['loc'][:-1]))}"
-    elif first["type"] == "missing":
-        text = f"key {key!r} is missing"
-    else:
-        text = f"key {key!r}: got {first['input']!r}; {first['msg'].removeprefix('Value error, ')}"
-    return text + (f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else "")
-
-
-def _allowed_keys(model: type[BaseModel], loc: Sequence[Any]) -> list[str]:
-    """Keys of the model that an error's location points into."""
-    part: Any = model
+def _line(node: yaml.Node | None, loc: Sequence[Any]) -> int | None:
+    """The line, counted from 1, of the deepest key or list entry of the file on an error's location."""
+    line = None
     for step in loc:
-        if _is_model(part):
-            part = part.model_fields[str(step)].annotation if str(step) in part.model_fields else part
-        part = next((a for a in getattr(part, "__args__", ()) if _is_model(a)), part)
-    return sorted(part.model_fields) if _is_model(part) else []
+        if isinstance(node, yaml.MappingNode):
+            found = next(((k, v) for k, v in node.value if k.value == str(step)), None)
+            if found is not None:
+                line, node = found[0].start_mark.line + 1, found[1]
+        elif isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value):
+            node = node.value[step]
+            line = node.start_mark.line + 1
+    return line
 
 
-def _is_model(part: Any) -> bool:
-    return isinstance(part, type) and issubclass(part, BaseModel)
+def _in_words(problem: ErrorDetails, model: type[BaseModel], above: str) -> str:
+    """One problem; keys stand below `above`."""
+    loc = problem["loc"]
+    key = ".".join([above] * bool(above) + [str(p) for p in loc])
+    if problem["type"] == "extra_forbidden":
+        return f"unknown key {key!r}; {closest(str(loc[-1]), _allowed_keys(model, loc[:-1]))}"
+    if problem["type"] == "missing":
+        return f"key {key!r} is missing"
+    return f"key {key!r}: got {problem['input']!r}; {problem['msg'].removeprefix('Value error, ')}"
+
+
+def _allowed_keys(annotation: Any, loc: Sequence[Any]) -> list[str]:
+    """Keys of the model that an error's location points into, from the type at its beginning."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if not loc:
+            return sorted(annotation.model_fields)
+        field = annotation.model_fields.get(str(loc[0]))
+        return _allowed_keys(field.annotation, loc[1:]) if field is not None else []
+    inner, origin = get_args(annotation), get_origin(annotation)
+    if isinstance(origin, type) and issubclass(origin, Collection):
+        return _allowed_keys(inner[-1], loc[1:]) if loc else []
+    return next((keys for part in inner if (keys := _allowed_keys(part, loc))), [])

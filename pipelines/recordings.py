@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from data.batch import Batch
+from data.batch import Batch, Channel
 from data.checks import check_machine
 from data.errors import InputError, closest
-from data.ingest import IngestReport, ingest
+from data.ingest import IngestReport, id_prefix, ingest
 from data.lake import Lake
 from data.machine import Machine
 from data.recording import read_batches, recording_files
@@ -41,13 +41,52 @@ def load_batches(lake: Lake, machine: Machine) -> list[Batch]:
     """A machine's batches from the lake, with the checks that need several batches and the user's overrules.
 
     Raises:
-        InputError: the lake has no batch of the machine.
+        InputError: the lake has no batch of the machine, or has batches with other channels than the machine file.
     """
-    return check_machine(lake.load_all(machine.machine), machine)
+    batches = lake.load_all(machine.machine)
+    check_channels(batches, machine, lake)
+    return check_machine(batches, machine)
+
+
+def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> None:
+    """Whether stored batches have the channels of the machine file: names, roles, units and positions.
+
+    Raises:
+        InputError: some have others; the differences, and what to do.
+    """
+    now = {n: _meaning(c) for n, c in machine.batch_channels().items()}
+    stored = {b.batch_id: {n: _meaning(c) for n, c in b.channels.items()} for b in batches}
+    unfit = [i for i, channels in stored.items() if channels != now]
+    if not unfit:
+        return
+    then = [stored[i] for i in unfit]
+    changes = [
+        ("not stored", sorted({n for n in now if any(n not in c for c in then)})),
+        ("no longer in the machine file", sorted({n for c in then for n in c if n not in now})),
+        ("changed", sorted({f"{n} ({c[n]} → {now[n]})" for c in then for n in c if n in now and c[n] != now[n]})),
+    ]
+    what = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in changes if names)
+    name = machine.machine
+    raise InputError(
+        f"machine file {name}: {len(unfit)} of {len(batches)} batches in the lake ({_few(unfit)}) have other channels; "
+        f"{what}; ingest their recordings again with this machine file, or where these are gone their copies in the "
+        f"lake (`thermodrift ingest {lake.root / f'machine={name}'} --machine FILE`; a renamed channel is empty then), "
+        f"or withdraw them (`thermodrift lake withdraw {name} BATCH... --reason TEXT`)"
+    )
+
+
+def _meaning(channel: Channel) -> str:
+    along = f" along {channel.position}" if channel.position else ""
+    return f"{channel.role} in {channel.unit}{along}"
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names if len(names) <= 4 else [*names[:3], "…"])
 
 
 def read_files(machine: Machine, path: Path, need_error: bool = True) -> Iterator[Batch]:
-    """The batches of a file, or of all files in a folder that `recording.files` names; without findings.
+    """The batches of a file, or of all files in a folder that `recording.files` names, with the ids that an ingest
+    gives them; without the findings of `check_batch`.
 
     Raises:
         InputError: nothing there, or a file that cannot be used.
@@ -61,7 +100,8 @@ def read_files(machine: Machine, path: Path, need_error: bool = True) -> Iterato
                 f"{', '.join(machine.recording.files)}"
             )
     for file in files:
-        yield from read_batches(file, machine, need_error)
+        for batch in read_batches(file, machine, need_error):
+            yield replace(batch, batch_id=id_prefix(file, path) + batch.batch_id)
 
 
 def gather_batches(machine: Machine, recordings: Sequence[Path], batch_ids: Sequence[str], say: Say) -> Gathered:
@@ -80,11 +120,11 @@ def gather_batches(machine: Machine, recordings: Sequence[Path], batch_ids: Sequ
     report: IngestReport | None = None
     if recordings:
         report = ingest(list(recordings), machine, lake, progress=say)
-        if not report.batches:
+        if not any(r.stored_as for r in report.rows):
             raise InputError(f"--recordings: no recording of {machine.machine} could be used{_reason(report, machine)}")
     held = load_batches(lake, machine)
     if report is not None:
-        ingested = {r.batch_id for r in report.batches}
+        ingested = {r.stored_as for r in report.rows}
         held = [b for b in held if b.batch_id in ingested]
     ids = [b.batch_id for b in held]
     for name in batch_ids:
@@ -94,8 +134,9 @@ def gather_batches(machine: Machine, recordings: Sequence[Path], batch_ids: Sequ
 
 
 def _reason(report: IngestReport, machine: Machine) -> str:
-    if report.quarantined:
-        return f"; {report.quarantined[0].reason}"
+    left_out = [r.reason for r in (*report.quarantined, *report.waiting, *report.rows) if r.reason]
+    if left_out:
+        return f"; {left_out[0]}"
     return (
         f"; {len(report.ignored)} other files there, the machine file takes "
         f"{', '.join(machine.recording.files)}; give another folder or correct recording.files"

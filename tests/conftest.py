@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import data.ingest
 from data.batch import Batch, Channel
 
 
@@ -47,3 +48,11 @@ def make_toy_batches(
 @pytest.fixture(scope="session")
 def toy_batches() -> Callable[..., list[Batch]]:
     return make_toy_batches
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_looks() -> Iterator[None]:
+    """Every recording of a test was written a moment ago; do not wait for a second look at it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(data.ingest, "LOOK_AGAIN_S", 0.0)
+        yield

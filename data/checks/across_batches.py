@@ -22,16 +22,22 @@ class Offset(Check):
 
     For each sensor the three others with the steadiest start difference are its neighbours; a batch stands
     out when the median difference to them is off its median over the batches by 3 K and 8 robust sigma.
+
+    Nothing is masked where the sensor returns during the run by more than half: a part that starts warm.
     """
 
     key = "offset"
     summary = "start level far off the neighbours, unlike in other batches"
+    common_cause = "a normal state of this part, such as being heated"
+
+    def habit(self, batch: Batch, finding: Finding) -> str:
+        return "level"
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         names = batches[0].names(*THERMAL) if batches else ()
         if len(batches) < _BATCHES or len(names) < 2:
             return {}
-        start = np.array([[_start(b, n) for n in names] for b in batches])
+        start, end = (np.array([[_level(b, n, at_end) for n in names] for b in batches]) for at_end in (False, True))
         found: dict[int, list[Finding]] = {}
         for j, name in enumerate(names):
             difference = start[:, [j]] - np.delete(start, j, axis=1)
@@ -43,21 +49,29 @@ class Offset(Check):
             spread = 1.4826 * np.nanmedian(np.abs(centred), axis=0)
             near = np.argsort(spread, kind="stable")[:_NEIGHBOURS]
             limit = max(_FLOOR_K, _SIGMAS * float(np.median(spread[near])))
-            off = row_medians(centred[:, near])
-            for k in np.flatnonzero(np.abs(np.nan_to_num(off)) > limit):
+            off = np.nan_to_num(row_medians(centred[:, near]))
+            far = np.abs(off) > limit
+            if not far.any():
+                continue
+            moved = row_medians(((end - start)[:, [j]] - np.delete(end - start, j, axis=1))[:, enough][:, near])
+            back = -np.sign(off) * np.nan_to_num(moved - np.nanmedian(moved)) > 0.5 * np.abs(off)
+            for k in np.flatnonzero(far):
                 message = (
                     f"{name} starts {off[k]:+.1f} K off its level relative to its neighbours in the other batches "
                     f"(they repeat within {float(np.median(spread[near])):.2f} K)"
                 )
-                found.setdefault(int(k), []).append(self.finding(name, message))
+                if back[k]:
+                    message += "; it returns during the run, so the part was warm or cold at the start: not masked"
+                found.setdefault(int(k), []).append(self.finding(name, message, masks=not back[k]))
         return found
 
 
-def _start(batch: Batch, name: str) -> float:
+def _level(batch: Batch, name: str, at_end: bool) -> float:
+    """Median of the first or last three values within 10 min of the batch's start or end."""
     if name not in batch.channels:
         return float("nan")
     rows = max(3, int(600.0 / batch.step_s)) if batch.step_s else 3
-    v = batch.masked(name)[:rows]
+    v = batch.masked(name)[:: -1 if at_end else 1][:rows]
     v = v[np.isfinite(v)]
     return float(np.median(v[:3])) if len(v) else float("nan")
 

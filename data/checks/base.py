@@ -164,10 +164,14 @@ SETTLE_S = 600.0  # after a start, stop or speed change the machine may move as 
 
 
 class Check:
-    """One kind of fault: `key` names it in findings, `summary` describes it in a line."""
+    """One kind of fault: `key` names it in findings, `summary` describes it in a line.
+
+    `common_cause`: the likely cause where most runs of a machine show the same `habit` ({0} is the machine).
+    """
 
     key: ClassVar[str] = ""
     summary: ClassVar[str] = ""
+    common_cause: ClassVar[str] = ""
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         """Findings in one recording."""
@@ -176,6 +180,14 @@ class Check:
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
         """Findings that need the machine's other batches: position in `batches` -> findings."""
         return {}
+
+    def habit(self, batch: Batch, finding: Finding) -> str:
+        """What a finding shows, where its only evidence is that the run is unusual; "" where it is a fault in any case.
+
+        What most runs of a machine show alike is no fault. Evidence from physics, from the instrument or from other
+        channels does not weaken by repetition: a sensor can be faulty in every run.
+        """
+        return ""
 
     def finding(
         self,
@@ -186,6 +198,12 @@ class Check:
         masks: bool = True,
     ) -> Finding:
         return Finding(self.key, channel, message, start_s, end_s, masks)
+
+
+def overrule_line(channel: str, check: str, batch_id: str = "") -> str:
+    """The entry of the machine file's `overrule` list that lifts a check's masks of a channel."""
+    only = f"batch: {batch_id}, " if batch_id else ""
+    return f"- {{{only}channel: {channel}, check: {check}, reason: ...}}"
 
 
 def in_time(batch: Batch, *roles: str) -> tuple[str, ...]:

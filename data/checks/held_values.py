@@ -118,8 +118,9 @@ class Frozen(Check):
 
     Noise above the resolution (75 % of the samples differ from the one before, or half of them and often by more than
     one step of the display) makes so many equal samples impossible: chance below 1e-9 and three times the longest other
-    run. Or the other temperatures, fitted outside the interval, and the channel's own slope at its ends both predict a
-    movement of at least 15 resolution steps, 1 K or 5 µm, and six sigma of that fit.
+    run. A temperature that rests from the start on is left out: its noise may begin with the heating. Or the other
+    temperatures, fitted outside the interval, and the channel's own slope at its ends both predict a movement of at
+    least 15 resolution steps, 1 K or 5 µm, and six sigma of that fit.
     """
 
     key = "frozen"
@@ -154,6 +155,8 @@ class Frozen(Check):
     def _no_flicker(self, batch: Batch, name: str, v: Array, a: int, b: int, longest_other: int) -> str:
         if b - a + 1 <= 3 * longest_other:
             return ""
+        if a == 0 and batch.channels[name].role != "error":
+            return ""  # a part may rest until it is heated, and its noise begin with the heating
         d = np.diff(v)
         outside = np.isfinite(d)
         outside[a:b] = False

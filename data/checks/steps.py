@@ -102,6 +102,15 @@ class JumpNoReturn(Check):
 
     key = "jump_no_return"
     summary = "a step of one channel that noise, load and neighbours do not explain"
+    common_cause = "the time unit (recording.time.unit: {0.recording.time.unit}) or a normal event of this machine"
+
+    def habit(self, batch: Batch, finding: Finding) -> str:
+        """The direction: a machine does the same in every run, a loose contact reads up or down."""
+        v = batch.values(finding.channel or "")
+        row = int(np.searchsorted(batch.time_s, (finding.start_s or 0.0) - 1e-6))
+        before, after = v[max(0, row - 3) : row], v[row : row + max(3, int(_BACK_S / (batch.step_s or 1.0)))]
+        before, after = before[np.isfinite(before)], after[np.isfinite(after)]
+        return "up" if len(before) and len(after) and np.median(after) > before[-1] else "down"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = self._at(batch)

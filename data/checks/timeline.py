@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import pandas as pd
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Check, clock, in_time, signals, span_text, step_limit, stretches, thinned, widened
@@ -17,16 +20,54 @@ _REPAIRS = {
 }
 
 
+_FIRST = pd.Timestamp("1990-01-01")  # before, a clock without a battery counts from its zero: 1970, 1980
+_AHEAD = pd.Timedelta(days=2)  # of this computer: time zones and a late clock
+
+
 class Clock(Check):
     key = "clock"
-    summary = "the recording's clock was repaired"
+    summary = "the recording's clock was repaired, or its date cannot be right"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
-        return [
+        found = [
             self.finding(None, f"clock: {batch.repairs[kind]} {repair}", masks=False)
             for kind, repair in _REPAIRS.items()
             if batch.repairs.get(kind)
         ]
+        start = batch.start
+        if start is not None and not _FIRST <= start <= pd.Timestamp.now() + _AHEAD:
+            when = "before any logger of this kind" if start < _FIRST else "in the future"
+            message = (
+                f"clock: the recording starts on {start:%Y-%m-%d}, {when}. Seasons and the order of runs follow from "
+                "it: set the logger's clock and correct the time column, or recording.start_from_name"
+            )
+            found.append(self.finding(None, message, masks=False))
+        return found
+
+
+_SHORT_BATCHES = 5
+_SHORT_SHARE = 1.0 / 3.0
+
+
+class Short(Check):
+    """A run of less than a third of the median length has not gone through the machine's warming."""
+
+    key = "short"
+    summary = "much shorter than the machine's other runs"
+
+    def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
+        if len(batches) < _SHORT_BATCHES:
+            return {}
+        length_s = np.array([float(b.time_s[-1]) if b.n_rows else 0.0 for b in batches])
+        usual_s = float(np.median(length_s))
+        found = {}
+        for k in np.flatnonzero(length_s < _SHORT_SHARE * usual_s):
+            message = (
+                f"the run lasts {clock(length_s[k])}, the median run {clock(usual_s)}: if it was broken off, withdraw "
+                "it (thermodrift lake withdraw)"
+            )
+            found[int(k)] = [self.finding(None, message, masks=False)]
+        return found
 
 
 class Gap(Check):
@@ -46,7 +87,10 @@ class Gap(Check):
             if empty[name].all() and not everywhere.all():
                 found.append(self.finding(name, f"{name} was not recorded", masks=False))
                 continue
-            found += [self._gap(batch, name, a, b) for a, b in stretches(empty[name] & ~everywhere)]
+            # a hole that the grid would have bridged stems from cells without a value, which have a finding
+            least = machine.recording.max_gap_s if any(f.channel == name for f in batch.findings) else 0.0
+            holes = stretches(empty[name] & ~everywhere)
+            found += [self._gap(batch, name, a, b) for a, b in holes if (b - a + 1) * batch.step_s > least]
         return found
 
     def _gap(self, batch: Batch, name: str | None, a: int, b: int) -> Finding:
@@ -66,6 +110,10 @@ class Interruption(Check):
 
     key = "interruption"
     summary = "recording interrupted: all temperatures jump together"
+    common_cause = "the time unit (recording.time.unit: {0.recording.time.unit}) or a normal event of this machine"
+
+    def habit(self, batch: Batch, finding: Finding) -> str:
+        return self.key
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         found = self._at(batch)

@@ -117,36 +117,48 @@ def _rail(value: float, resolution: float, low: float | None, high: float | None
 
 
 _HOT_START_DEGC = 45.0  # no machine stands this warm when a run starts
-_NEAR_K = 5.0  # sensors of one machine agree this well at its start
+_COLD_START_DEGC = -10.0
+_KELVIN = (250.0, 330.0)  # starts of a machine in K
+_NEAR_K = 2.0  # a sensor starts this near to the range of the others
 _FAR_K = 15.0
 _TINY_UM = 0.5  # a machine that warms by 3 K moves by more than this
 
 
 class WrongUnit(Check):
+    """A temperature whose start is far from the others' and, read in K or degF, lies among them; or all temperatures,
+    where each start is plausible only in that unit. An error channel that does not move while the machine warms.
+    """
+
     key = "wrong_unit"
     summary = "level or scale fits another unit"
+    common_cause = "a part that is this hot, or unit_in_file is degF in all recordings"
+
+    def habit(self, batch: Batch, finding: Finding) -> str:
+        """A heated part can start where degF would put a cold one; no room is so hot, and no part exactly 273.15 K."""
+        name = finding.channel or ""
+        if batch.channels[name].unit != "degC" or _start(batch.values(name)) > _KELVIN[0]:
+            return ""
+        rooms = [_start(batch.values(n)) for n in batch.names("ambient") if n in batch.table.columns]
+        return "" if any(r > _HOT_START_DEGC for r in rooms) else "level"
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         starts = {n: _start(batch.values(n)) for n in batch.names(*THERMAL) if batch.channels[n].unit == "degC"}
         starts = {n: v for n, v in starts.items() if np.isfinite(v)}
-        kelvin = {n for n, v in starts.items() if 200.0 < v < 350.0}
-        plain = [v for n, v in starts.items() if n not in kelvin]
-        usual = float(np.median(plain)) if plain else float("nan")
+        plain = [v for v in starts.values() if _COLD_START_DEGC < v < _HOT_START_DEGC]
         found = []
         for name, start in starts.items():
-            if name in kelvin:
-                found.append(self._unit_finding(batch, name, f"starts at {start:.1f}", "K", start - 273.15, "degC"))
-            elif self._fahrenheit(start, usual):
-                found.append(
-                    self._unit_finding(batch, name, f"starts at {start:.1f}", "degF", (start - 32) / 1.8, "degC")
-                )
+            for unit, value in (("K", start - 273.15), ("degF", (start - 32.0) / 1.8)):
+                if self._fits(start, value, plain, _KELVIN if unit == "K" else (_HOT_START_DEGC, _KELVIN[0])):
+                    found.append(self._unit_finding(batch, name, f"starts at {start:.1f}", unit, value, "degC"))
         return found + self._millimetres(batch, list(starts))
 
-    def _fahrenheit(self, start: float, usual: float) -> bool:
-        as_degc = (start - 32.0) / 1.8
-        if start > _HOT_START_DEGC and usual > _HOT_START_DEGC:
-            return -5.0 < as_degc < _HOT_START_DEGC  # every channel is in °F
-        return abs(as_degc - usual) < _NEAR_K and start - usual > _FAR_K
+    @staticmethod
+    def _fits(start: float, value: float, plain: list[float], ends: tuple[float, float]) -> bool:
+        """`ends`: the starts in this unit of a cold machine; `plain` are those that are plausible in degC."""
+        if not plain:
+            return ends[0] < start < ends[1] and _COLD_START_DEGC < value < _HOT_START_DEGC
+        near = min(plain) - _NEAR_K <= value <= max(plain) + _NEAR_K
+        return near and start - float(np.median(plain)) > _FAR_K
 
     def _millimetres(self, batch: Batch, temperatures: list[str]) -> list[Finding]:
         seen = signals(batch)
@@ -171,8 +183,8 @@ class WrongUnit(Check):
         expected = batch.channels[name].unit
         return self.finding(
             name,
-            f"{name} {observed}, which is no plausible {expected} but as {unit} gives {value:.1f} {canonical}: "
-            f"set unit_in_file: {unit} for this channel",
+            f"{name} {observed}, which is not plausible in {expected} and in {unit} is {value:.1f} {canonical}: "
+            f"if so, set unit_in_file: {unit} for this channel",
         )
 
 

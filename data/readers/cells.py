@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError
+from data.units import TIME_UNITS_S
 
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%Y%m%d",
           "%d.%m.%y", "%d/%m/%y", "%m/%d/%y", "%Y年%m月%d日")  # fmt: skip
-_TIMES = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S", "%H时%M分%S秒", "%H時%M分%S秒")
+_TIMES = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%H-%M-%S", "%I:%M:%S %p", "%I:%M %p", "%H%M%S", "%H时%M分%S秒",
+          "%H時%M分%S秒")  # fmt: skip
+_BETWEEN = (" ", "T", "-", "_", ", ")  # date and time of day
 _ISO = "ISO8601"
 _MISSING = ("", "nan", "NaN", "NAN")
 
@@ -51,6 +54,15 @@ def to_float(column: Any, decimal: str = ".") -> tuple[Array, NDArray[np.bool_] 
     if pa.types.is_null(kind):
         return np.full(len(column), np.nan), None
     return np.full(len(column), np.nan), np.ones(len(column), bool)
+
+
+def cell_texts(column: Any, which: NDArray[np.bool_]) -> NDArray[Any]:
+    """What the cells at `which` (n,) hold, as text, one object for each distinct text."""
+    distinct: dict[str, str] = {}
+    cells = pc.take(column, pa.array(np.flatnonzero(which))).to_pylist()
+    texts = np.empty(len(cells), object)
+    texts[:] = [distinct.setdefault(text, text) for text in (str(cell).strip() for cell in cells)]
+    return texts
 
 
 def _numpy(column: Any) -> Array:
@@ -131,7 +143,7 @@ def stamp_formats(samples: Sequence[str]) -> list[str]:
     need = max(1, int(0.8 * len(cells)))
     if cells.str.match(r"\d{4}\D").all() and _parse(cells, _ISO).notna().sum() >= need:
         return [_ISO]
-    patterns = [f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in (" ", "T")] + list(_TIMES) + list(_DATES)
+    patterns = [f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in _BETWEEN] + list(_TIMES) + list(_DATES)
     fits = [p for p in patterns if _parse(cells.iloc[:3], p).notna().any() and _parse(cells, p).notna().sum() >= need]
     fits = [p for p in fits if _parse(cells, p).dropna().is_monotonic_increasing] or fits
     starts: dict[Any, str] = {}
@@ -175,12 +187,12 @@ def _parse(cells: pd.Series[Any], pattern: str) -> pd.Series[Any]:
 def to_seconds(column: Any, unit: str, pattern: str | None, decimal: str) -> Array:
     """Time column to seconds, shape (n,), NaN where unreadable.
 
-    unit s, min, h: the number in seconds. unit timestamp: seconds since 1970-01-01; stamps with an offset are taken
-    to UTC; numbers count as Excel days (20,000–80,000), Unix seconds (from 1e8) or Unix milliseconds (from 1e11).
+    unit s, min, h, d, ms: the number in seconds. unit timestamp: seconds since 1970-01-01; stamps with an offset are
+    taken to UTC; numbers count as Excel days (20,000–80,000), Unix seconds (from 1e8) or Unix milliseconds (from 1e11).
     """
     if unit != "timestamp":
         values, _ = to_float(column, decimal)
-        return values * {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]
+        return values * TIME_UNITS_S[unit]
     kind = column.type
     if pa.types.is_date(kind):
         column, kind = column.cast(pa.timestamp("us")), pa.timestamp("us")
@@ -189,6 +201,15 @@ def to_seconds(column: Any, unit: str, pattern: str | None, decimal: str) -> Arr
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         return _text_to_seconds(column, pattern, decimal)
     return _serial_to_seconds(to_float(column, decimal)[0])
+
+
+def with_date(date: Any, time: Any) -> Any:
+    """Columns of dates and of times of day, text or Arrow's time stamps, as one column of text with a blank between."""
+    texts = [
+        pc.utf8_trim_whitespace(c) if pa.types.is_string(c.type) else pc.strftime(c.cast(pa.timestamp("us")), form)
+        for c, form in ((date, "%Y-%m-%d"), (time, "%H:%M:%S"))
+    ]
+    return pc.binary_join_element_wise(*texts, " ")
 
 
 def _text_to_seconds(column: Any, pattern: str | None, decimal: str) -> Array:

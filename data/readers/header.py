@@ -22,16 +22,18 @@ class NotThisTable(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """First data row, position of time and of each channel found, and counts of what was skipped.
+    """First data row, position of time (None: the rows are the clock) and of each channel found, counts of what was
+    skipped.
 
     `sweeps`: error channel -> (key in `positions`, position along its axis) where each position has a column.
     """
 
     first_row: int
-    time: int
+    time: int | None
     positions: Mapping[str, int]
     counts: Mapping[str, int] = field(default_factory=dict)
     sweeps: Mapping[str, tuple[tuple[str, float], ...]] = field(default_factory=dict)
+    date: int | None = None  # of the dates, where time holds times of day
 
 
 def wanted_columns(machine: Machine) -> dict[str, str | int]:
@@ -49,7 +51,8 @@ def wanted_columns(machine: Machine) -> dict[str, str | int]:
 def hints(machine: Machine) -> list[str]:
     """The column names that a recording is expected to have."""
     several = [c for part in machine.channels.values() if isinstance(part.columns, dict) for c in part.columns]
-    columns = [machine.recording.time.column, *wanted_columns(machine).values(), *several]
+    time = machine.recording.time
+    columns = [*([time.column, time.date] if time.step is None else []), *wanted_columns(machine).values(), *several]
     return [c for c in columns if isinstance(c, str)]
 
 
@@ -75,7 +78,7 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         InputError: no time column; no error channel although the machine file has some.
     """
     wanted = wanted_columns(machine)
-    time = machine.recording.time.column
+    time = machine.recording.time
     header: Sequence[Any] = ()
     row = -1
     if machine.recording.header:
@@ -102,12 +105,20 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         elif (p := position(column)) is not None:
             positions[name] = p
     got_channels = {*positions, *sweeps} & set(wanted)
-    at = position(time)
+    at = position(time.column) if time.step is None else None
+    date = None if time.date is None else position(time.date)
     got = _some([str(c) for c in header]) if header else f"{width} columns"
     if not positions:
         raise _unknown(where, width, got, machine)
-    if at is None:
-        raise InputError(f"{where}: time column {time!r} is missing; got {got}; correct recording.time.column")
+    if at is None and time.step is None:
+        raise InputError(
+            f"{where}: time column {time.column!r} is missing; got {got}; correct recording.time.column, or give"
+            " time: {step: 60 s} where the recording has no clock"
+        )
+    if time.date is not None and date is None:
+        raise InputError(
+            f"{where}: column {time.date!r} of the dates is missing; got {got}; correct recording.time.date"
+        )
     errors = [n for n in machine.names("error") if n in wanted]
     if need_error and errors and not any(n in got_channels for n in errors):
         raise InputError(
@@ -115,7 +126,7 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
             " correct column: of the error channels"
         )
     ignored = (position(int(c) if c.isdigit() else c) for c in machine.ignore)
-    known = {*positions.values(), at, *(p for p in ignored if p is not None)}
+    known = {*positions.values(), *(p for p in (at, date, *ignored) if p is not None)}
     named = sum(bool(str(c or "").strip()) for c in header) if header else width
     first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
     counts = {
@@ -124,7 +135,7 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
         "unknown_columns": max(0, named - len(known)),
         "missing_channels": len(wanted) - len(got_channels),
     }
-    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps)
+    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps, date)
 
 
 def _some(names: Sequence[str], n: int = 3) -> str:
@@ -159,18 +170,16 @@ def _header_row(head: Sequence[Sequence[Any]], names: Sequence[str], where: str)
     return filled[0]
 
 
-def _first_data_row(sheet: Sheet, start: int, time: int, positions: Sequence[int], header: bool) -> int:
+def _first_data_row(sheet: Sheet, start: int, time: int | None, positions: Sequence[int], header: bool) -> int:
     """Row of the first data: behind units, or, without a header, behind any title lines."""
     for i in range(start, len(sheet.head) if not header else min(len(sheet.head), start + _UNIT_ROWS)):
         row = sheet.head[i]
-        clock = row[time] if time < len(row) else None
-        if not row or (clock is None and header):
+        clock = row[time] if time is not None and time < len(row) else None
+        if not row or (clock is None and header and time is not None):
             continue
-        values = [row[p] for p in positions if p < len(row)]
-        numbers = any(parse_number(v, sheet.decimal) is not None for v in values)
-        if header and (numbers or _is_clock(clock)):
-            return i
-        if not header and numbers and _is_clock(clock):
+        numbers = any(parse_number(row[p], sheet.decimal) is not None for p in positions if p < len(row))
+        ticks = time is None or _is_clock(clock)
+        if (numbers and ticks) or (header and numbers) or (header and time is not None and ticks):
             return i
     return start
 

@@ -45,10 +45,10 @@ class XlsxSheet(Sheet):
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         rows = (row for row in self._rows(first_row + 1) if row)
         while chunk := list(itertools.islice(rows, _BLOCK_ROWS)):
-            yield Block({i: _column([row[i] if i < len(row) else None for row in chunk]) for i in positions})
+            yield Block({i: arrow_column([row[i] if i < len(row) else None for row in chunk]) for i in positions})
 
 
-def _column(cells: list[Any]) -> Any:
+def arrow_column(cells: list[Any]) -> Any:
     """Arrow array of numbers, of timestamps, or of text where cells are mixed."""
     kinds = {type(cell) for cell in cells} - {type(None)}
     if kinds <= {int, float}:

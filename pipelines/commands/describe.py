@@ -12,6 +12,7 @@ import typer
 from rich.markup import escape
 
 from data.errors import InputError, check_suffix, closest
+from data.files import write_atomic
 from pipelines import console
 
 if TYPE_CHECKING:
@@ -167,13 +168,26 @@ def describe(
         raise InputError("describe: got nothing to describe; name recordings, or a machine file as --twin MACHINE.yml")
     if at:
         raise InputError(f"--at {at[0]}: belongs to a twin's picture; add --twin MACHINE.yml")
-    from data.describe import draft_machine_file
+    from data.describe import draft_machine_file, notes
 
     text = draft_machine_file(files)
     if to is None:
         sys.stdout.write(text)
-        return
+    else:
+        _write(to, text)
+        console.line(
+            f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`"
+        )
+    for note in notes(text):
+        console.note(f"check: {note}")
+
+
+def _write(to: Path, text: str) -> None:
+    """Write the draft; missing folders are made."""
     if to.exists():
         raise InputError(f"{to} exists; give another --out or remove it first")
-    to.write_text(text, encoding="utf-8")
-    console.line(f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`")
+    try:
+        to.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(to, text)
+    except OSError as error:
+        raise InputError(f"--out {to}: cannot be written ({error.strerror}); give another path") from None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data.errors import InputError
+from data.errors import InputError, WorkError
 from pipelines import console
 from pipelines.options import Json, MachineFile
 
@@ -18,9 +18,22 @@ if TYPE_CHECKING:
     from data.ingest import IngestReport
 
 
+SHOWN = 5  # names of ignored files per reason
+
+
 def print_ingest(report: IngestReport) -> None:
-    """One line of totals, then one line per file in quarantine."""
+    """One line of totals, then one per file in quarantine, batch left out, waiting file and reason to ignore files."""
     console.line("ingest   " + ", ".join(f"{k}: {v}" for k, v in ingest_totals(report).items()))
+    for row in report.waiting:
+        console.line(f"  waiting: {row.reason}")
+    for row in (r for r in report.rows if r.status in ("duplicate", "withdrawn")):
+        console.line(f"  left out: {row.file} ({row.batch_id}): {row.reason}")
+    reasons: dict[str, list[str]] = {}
+    for file, reason in report.ignored:
+        reasons.setdefault(reason, []).append(file.name)
+    for reason, names in reasons.items():
+        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+        console.line(f"  ignored, {reason}: {', '.join(names[:SHOWN])}{more}")
     for row in report.quarantined:
         folder, _, name = row.file.rpartition("/")
         where = "" if row.reason.startswith(row.file) else f"{folder}/" if folder else ""
@@ -47,6 +60,7 @@ def ingest_totals(report: IngestReport) -> dict[str, int]:
         "rows read": report.rows_in,
         "rows dropped": report.rows_dropped,
         "files in quarantine": len(report.quarantined),
+        "files waiting": len(report.waiting),
         "files ignored": len(report.ignored),
     }
 
@@ -75,5 +89,7 @@ def ingest(
             f"{', '.join(map(str, paths))}: no recording there, {len(report.ignored)} other files; the machine file "
             f"takes {', '.join(described.recording.files)}; give another folder or correct recording.files"
         )
+    if not report.batches and report.waiting:
+        raise WorkError(f"no file was taken; still being written: {len(report.waiting)}; ingest again when complete")
     if not report.batches:
         raise InputError(f"no file could be used ({len(report.quarantined)} in quarantine); the reasons are above")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from data.batch import Batch, Finding
-from data.checks import CHECKS, check_batch, check_machine, usable_channels
+from data.checks import CHECKS, check_batch, check_machine, checked, usable_channels, why_missing
 from data.errors import InputError
 from data.machine import Machine, Overrule, parse_machine
 
@@ -28,6 +29,7 @@ channels:
   z: {role: error, unit: um, resolution: 1, range: [-500, 500]}
 """
 THERMAL = ("front", "rear", "head", "column", "bed")
+AIR = (*THERMAL, "room")
 TAU_S = np.array([1200.0, 1800.0, 3600.0, 10000.0, 28000.0])
 GAIN_K = np.array([20.0, 14.0, 10.0, 6.0, 2.0])  # at 6000 rpm
 OFFSET_K = np.array([0.1, -0.1, 0.2, -0.2, 0.1])
@@ -90,6 +92,15 @@ def row_of(batch: Batch, finding: Finding) -> int:
     return round(finding.start_s / batch.step_s)
 
 
+def on_the_machine(batches: list[Batch], machine: Machine | None = None) -> list[Batch]:
+    machine = machine or toy_machine()
+    return check_machine([checked(b, machine) for b in batches], machine)
+
+
+def masks_of(batches: list[Batch]) -> set[tuple[str, str | None]]:
+    return {(f.check, f.channel) for b in batches for f in b.findings if f.masks and not f.overruled}
+
+
 def the_one(batch: Batch, check: str, channel: str | None) -> Finding:
     """The fault is found, and nothing is claimed of other channels."""
     found = findings(batch)
@@ -115,6 +126,7 @@ def test_every_check_says_what_it_is() -> None:
     for key, check in CHECKS.items():
         assert check.key == key
         assert check.summary
+        assert f"| `{key}` |" in (Path(__file__).parents[2] / "docs" / "method.md").read_text()
     with pytest.raises(InputError, match="unknown check 'spyke': did you mean 'spike'"):
         CHECKS["spyke"]
 
@@ -270,8 +282,9 @@ def test_a_sensor_that_reads_30_K_more_from_some_day_on() -> None:
     usable, excluded = usable_channels(known, (*THERMAL, "room"))
     assert usable == ("front", "rear", "column", "bed", "room")
     assert excluded == (
-        ("head", "head is unusable in 100% of b08 (offset), unusable in 100% of b09 (offset), "
-                 "unusable in 100% of b10 (offset) and 1 more"),
+        ("head", "head has no value in 100% of b08 (offset), 100% of b09 (offset), "
+                 "100% of b10 (offset) and 1 more; if the values are right, add to overrule: "
+                 "- {channel: head, check: offset, reason: ...}"),
     )  # fmt: skip
 
 
@@ -303,6 +316,120 @@ def test_a_drifting_probe_is_odd_but_not_masked() -> None:
     assert np.isfinite(known[5].masked("x")).all()
 
 
+def heated(batch: Batch, name: str, first: int, level: float) -> Batch:
+    """The channel held at a level by a heater from a row on, with a ripple of 0.3 K; it heats up within three rows."""
+    v = batch.values(name).copy()
+    rows = np.arange(batch.n_rows - first)
+    share = np.clip((rows + 1) / 3.0, 0.0, 1.0)
+    v[first:] = np.round(v[first:] + share * (level - v[first:]) + 0.3 * np.sin(rows / 3), 1)
+    return changed(batch, name, v)
+
+
+def wide_range() -> Machine:
+    machine = toy_machine()
+    bed = machine.channels["bed"].model_copy(update={"range": (-20.0, 150.0)})
+    return machine.model_copy(update={"channels": {**machine.channels, "bed": bed}})
+
+
+def test_what_most_runs_show_is_reported_and_not_masked() -> None:
+    batches = [heated(b, "bed", 12 + k, 110.0) if k < 8 else b for k, b in enumerate(year())]
+    batches[9] = added(batches[9], "head", 30, None, 15.0)
+    batches[2] = added(batches[2], "head", 14, None, 15.0)  # as the bed begins
+    batches = [replace(b, channels=wide_range().batch_channels()) for b in batches]
+    known = on_the_machine(batches, wide_range())
+    assert masks_of(known) == {("jump_no_return", "head")}
+    (bed,) = [f for f in known[0].findings if f.channel == "bed"]
+    assert (bed.check, bed.masks) == ("jump_no_return", False)
+    assert "In 8 of 12 runs, so probably the time unit (recording.time.unit: s) or a normal event" in bed.message
+    assert "{channel: bed, mask: true, reason: ...}" in bed.message
+    assert [b.findings for b in check_machine(known, wide_range())] == [b.findings for b in known]
+    # of fewer runs nothing is known in common, and the same batches mask again
+    assert masks_of(check_machine(known[:2], wide_range())) == {("jump_no_return", "bed")}
+
+
+def test_a_loose_contact_in_every_run_stays_a_fault() -> None:
+    batches = [added(b, "bed", 20 + k, None, 15.0 if k % 2 else -15.0) for k, b in enumerate(year())]
+    known = on_the_machine(batches)
+    assert all(np.isnan(b.masked("bed")[40:]).all() for b in known)
+
+
+def test_a_faulty_sensor_or_unit_in_every_run_stays_a_fault() -> None:
+    kelvin = [changed(b, "head", b.values("head") + 273.15) for b in year()]
+    assert masks_of(on_the_machine(kelvin)) == {("wrong_unit", "head")}
+    tenfold = [changed(b, "head", b.values("head") * 10.0 + 100.0) for b in year()]
+    tenfold = on_the_machine(tenfold)
+    assert masks_of(tenfold) <= {("out_of_range", "head"), ("wrong_unit", "head")}
+    assert all(np.isnan(b.masked("head")).all() for b in tenfold)
+    fahrenheit = [at(b, 22.0) for b in year()]
+    fahrenheit = [replace(b, table=b.table.assign(**{n: 1.8 * b.table[n] + 32 for n in AIR})) for b in fahrenheit]
+    assert masks_of(on_the_machine(fahrenheit)) == {("wrong_unit", n) for n in AIR}
+    held = [changed(b, "z", np.where(b.time_s > 2e4, b.values("z")[67], b.values("z"))) for b in year()]
+    assert masks_of(on_the_machine(held)) == {("frozen", "z")}
+
+
+def test_a_bed_that_starts_where_degF_would_put_a_cold_one_is_hot() -> None:
+    # 22 degC is 71.6 degF
+    batches = [added(b, "bed", 0, None, 71.6 - b.values("bed")[0]) for b in (at(b, 22.0) for b in year())]
+    assert [f.check for f in findings(batches[0]) if f.masks] == ["wrong_unit"]  # of one run nobody knows
+    known = on_the_machine(batches)
+    assert masks_of(known) == set()
+    assert "a part that is this hot, or unit_in_file is degF" in known[0].findings[0].message
+
+
+def at(batch: Batch, start_degC: float) -> Batch:
+    move = start_degC - batch.values("room")[0]
+    return replace(batch, table=batch.table.assign(**{n: batch.values(n) + move for n in (*THERMAL, "room")}))
+
+
+@pytest.mark.parametrize("hot", [{3, 7, 10}, {1, 2, 5, 6, 9}])
+def test_a_part_that_is_heated_in_some_runs_has_no_offset(hot: set[int]) -> None:
+    batches = [added(b, "bed", 0, None, 45.0) if k in hot else b for k, b in enumerate(year())]
+    known = on_the_machine(batches)
+    assert masks_of(known) == set()
+    assert {k for k, b in enumerate(known) if b.findings} == hot
+    assert f"In {len(hot)} of 12 runs, in 3 separate periods, so probably" in known[min(hot)].findings[-1].message
+
+
+def test_a_permanent_offset_stays_a_fault_where_other_masks_interrupt_it() -> None:
+    batches = [added(b, "head", 0, None, 30.0) if k >= 7 else b for k, b in enumerate(year())]
+    for k in (8, 10):
+        batches[k] = changed(batches[k], "head", np.full(batches[k].n_rows, 400.0))
+    assert masks_of(on_the_machine(batches)) == {("offset", "head"), ("out_of_range", "head")}
+
+
+def test_a_part_that_starts_warm_and_cools_has_no_offset() -> None:
+    batches = year()
+    warm = batches[4].values("bed") + 25.0 * np.exp(-batches[4].time_s / 6000.0)
+    known = on_the_machine([*batches[:4], changed(batches[4], "bed", np.round(warm, 1)), *batches[5:]])
+    assert masks_of(known) == set()
+    assert "returns during the run" in known[4].findings[0].message
+
+
+def test_a_run_much_shorter_than_the_others_is_noted() -> None:
+    batches = year()
+    batches[6] = replace(batches[6], table=batches[6].table.iloc[:25].reset_index(drop=True))
+    known = on_the_machine(batches)
+    told = [(k, f.check, f.masks) for k, b in enumerate(known) for f in b.findings]
+    assert told == [(6, "short", False)]
+    assert "lasts 2 h 00 min, the median run 8 h 00 min" in known[6].findings[0].message
+
+
+@pytest.mark.parametrize(("start", "words"), [("2199-03-01", "in the future"), ("1980-01-01", "before any logger")])
+def test_a_date_that_cannot_be_is_noted(start: str, words: str) -> None:
+    (found,) = findings(replace(toy_batch(0), start=pd.Timestamp(start)))
+    assert (found.check, found.masks) == ("clock", False) and words in found.message
+    assert findings(replace(toy_batch(0), start=pd.Timestamp("2024-03-01"))) == ()
+
+
+def test_why_a_channel_is_missing_names_check_and_overrule() -> None:
+    batch = checked(added(toy_batch(0), "bed", 30, None, 15.0), toy_machine())
+    assert why_missing(batch, "bed") == (
+        " (masked by jump_no_return; if the values are right, add to overrule: "
+        "- {batch: b00, channel: bed, check: jump_no_return, reason: ...})"
+    )
+    assert why_missing(batch, "rear") == ""
+
+
 def test_the_machine_file_overrules() -> None:
     rules = [
         Overrule(batch="b0*", channel="bed", check="jump*", reason="sensor was moved on purpose"),
@@ -330,7 +457,7 @@ def test_a_missing_channel_is_no_input() -> None:
     batch = toy_batch(0)
     lacking = changed(batch, "bed", np.full(batch.n_rows, np.nan))
     usable, excluded = usable_channels([batch, replace(lacking, batch_id="b77")], ("bed", "rear"))
-    assert usable == ("rear",) and excluded == (("bed", "bed is missing in b77"),)
+    assert usable == ("rear",) and excluded == (("bed", "bed has no value in 100% of b77 (not recorded)"),)
 
 
 def test_a_batch_of_two_rows_is_survived() -> None:

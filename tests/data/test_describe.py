@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
+import openpyxl
 import pandas as pd
 import pytest
 
 from data import guess
-from data.describe import draft_machine_file
+from data.describe import draft_machine_file, notes
 from data.errors import InputError
 from data.machine import parse_machine
+from data.peek import look_at
 from data.recording import read_batches, recording_files
 
 
@@ -148,3 +151,160 @@ def test_resolution_is_the_step_of_the_lattice(step):
     rng = np.random.default_rng(3)
     assert guess.resolution(np.round(rng.normal(20 / step, 8, 500)) * step) == pytest.approx(step)
     assert guess.resolution(rng.normal(20, 5, 500)) is None
+
+
+def warm_up(clock: str, step: float = 1.0, n: int = 300, **more) -> pd.DataFrame:
+    """A warm-up of the spindle with a time constant of an hour if the steps are minutes."""
+    t = np.arange(n) * step
+    rise = 12 * (1 - np.exp(-np.arange(n) / 60))
+    table = {clock: t, "Spindle temp": np.round(20 + rise, 2), "dz [um]": np.round(3 * rise, 1), **more}
+    return pd.DataFrame(table)
+
+
+@pytest.mark.parametrize(
+    ("clock", "unit"),
+    [
+        ("Minutes", "min"), ("Zeit in Minuten", "min"), ("Minuten seit Start", "min"), ("Zeit/min", "min"),
+        ("时间(分)", "min"), ("经过分钟", "min"), ("時間（分）", "min"), ("Tiempo (minutos)", "min"),
+        ("Temps en minutes", "min"),
+        ("Tempo [minuti]", "min"), ("t_min", "min"), ("t [s]", "s"), ("Sekunden", "s"), ("経過秒数", "s"),
+        ("Stunden", "h"), ("Temps (heures)", "h"), ("Laufzeit h", "h"), ("Time [ms]", "ms"), ("días", "d"),
+    ],
+)  # fmt: skip
+def test_the_unit_of_time_is_read_from_the_header(tmp_path, clock, unit):
+    per_minute = {"s": 60, "min": 1, "h": 1 / 60, "ms": 60_000, "d": 1 / 1440}[unit]
+    warm_up(clock, per_minute).to_csv(tmp_path / "a.csv", index=False)
+    text, machine = draft([tmp_path / "a.csv"])
+    assert (machine.recording.time.column, machine.recording.time.unit) == (clock, unit)
+    assert machine.recording.step_s == 60 and "# check" not in text
+    (batch,) = read_batches(tmp_path / "a.csv", machine)
+    assert batch.time_s[-1] == pytest.approx(299 * 60)
+
+
+@pytest.mark.parametrize(
+    ("clock", "step", "unit", "words"),
+    [
+        ("Time", 1.0, "min", "no header gives the unit of time; steps of 1 over 299 are taken for min; s would give"),
+        ("Time", 60.0, "s", "no header gives the unit of time; steps of 60 over 1.794e+04 are taken for s"),
+        (
+            "Time [s]",
+            1.0,
+            "s",
+            "the header's unit of time s gives a recording of 0.0831 h and temperatures that change",
+        ),
+    ],
+)
+def test_an_unknown_or_implausible_unit_of_time_is_pointed_out(tmp_path, clock, step, unit, words):
+    warm_up(clock, step).to_csv(tmp_path / "a.csv", index=False)
+    text, machine = draft([tmp_path / "a.csv"])
+    assert machine.recording.time.unit == unit
+    (said,) = notes(text)
+    assert said.startswith(words)
+
+
+@pytest.mark.parametrize("counter", [None, "No.", "Nr", "index", "序号", "Unnamed: 0"])
+def test_without_a_clock_the_draft_asks_for_the_step(tmp_path, counter):
+    table = warm_up("x").drop(columns="x").assign(T9=20 + np.arange(300) * 1.01e-4)  # rises with every row
+    if counter is not None:
+        table.insert(0, counter, np.arange(300))
+    table.to_csv(tmp_path / "a.csv", index=False)
+    text = draft_machine_file([tmp_path / "a.csv"])
+    assert notes(text) == ["no column is a clock: write the time between two rows as recording.time.step, such as 60 s"]
+    with pytest.raises(InputError, match=r"line \d+: key 'recording.time': .*the time between two rows"):
+        parse_machine(text, "draft")
+    machine = parse_machine(text.replace("? s", "1 min"), "draft")
+    assert {"T9", "Spindle_temp", "dz_um"} == {*machine.channels}
+    assert machine.ignore == ([] if counter is None else [counter])
+    (batch,) = read_batches(tmp_path / "a.csv", machine)
+    assert batch.time_s.tolist() == [60.0 * i for i in range(300)]
+
+
+def test_columns_that_are_no_clock():
+    rng = np.random.default_rng(5)
+    warm = 20 + 12 * (1 - np.exp(-np.arange(400) / 60))
+    for header, values in (("T9", 20 + np.arange(400) * 1e-4), ("Weg", np.arange(400.0)), ("a", warm),
+                           ("a", np.cumsum(rng.exponential(1, 400)))):  # fmt: skip
+        body = [[v, 1.0] for v in values.tolist()]
+        sheet = SimpleNamespace(head=[[header, "b"], *body], decimal=".", summary="", name="")
+        assert look_at(sheet, "test").time is None
+
+
+@pytest.mark.parametrize("form", ["%Y/%m/%d-%H:%M:%S", "%Y-%m-%d_%H-%M-%S", "%d.%m.%Y, %H:%M:%S", "%Y%m%d-%H%M%S"])
+def test_spellings_of_time_stamps(tmp_path, form):
+    stamps = pd.date_range("2021-06-15 23:04:41", periods=300, freq="min")
+    table = warm_up("Stamp").assign(Stamp=stamps.strftime(form))
+    table.to_csv(tmp_path / "a.csv", index=False)
+    _, machine = draft([tmp_path / "a.csv"])
+    for m in (machine, parse_machine("machine: m\nrecording: {time: {column: Stamp, unit: timestamp}}\nchannels: "
+                                     "{z: {role: error, unit: um, column: 'dz [um]'}}", "m")):  # fmt: skip
+        (batch,) = read_batches(tmp_path / "a.csv", m)
+        assert batch.start == stamps[0] and batch.n_rows == 300
+
+
+@pytest.mark.parametrize(("suffix", "start"), [("csv", "07:00"), ("csv", "22:00"), ("xlsx", "22:00")])
+def test_dates_and_times_of_day_in_two_columns(tmp_path, suffix, start):
+    stamps = pd.date_range(f"2021-06-15 {start}", periods=300, freq="min")
+    table = warm_up("Uhrzeit", Datum=stamps.strftime("%d.%m.%Y")).assign(Uhrzeit=stamps.strftime("%H:%M:%S"))
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "csv":
+        table.to_csv(path, index=False, sep=";", decimal=",")
+    else:
+        book = openpyxl.Workbook()
+        book.active.append([*table])
+        for row in table.assign(Datum=stamps.date, Uhrzeit=stamps.time).itertuples(index=False):
+            book.active.append([*row])
+        book.save(path)
+    _, machine = draft([path])
+    assert (machine.recording.time.column, machine.recording.time.date) == ("Uhrzeit", "Datum")
+    assert machine.ignore == []
+    (batch,) = read_batches(path, machine)
+    assert batch.start == stamps[0] and batch.time_s.tolist() == [60.0 * i for i in range(300)]
+    assert batch.repairs.get("unknown_columns", 0) == 0
+
+
+def test_serial_numbers_of_a_workbook_are_time_stamps(tmp_path):
+    warm_up("Time").assign(Time=44352.25 + np.arange(300) / 1440).to_csv(tmp_path / "a.csv", index=False)
+    _, machine = draft([tmp_path / "a.csv"])
+    (batch,) = read_batches(tmp_path / "a.csv", machine)
+    warm_up("Ora").assign(Ora=1.7e9 + 60.0 * np.arange(300)).to_csv(tmp_path / "b.csv", index=False)
+    _, of_unix = draft([tmp_path / "b.csv"])
+    assert of_unix.recording.time.unit == "timestamp" and of_unix.recording.step_s == 60
+    assert batch.start.round("s") == pd.Timestamp("2021-06-05 06:00") and machine.recording.step_s == 60
+
+
+def test_empty_columns(tmp_path):
+    warm_up("Minutes", oil=np.nan).to_csv(tmp_path / "a.csv", index=False)
+    warm_up("Minutes", oil=25.0).to_csv(tmp_path / "b.csv", index=False)
+    _, machine = draft([tmp_path / "a.csv"])
+    assert machine.ignore == ["oil"]
+    for order in ("ab", "ba"):
+        _, machine = draft([tmp_path / f"{name}.csv" for name in order])
+        assert "oil" in machine.channels and not machine.ignore
+
+
+def test_codes_for_no_value_are_no_readings(tmp_path):
+    table = warm_up("Minutes")
+    table.loc[50:54, "Spindle temp"] = -999
+    table.loc[7, "dz [um]"] = 3.4e38
+    table.to_csv(tmp_path / "a.csv", index=False)
+    text, machine = draft([tmp_path / "a.csv"])
+    assert notes(text) == [
+        "column 'Spindle temp': -999 (5×) is taken for a missing value",
+        "column 'dz [um]': 3.4e+38 (1×) is taken for a missing value",
+    ]
+    warm, error = machine.channels["Spindle_temp"], machine.channels["dz_um"]
+    assert warm.resolution == 0.01 and warm.range[0] >= -50 and error.range[1] < 1000
+    assert guess.seen_range(np.append(np.linspace(20, 30, 50), 1e12)) == (20.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        ("位移（微米）", "um"), ("温度℃", "degC"), ("主轴转速(转/分)", "rpm"), ("Temperatur in Grad Celsius", "degC"),
+        ("Weg/µm", "um"), ("Leistung in Watt", "W"), ("変位(ミクロン)", "um"), ("Déplacement en micromètres", "um"),
+        ("Velocità [giri/min]", "rpm"), ("T_min", None), ("Spindel", None), ("C", None), ("Disp. X", None),
+        ("温度A", None),
+    ],
+)  # fmt: skip
+def test_units_in_headers(header, unit):
+    assert guess.channel_unit_in_name(header) == unit

@@ -11,7 +11,7 @@ import pytest
 import data.ingest
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
-from data.ingest import COLUMNS, IngestReport, ingest
+from data.ingest import COLUMNS, Clock, IngestReport, ingest
 from data.lake import Lake
 from data.machine import Machine, Overrule, parse_machine
 
@@ -101,7 +101,7 @@ def test_a_directory_of_mixed_files(tmp_path: Path, lake: Lake) -> None:
     report = ingest([folder, good, folder], MACHINE, lake)
     balanced(report)
     assert [(Path(r.file).name, r.status) for r in report.rows] == [("bad.csv", "quarantined"), ("good.csv", "new")]
-    assert report.ignored == [notes]
+    assert report.ignored == [(notes, "not in recording.files (*.csv)")]
     (entry,) = lake.quarantined("vmc")
     assert entry.reason == f"{folder / 'bad.csv'}: row 7: not a number" == report.quarantined[0].reason
     assert entry.copy is not None and entry.copy.read_bytes() == (folder / "bad.csv").read_bytes()
@@ -206,7 +206,7 @@ def test_through_the_real_readers_and_checks(tmp_path: Path) -> None:
     balanced(report)
     assert {Path(r.file).name for r in report.quarantined} == {"empty.csv", "junk.csv", "one_row.csv", "others.csv"}
     assert all("\n" not in r.reason and Path(r.file).name in r.reason for r in report.quarantined)
-    assert len(lake.quarantined("vmc")) == 4 and [p.name for p in report.ignored] == ["readme.md"]
+    assert len(lake.quarantined("vmc")) == 4 and [p.name for p, _ in report.ignored] == ["readme.md"]
     assert report.rows_stored == 240
     for batch in lake.load_all("vmc"):
         for mine, theirs in (("time_s", "t"), ("T1", "T1"), ("z_um", "z_um")):
@@ -220,3 +220,111 @@ def test_the_report_tells_what_the_user_overrules_and_the_lake_keeps_what_was_fo
     (row,) = ingest([write(tmp_path / "a.csv", "a1,1.0,100,5")], machine, lake).rows
     assert row.found == (Finding("spike", "T1", "one", overruled="checked by hand"),)
     assert lake.load("vmc", "a1").findings == (Finding("spike", "T1", "one"),)
+
+
+def statuses(report: IngestReport) -> list[tuple[str, str]]:
+    balanced(report)
+    return [(r.batch_id, r.status) for r in report.rows]
+
+
+def test_a_copy_under_another_name_is_left_out(tmp_path: Path, lake: Lake) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    write(folder / "a copy.csv", "a copy,1,30,2")
+    write(folder / "run.csv", "run,1,30,2", "more,2,30,2")
+    report = ingest([folder], MACHINE, lake)
+    assert statuses(report) == [("run", "new"), ("more", "new"), ("a copy", "duplicate")]
+    assert report.rows[2].reason == "the same measured values as batch run, which is stored"
+    assert (report.rows[2].stored_as, report.rows_stored, report.rows_dropped) == ("run", 56, 34)
+    report = ingest([write(folder / "later.csv", "later,2,30,2")], MACHINE, lake)
+    assert statuses(report) == [("later", "duplicate")] and report.rows[0].stored_as == "more"
+    assert lake.batch_ids("vmc") == ["more", "run"] and not lake.quarantined("vmc")
+
+
+def test_a_withdrawn_recording_stays_out(tmp_path: Path, lake: Lake) -> None:
+    files = [write(tmp_path / "a.csv", "a,1,30,2"), write(tmp_path / "b.csv", "b,2,30,2")]
+    ingest(files, MACHINE, lake)
+    lake.withdraw("vmc", ["a"], "door open")
+    files.append(write(tmp_path / "c.csv", "c,1,30,2"))
+    report = ingest(files, MACHINE, lake)
+    assert statuses(report) == [("a", "withdrawn"), ("b", "unchanged"), ("c", "withdrawn")]
+    assert {r.reason for r in report.rows if r.status == "withdrawn"} == {
+        "withdrawn: door open; restore with `thermodrift lake restore vmc a`"
+    }
+    lake.restore("vmc", ["a"])
+    assert statuses(ingest(files, MACHINE, lake)) == [("a", "unchanged"), ("b", "unchanged"), ("c", "duplicate")]
+
+
+def test_subfolders_are_read_and_every_file_is_listed(tmp_path: Path, lake: Lake) -> None:
+    for k, name in enumerate(("b.csv", "2025/a.csv", "2025/b.csv", "2025/x/b.csv", ".git/a.csv", "lake/a.csv")):
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        write(tmp_path / "in" / name, f"{Path(name).stem},{k + 1},3,0")
+    for name in ("lake/_manifest.json", "2025/notes.md", "2025/~$a.csv", "2025/.~lock.b.csv#", "2025/.DS_Store"):
+        (tmp_path / "in" / name).write_text("")
+    (tmp_path / "in" / "linked").symlink_to(tmp_path / "in" / "2025")
+    report = ingest([tmp_path / "in"], MACHINE, lake)
+    assert statuses(report) == [("b", "new"), ("2025/a", "new"), ("2025/b", "new"), ("2025/x/b", "new")]
+    assert {f.name: reason for f, reason in report.ignored} == {
+        ".git": "hidden",
+        "lake": "a lake",
+        "linked": "link to a folder",
+        "notes.md": "not in recording.files (*.csv)",
+        "~$a.csv": "lock file of an open document",
+        ".~lock.b.csv#": "lock file of an open document",
+        ".DS_Store": "hidden",
+    }
+    assert (report.as_frame()["status"] == "ignored").sum() == 7
+    assert lake.load("vmc", "2025/b").values("T1")[0] == 3.0
+    assert statuses(ingest([tmp_path / "in" / "2025"], MACHINE, lake)) == [
+        ("a", "duplicate"), ("b", "duplicate"), ("x/b", "duplicate"),
+    ]  # fmt: skip
+    assert lake.load("vmc", "b").values("T1")[0] == 1.0
+
+
+def test_a_growing_file_waits(tmp_path: Path, lake: Lake) -> None:
+    still, growing = write(tmp_path / "a.csv", "a,1,3,0"), write(tmp_path / "b.csv", "b,2,3,0")
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        with growing.open("a") as file:
+            file.write("c,3,3,0\n")
+
+    now = growing.stat().st_mtime
+    report = ingest([still, growing], MACHINE, lake, clock=Clock(lambda: now + 1, wait))
+    assert statuses(report) == [("a", "new"), ("", "waiting")] and len(waits) == 1
+    assert report.waiting[0].reason == f"{growing}: still being written; ingest it again when it is complete"
+    assert not lake.quarantined("vmc")
+    report = ingest([still, growing], MACHINE, lake, clock=Clock(lambda: now + 60, wait))
+    assert statuses(report) == [("a", "unchanged"), ("b", "new"), ("c", "new")] and len(waits) == 1
+
+
+@pytest.mark.parametrize("line", ["b,2,3,0", "!"])
+def test_a_file_that_grows_while_it_is_read_waits(
+    line: str, tmp_path: Path, lake: Lake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither its first batches nor the damage at its present end count."""
+
+    def growing(path: Path, machine: Machine) -> Iterator[Batch]:
+        lines = path.read_text()
+        path.write_text(lines + "c,3,3,0\n")
+        yield from fake_batches(path, machine)
+
+    file = write(tmp_path / "a.csv", "a,1,3,0", line)
+    monkeypatch.setattr(data.ingest, "read_batches", growing)
+    assert statuses(ingest([file], MACHINE, lake)) == [("", "waiting")]
+    assert lake.machines() == [] and not lake.quarantined("vmc") and not list(lake.root.rglob("*.parquet"))
+
+
+def test_the_lakes_own_files_can_be_ingested_again(tmp_path: Path) -> None:
+    """Where the recordings are gone: ids, values and units stay, and the machine file's new channel is empty."""
+    lake = Lake(tmp_path / "lake")
+    table = pd.DataFrame({"t": np.arange(20) * 60.0, "T1": np.linspace(20, 25, 20), "z_um": np.linspace(0, 9, 20)})
+    (tmp_path / "in" / "2025").mkdir(parents=True)
+    table.to_csv(tmp_path / "in" / "2025" / "run.csv", index=False)
+    ingest([tmp_path / "in"], MACHINE, lake)
+    more = MACHINE.model_copy(update={"channels": {**MACHINE.channels, "T2": MACHINE.channels["T1"]}})
+    assert statuses(ingest([lake.root / "machine=vmc"], more, lake)) == [("2025/run", "new_version")]
+    batch = lake.load("vmc", "2025/run")
+    assert np.isnan(batch.values("T2")).all()
+    np.testing.assert_array_equal(batch.values("T1"), lake.load("vmc", "2025/run", 1).values("T1"))

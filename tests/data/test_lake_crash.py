@@ -127,15 +127,16 @@ def shown_by_plain_readers(root: Path) -> dict[str, list[float]]:
     return {str(name): part["T1"].tolist() for name, part in frame.groupby("batch")}
 
 
-def run(function: str, base: Path) -> subprocess.Popen[bytes]:
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_lake_crash as t; "
-    return subprocess.Popen([sys.executable, "-c", code + f"t.{function}"])
+def run(function: str, module: str = "test_lake_crash") -> subprocess.Popen[bytes]:
+    """A function of a module of this folder in a process of its own."""
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import {module} as t; "
+    return subprocess.Popen([sys.executable, "-c", code + f"t.{function}"], cwd=Path(__file__).parents[2])
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> None:
     (tmp_path / "junk.csv").write_text("junk")
-    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))", tmp_path).wait(300) == 0
+    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))").wait(300) == 0
     roots = sorted(p for p in tmp_path.iterdir() if p.is_dir())
     assert len(roots) > 60
     seen = set()
@@ -160,7 +161,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> N
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_kills_at_random_moments_on_one_lake(tmp_path: Path) -> None:
-    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))", tmp_path).wait(300) == 0
+    assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))").wait(300) == 0
     found = check(tmp_path / "lake")
     assert len(found["a"]) > 25
     for name, seeds in (("a", 0), ("b", 1)):
@@ -183,7 +184,7 @@ def store_range(root: Path, who: str, go: Path) -> None:
 def test_two_writers_at_once_lose_nothing(tmp_path: Path) -> None:
     root, go = tmp_path / "lake", tmp_path / "go"
     call = "store_range(t.Path({!r}), {!r}, t.Path({!r}))"
-    writers = [run(call.format(str(root), who, str(go)), tmp_path) for who in ("x", "y")]
+    writers = [run(call.format(str(root), who, str(go))) for who in ("x", "y")]
     go.touch()
     assert [w.wait(300) for w in writers] == [0, 0]
     lake = Lake(root)

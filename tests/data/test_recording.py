@@ -228,9 +228,13 @@ def test_recording_files_of_a_mixed_directory(tmp_path):
     (tmp_path / "sub").mkdir()
     for name in ("b.CSV", "a.csv", "runs.csv", "note.docx", ".hidden.csv", "sub/x.parquet", "sub/y.csv", "~$a.csv"):
         (tmp_path / name).write_text("x")
-    files, others = recording_files(tmp_path, m)
-    names = [[f.relative_to(tmp_path).as_posix() for f in part] for part in (files, others)]
-    assert names == [["a.csv", "b.CSV", "sub/x.parquet", "sub/y.csv"], ["note.docx", "~$a.csv"]]
+    files, ignored = recording_files(tmp_path, m)
+    assert [f.relative_to(tmp_path).as_posix() for f in files] == ["a.csv", "b.CSV", "sub/x.parquet", "sub/y.csv"]
+    assert [(f.name, reason) for f, reason in ignored] == [
+        (".hidden.csv", "hidden"),
+        ("note.docx", "not in recording.files (*.csv, sub/*.parquet)"),
+        ("~$a.csv", "lock file of an open document"),
+    ]
     with pytest.raises(InputError, match="no such directory"):
         recording_files(tmp_path / "gone", m)
 

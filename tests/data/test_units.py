@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from data.units import conversion, convert, known_unit, quantity
+from data.units import conversion, convert, known_unit, quantity, seconds
 
 
 @pytest.mark.parametrize(
@@ -37,3 +37,14 @@ def test_what_measures_something_else_is_refused() -> None:
     with pytest.raises(InputError, match=r"z: unknown unit 'umm'; did you mean 'um/m'"):
         conversion("umm", "um", "z")
     assert quantity("rpm") == "rotation" and quantity("umm") is None
+
+
+@pytest.mark.parametrize(("text", "expected"), [("60 s", 60.0), ("0.5min", 30.0), ("1 h", 3600.0), ("200 ms", 0.2)])
+def test_durations(text: str, expected: float) -> None:
+    assert seconds(text) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("text", ["60", "? s", "0 s", "-1 s", "1 K", "s", "1 2 s"])
+def test_what_is_no_duration(text: str) -> None:
+    with pytest.raises(ValueError, match=r"expected a duration above 0 with its unit, such as '60 s'"):
+        seconds(text)

@@ -18,6 +18,19 @@ GOOD = "machine: m1\nchannels: {z: {role: error, unit: um}}\n"
             "machine: m1\nchannels: {z: {role: error, unit: um, rang: [0, 1]}}",
             "'channels.z.rang'; did you mean 'range'?",
         ),
+        ("machine: m1\nchanels: {}", "m.yml line 2: unknown key 'chanels'; did you mean 'channels'?"),
+        (
+            "machine: m1\nchannels:\n  unit: {role: error, unit: um}\n  range: {role: error, units: um}\n",
+            "m.yml line 4: unknown key 'channels.range.units'; did you mean 'unit'?",
+        ),
+        (
+            GOOD + "overrule:\n- {reason: a}\n- {reason: b, chek: c}\n",
+            "line 5: unknown key 'overrule.1.chek'; did you mean",
+        ),
+        (
+            GOOD + "recording: {schedule: {file: a, batch_column: b, stages: [{hours: c, driver: {}}]}}",
+            "line 3: unknown key 'recording.schedule.stages.0.driver'; did you mean 'drivers'?",
+        ),
         ("machine: m1", "key 'channels' is missing"),
         (GOOD + "recording: {step_s: -1}", "key 'recording.step_s': got -1; Input should be greater than 0"),
         ("machine: m1\nchannels: {z: {role: eror, unit: um}}", "key 'channels.z.role': got 'eror'; Input should be"),

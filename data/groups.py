@@ -1,0 +1,315 @@
+"""Undescribed files: groups of tables with the same columns, their values and clock, and what belongs together."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from data import guess
+from data.arrays import Array
+from data.checks.invalid import sentinels
+from data.errors import InputError
+from data.guess import Guess, PositionGroup
+from data.machine import ChannelPart, Machine
+from data.peek import Table, look, sheets_of
+from data.readers.csv import normalise
+from data.readers.header import Layout
+from data.rows import Rows, join, stream
+from data.timegrid import repair_time
+from data.units import TIME_UNITS_S, known_unit, quantity
+from data.yaml_edit import flow
+
+FILL_IN = "? s"  # in place of the step of a recording without a clock
+_MAX_TABLES = 20
+_MAX_ROWS = 200_000
+_NAME_DATES = ("%Y%m%d", "%Y-%m-%d", "%Y_%m_%d", "%Y%m%d_%H%M%S", "%Y-%m-%d_%H%M%S", "%Y%m%d-%H%M%S", "%Y%m%d%H%M%S")
+_EXCEL_DAYS = (36_000.0, 60_000.0)  # 1998 to 2064
+_UNIX_S, _UNIX_MS = 1e9, 1e11  # from 2001 on
+_ANY = ChannelPart(role="temperature", unit="1")  # no range and no physical limits are known yet
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a group: its line in the machine file and why, its unit in s, and what the user must check."""
+
+    line: str
+    why: str
+    unit_s: float
+    note: str = ""
+
+
+@dataclass
+class Group:
+    """Tables with the same columns: files, or sheets of workbooks. `notes`: what the user must check."""
+
+    tables: list[tuple[Path, Table]]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def table(self) -> Table:
+        """The first table, whose columns are those of all."""
+        return self.tables[0][1]
+
+    @property
+    def paths(self) -> list[Path]:
+        return list(dict.fromkeys(path for path, _ in self.tables))
+
+    @property
+    def sheets(self) -> list[str]:
+        return list(dict.fromkeys(table.sheet for _, table in self.tables))
+
+    @cached_property
+    def names(self) -> dict[str, int]:
+        """Channel name -> place of its column, for every column that holds a number in any table."""
+        names: dict[str, int] = {}
+        for i in sorted({i for _, table in self.tables for i in table.numeric}):
+            name = self._slug(i)
+            names[name if name not in names and name != "time_s" else f"{name}_{i}"] = i
+        return names
+
+    def _slug(self, i: int) -> str:
+        column = self.table.columns[i]
+        if not self.table.header:
+            return f"column_{i}"
+        return re.sub(r"[^\w]+", "_", column if column.isascii() else normalise(column)).strip("_") or f"column_{i}"
+
+    @cached_property
+    def rows(self) -> list[Rows]:
+        """Up to 200 000 rows of up to 20 tables, codes for no value removed; time in the file's unit."""
+        every = -(-len(self.tables) // _MAX_TABLES)
+        found = [self._read(path, table) for path, table in self.tables[::every]]
+        for name, i in self.names.items():
+            codes: Counter[float] = Counter()
+            for rows in found:
+                seen = sentinels(rows.columns[name], _ANY, "draft")
+                rows.columns[name] = np.where(np.isin(rows.columns[name], list(seen)), np.nan, rows.columns[name])
+                codes.update(seen)
+            if codes:
+                said = ", ".join(f"{v:.6g} ({n}×)" for v, n in codes.items())
+                self.notes.append(f"column {self.table.columns[i]!r}: {said} is taken for a missing value")
+        return found
+
+    def _read(self, path: Path, table: Table) -> Rows:
+        time: dict[str, object] = (
+            {"unit": "timestamp", "format": pattern(table), "date": table.clock.date} if table.stamps else {}
+        )
+        if table.time is None:
+            time = {"step": "1 s"}
+        machine = Machine.model_validate({"machine": "draft", "channels": {}, "recording": {"time": time}})
+        with sheets_of(path) as sheets:
+            sheet = next(s for s in sheets if s.name == table.sheet)
+            layout = Layout(table.first_row, table.time, self.names, date=table.clock.date)
+            return join(list(_limited(stream(sheet, layout, machine, path.name))))
+
+    def column(self, name: str) -> Array:
+        """A channel's values in all rows that were read."""
+        return np.concatenate([r.columns[name] for r in self.rows])
+
+    @property
+    def longest(self) -> Rows:
+        return max(self.rows, key=len)
+
+    @cached_property
+    def position_groups(self) -> list[PositionGroup]:
+        """Columns that are one error at several positions; what is in degrees is none."""
+        table = self.table
+        places = [i for i in self.names.values() if quantity(known_unit(table.units[i]) or "um") == "length"]
+        return guess.position_groups(table.columns, places) if table.header else []
+
+    def written_unit(self, i: int) -> str | None:
+        """The unit of a column as its units row or its header gives it."""
+        in_row = known_unit(self.table.units[i])
+        return in_row or (guess.channel_unit_in_name(self.table.columns[i]) if self.table.header else None)
+
+    @cached_property
+    def roles(self) -> dict[str, Guess]:
+        """Role of each channel, from its name and its longest recording."""
+        headers = {n: self.table.columns[i] if self.table.header else "" for n, i in self.names.items()}
+        return {n: guess.role(headers[n], self.written_unit(i), self.longest.columns[n]) for n, i in self.names.items()}
+
+    def named(self, role: str) -> list[str]:
+        return [n for n, r in self.roles.items() if r.value == role]
+
+    @cached_property
+    def clock(self) -> Clock:
+        table = self.table
+        if table.time is None:
+            return Clock(
+                f"{{step: {FILL_IN!r}}}", "fill in: no column is a clock; the time between two rows, such as 60 s", 1.0,
+                "no column is a clock: write the time between two rows as recording.time.step, such as 60 s",
+            )  # fmt: skip
+        header = table.columns[table.time] if table.header else ""
+        column = flow(header) if table.header else str(table.time)
+        if table.stamps:
+            form = f", format: {flow(pattern(table))}" if pattern(table) else ""
+            at = table.clock.date
+            form = form if at is None else f", date: {flow(table.columns[at]) if table.header else at}{form}"
+            others = f" (or {', '.join(table.stamps[1:])})" if len(table.stamps) > 1 else ""
+            note = f"time stamps can be {' or '.join(table.stamps)}: day and month" if others else ""
+            return Clock(f"{{column: {column}, unit: timestamp{form}}}", f"its cells look like it{others}", 1.0, note)
+        unit, unit_s, note = self._time_unit(header)
+        return Clock(f"{{column: {column}, unit: {unit.value}}}", unit.why, unit_s, note)
+
+    def _time_unit(self, header: str) -> tuple[Guess, float, str]:
+        """Unit of a numeric clock, in s, and what to check."""
+        step, length = self.step_and_length
+        first = float(np.nanmedian(self.longest.time_s))
+        written = known_unit(self.table.units[self.table.time or 0]) or guess.time_unit_in_name(header)
+        written = written if written in TIME_UNITS_S else None
+        if written is None and _EXCEL_DAYS[0] <= first <= _EXCEL_DAYS[1] and step < 0.5:
+            return Guess("timestamp", "numbers like the days of a workbook"), 86400.0, ""
+        if written in (None, "s", "ms") and first >= _UNIX_S:
+            return Guess("timestamp", "numbers like seconds since 1970"), 1.0 if first < _UNIX_MS else 1e-3, ""
+        warm = self.named("temperature")
+        rates = [guess.sustained_rate(r.time_s, r.columns[n]) for r in self.rows for n in warm]
+        unit, note = guess.time_unit(written, step, length, max(rates, default=0.0))
+        return unit, TIME_UNITS_S[unit.value], note
+
+    @cached_property
+    def step_and_length(self) -> tuple[float, float]:
+        """Median step and longest recording, in the file's unit of time."""
+        repaired = [repair_time(r.time_s, np.inf).time_s for r in self.rows]
+        steps = np.concatenate([np.diff(t) for t in repaired])
+        interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+        return interval, max(float(t[-1]) if len(t) else 0.0 for t in repaired)
+
+    @property
+    def start_from_name(self) -> str | None:
+        """The strptime pattern of all files' names, or of the sheets' names in workbooks of several recordings."""
+        several = len(self.tables) > len(self.paths)
+        stems = [table.sheet for _, table in self.tables] if several else [p.stem for p in self.paths]
+        split = [re.fullmatch(r"(\D*)(\d[\d_-]*\d)(\D*)", stem) for stem in stems]
+        around = {(m[1], m[3]) for m in split if m}
+        if len(around) != 1 or None in split:
+            return None
+        before, after = (text.replace("%", "%%") for text in around.pop())
+        for form in _NAME_DATES:
+            try:
+                years = {dt.datetime.strptime(m[2], form).year for m in split if m}
+            except ValueError:
+                continue
+            if all(1980 <= y <= 2100 for y in years):
+                return f"{before}{form}{after}"
+        return None
+
+
+def pattern(table: Table) -> str | None:
+    """The strptime pattern that the machine file must give."""
+    return table.stamps[0] if table.stamps and table.stamps[0] not in ("", "ISO8601") else None
+
+
+def _limited(blocks: Iterator[Rows]) -> Iterator[Rows]:
+    left = _MAX_ROWS
+    for rows in blocks:
+        yield rows if len(rows) <= left else rows.part(0, left)
+        left -= len(rows)
+        if left <= 0:
+            return
+
+
+def grouped(files: Sequence[Path]) -> tuple[list[Group], list[str]]:
+    """Groups of the files' tables, the recordings first, and a line for each file without a table.
+
+    The recordings are the group of most tables, or else of most temperatures.
+
+    Raises:
+        InputError: no file holds a table of numbers.
+    """
+    groups: dict[tuple[object, ...], Group] = {}
+    left_out: list[str] = []
+    for path in files:
+        try:
+            for table in look(path):
+                groups.setdefault((table.columns, table.header), Group([])).tables.append((path, table))
+        except InputError as error:
+            left_out.append(f"{path.name}: {str(error).removeprefix(path.name + ': ')}")
+    if not groups:
+        raise InputError(left_out[0])
+    if len(groups) == 1:
+        return [*groups.values()], left_out
+    return sorted(groups.values(), key=lambda g: (-len(g.tables), -len(g.named("temperature")))), left_out
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How files of another group belong to the recordings: keys of `recording.joined`, why, `recording.files`."""
+
+    keys: Mapping[str, str]
+    why: str
+    files: str | None = None
+
+
+def joint(main: Group, other: Group) -> Joint | None:
+    """How tables with other columns belong to the recordings; None where they do not or it cannot be seen."""
+    mine, theirs = ({normalise(g.table.columns[i]) for i in g.names.values()} for g in (main, other))
+    if main.table.header and other.table.header and mine & theirs:
+        return None
+    if main.paths == other.paths:
+        same = len(other.sheets) == 1 and other.sheets[0] not in main.sheets
+        return Joint({"sheet": other.sheets[0]}, "the sheet has other columns of the same run") if same else None
+    if other.table.time is None:
+        return None
+    folder = Path(os.path.relpath(other.paths[0].resolve().parent, main.paths[0].resolve().parent))
+    here, there = _runs(main.paths, other.paths), _runs(other.paths, main.paths)
+    if here and there and here[1] == there[1]:
+        files = {"file": (folder / there[0]).as_posix()}
+        return Joint(files, "the names of the files differ by the same text", here[0])
+    single = {"file": (folder / other.paths[0].name).as_posix()}
+    if len(other.paths) == 1:
+        if len(main.paths) == 1 and (main.sheets == other.sheets or len(main.sheets) == len(other.sheets) == 1):
+            return Joint(single, "given together with the recording", main.paths[0].name)
+        if {*other.sheets} & {*main.sheets, *(p.stem for p in main.paths)} - {""}:
+            return Joint(single, "its sheets are called as those of the recordings, or as their files")
+    if main.table.stamps and other.table.stamps and _overlap(main, other):
+        found = single["file"] if len(other.paths) == 1 else (folder / files_pattern(other.paths)).as_posix()
+        return Joint({"file": found, "by": "time"}, "its time stamps are those of the recordings")
+    return None
+
+
+def _runs(paths: Sequence[Path], others: Sequence[Path]) -> tuple[str, list[str]] | None:
+    """A pattern with one * of the files' names, and what the * stands for; None where a name gives no such part."""
+    stems = [p.stem for p in paths]
+    if len(stems) == 1:
+        digits = [m for m in re.findall(r"\d[\d\-_]{4,}\d", stems[0]) if m in others[0].stem]
+        if len(others) > 1 or not digits:
+            return None
+        before, _, after = stems[0].partition(digits[0])
+        runs = [digits[0]]
+    else:
+        before = _common(stems).rstrip("0123456789")
+        after = _common([s[len(before) :][::-1] for s in stems])[::-1].lstrip("0123456789")
+        runs = sorted(s[len(before) : len(s) - len(after)] for s in stems)
+    return f"{before}*{after}{paths[0].suffix}", runs
+
+
+def _common(texts: Sequence[str]) -> str:
+    """What all texts begin with."""
+    same = 0
+    while len({t[: same + 1] for t in texts}) == 1 and same < len(texts[0]):
+        same += 1
+    return texts[0][:same]
+
+
+def _overlap(main: Group, other: Group) -> bool:
+    """Whether every recording that was read has rows of the other files at its times."""
+    theirs = np.sort(np.concatenate([r.time_s[np.isfinite(r.time_s)] for r in other.rows]))
+    spans = [(np.nanmin(r.time_s), np.nanmax(r.time_s)) for r in main.rows if np.isfinite(r.time_s).any()]
+    return all(np.searchsorted(theirs, a) < np.searchsorted(theirs, b, "right") for a, b in spans)
+
+
+def files_pattern(paths: Sequence[Path]) -> str:
+    """A pattern of the files' names: digits first, or what they begin with."""
+    suffix = paths[0].suffix
+    stems = [p.stem for p in paths]
+    if all(s[:1].isdigit() for s in stems):
+        return f"[0-9]*{suffix}"
+    prefix = _common(stems).rstrip("0123456789") if len(stems) > 1 else ""
+    return f"{prefix if len(prefix) > 2 else ''}*{suffix}".replace("[", "?")

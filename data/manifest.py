@@ -1,0 +1,209 @@
+"""The lake's manifest as plain data: which versions of which batches exist, which are withdrawn, and changes to them.
+
+``{"schema", "pending": [[machine, batch], …], "machines": {machine: {batch: [version, …]}}}``, versions oldest first.
+A withdrawn version has ``"withdrawn": {"reason", "at", "purged_at"}``; `purged_at` is empty while its file is kept. A
+batch is withdrawn where its last version is. Functions change the manifest that they are given; nothing is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+from data.errors import InputError, closest
+
+SCHEMA = "thermodrift.lake/1"
+Status = Literal["new", "unchanged", "refreshed", "new_version", "duplicate", "withdrawn"]
+Entry = dict[str, Any]  # one version of a batch as it is stored
+Copies = dict[str, dict[str, Entry]]  # digest of measured values -> batch id -> version
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The outcome of storing a batch.
+
+    `status`: new, new_version; unchanged, refreshed (the same content, with other findings); duplicate: left out,
+    another batch has the same measured values; withdrawn: left out, these were withdrawn for `reason`. `version` and
+    `batch_id` are what the lake holds, so those of the other batch for a duplicate. `replaces` is the source of the
+    version before a new one.
+    """
+
+    status: Status
+    version: int
+    digest: str
+    machine: str
+    batch_id: str
+    replaces: str = ""
+    reason: str = ""
+
+    @property
+    def left_out(self) -> bool:
+        return self.status in ("duplicate", "withdrawn")
+
+
+@dataclass(frozen=True)
+class Withdrawal:
+    """Why and when (UTC) a version was withdrawn; `purged_at` is when its content was deleted, else empty."""
+
+    reason: str
+    at: str
+    purged_at: str = ""
+
+
+@dataclass(frozen=True)
+class Version:
+    """One version of a batch. `files`: its files under the root, oldest remarks first, the last one in use."""
+
+    version: int
+    digest: str
+    source: str
+    stored_at: str
+    rows: int
+    year: int
+    simulated: bool
+    current: bool
+    files: tuple[str, ...]
+    withdrawn: Withdrawal | None = None
+
+
+@dataclass(frozen=True)
+class Staged:
+    """A batch whose file is written and waits for a commit; `measured` as `lakefile.measured_digest`."""
+
+    machine: str
+    batch_id: str
+    digest: str
+    measured: str
+    file: str
+    source: str
+    rows: int
+    year: int
+    simulated: bool
+
+
+def empty() -> dict[str, Any]:
+    """The manifest of a lake without a batch."""
+    return {"schema": SCHEMA, "pending": [], "machines": {}}
+
+
+def version_of(entry: Entry) -> Version:
+    """A stored version as a value."""
+    keys = ("version", "digest", "source", "stored_at", "rows", "year", "simulated", "current")
+    gone = withdrawal(entry)
+    return Version(**{k: entry[k] for k in keys}, files=(*entry["earlier"], entry["file"]), withdrawn=gone)
+
+
+def withdrawal(entry: Entry) -> Withdrawal | None:
+    """The withdrawal of a version, None where it is in use."""
+    return Withdrawal(**entry["withdrawn"]) if "withdrawn" in entry else None
+
+
+def active(batches: Mapping[str, list[Entry]]) -> dict[str, list[Entry]]:
+    """The batches of a machine that are in use."""
+    return {batch_id: entries for batch_id, entries in batches.items() if "withdrawn" not in entries[-1]}
+
+
+def files_kept(entries: Iterable[Entry]) -> set[str]:
+    """Files of all versions whose content is not purged."""
+    return {f for e in entries if not e.get("withdrawn", {}).get("purged_at") for f in (*e["earlier"], e["file"])}
+
+
+def copies_of(batches: Mapping[str, list[Entry]]) -> Copies:
+    """Current and withdrawn versions by the digest of their measured values, where that is known."""
+    found: Copies = {}
+    for batch_id, entries in batches.items():
+        for entry in entries:
+            if "measured" in entry and ("withdrawn" in entry or entry is entries[-1]):
+                found.setdefault(entry["measured"], {})[batch_id] = entry
+    return found
+
+
+def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None = None) -> Stored:
+    """Write a staged batch into the manifest.
+
+    Content equal to the current version makes no new one. Withdrawn content stays out, and with `copies` a batch
+    whose measured values stand under another id as well; `copies` is updated.
+    """
+    batches = manifest["machines"].get(s.machine, {})
+    entries = batches.get(s.batch_id, [])
+    last = entries[-1] if s.batch_id in active(batches) else None
+    if last is not None and last["digest"] == s.digest:
+        return _same_again(last, s)
+    same = dict((copies or {}).get(s.measured, {}))
+    for entry in entries:
+        if "withdrawn" in entry and entry["digest"] == s.digest:
+            same[s.batch_id] = entry
+    if same and not (s.batch_id in same and "withdrawn" not in same[s.batch_id]):
+        other = min(same, key=lambda i: (i != s.batch_id, "withdrawn" in same[i], i))
+        gone = withdrawal(same[other])
+        left_out: Status = "duplicate" if gone is None else "withdrawn"
+        version, reason = same[other]["version"], "" if gone is None else gone.reason
+        return Stored(left_out, version, s.digest, s.machine, other, reason=reason)
+    replaces = ""
+    for entry in entries:
+        entry["current"] = False
+        replaces = entry["source"]
+    made: Entry = {
+        "version": entries[-1]["version"] + 1 if entries else 1, "digest": s.digest, "measured": s.measured,
+        "source": s.source, "stored_at": now, "rows": s.rows, "year": s.year, "simulated": s.simulated,
+        "current": True, "file": s.file, "earlier": [],
+    }  # fmt: skip
+    replaced = bool(entries)
+    manifest["machines"].setdefault(s.machine, {}).setdefault(s.batch_id, []).append(made)
+    if copies is not None:
+        if last is not None:
+            copies.get(last.get("measured", ""), {}).pop(s.batch_id, None)
+        copies.setdefault(s.measured, {})[s.batch_id] = made
+    return Stored("new_version" if replaced else "new", made["version"], s.digest, s.machine, s.batch_id, replaces)
+
+
+def _same_again(last: Entry, s: Staged) -> Stored:
+    status: Status = "unchanged" if last["file"] == s.file else "refreshed"
+    if status == "refreshed":
+        last["earlier"] = [f for f in (*last["earlier"], last["file"]) if f != s.file]
+        last["file"] = s.file
+    return Stored(status, last["version"], s.digest, s.machine, s.batch_id)
+
+
+def chosen(ids: Sequence[str], wanted: Sequence[str], where: str) -> list[str]:
+    """Ids that equal one of `wanted` or match it as a pattern (``2025*``), sorted.
+
+    Raises:
+        InputError: one of `wanted` fits none; `where` says what the ids are.
+    """
+    found: set[str] = set()
+    for name in wanted:
+        fits = {name} & set(ids) or {i for i in ids if fnmatchcase(i, name)}
+        if not fits:
+            raise InputError(f"{where} {name!r}; {closest(name, ids) if ids else 'there is none at all'}")
+        found |= fits
+    return sorted(found)
+
+
+def withdraw(batches: Mapping[str, list[Entry]], ids: Sequence[str], reason: str, now: str) -> None:
+    """Withdraw every version of these batches that is not withdrawn yet."""
+    for entry in (e for i in ids for e in batches[i]):
+        entry.setdefault("withdrawn", {"reason": reason, "at": now, "purged_at": ""})
+        entry["current"] = False
+
+
+def restore(batches: dict[str, list[Entry]], ids: Sequence[str]) -> None:
+    """Bring withdrawn versions back; those whose content is purged are forgotten, so that they can be stored again."""
+    for batch_id in ids:
+        kept = [e for e in batches[batch_id] if not e.get("withdrawn", {}).get("purged_at")]
+        for entry in kept:
+            entry.pop("withdrawn", None)
+            entry["current"] = entry is kept[-1]
+        if kept:
+            batches[batch_id] = kept
+        else:
+            del batches[batch_id]
+
+
+def purge(batches: Mapping[str, list[Entry]], ids: Sequence[str], now: str) -> None:
+    """Mark withdrawn versions of these batches as purged; a note with their digests and reasons stays."""
+    for entry in (e for i in ids for e in batches[i]):
+        if "withdrawn" in entry and not entry["withdrawn"]["purged_at"]:
+            entry["withdrawn"]["purged_at"] = now

@@ -1,0 +1,209 @@
+"""Batches out of use and back: withdrawn, restored, purged; copies under another name; kills in between."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.batch import Batch, Channel
+from data.errors import InputError
+from data.lake import Lake
+from data.lakefile import measured_digest
+from tests.data.test_lake import make, same
+from tests.data.test_lake_crash import die_at, run
+
+
+@pytest.fixture(autouse=True)
+def quick_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(os, "fsync", lambda fd: None)
+    yield
+
+
+@pytest.fixture
+def lake(tmp_path: Path) -> Lake:
+    lake = Lake(tmp_path / "lake")
+    lake.put_many([make("run1", seed=1), make("run2", seed=2), make("other", seed=3, machine="lathe")])
+    return lake
+
+
+def plain(lake: Lake) -> set[str]:
+    """Batches that a plain reader finds."""
+    return {str(b) for f in lake.root.glob("machine=*/*/*.parquet") for b in pd.read_parquet(f)["batch"]}
+
+
+def test_a_withdrawn_batch_is_out_of_use_until_it_is_restored(lake: Lake) -> None:
+    lake.put(make("run1", seed=9))
+    assert lake.withdraw("vmc", ["run1"], " door open ") == ["run1"]
+    assert lake.batch_ids("vmc") == ["run2"] and [b.batch_id for b in lake.load_all("vmc")] == ["run2"]
+    assert plain(lake) == {"run2", "other"}
+    with pytest.raises(
+        InputError, match=r"run1 of vmc is withdrawn \(door open\); `thermodrift lake restore vmc run1`"
+    ):
+        lake.load("vmc", "run1", 1)
+    assert [(v.withdrawn.reason, v.current) for v in lake.versions("vmc", "run1") if v.withdrawn] == [
+        ("door open", False)
+    ] * 2
+    assert lake.put(make("run1", seed=1)).status == lake.put(make("run1", seed=9)).status == "withdrawn"
+    assert lake.restore("vmc", ["run1"]) == ["run1"]
+    assert plain(lake) == {"run1", "run2", "other"}
+    same(lake.load("vmc", "run1"), make("run1", seed=9))
+    same(lake.load("vmc", "run1", 1), make("run1", seed=1))
+
+
+def test_a_corrected_recording_follows_a_withdrawn_one(lake: Lake) -> None:
+    lake.withdraw("vmc", ["run1"], "wrong sensor")
+    stored = lake.put(make("run1", seed=7))
+    assert (stored.status, stored.version) == ("new_version", 2)
+    same(lake.load("vmc", "run1"), make("run1", seed=7))
+    assert lake.put(make("run1", seed=1)).status == "withdrawn"
+    lake.restore("vmc", ["run1"])
+    assert [v.current for v in lake.versions("vmc", "run1")] == [False, True]
+    same(lake.load("vmc", "run1", 1), make("run1", seed=1))
+
+
+def test_a_forgotten_machine_comes_back_whole(lake: Lake) -> None:
+    assert lake.forget_machine("vmc", "sold") == ["run1", "run2"]
+    assert lake.machines() == ["lathe"] and lake.machines(withdrawn=True) == ["lathe", "vmc"]
+    with pytest.raises(InputError, match="every batch of machine 'vmc' is withdrawn; `thermodrift lake restore vmc"):
+        lake.load_all("vmc")
+    assert lake.restore("vmc", ["*"]) == ["run1", "run2"] and lake.machines() == ["lathe", "vmc"]
+
+
+def test_purged_content_is_gone_and_stays_out_until_it_is_forgotten(lake: Lake, tmp_path: Path) -> None:
+    junk = tmp_path / "junk.csv"
+    junk.write_text("junk")
+    lake.quarantine(junk, "vmc", "junk")
+    lake.withdraw("vmc", ["run1"], "private")
+    assert lake.purge("vmc", ["*"]) == ["run1"] and lake.quarantined("vmc")
+    assert not (lake.root / "_versions/machine=vmc/run1").exists()
+    assert lake.versions("vmc", "run1")[0].withdrawn.purged_at  # type: ignore[union-attr]
+    assert lake.put(make("run1", seed=1)).status == "withdrawn"
+    assert not (lake.root / "_versions/machine=vmc/run1").exists()
+    lake.restore("vmc", ["run1"])
+    assert lake.put(make("run1", seed=1)).status == "new"
+    lake.forget_machine("vmc", "sold")
+    lake.purge("vmc", ["*"], quarantined=True)
+    assert not [p for p in lake.root.rglob("*vmc*")] and plain(lake) == {"other"}
+
+
+def test_purging_keeps_versions_in_use(lake: Lake) -> None:
+    lake.withdraw("vmc", ["run1"], "wrong sensor")
+    lake.put(make("run1", seed=7))
+    lake.purge("vmc", ["run1"])
+    same(lake.load("vmc", "run1"), make("run1", seed=7))
+    lake.restore("vmc", ["run1"])
+    assert [(v.version, v.current) for v in lake.versions("vmc", "run1")] == [(2, True)]
+    assert lake.put(make("run1", seed=8)).version == 3
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda lake: lake.withdraw("vmc", ["run1"], " "), "the reason is empty"),
+        (lambda lake: lake.withdraw("vmc", ["run3"], "x"), "no batch in use that fits 'run3'; did you mean 'run"),
+        (lambda lake: lake.withdraw("vmd", ["run1"], "x"), "no batch of machine 'vmd'; did you mean 'vmc'"),
+        (lambda lake: lake.restore("vmc", ["run1"]), "no withdrawn batch that fits 'run1'"),
+        (lambda lake: lake.purge("vmc", ["run1"]), "no withdrawn batch that fits 'run1'"),
+    ],
+)
+def test_what_cannot_be_done_changes_nothing(lake: Lake, call: object, words: str) -> None:
+    before = (lake.root / "_manifest.json").read_bytes()
+    with pytest.raises(InputError, match=words):
+        call(lake)  # type: ignore[operator]
+    assert (lake.root / "_manifest.json").read_bytes() == before
+
+
+def copy(of: Batch, batch_id: str) -> Batch:
+    """The same recording under another name, with what names give: start, labels, the schedule's drivers."""
+    table = of.table.assign(rpm=500.0)
+    return replace(of, batch_id=batch_id, table=table, start=pd.Timestamp("2027-01-01"), labels={"speed": 500})
+
+
+def test_measured_values_identify_a_recording_under_any_name() -> None:
+    batch = make("run1", seed=1)
+    renamed = batch.table.rename(columns={"T1": "front"})
+    channels = {**batch.channels, "front": Channel("front", "temperature", "degC")}
+    for other in (copy(batch, "b"), replace(batch, table=renamed, channels=channels)):
+        assert measured_digest(other) == measured_digest(batch)
+    changed = batch.table.assign(T1=batch.table["T1"] + 1e-12)
+    assert measured_digest(replace(batch, table=changed)) != measured_digest(batch)
+
+
+def test_a_copy_is_left_out_where_batches_shall_be_distinct(lake: Lake) -> None:
+    def put(batch: Batch) -> tuple[str, str]:
+        (stored,) = lake.commit([lake.stage(batch)], distinct=True)
+        return stored.status, stored.batch_id
+
+    assert put(copy(make("run1", seed=1), "run9")) == ("duplicate", "run1")
+    assert not (lake.root / "_versions/machine=vmc/run9").exists() and lake.batch_ids("vmc") == ["run1", "run2"]
+    assert put(copy(make("run1", seed=1), "run1")) == ("new_version", "run1")  # other labels of the same batch
+    assert put(replace(make("run1", seed=1), batch_id="x", machine="lathe")) == ("new", "x")
+    lake.withdraw("vmc", ["run2"], "door open")
+    assert put(copy(make("run2", seed=2), "run9")) == ("withdrawn", "run2")
+
+
+def test_a_lake_of_an_earlier_program_knows_copies_too(lake: Lake) -> None:
+    manifest = json.loads((lake.root / "_manifest.json").read_text())
+    for entries in (e for batches in manifest["machines"].values() for e in batches.values()):
+        for entry in entries:
+            del entry["measured"]
+    (lake.root / "_manifest.json").write_text(json.dumps(manifest))
+    assert lake.batch_ids("vmc") == ["run1", "run2"]
+    (stored,) = lake.commit([lake.stage(copy(make("run2", seed=2), "run9"))], distinct=True)
+    assert (stored.status, stored.batch_id) == ("duplicate", "run2")
+
+
+def store_copies(root: Path, who: str) -> None:
+    lake = Lake(root)
+    for seed in range(20):
+        lake.commit([lake.stage(make(f"{who}{seed}", seed=seed))], distinct=True)
+        if seed % 5 == 4:
+            lake.withdraw("vmc", [lake.batch_ids("vmc")[0]], who)
+
+
+def test_two_writers_at_once_store_one_of_two_copies(tmp_path: Path) -> None:
+    calls = [f"store_copies(t.Path({str(tmp_path / 'lake')!r}), {who!r})" for who in ("x", "y")]
+    assert [w.wait(300) for w in [run(call, "test_lake_withdrawal") for call in calls]] == [0, 0]
+    lake = Lake(tmp_path / "lake")
+    contents = lake.contents("vmc")
+    assert sorted(int(i[1:]) for i in contents) == list(range(20)) and len(lake.batch_ids("vmc")) == 12
+    stored = {f for versions in contents.values() for v in versions for f in v.files}
+    assert {p.relative_to(lake.root).as_posix() for p in (lake.root / "_versions").rglob("*.parquet")} == stored
+    assert plain(lake) == set(lake.batch_ids("vmc"))
+
+
+def crash_everywhere(base: Path) -> None:
+    """Run in a process of its own: one forked child per point of death, until a child lives to the end."""
+    for n in range(1, 500):
+        root = base / f"{n:03d}"
+        Lake(root).put_many([make("run1", seed=1), make("run2", seed=2)])
+        child = os.fork()
+        if child == 0:
+            die_at(n)
+            Lake(root).withdraw("vmc", ["run1"], "x")
+            Lake(root).purge("vmc", ["run1"])
+            os._exit(0)
+        if os.waitpid(child, 0)[1] == 0:
+            return
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> None:
+    """Versions in use always load; the next write completes what was begun."""
+    assert run(f"crash_everywhere(t.Path({str(tmp_path)!r}))", "test_lake_withdrawal").wait(300) == 0
+    states = []
+    for root in sorted(tmp_path.iterdir()):
+        lake = Lake(root)
+        gone = lake.contents("vmc")["run1"][-1].withdrawn
+        states.append("in use" if gone is None else "purged" if gone.purged_at else "withdrawn")
+        for b in lake.load_all("vmc"):
+            np.testing.assert_array_equal(b.values("T1"), make(seed=int(b.batch_id[-1])).values("T1"))
+        lake.put(make("run3", seed=3))
+        assert plain(lake) == {"run2", "run3"} | ({"run1"} if states[-1] == "in use" else set())
+        assert (root / "_versions/machine=vmc/run1").exists() == (states[-1] != "purged")
+    assert list(dict.fromkeys(states)) == ["in use", "withdrawn", "purged"] and len(states) > 30

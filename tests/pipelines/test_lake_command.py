@@ -1,0 +1,140 @@
+"""`thermodrift lake`, and what training makes of a lake with withdrawn batches, copies or other channels."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from data.errors import InputError
+from data.lake import Lake
+from data.machine import load_machine
+from pipelines.caller import DirectCaller
+from pipelines.recordings import gather_batches, load_batches
+from pipelines.training import Plan, TrainRequest, promote_tracked, train
+from tests.toys.command import Call, in_process
+from tests.toys.small_year import write_machine, write_year
+
+NAME = "small-lake"
+PLAN = Plan(selectors=("none",), families=("zero", "ridge"), protocols=("leave-batch-out",))
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], year: Path, store_home: Path) -> Call:
+    """`thermodrift ARGS` in this process, on the lake of the trained year as it was after the training."""
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    monkeypatch.setenv("COLUMNS", "200")
+    shutil.rmtree(store_home / "lake")
+    shutil.copytree(year / "kept", store_home / "lake")
+    return in_process(monkeypatch, capsys)
+
+
+@pytest.fixture(scope="module")
+def year(store: Any, store_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a machine file and six recordings that were trained on, and a copy of the lake."""
+    folder = tmp_path_factory.mktemp("lake-year")
+    machine = write_machine(folder / "small.yml", NAME)
+    write_year(folder / "in")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THERMODRIFT_HOME", str(store_home))
+        outcome = train(TrainRequest(machine, (folder / "in",), ("z",), PLAN), store, DirectCaller())
+        (folder / "training").write_text(outcome.training_ids["z"])
+        shutil.copytree(store_home / "lake", folder / "kept")
+        yield folder
+
+
+def test_list_and_show(year: Path, call: Call) -> None:
+    (row,) = [r for r in json.loads(call("lake", "list", "--json").out) if r["machine"] == NAME]
+    assert (row["batches"], row["withdrawn"], row["versions"], row["quarantined"]) == (6, 0, 6, 0)
+    done = call("lake", "list", NAME)
+    assert done.code == 0 and done.out.count("in use") == 6 and "20250114.csv" in done.out
+    shown = json.loads(call("lake", "show", NAME, "20250114", "--json").out)
+    assert shown["start"].startswith("2025-01-14") and [v["state"] for v in shown["versions"]] == ["in use"]
+    (used,) = shown["trainings"]
+    assert used["training_id"] == (year / "training").read_text() and used["target"] == "z"
+    assert used["digest"] == shown["versions"][0]["digest"] and used["models"] == [f"{NAME}-z/1 champion"]
+    assert f"models {NAME}-z/1 champion" in call("lake", "show", NAME, "20250114").out
+
+
+def test_withdraw_and_restore(year: Path, call: Call, store: Any) -> None:
+    done = call("lake", "withdraw", NAME, "202501*", "--reason", "door open")
+    assert done.out.splitlines() == [
+        f"{NAME} 20250114: withdrawn",
+        f"models that were trained with these batches: {NAME}-z/1 champion; train again to replace them",
+    ]
+    done = call("ingest", year / "in", "--machine", year / "small.yml")
+    assert "batches withdrawn: 1, batches unchanged: 5" in done.out
+    assert f"20250114.csv (20250114): withdrawn: door open; restore with `thermodrift lake restore {NAME}" in done.out
+    request = TrainRequest(year / "small.yml", (year / "in",), ("z",), PLAN, promote=False)
+    assert len(train(request, store, DirectCaller()).results["z"].batches) == 5
+    with pytest.raises(InputError, match=r"20250114 of small-lake is withdrawn \(door open\)"):
+        promote_tracked((year / "training").read_text(), year / "small.yml", "none|ridge|3", False, store)
+    assert "door open" in call("lake", "list", NAME).out
+    done = call("lake", "restore", NAME, "*", "--json")
+    assert json.loads(done.out) == {"machine": NAME, "restored": ["20250114"], "ingest_again": []}
+
+
+def test_forget_and_purge(call: Call, year: Path, store_home: Path) -> None:
+    assert call("lake", "forget-machine", NAME, "--reason", "sold").code == 0
+    assert f"{NAME}: " not in call("status").out.partition("Registered models")[0]
+    done = call("lake", "purge", NAME, "20250114")
+    assert done.code == 2 and f"withdrawn batches of {NAME}: 1, 0.0 MB); give --yes" in done.err
+    done = call("lake", "purge", NAME, "20250114", "--yes", "--json")
+    assert json.loads(done.out)["purged"] == ["20250114"]
+    assert not list((store_home / "lake" / "_versions" / f"machine={NAME}").glob("20250114/*"))
+    assert call("lake", "show", NAME, "20250114").out.startswith(f"{NAME} 20250114: purged")
+    done = call("lake", "restore", NAME, "*")
+    assert done.out.splitlines()[:2] == [
+        f"{NAME} 20250114: its content was purged; ingest its recording again",
+        f"{NAME} 20250214: restored",
+    ]
+    assert "batches new: 1, batches unchanged: 5" in call("ingest", year / "in", "--machine", year / "small.yml").out
+    done = call("lake", "purge", NAME, "--yes")
+    assert done.code == 2 and "no withdrawn batch of small-lake has content" in done.err
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (("withdraw", NAME, "20250114"), "Missing option '--reason'"),
+        (("withdraw", NAME, "2025014", "--reason", "x"), "no batch in use that fits '2025014'; did you mean '20250"),
+        (("show", "small-lak", "20250114"), "no batch of machine 'small-lak'; did you mean 'small-lake'"),
+        (("show", NAME, "nothing"), f"{NAME} has no batch 'nothing'"),
+        (("restore", NAME, "*"), "no withdrawn batch that fits '*'"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(args: tuple[str, ...], words: str, call: Call) -> None:
+    done = call("lake", *args)
+    assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1) and words in done.err
+
+
+def test_copies_given_to_a_command_are_the_stored_batches(year: Path, call: Call, tmp_path: Path) -> None:
+    copy = shutil.copy(year / "in" / "20250214.csv", tmp_path / "20260101.csv")
+    gathered = gather_batches(load_machine(year / "small.yml"), [Path(copy)], (), lambda text: None)
+    assert [b.batch_id for b in gathered.batches] == ["20250214"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("  bed:", "  base:", "not stored: base; no longer in the machine file: bed;"),
+        ("  bed: {role: temperature", "  bed: {role: ambient", "changed: bed (temperature in degC → ambient in degC);"),
+        ("  x: ", "  tip: {role: temperature, unit: degC}\n  x: ", "channels; not stored: tip; ingest their"),
+    ],
+)
+def test_stored_batches_with_other_channels_are_one_line(
+    old: str, new: str, words: str, year: Path, call: Call, store_home: Path, tmp_path: Path
+) -> None:
+    changed = tmp_path / "changed.yml"
+    changed.write_text((year / "small.yml").read_text().replace(old, new))
+    lake = Lake(store_home / "lake")
+    with pytest.raises(InputError) as caught:
+        load_batches(lake, load_machine(changed))
+    told = str(caught.value)
+    assert words in told and "6 of 6 batches in the lake (20250114, 20250214, 20250314, …)" in told
+    assert call("ingest", lake.root / f"machine={NAME}", "--machine", changed).code == 0
+    assert len(load_batches(lake, load_machine(changed))) == 6
