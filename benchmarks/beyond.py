@@ -20,7 +20,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from data.batch import Batch
-from data.checks import check_batch, check_machine
+from data.checks import check_machine, checked
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
 from models.crossing import Plan
@@ -40,7 +40,7 @@ def recorded(name: str, folder: Path) -> tuple[Machine, list[Batch]]:
     machine = load_machine(ROOT / "machines" / f"{name}.yml")
     files, _ = recording_files(folder, machine)
     batches = [b for f in files for b in read_batches(f, machine)]
-    return machine, check_machine([b.with_findings(check_batch(b, machine)) for b in batches], machine)
+    return machine, check_machine([checked(b, machine) for b in batches], machine)
 
 
 def table(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine | None) -> None:

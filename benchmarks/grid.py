@@ -8,8 +8,8 @@ leave-batch-out where the family has one; error channel z):
 - joblib: scikit-learn's `cross_validate` over `LeaveOneGroupOut`, the selector in the pipeline, a process a core;
 - grid: the crossing of all quick selectors × numbers of points, one thread, by its number of cells.
 The plain ways are timed on every fifth fold of the cell `correlation`, 4 points, and counted five times; families on
-few rows (`ROWS`) give them as few. S is of those folds, the same where the fits are the same. Then the quick and the
-complete crossing. Nothing is asserted about time.
+few rows (`ROWS`) give them as few. S is of those folds, the same where the fits are the same. Then what each protocol
+costs, the quick and the complete crossing. Nothing is asserted about time.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from data.recording import read_batches
 from models.crossing import Crossing, Plan, cross_family, prepare
 from models.grid import run_grid
 from models.metrics import residual_std_um
+from models.protocols import PROTOCOLS
 from plants.sample.sample_year import write_sample_year
 
 P = ParamSpec("P")
@@ -148,6 +149,19 @@ def whole(batches: list[Batch], plan: Plan, words: str) -> None:
           f"waited longest for {', '.join(f'{f} {took[f]:.0f} s' for f in slowest)}", flush=True)  # fmt: skip
 
 
+def protocols(batches: list[Batch], repeats: int) -> None:
+    """What each protocol costs: the quick crossing of z in one process, protocols in turn."""
+    took: dict[str, list[float]] = {p: [] for p in PROTOCOLS}
+    for _ in range(repeats):
+        for p, seconds in took.items():
+            plan = Plan(effort="quick", protocols=(p,))
+            seconds.append(timed(run_grid, batches, ["z"], plan, sample_machine())[0])
+    for p, seconds in took.items():
+        folds = len(PROTOCOLS[p](batches))
+        print(f"{p:24}{statistics.median(seconds):9.2f} s, {folds} folds", flush=True)
+    print()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
@@ -161,7 +175,8 @@ def main() -> None:
     print(f"simulated sample year: {len(batches)} batches, {sum(b.n_rows for b in batches)} rows\n")
     compare(batches, args.families.split(","), args.repeats)
     if not args.no_whole:
-        whole(batches, Plan(effort="quick"), "quick crossing, four protocols, x, y and z")
+        protocols(batches, args.repeats)
+        whole(batches, Plan(effort="quick"), f"quick crossing, {len(PROTOCOLS)} protocols, x, y and z")
         whole(
             batches,
             Plan(protocols=("leave-batch-out",), effort="complete"),

@@ -29,7 +29,7 @@ class NearestBatch(Family):
         y = np.stack([design.y_um[design.rows(k)][:n] for k in train])
         return self._learned(design, {"x_K": x, "y_um": np.nan_to_num(y)})
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         out = []
         for k in batches:
             x = design.x[design.rows(k)]

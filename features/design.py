@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from data.batch import Batch
 from data.errors import InputError, closest
 from data.machine import Machine
 from features.rises import feature, feature_unit, zeroed_error_um
+from features.start import Start
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class Moments:
 
     count (K,), sum_x (K, p), sum_y (K,), xx (K, p, p), xy (K, p), yy (K,). Inputs and target are
     first shifted by `shift_x`, `shift_y` (fixed, only for conditioning: results do not depend on it).
+    `about_start`: of values relative to the batch's start, for fits without an intercept; the shifts are 0.
     """
 
     count: Array
@@ -32,11 +34,12 @@ class Moments:
     yy: Array
     shift_x: Array
     shift_y: float
+    about_start: bool = False
 
     def subset(self, columns: Sequence[int]) -> Moments:
         c = np.asarray(columns, int)
         return Moments(self.count, self.sum_x[:, c], self.sum_y, self.xx[:, c[:, None], c[None, :]],
-                       self.xy[:, c], self.yy, self.shift_x[c], self.shift_y)  # fmt: skip
+                       self.xy[:, c], self.yy, self.shift_x[c], self.shift_y, self.about_start)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Design:
     `drivers` (n, d) are the first batch's driver channels as recorded (NaN where a batch lacks one), for the
     families that follow the load; empty where the design was made by hand. Units are in the same order as names.
     `batches` and `machine` are what it was built from, for families that need more than rows (the twin).
+    `about_start`: x is relative to each batch's start, see `started`.
     """
 
     inputs: tuple[str, ...]
@@ -67,6 +71,7 @@ class Design:
     input_units: tuple[str, ...] = ()
     batches: tuple[Batch, ...] = field(default=(), repr=False)
     machine: Machine | None = field(default=None, repr=False)
+    about_start: bool = False
 
     @classmethod
     def build(
@@ -124,8 +129,50 @@ class Design:
     @cached_property
     def along(self) -> str:
         """The position channel along which the target was measured, "" for none."""
+        return self._along(self.target)
+
+    def _along(self, target: str) -> str:
         known = self.batches[0].channels if self.batches else {}
-        return known[self.target].position if self.target in known else ""
+        return known[target].position if target in known else ""
+
+    def since_start(self, values: Array, k: int, target: str) -> Array:
+        """A series (n_k,) of batch k less its values at the start, as the error channel `target` is zeroed.
+
+        The start is the first finite value, and along an axis the first sweep (`features.start`).
+        """
+        known = np.isfinite(values)
+        along = self._along(target)
+        if not along:
+            return values - values[np.argmax(known)] if len(values) else values
+        rows = self.rows(k)
+        start = Start.of(known, self.time_s[rows], self.position_mm(along)[rows])
+        return values if start is None else start.since(values)
+
+    @cached_property
+    def _starts(self) -> list[Start | None]:
+        """References of each batch's rows; only rows with all inputs can be the start."""
+        complete: NDArray[np.bool_] = np.asarray(self._finite.all(axis=1))
+        position_mm = self.position_mm(self.along) if self.along else None
+        rows = map(self.rows, range(self.n_batches))
+        return [Start.of(complete[r], self.time_s[r], None if position_mm is None else position_mm[r]) for r in rows]
+
+    @cached_property
+    def started(self) -> Design:
+        """The same rows with the inputs relative to each batch's start, for fits whose prediction is 0 there.
+
+        `moments` and `quarters` of it are about 0 instead of about a mean. A batch without a row that has all inputs
+        is NaN throughout.
+        """
+        parent = self._parent
+        if self.about_start:
+            return self
+        if parent is not None and _same(parent._starts, self._starts):
+            return parent.started.subset(self.inputs)
+        x = np.full(self.x.shape, np.nan)
+        for k, start in enumerate(self._starts):
+            if start is not None:
+                x[self.rows(k)] = start.since(self.x[self.rows(k)])
+        return replace(self, x=x, about_start=True, _columns=None, _parent=None)
 
     def position_mm(self, channel: str) -> Array:
         """A position channel of the batches on every row (n,), NaN where nothing was read."""
@@ -192,7 +239,7 @@ class Design:
         return Design(tuple(inputs), self.target, self.batch_ids, x, self.y_um, self.time_s, self.offsets,
                       self.step_s, columns, self, self.drivers, self.driver_names, self.driver_units,
                       tuple(self.input_units[c] for c in columns if c < len(self.input_units)),
-                      self.batches, self.machine)  # fmt: skip
+                      self.batches, self.machine, self.about_start)  # fmt: skip
 
     @property
     def root(self) -> Design:
@@ -225,8 +272,9 @@ class Design:
         """Moments per block; `block` numbers the usable rows, rising."""
         ok = self.usable
         usable_x, usable_y = self.x[ok], self.y_um[ok]
-        shift_x = usable_x.mean(axis=0) if len(block) else np.zeros(len(self.inputs))
-        shift_y = float(usable_y.mean()) if len(block) else 0.0
+        about_mean = len(block) > 0 and not self.about_start
+        shift_x = usable_x.mean(axis=0) if about_mean else np.zeros(len(self.inputs))
+        shift_y = float(usable_y.mean()) if about_mean else 0.0
         usable_x, usable_y = usable_x - shift_x, usable_y - shift_y
         k, p = n_blocks, len(self.inputs)
         count, sum_x, sum_y = np.zeros(k), np.zeros((k, p)), np.zeros(k)
@@ -236,7 +284,17 @@ class Design:
             x, y = usable_x[border[i] : border[i + 1]], usable_y[border[i] : border[i + 1]]
             count[i], sum_x[i], sum_y[i] = len(y), x.sum(axis=0), y.sum()
             xx[i], xy[i], yy[i] = x.T @ x, x.T @ y, y @ y
-        return Moments(count, sum_x, sum_y, xx, xy, yy, shift_x, shift_y)
+        return Moments(count, sum_x, sum_y, xx, xy, yy, shift_x, shift_y, self.about_start)
+
+
+def _same(some: Sequence[Start | None], others: Sequence[Start | None]) -> bool:
+    """Whether all rows refer to the same rows."""
+    return all(
+        a is b
+        or (a is not None and b is not None
+            and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("left", "right", "share")))
+        for a, b in zip(some, others, strict=True)
+    )  # fmt: skip
 
 
 def even_rows(design: Design, batch: int, most: int) -> NDArray[np.int64]:

@@ -24,11 +24,11 @@ def train(
 ) -> tuple[Nets, NDArray[np.int64]]:
     """Every net's parameters after at most `iterations` damped Gauss–Newton steps, and the steps each took.
 
-    Net s minimises `mean_n known·(y − ŷ)² + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known (S, n);
-    known is 0 on padding, else 1. Each net has its own damping (÷ 10 after a step that brings a quarter of the fall
-    that the quadratic model promises, else × 10; a step that raises the loss is taken back) and stops by itself, so
-    a net's result does not depend on its neighbours. Float64 in one thread, whatever torch is set to: the matrices are
-    small, and callers train in parallel.
+    Net s minimises `Σ_n (known·(y − ŷ))² / Σ_n known + decay · |w, b, v|²` over its rows: x_t (S, p, n), y and known
+    (S, n); known is 0 on padding, else 1, or the square root of a row's weight. Each net has its own damping (÷ 10
+    after a step that brings a quarter of the fall that the quadratic model promises, else × 10; a step that raises the
+    loss is taken back) and stops by itself, so a net's result does not depend on its neighbours. Float64 in one
+    thread, whatever torch is set to: the matrices are small, and callers train in parallel.
 
     Source: M. Hagan and M. Menhaj, Training feedforward networks with the Marquardt algorithm (1994).
     """
@@ -70,7 +70,7 @@ def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -
     penalty = torch.full_like(theta[0], decay)
     penalty[-1] = 0.0
     damping = torch.full_like(count, _DAMPING_START)
-    padded = not bool(known.all())
+    weighted = not bool((known == 1.0).all())
     output, hidden = outputs(theta, x_t, n_hidden, transfer)
     error = (y - output).mul_(known)
     loss = error.square().sum(dim=1) / count + theta.square() @ penalty
@@ -79,7 +79,7 @@ def _trained(tensors: list[Tensor], nets: Nets, decay: float, iterations: int) -
     for step in range(1, iterations + 1):
         both = room[: len(theta)]
         slopes = jacobian(theta, x_t, hidden, both[:, :-1], transfer)
-        if padded:
+        if weighted:
             slopes *= known[:, None]
         both[:, -1] = error  # below the slopes, so that one product gives curvature and gradient
         product = torch.bmm(both, both.mT).div_(count[:, None, None])

@@ -43,7 +43,7 @@ class ArrayRegressor(RegressorMixin, BaseEstimator):
                     f"ArrayRegressor: family {self.family!r} needs whole batches or no inputs; expected a family that "
                     "predicts each row from its inputs alone"
                 )
-            model = member(**(self.options or {}))
+            model = member(**(self.options or {})).as_published()  # rows of an array have no start
             design = self._design(x[order], np.asarray(target, float)[order], [str(i) for i in ids], offsets)
             self.model_: Family = model.fit_design(design, range(len(ids)))
         except InputError as error:

@@ -53,7 +53,10 @@ def since_first_reading(x: Array, position_mm: Array) -> Array:
 
 
 def expanded(design: Design) -> Design:
-    """The design with 2 p inputs, x_i and P x_i, rises counted from each batch's first reading; made once a root."""
+    """The design with 2 p inputs, x_i and P x_i, rises counted from each batch's first reading; made once a root.
+
+    Its `started` counts the terms from the first sweep at the same position, as the error is zeroed.
+    """
     root = design.root
     whole = root.__dict__.get("_axis_terms")
     if not isinstance(whole, Design):
@@ -62,7 +65,8 @@ def expanded(design: Design) -> Design:
         rise = np.concatenate([np.empty((0, len(root.inputs))), *parts])
         names = (*root.inputs, *map(_slope_name, root.inputs))
         x = np.hstack([rise, position_mm[:, None] * rise])
-        whole = Design(names, root.target, root.batch_ids, x, root.y_um, root.time_s, root.offsets, root.step_s)
+        whole = Design(names, root.target, root.batch_ids, x, root.y_um, root.time_s, root.offsets, root.step_s,
+                       batches=root.batches)  # fmt: skip
         root.__dict__["_axis_terms"] = whole
     return whole.subset((*design.inputs, *map(_slope_name, design.inputs)))
 
@@ -267,7 +271,8 @@ class AxisCoupled(Family):
     Published (see source): ``K0 = β0 + β1 (T_amb − 20) + β2 dT_spindle``, ``tan β = c0 + c1 (T_amb − 20) + c2 dT_nut``.
     The recorded error is zeroed at every position, E(P, t) − E(P, 0), so what does not change since the first sweep is
     gone from it: β0, c0 and the reference temperature cannot be seen and are not fitted, and every temperature enters
-    as its rise since the batch's first reading. A control adds the line to what was true when its zero was set.
+    as its rise since the batch's first reading; what the line is during the first sweep is subtracted from it. A
+    control adds the line to what was true when its zero was set.
 
     Which inputs drive the offset and which the slope is chosen inside the training batches by the mean left-out S: the
     best pair of an offset and a slope first, then the best term more up to `max_terms`; of the best of these models
@@ -311,7 +316,7 @@ class AxisCoupled(Family):
             )
         if not design.inputs:
             raise InputError(f"axis_coupled: no inputs given for {design.target}; name at least one channel")
-        terms = expanded(design)
+        terms = self.started(expanded(design))
         batches = RawSums.of(terms.moments)
         masks = fold_masks(self.key, design, folds, batches.count, _LEAST_ROWS)
         ends_mm = self._ends_mm(design, masks)
@@ -360,7 +365,7 @@ class AxisCoupled(Family):
         offset, slope = ([place[i] for i in self.fitted[part]] for part in ("offset_inputs", "slope_inputs"))
         return rise[:, offset] @ self.fitted["offset_um_per_K"], rise[:, slope] @ self.fitted["slope_um_per_mm_K"]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row without a position, or where a chosen input is missing."""
         out = []
         for k in batches:

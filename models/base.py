@@ -1,7 +1,8 @@
 """Base class of the model families.
 
 To add one: a class below `Family` in a file of its own and a line in `models/__init__.py`. It needs
-`fit_design` and `predict_design`; `fit_folds` only where many folds can be fitted at once.
+`fit_design` and `respond`; `fit_folds` and `respond_folds` only where many folds share work. Predictions are 0 at a
+batch's start whatever `respond` gives there; `started` is the design that such a model is to be fitted on.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Self
+from dataclasses import replace
+from typing import Any, ClassVar, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,10 @@ class Family(ABC):
     """A model of one error channel. Options are constructor arguments; what is learned is in `fitted`.
 
     `fitted` is plain data (numbers, strings, lists, arrays), so a model is stored as JSON and arrays.
+
+    An error is recorded relative to the batch's start, so a prediction is exactly 0 there: at the first row that has
+    one, and along an axis throughout the first sweep (`Design.since_start`). `as_published` gives a copy with the
+    level free, as most methods are published.
     """
 
     key: ClassVar[str]
@@ -47,6 +53,13 @@ class Family(ABC):
         self.inputs: tuple[str, ...] = ()
         self.target: str = ""
         self.fitted: Plain = {}
+        self.zero_start = True
+
+    def as_published(self) -> Self:
+        """A copy whose level is fitted too (an intercept): its prediction at a batch's start need not be 0."""
+        other = copy.copy(self)
+        other.zero_start = False
+        return other
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """A new, fitted copy from the usable rows of the batches `train` of the design.
@@ -59,11 +72,16 @@ class Family(ABC):
         return self.fit_folds(design, [train])[0]
 
     @abstractmethod
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Free-running error_um (n_k,) of each batch, from the design's inputs (never its target).
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """The model's output in µm (n_k,) for each batch, from the design's inputs (never its target), at any level.
 
         NaN where an input is missing, unless the family can bridge it.
         """
+
+    @final
+    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        """Free-running error_um (n_k,) of each batch, 0 at its start; NaN as `respond` gives."""
+        return self._from_start(design, batches, self.respond(design, batches))
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
         """One fitted copy per fold (a fold is the training batches' indices), equal to `fit_design` fold by fold."""
@@ -82,11 +100,36 @@ class Family(ABC):
             except InputError as error:
                 yield error
 
+    def respond_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        """For each of F fitted copies the outputs (n_k,) of its batches `wanted[f]`, as `respond` gives."""
+        return [f.respond(design, batches) for f, batches in zip(fitted, wanted, strict=True)]
+
+    @final
     def predict_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         """For each of F fitted copies the predictions (n_k,) of its batches `wanted[f]`, as `predict_design` gives."""
-        return [f.predict_design(design, batches) for f, batches in zip(fitted, wanted, strict=True)]
+        outputs = self.respond_folds(design, fitted, wanted)
+        parts = zip(fitted, wanted, outputs, strict=True)
+        return [f._from_start(design, batches, own) for f, batches, own in parts]
+
+    def _from_start(self, design: Design, batches: Sequence[int], outputs: Sequence[Array]) -> list[Array]:
+        if not self.zero_start:
+            return list(outputs)
+        return [design.since_start(values, k, self.target) for k, values in zip(batches, outputs, strict=True)]
+
+    def started(self, design: Design) -> Design:
+        """The design with inputs relative to each batch's start, as the target is; itself for a free level.
+
+        Of a fitted family the target is its own, since the design of a prediction has none.
+        """
+        if not self.zero_start:
+            return design
+        if not design.target and self.target:
+            design = replace(design, target=self.target, _columns=None, _parent=None)
+        return design.started
 
     def fitting_S_um(self, design: Design, fitted: Sequence[Self], trained: Sequence[Sequence[int]]) -> Array | None:
         """Mean S (F,) of each copy on its batches `trained[f]` where it can be had without rows; None: predict them."""
@@ -119,13 +162,13 @@ class Family(ABC):
 
     def options(self) -> Plain:
         """The constructor's arguments of this object."""
-        hidden = {"inputs", "target", "fitted"}
+        hidden = {"inputs", "target", "fitted", "zero_start"}
         return {k: v for k, v in vars(self).items() if k not in hidden and not k.startswith("_")}
 
     def as_plain(self) -> Plain:
         """Everything needed to predict elsewhere; `family_from_plain` reads it back."""
         return {"family": self.key, "options": self.options(), "inputs": list(self.inputs), "target": self.target,
-                "fitted": dict(self.fitted)}  # fmt: skip
+                "zero_start": self.zero_start, "fitted": dict(self.fitted)}  # fmt: skip
 
     def _learned(self, design: Design, fitted: Plain) -> Self:
         """A copy of this object with inputs, target and learned numbers set."""
@@ -135,7 +178,7 @@ class Family(ABC):
 
 
 def family_from_plain(plain: Plain) -> Family:
-    """The inverse of `Family.as_plain`.
+    """The inverse of `Family.as_plain`; one without `zero_start` was stored with a free level.
 
     Raises:
         InputError: unknown family key.
@@ -144,7 +187,7 @@ def family_from_plain(plain: Plain) -> Family:
 
     family: Family = FAMILIES[plain["family"]](**plain["options"])
     family.inputs, family.target = tuple(plain["inputs"]), plain["target"]
-    family.fitted = dict(plain["fitted"])
+    family.fitted, family.zero_start = dict(plain["fitted"]), bool(plain.get("zero_start", False))
     return family
 
 

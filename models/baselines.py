@@ -79,7 +79,7 @@ class MeanCurve(Family):
             },
         )
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         time_s, error_um = self.fitted["time_s"], self.fitted["error_um"]
         if "along" not in self.fitted:
             return [np.interp(design.time_s[design.rows(k)], time_s, error_um) for k in batches]
@@ -130,5 +130,5 @@ class Zero(Family):
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         return self._learned(design, {})
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         return [np.zeros(len(design.time_s[design.rows(k)])) for k in batches]

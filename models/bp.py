@@ -29,7 +29,9 @@ class BP(Family):
     linear map x · Σ_j v_j w_j, found iteratively: least squares with the penalty 2 · decay · |β|, not squared, which
     is the least that |w|² + |v|² can be for a slope β (Cauchy and Schwarz).
 
-    Inputs and target are standardised by the training rows of the fold. Batches are decimated evenly to at most
+    Inputs are relative to the batch's start, where they are 0; that start, with an error of 0, is one row more that
+    weighs as much as all others (`as_published`: the inputs as they are, without that row). Inputs and target are
+    standardised by the training rows of the fold. Batches are decimated evenly to at most
     `max_rows` usable rows each. Every net takes at most `iterations` Levenberg–Marquardt steps with weight `decay`
     (on standardised data), the same for every fold: train-on-one has no batch for early stopping.
     With tanh the decay bounds the extrapolation: |ŷ − mean| ≤ std_y (|c| + Σ|v_j|).
@@ -76,8 +78,9 @@ class BP(Family):
             out |= dict(zip(stack, self._fit_stack(design, [rows[f] for f in stack]), strict=True))
         return [out[f] for f in range(len(folds))]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        return [self._predict(design.x[design.rows(k)]) for k in batches]
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        x = self.started(design).x
+        return [self._predict(x[design.rows(k)]) for k in batches]
 
     def n_parameters(self) -> int:
         return int(np.size(self.fitted["nets"]))
@@ -104,15 +107,19 @@ class BP(Family):
     def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
         from features.levenberg_marquardt import train
 
-        n, p, starts = max(len(r) for r in rows), len(design.inputs), self.starts
+        n, p, starts = max(len(r) for r in rows) + self.zero_start, len(design.inputs), self.starts
+        all_x = self.started(design).x
         x_t, y, known = np.zeros((len(rows), p, n)), np.zeros((len(rows), n)), np.zeros((len(rows), n))
         scales = []
         for s, r in enumerate(rows):
-            x, y_um = design.x[r], design.y_um[r]
+            x, y_um = all_x[r], design.y_um[r]
             x_mean, x_spread = x.mean(axis=0), np.maximum(x.std(axis=0), _LEAST_SPREAD)
             y_mean, y_spread = float(y_um.mean()), float(y_um.std()) or 1.0
             x_t[s, :, : len(r)] = ((x - x_mean) / x_spread).T
             y[s, : len(r)], known[s, : len(r)] = (y_um - y_mean) / y_spread, 1.0
+            if self.zero_start:
+                x_t[s, :, len(r)], y[s, len(r)] = -x_mean / x_spread, -y_mean / y_spread
+                known[s, len(r)] = np.sqrt(len(r))
             scales.append({"x_mean": x_mean, "x_spread": x_spread, "y_mean": y_mean, "y_spread": y_spread})
         first = Nets.drawn(starts, p, self.hidden, self.seed, self.transfer)
         nets = replace(first, parameters=np.tile(first.parameters, (len(rows), 1)))

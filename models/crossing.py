@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from data.batch import Batch, Channel
-from data.checks import usable_channels
+from data.checks import usable_channels, why_missing
 from data.errors import InputError
 from data.machine import Machine
 from data.registry import EFFORTS, Effort
@@ -25,7 +25,7 @@ from features.stability import tsp_stability
 from models import FAMILIES
 from models.base import Family
 from models.judging import FamilyScores, score_table
-from models.protocols import PROTOCOLS, Fold, folds_of
+from models.protocols import PROTOCOLS, Fold, folds_of, forward_obstacle
 from models.result import CELL_KEYS
 
 Inputs = tuple[str, ...]
@@ -170,11 +170,15 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
     known = [b.channels[target] for b in batches[:1] if target in b.channels]
     plan = plan.suited(machine, () if plan.families else known)
     kept = with_target(batches, target)
-    lost = [(target, f"batch {b.batch_id} is left out: no usable {target}") for b in batches if b not in kept]
+    lost = [
+        (target, f"batch {b.batch_id} is left out: no usable {target}{why_missing(b, target)}")
+        for b in batches
+        if b not in kept
+    ]
     if len(kept) < 2:
         raise InputError(
             f"{batches[0].machine if batches else 'training'}: got {len(kept)} batch(es) with a usable {target}, "
-            "need at least 2; ingest more recordings or overrule a check in the machine file"
+            f"need at least 2; ingest more recordings or overrule a check in the machine file{_first_lost(lost)}"
         )
     if not any(suits(f, kept[0].channels[target]) for f in plan.families):
         raise _not_along_an_axis(plan.families[0], target)
@@ -183,6 +187,8 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
         raise InputError(f"{kept[0].machine}: no temperature channel is usable in every batch; {excluded[0][1]}")
     design = Design.build(kept, inputs, target, machine)
     folds = {p: folds_of(p, kept) for p in plan.protocols}
+    if "forward" in plan.protocols and (obstacle := forward_obstacle(kept)):
+        lost.append(("forward", obstacle))
     chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = {}
     n_all = range(1, len(inputs) + 1)
 
@@ -201,6 +207,10 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
                 group.remove(fold)
                 lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
     return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost))
+
+
+def _first_lost(lost: Sequence[tuple[str, str]]) -> str:
+    return f"; {lost[0][1]}" if lost else ""
 
 
 def cross_family(crossing: Crossing, key: str) -> FamilyResult:

@@ -33,7 +33,7 @@ _LEAST_ROWS = 4
 
 
 class DistributedLag(Family):
-    """`y_t = c + Σ_l Σ_i β_il x_i(t − l)` over inputs i and lags l, free-running: inputs only, never an earlier error.
+    """`y_t = Σ_l Σ_i β_il x_i(t − l)` over inputs i and lags l, free-running: inputs only, never an earlier error.
 
     `lags` gives the form of the β of an input:
 
@@ -89,7 +89,7 @@ class DistributedLag(Family):
         if not folds:
             return []
         responses, shapes = self._tried(design)
-        columns = _columns(design, responses)
+        columns = self.started(_columns(design, responses))
         moments = columns.moments
         count = moments.count if design.inputs else np.zeros(design.n_batches)
         masks = fold_masks(self.key, design, folds, count, _LEAST_ROWS)
@@ -115,11 +115,11 @@ class DistributedLag(Family):
             out.append(self._learned(design, fitted))
         return out
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch; inputs that are missing for a while are bridged by the last value."""
-        return self.predict_folds(design, [self], [batches])[0]
+        return self.respond_folds(design, [self], [batches])[0]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         """Copies share the responses of the inputs."""
@@ -133,8 +133,8 @@ class DistributedLag(Family):
         return by_batch(design, predicted, wanted)
 
     def n_parameters(self) -> int:
-        """Coefficients, intercept, and the order or decay."""
-        return int(self.fitted["weights_um_per_K"].size) + 2
+        """Coefficients, the order or decay, and the intercept where the level is free."""
+        return int(self.fitted["weights_um_per_K"].size) + 1 + (not self.zero_start)
 
     def _tried(self, design: Design) -> tuple[list[Response], list[Shape]]:
         if self.lags == "koyck":
@@ -152,4 +152,4 @@ def _columns(design: Design, responses: Sequence[Response]) -> Design:
     names = tuple(f"{name}@{delay_s:g}s+{tau_s:g}s" for delay_s, tau_s in responses for name in design.inputs)
     y_um = np.where(design.usable, design.y_um, np.nan)
     return Design(names, design.target, design.batch_ids, x.reshape(len(x), -1), y_um, design.time_s, design.offsets,
-                  design.step_s)  # fmt: skip
+                  design.step_s, batches=design.batches)  # fmt: skip

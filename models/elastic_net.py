@@ -15,7 +15,7 @@ from models.solvers.penalised import sparse_coefficients
 
 
 class ElasticNet(Tuned):
-    """Least squares that shrinks coefficients and sets some of them to zero, intercept free.
+    """Least squares that shrinks coefficients and sets some of them to zero.
 
     Minimises `|y − X β|²/(2 n) + α (ρ |β|₁ + (1 − ρ) |β|²/2)` over the centred training rows. ρ is one of `mixings`
     (1 is the lasso). α is k times the α above which every coefficient is zero, k from a logarithmic grid of

@@ -35,7 +35,8 @@ class Setting:
     """Variances over the noise's: of the common line, of the curve about it (with its length), of a batch's own line.
 
     The length is in the inputs' scale. A batch's own zero has the noise's variance: an error is recorded against the
-    batch's first sample, which has noise too. The common constant has the same.
+    batch's first sample, which has noise too. `free`: with a common constant of the same variance and the whole curve,
+    else the curve less its value at 0.
     """
 
     line: float = 1e5
@@ -43,29 +44,39 @@ class Setting:
     length: float = 1.0
     own_line: float = 0.1
 
-    def shared(self, half: Array, dot: Array) -> Array:
-        """Covariance of what all batches have in common, from `kernel_expansion.products`."""
-        out: Array = self.line * dot + 1.0
+    def shared(self, u: Array, v: Array, free: bool) -> Array:
+        """Covariance (n, m) of what all batches have in common, between inputs u (n, p) and v (m, p)."""
+        return self.of_products(*products(u, v), *(_to_origin(u), _to_origin(v)), free)
+
+    def of_products(self, half: Array, dot: Array, half_u: Array, half_v: Array, free: bool) -> Array:
+        """The same from `products` of u with v, and of each with 0."""
+        out: Array = self.line * dot + (1.0 if free else 0.0)
         if self.curve > 0:
             out += self.curve * np.exp(half / self.length**2)
+        if self.curve > 0 and not free:
+            to_u, to_v = np.exp(half_u / self.length**2), np.exp(half_v / self.length**2)
+            out += self.curve * (1.0 - to_u[:, None] - to_v)
         return out
 
     def own(self, dot: Array) -> Array:
         """Covariance of what a batch has of its own, between rows of one batch."""
         return 1.0 + self.own_line * dot
 
-    def prior(self, u: Array) -> Array:
+    def prior(self, u: Array, free: bool) -> Array:
         """Variance (n,) of a recorded value before anything was learned, noise included."""
         dot = (u**2).sum(axis=1) / u.shape[1]
-        return self.line * dot + 1.0 + self.curve + self.own(dot) + 1.0
+        level = 1.0 + self.curve if free else 2.0 * self.curve * -np.expm1(_to_origin(u) / self.length**2)
+        return np.asarray(self.line * dot + level + self.own(dot) + 1.0)
 
 
 class GaussianProcess(Family):
-    """`y = constant + line(u) + curve(u) + own zero and own line of the batch + noise`, all Gaussian.
+    """`y = line(u) + curve(u) − curve(0) + own zero and own line of the batch + noise`, all Gaussian.
 
     Covariances over the p inputs u, each divided by a fixed scale per unit (10 K, …): the line u·u'/p, the curve
     `exp(−|u − u'|²/(2 p length²))`, one length for all inputs. The batch's own part is what makes the stated interval
-    honest: rows of one batch are not independent, and a new batch brings an own part that nobody has seen.
+    honest: rows of one batch are not independent, and a new batch brings an own part that nobody has seen. u is
+    relative to the batch's start, where it is 0 (`as_published`: the inputs as they are, a common constant and the
+    whole curve).
 
     Ratios to the noise are chosen one after the other by leave-batch-out inside the training batches (contiguous
     quarters of one or two), least mean RMS: the predictive density of left-out batches chose worse on simulated
@@ -94,6 +105,7 @@ class GaussianProcess(Family):
         Raises:
             InputError: fewer than 4 usable rows in a fold, or inputs far beyond their unit's scale.
         """
+        design = self.started(design)
         present = np.unique(design.group[design.usable])
         out: dict[int, Self] = {}
         gaps = {f: present[~np.isin(present, list(fold))] for f, fold in enumerate(folds)}
@@ -115,10 +127,11 @@ class GaussianProcess(Family):
                 out[f] = self._made(design, rows, setting, size_um)
         return [out[f] for f in range(len(folds))]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing."""
         setting, support, alpha = self._setting(), np.asarray(self.fitted["support"]), self.fitted["alpha"]
-        return [setting.shared(*products(self._scaled(design, k), support)) @ alpha for k in batches]
+        u = self._scaled(design)
+        return [setting.shared(u[design.rows(k)], support, not self.zero_start) @ alpha for k in batches]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value of a new batch, its own part and noise included.
@@ -126,12 +139,13 @@ class GaussianProcess(Family):
         NaN throughout where fewer than three batches were learned from: nobody has seen how batches differ.
         """
         setting, support, factor = self._setting(), np.asarray(self.fitted["support"]), self.fitted["factor"]
+        free, scaled = not self.zero_start, self._scaled(design)
         out = []
         for k in batches:
-            u = self._scaled(design, k)
+            u = scaled[design.rows(k)]
             ok = np.isfinite(u).all(axis=1)
-            known = solve_triangular(factor, setting.shared(*products(u[ok], support)).T, lower=True)
-            left = np.maximum(setting.prior(u[ok]) - (known**2).sum(axis=0), 1.0)
+            known = solve_triangular(factor, setting.shared(u[ok], support, free).T, lower=True)
+            left = np.maximum(setting.prior(u[ok], free) - (known**2).sum(axis=0), 1.0)
             sd_um = np.full(len(u), np.nan)
             if self.fitted["n_batches"] >= _ENOUGH_BATCHES:
                 sd_um[ok] = self.fitted["size_um"] * np.sqrt(left)
@@ -148,8 +162,8 @@ class GaussianProcess(Family):
 
     def _made(self, design: Design, rows: Rows, setting: Setting, size_um: float) -> Self:
         u, group = design.x[rows] / unit_scale(design), design.group[rows]
-        half, dot = products(u, u)
-        covariance = setting.shared(half, dot) + (group[:, None] == group) * setting.own(dot)
+        covariance = setting.shared(u, u, not design.about_start)
+        covariance += (group[:, None] == group) * setting.own(products(u, u)[1])
         covariance.flat[:: len(rows) + 1] += 1.0
         factor = cholesky(covariance, lower=True)
         return self._learned(design, {
@@ -160,8 +174,8 @@ class GaussianProcess(Family):
     def _setting(self) -> Setting:
         return Setting(*(float(self.fitted[name]) for name in ("line", "curve", "length", "own_line")))
 
-    def _scaled(self, design: Design, k: int) -> Array:
-        return np.asarray(design.x[design.rows(k)] / self.fitted["scale"])
+    def _scaled(self, design: Design) -> Array:
+        return np.asarray(self.started(design).x / self.fitted["scale"])
 
 
 @dataclass(frozen=True)
@@ -170,6 +184,8 @@ class _Problem:
 
     half: Array
     dot: Array
+    to_origin: Array
+    free: bool
     same: NDArray[np.bool_]
     y_um: Array
     known: NDArray[np.bool_]
@@ -190,7 +206,7 @@ class _Problem:
                 "check their units"
             )
         at = np.arange(n) // m
-        return cls(half, dot, at[:, None] == at, y_um, known, m)
+        return cls(half, dot, _to_origin(u), not design.about_start, at[:, None] == at, y_um, known, m)
 
     def chosen(self, out: Sequence[int | None]) -> list[tuple[Setting, float]]:
         """Setting and noise in µm for each training set: all groups but one, or all of them (None)."""
@@ -216,7 +232,8 @@ class _Problem:
 
     def _left_out(self, setting: Setting) -> LeftOut | None:
         """None where the covariance is beyond rounding."""
-        covariance = setting.shared(self.half, self.dot) + self.same * setting.own(self.dot)
+        covariance = setting.of_products(self.half, self.dot, self.to_origin, self.to_origin, self.free)
+        covariance += self.same * setting.own(self.dot)
         covariance *= self.known[:, None] & self.known
         if not np.abs(covariance).max() < _LOST:
             return None
@@ -238,6 +255,11 @@ _STEPS: tuple[Callable[[Setting], list[Setting]], ...] = (
     lambda s: [replace(s, own_line=v) for v in OWN_LINES],
     lambda s: [replace(s, line=v) for v in LINES],
 )
+
+
+def _to_origin(u: Array) -> Array:
+    """−|u|²/(2p) of each row, (n,)."""
+    return np.asarray((u**2).sum(axis=1) / (-2.0 * max(1, u.shape[1])))
 
 
 def _rms_um(error: Array, variance: Array, group: Rows) -> float:

@@ -93,7 +93,7 @@ class GM1N(Family):
             out.append(self._learned(design, self._solve(triangles[f], step_s) | {"n_rows": got}))
         return out
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch, from a zero error at its start.
 
         Raises:
@@ -102,7 +102,7 @@ class GM1N(Family):
         rows = self._respond(design, [self], batches)[:, 0]
         return [rows[design.rows(k)] for k in batches]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         every = sorted({k for batches in wanted for k in batches})

@@ -96,7 +96,7 @@ class GMDL(Family):
             for own, bands in zip(taught, parts, strict=True)
         ]  # fmt: skip
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch, from a zero error at its start.
 
         Raises:
@@ -122,12 +122,13 @@ class GMDL(Family):
         return total
 
     def n_parameters(self) -> int:
-        """Those of the grey models, and of every band its coefficients, intercept and order."""
-        f = self.fitted
-        return int(f["a"].size + f["b"].size + f["weights"].size + 2 * len(f["band_batches"]))
+        """Those of the grey models, and of every band coefficients, order, and intercept where the level is free."""
+        f, more = self.fitted, 1 + (not self.zero_start)
+        return int(f["a"].size + f["b"].size + f["weights"].size + more * len(f["band_batches"]))
 
     def _layers(self) -> tuple[GM1N, DistributedLag]:
-        return GM1N(self.response, recent_rows=self.recent_rows), DistributedLag(self.lags, self.lag_min)
+        grey, lag = GM1N(self.response, recent_rows=self.recent_rows), DistributedLag(self.lags, self.lag_min)
+        return (grey, lag) if self.zero_start else (grey.as_published(), lag.as_published())
 
 
 def _plain(

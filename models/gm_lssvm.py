@@ -84,7 +84,7 @@ class GMLSSVM(Family):
             out.append(self._learned(design, fitted))
         return out
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch, from a zero error at its start.
 
         Raises:
@@ -105,7 +105,8 @@ class GMLSSVM(Family):
         return int(self.fitted["a"].size + self.fitted["b"].size + self.fitted["alpha"].size) + 3
 
     def _corrector(self, max_rows: int) -> LSSVM:
-        return LSSVM(max_rows=max_rows, tuning=self.tuning, seed=self.seed)
+        corrector = LSSVM(max_rows=max_rows, tuning=self.tuning, seed=self.seed)
+        return corrector if self.zero_start else corrector.as_published()
 
     def _rows(self, design: Design) -> list[int]:
         least = len(design.inputs) + 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, fields
 from types import TracebackType
 from typing import Self
@@ -15,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from data.batch import Batch, finding_table
 from data.machine import Machine
-from data.processes import Processes, Shared, one_thread
+from data.processes import Processes, Shared, in_threads, one_thread
 from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
 from features.stability import stability_over_batches
@@ -23,7 +22,8 @@ from models import FAMILIES
 from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
 from models.protocols import Fold, season, speed, start_ambient_degC
 from models.result import CELL_KEYS, GridResult
-from models.trust import error_against_distance
+from models.trust import LeftOut, left_out_runs
+from models.updating import COLUMNS, updated_scores
 
 
 class Workers:
@@ -41,9 +41,15 @@ class Workers:
         """`cross_family` of (error channel, family); waits for it."""
         return self._pool_of(job[1]).submit(_cross, self._crossings, job)()
 
-    def distances(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
-        """`error_against_distance` of (error channel, selector, family, n_tsp), where the crossing left its results."""
+    def distances(self, cell: tuple[str, str, str, int]) -> LeftOut:
+        """`left_out_runs` of (error channel, selector, family, n_tsp), where the crossing left its results."""
         return self._pool_of(cell[2]).submit(_distances, self._crossings, cell)()
+
+    def readings(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
+        """`updated_scores` forward in time of the same; empty for iterative families, whose many fits take hours."""
+        if not FAMILIES[cell[2]].closed_form:
+            return pd.DataFrame(columns=COLUMNS)
+        return self._pool_of(cell[2]).submit(_readings, self._crossings, cell)()
 
     def _pool_of(self, family: str) -> Processes:
         return self._sharing if FAMILIES[family].shares_targets else self._pool
@@ -91,12 +97,13 @@ def run_grid(
     with threadpool_limits(limits=1):
         crossings = {t: prepare(batches, t, plan, machine) for t in targets}
         jobs = jobs_of(plan, targets)
-        done: dict[tuple[str, str], FamilyResult] = {}
-        with Workers(crossings, workers) as crew, ThreadPoolExecutor(workers) as pool:
-            for job, result in zip(jobs, pool.map(crew.cross, jobs), strict=True):
-                done[job] = result
-                if progress:
-                    progress(f"{job[0]} {job[1]}", len(done), len(jobs))
+
+        def finished(job: tuple[str, str], n: int) -> None:
+            if progress:
+                progress(f"{job[0]} {job[1]}", n, len(jobs))
+
+        with Workers(crossings, workers) as crew:
+            done = dict(zip(jobs, in_threads(crew.cross, jobs, workers, finished), strict=True))
     return {t: (crossings[t], assemble(crossings[t], [done[t, f] for f in plan.families])) for t in targets}
 
 
@@ -186,5 +193,9 @@ def _cross(crossings: Shared[dict[str, Crossing]], job: tuple[str, str]) -> Fami
     return cross_family(crossings.get()[job[0]], job[1])
 
 
-def _distances(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> pd.DataFrame:
-    return error_against_distance(crossings.get()[cell[0]], *cell[1:])
+def _distances(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> LeftOut:
+    return left_out_runs(crossings.get()[cell[0]], *cell[1:])
+
+
+def _readings(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> pd.DataFrame:
+    return updated_scores(crossings.get()[cell[0]], *cell[1:], protocols=("forward",))

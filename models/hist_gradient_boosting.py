@@ -58,7 +58,7 @@ class HistGradientBoosting(Family):
         base_um = float(np.ravel(boosted._baseline_prediction)[0])
         return self._learned(design, {**Trees.joined(parts).as_plain(), "base_um": base_um, "n_rows": len(rows)})
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing."""
         trees, out = Trees.from_plain(self.fitted), []
         for k in batches:

@@ -113,15 +113,15 @@ class LagDictionary(Family):
             for fold, pooled in zip(folds, learned, strict=True)
         ]  # fmt: skip
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing.
 
         Raises:
             InputError: the design lacks the drivers or whole batches that the model was fitted with.
         """
-        return self.predict_folds(design, [self], [batches])[0]
+        return self.respond_folds(design, [self], [batches])[0]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         """Copies share the columns."""

@@ -127,7 +127,8 @@ class Task:
             rows = self.design.rows(k)
             ok = self.design.usable[rows]
             table = np.column_stack([self.design.x[rows][ok], self.design.y_um[rows][ok]])
-            mean = table.mean(axis=0) if len(table) else np.zeros(table.shape[1])
+            free = len(table) > 0 and not self.design.about_start
+            mean = table.mean(axis=0) if free else np.zeros(table.shape[1])
             triangle: Array = np.asarray(np.linalg.qr(table - mean, mode="r"))
             out.append((triangle, mean, float(len(table))))
         return out
@@ -159,11 +160,12 @@ class Task:
 
 
 class Linear(Family):
-    """error_um = x · coef_um_per_K + intercept_um.
+    """error_um = x · coef_um_per_K, with the inputs x relative to the batch's start; `as_published` + intercept_um.
 
     `fitted`: coef_um_per_K (p,) (µm per K, or per the input's own unit), intercept_um, condition, n_rows and what the
     family adds. Families that are not indifferent to scale take the inputs as they are where all are in K or degC
-    (or the design knows no units), and divided by their training std where another unit is among them.
+    (or the design knows no units), and divided by their training rms (`as_published`: std) where another unit is among
+    them. "Centred" sums are about the start, so that no intercept is fitted (`as_published`: about the mean).
     """
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
@@ -177,6 +179,7 @@ class Linear(Family):
         if not design.inputs:
             target = design.target or "the error"
             raise InputError(f"{self.key}: no inputs given for {target}; name at least one channel")
+        design = self.started(design)
         moments = design.moments
         masks = fold_masks(self.key, design, folds, moments.count, _MIN_ROWS)
         scaled = any(unit not in _KELVIN for unit in design.input_units)
@@ -193,12 +196,12 @@ class Linear(Family):
             for f in range(len(folds))
         ]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where any input is missing."""
         coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
         return [design.x[design.rows(k)] @ coef + intercept for k in batches]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
@@ -215,7 +218,7 @@ class Linear(Family):
 
     def fitting_S_um(self, design: Design, fitted: Sequence[Self], trained: Sequence[Sequence[int]]) -> Array:
         """From the batches' sums alone."""
-        moments = design.moments
+        moments = self.started(design).moments
         blocks = Blocks.of(moments)
         block = np.concatenate([np.asarray(batches, np.int64) for batches in trained])
         which = np.repeat(np.arange(len(fitted)), [len(batches) for batches in trained])
@@ -242,11 +245,12 @@ class Linear(Family):
         if not self.has_sd:
             return super().sd_um(design, batches)
         a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
-        return [np.sqrt(a + b * mean_square(design.x[design.rows(k)], design)) for k in batches]
+        x = self.started(design).x
+        return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
     def n_parameters(self) -> int:
-        """Coefficients and intercept."""
-        return len(self.inputs) + 1 if self.fitted else 0
+        """Coefficients, and the intercept where the level is free."""
+        return len(self.inputs) + (not self.zero_start) if self.fitted else 0
 
     @abstractmethod
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:

@@ -15,7 +15,18 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import inner_groups
 from models.solvers.batches import too_few_rows
-from models.solvers.kernels import Bordered, Kernel, KernelExpansion, Rows, evenly, kernel_of, products, unit_scale
+from models.solvers.kernels import (
+    Bordered,
+    Kernel,
+    KernelExpansion,
+    Rows,
+    evenly,
+    from_origin,
+    kernel_from_origin,
+    kernel_of,
+    products,
+    unit_scale,
+)
 from models.solvers.particle_swarm import least
 
 TUNINGS = ("closed_form", "particle_swarm")
@@ -24,12 +35,12 @@ _STACK_VALUES = 500_000  # of the matrices solved together: what fits a processo
 
 
 class LSSVM(KernelExpansion):
-    """Least-squares support vector regression: `[[0, 1ᵀ], [1, Ω + I/γ]] [b; α] = [0; y]`.
+    """Least-squares support vector regression: `(Ω + I/γ) α = y`; `as_published` with a bias, `[0, 1ᵀ; 1, Ω + I/γ]`.
 
-    `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `10 u_i·u_j/p` with `linear`: an RBF alone falls back to b outside the
-    trained seasons, the linear part extrapolates. u are the p inputs divided by a fixed scale per unit (`SCALES`: 10 K,
-    10 K/h, 1000 rpm, …), the same for every fold, so all folds share one kernel; σ is in those scales. The model is
-    linear in y, so scaling y would change nothing.
+    `Ω_ij = exp(−|u_i − u_j|²/(2 p σ²))`, plus `10 u_i·u_j/p` with `linear`: an RBF alone falls back to a constant
+    outside the trained seasons, the linear part extrapolates. u are the p inputs divided by a fixed scale per unit
+    (`SCALES`: 10 K, 10 K/h, 1000 rpm, …), the same for every fold, so all folds share one kernel; σ is in those scales.
+    The model is linear in y, so scaling y would change nothing.
 
     γ and σ are those of least mean RMS over the training batches (contiguous quarters of one or two), each left out
     once. `tuning` searches them on the grid `gammas` × `sigmas` (`closed_form`), or between the grid's ends by a
@@ -89,6 +100,9 @@ class LSSVM(KernelExpansion):
             out |= self._fit_stack(design, {f: alone[f] for f in stack})
         return [out[f] for f in range(len(folds))]
 
+    def _problem(self, design: Design, rows: Sequence[Rows], layouts: Sequence[Rows]) -> _Problem:
+        return _Problem.of(self.started(design), rows, layouts)
+
     def _decimated(self, design: Design) -> tuple[Rows, Rows]:
         """Rows kept, evenly over each batch's usable rows, and their batch."""
         most = max(_LEAST_ROWS_PER_BATCH, self.max_rows // max(1, design.n_batches))
@@ -98,7 +112,7 @@ class LSSVM(KernelExpansion):
     def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gap: dict[int, int]) -> dict[int, Self]:
         """Fold f leaves out batch gap[f]: its inner residuals are those of pairs of batches left out."""
         present, compact = np.unique(batch, return_inverse=True)
-        problem = _Problem.of(design, [rows], [_layout(compact)])
+        problem = self._problem(design, [rows], [_layout(compact)])
         m, left = problem.group_rows, np.searchsorted(present, list(gap.values()))
         best = _Best.empty(len(gap), problem.n)
         for sigma, gamma, system in problem.systems(self):
@@ -111,7 +125,7 @@ class LSSVM(KernelExpansion):
         return {f: self._made(design, problem, best, i, 0, inside[i]) for i, f in enumerate(gap)}
 
     def _fit_stack(self, design: Design, alone: dict[int, tuple[Rows, Rows]]) -> dict[int, Self]:
-        problem = _Problem.of(design, [r for r, _ in alone.values()], [layout for _, layout in alone.values()])
+        problem = self._problem(design, [r for r, _ in alone.values()], [layout for _, layout in alone.values()])
         best = _Best.empty(len(alone), problem.n)
         for sigma, gamma, system in problem.systems(self):
             score = problem.score(system.left_out(problem.group_rows))
@@ -122,7 +136,7 @@ class LSSVM(KernelExpansion):
         return {f: self._made(design, problem, best, i, i, problem.known[i]) for i, f in enumerate(alone)}
 
     def _fit_swarm(self, design: Design, rows: Rows, layout: Rows) -> Self:
-        problem = _Problem.of(design, [rows], [layout])
+        problem = self._problem(design, [rows], [layout])
         best = _Best.empty(1, problem.n)
 
         def fitness(at: Array) -> Array:
@@ -144,9 +158,12 @@ class LSSVM(KernelExpansion):
                 f"family lssvm: no gamma of {self.gammas} gives a solvable kernel; inputs reach "
                 f"{np.abs(problem.u[s]).max():.3g} times their scale, expected about 1: check their units"
             )
+        support, alpha = problem.u[s, kept], best.alpha[f, kept]
+        if self.zero_start:
+            support, alpha = from_origin(support, alpha)
         fitted = {
-            "support": problem.u[s, kept],
-            "alpha": best.alpha[f, kept],
+            "support": support,
+            "alpha": alpha,
             "bias": float(best.bias[f]),
             "gamma": float(best.gamma[f]),
             "sigma": float(best.sigma[f]),
@@ -158,12 +175,16 @@ class LSSVM(KernelExpansion):
 
 @dataclass(frozen=True)
 class _Problem:
-    """S training sets, each in G groups of m rows, 0 where padded: u (S, n, p), y_um and known (S, n), n = G m."""
+    """S training sets, each in G groups of m rows, 0 where padded: u (S, n, p), y_um and known (S, n), n = G m.
+
+    `bias`: the level is free.
+    """
 
     u: Array
     y_um: Array
     known: NDArray[np.bool_]
     group_rows: int
+    bias: bool
 
     @classmethod
     def of(cls, design: Design, rows: Sequence[Rows], layouts: Sequence[Rows]) -> Self:
@@ -174,7 +195,7 @@ class _Problem:
         at = at.reshape(len(rows), -1)
         known = at >= 0
         u = np.where(known[:, :, None], design.x[at] / unit_scale(design), 0.0)
-        return cls(u, np.where(known, design.y_um[at], 0.0), known, int(m))
+        return cls(u, np.where(known, design.y_um[at], 0.0), known, int(m), not design.about_start)
 
     @property
     def n(self) -> int:
@@ -188,13 +209,13 @@ class _Problem:
         """The kernel of every training set."""
         out = []
         for product, known in zip(self._products, self.known.astype(float), strict=True):
-            omega = kernel_of(*product, sigma, linear)
+            omega = (kernel_of if self.bias else kernel_from_origin)(*product, sigma, linear)
             out.append(Kernel(omega if known.all() else omega * known[:, None] * known))
         return out
 
     def system(self, kernels: list[Kernel], gamma: float) -> Bordered:
         """Solved; NaN where γ is lost in rounding."""
-        return Bordered.of(kernels, self.known.astype(float), self.y_um, gamma)
+        return Bordered.of(kernels, self.known.astype(float), self.y_um, gamma, self.bias)
 
     def systems(self, family: LSSVM) -> Iterator[tuple[float, float, Bordered]]:
         """Every (σ, γ) of a family's grid, solved."""

@@ -12,7 +12,7 @@ from models.linear import DIGITS_LEFT, EPS, Linear, Pool, Task
 
 
 class MLR(Linear):
-    """Ordinary least squares with intercept; of equally good solutions the one of least norm.
+    """Ordinary least squares; of equally good solutions the one of least norm.
 
     `condition` bounds the accuracy of the coefficients: with head sensors 10²–10⁴ is usual.
     Where the covariance cannot carry the answer (near-deficient inputs) the fit goes back to the rows.

@@ -34,6 +34,8 @@ class PCR(Linear):
         self.contribution = contribution
 
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
+        if self.zero_start:
+            return _about_start(task, self.contribution)
         values, path = principal_path(task.pool)
         needed = count_needed(values, self.contribution)
         return pick(task, values, path, needed, self.contribution)
@@ -70,6 +72,34 @@ def principal_path(pool: Pool) -> tuple[Array, Array]:
     scores = np.einsum("sji,sj->si", vectors, pool.xy)
     weights = np.where(resolved, scores / np.where(resolved, values, 1.0), 0.0)
     return values, np.cumsum(vectors * weights[:, None, :], axis=2) / pool.scale[:, :, None]
+
+
+def _about_start(task: Task, contribution: float) -> tuple[Array, dict[str, NDArray[Any]]]:
+    """Coefficients (S, p) on the components of the covariance, fitted to the error without an intercept.
+
+    The covariance is about the mean: about the start, the first component would be the mean rise and nearly all.
+    """
+    pool = task.pool
+    total = task.masks @ task.design.moments.sum_x / pool.scale
+    covariance = pool.xx - total[:, :, None] * total[:, None, :] / np.maximum(pool.count, 1.0)[:, None, None]
+    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = np.maximum(values[:, ::-1], 0.0), vectors[:, :, ::-1]
+    wanted = count_needed(values, contribution)
+    held = np.maximum((values > _RESOLVED * values[:, :1]).sum(axis=1), 1)
+    n_components = np.minimum(wanted, held)
+    coef = np.zeros(pool.xy.shape)
+    for f, c in enumerate(n_components):
+        onto = vectors[f, :, :c]
+        moments, right = onto.T @ pool.xx[f] @ onto, onto.T @ pool.xy[f]
+        if values[f, c - 1] * DIGITS_LEFT < values[f, 0]:
+            x, y_um = task.centred_rows(int(f))
+            coef[f] = onto @ np.linalg.lstsq(x @ onto, y_um, rcond=None)[0]
+        else:
+            coef[f] = onto @ np.linalg.lstsq(moments, right, rcond=None)[0]
+    cumulated = np.cumsum(values, axis=1)
+    reached = np.take_along_axis(cumulated, n_components[:, None] - 1, axis=1)[:, 0]
+    reached = reached / np.where(cumulated[:, -1] > 0, cumulated[:, -1], 1.0)
+    return coef / pool.scale, {"n_components": n_components, "contribution": reached}
 
 
 def count_needed(values: Array, contribution: float) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""The promotion rule as pure functions: which cell is best, and whether a newcomer beats the champion."""
+"""The promotion rule: which cell is best, whether it is trustworthy, and whether it beats a champion."""
 
 from __future__ import annotations
 
@@ -11,19 +11,25 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
-from data.errors import InputError, closest
+from data.errors import InputError
 from models.protocols import PromotionRule
 from models.result import GridResult
 
 BASELINES = ("zero", "mean_curve")
+KEYS = ["selector", "family", "n_tsp"]
 _SIGN_PATTERNS = 2**16  # of up to 16 batches all are counted, of more so many are drawn
 _INTERVAL = 0.90
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The cell that the rule picked. `caution` is why it is not to be trusted: a baseline won, no set of points was
-    stable, or the search itself explains the score; empty where it is."""
+    """The cell that the rule picked.
+
+    `protocol` is the one that decides: under it the cell's weighted score is worst; `S_mean_um` and `S_std_um` are of
+    this protocol. `caution` is why the cell is not trustworthy: a baseline won, no set of points was stable, or the
+    cell is not shown to beat a baseline; empty where it is. The nested score predicts every batch by the cell that the
+    other batches chose, under the same protocol.
+    """
 
     protocol: str
     selector: str
@@ -37,7 +43,7 @@ class Choice:
     n_batches: int
     caution: str
     summary: str
-    nested_S_mean_um: float = float("nan")  # every batch predicted by the cell that the other batches chose
+    nested_S_mean_um: float = float("nan")
     nested_S_std_um: float = float("nan")
 
     @property
@@ -68,57 +74,95 @@ class Comparison:
     high_um: float
     p_value: float
     better: bool
-    words: str
+    evidence: str
+
+    @property
+    def words(self) -> str:
+        """The evidence with the decision on a champion."""
+        if self.better:
+            return f"{self.evidence}: the newcomer replaces the champion"
+        few = "need at least" in self.evidence
+        return f"{self.evidence}: {'' if few else 'not shown to be better, '}the champion stays"
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        return {**asdict(self), "words": self.words}
 
 
 def score_um(cells: pd.DataFrame, rule: PromotionRule) -> pd.Series:
-    """The rule's score of every cell, µm, smaller is better."""
+    """The rule's score of every row under its own protocol, µm, smaller is better."""
     if rule.score == "max_abs":
         return cells["max_abs_um"].astype(float)
     spread = cells["S_std_um"] if rule.score == "S_mean + S_std" else 0.0
     return (cells["S_mean_um"] + spread).astype(float)
 
 
-def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
-    """The cell to promote: least score among stable cells, ties to the simpler.
+def judged(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
+    """One row per cell: its row of `cells` under the deciding protocol, with the combined score in `score_um`.
 
-    Simpler is fewer inputs, then the family's rank, then fewer parameters, then the smaller score. A baseline is
-    promoted only where nothing beats it, and then not to be trusted.
+    `tsp_stability` is the least over the protocols. Cells without a finite score under one of the protocols are left
+    out.
 
     Args:
         cells: `GridResult.cells`.
 
     Raises:
-        InputError: no cell of the rule's protocol, or none with a finite score.
+        InputError: none of the rule's protocols was run, or no cell has a finite score.
     """
-    protocols = sorted(set(cells["protocol"]))
-    if rule.protocol not in protocols:
+    run = sorted(set(cells["protocol"]))
+    offered = rule.offered(run)
+    if not offered:
+        wanted = ", ".join(rule.protocols)
         raise InputError(
-            f"promotion rule: protocol {rule.protocol!r} was not run in this training; "
-            f"{closest(rule.protocol, protocols)}"
+            f"promotion rule: got trainings by {', '.join(run)}, expected one of its protocols {wanted}; "
+            "add one of them to the training or to promotion.protocols in mlflow.yml"
         )
-    table = cells[cells["protocol"] == rule.protocol].copy()
-    table["score_um"] = score_um(table, rule)
+    table = cells[cells["protocol"].isin(offered)].reset_index(drop=True)
+    weight = table["protocol"].map(rule.protocols).to_numpy(float)
+    table["score_um"] = score_um(table, rule) * weight
     table = table[np.isfinite(table["score_um"])]
+    cell = table.groupby(KEYS, sort=False)["score_um"]
+    table = table[cell.transform("size") == len(offered)]
     if table.empty:
-        raise InputError(f"promotion rule: no cell of protocol {rule.protocol} has a finite {rule.score}")
+        raise InputError(f"promotion rule: no cell of {', '.join(offered)} has a finite {rule.score}")
+    cell = table.groupby(KEYS, sort=False)["score_um"]
+    out = table.loc[cell.idxmax().to_numpy()].copy()
+    if rule.combine == "mean":
+        out["score_um"] = cell.sum().to_numpy() / sum(rule.protocols[p] for p in offered)
+    out["tsp_stability"] = table.groupby(KEYS, sort=False)["tsp_stability"].min().to_numpy()
+    return out.reset_index(drop=True)
+
+
+def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
+    """The cell to promote: least score among stable cells, ties to the simpler.
+
+    Simpler is fewer inputs, then the family's rank, then fewer parameters, then the smaller score. A baseline is
+    chosen only where nothing beats it, and then it is not trustworthy.
+
+    Args:
+        cells: `GridResult.cells`.
+
+    Raises:
+        InputError: as `judged`.
+    """
+    return _choose(judged(cells, rule), rule)
+
+
+def _choose(table: pd.DataFrame, rule: PromotionRule) -> Choice:
+    """`choose` from the table of `judged`."""
     is_baseline = table["family"].isin(BASELINES)
     baselines, candidates = table[is_baseline], table[~is_baseline]
     stable = candidates[candidates["tsp_stability"].fillna(0.0) >= rule.min_tsp_stability]
     caution = ""
     if stable.empty and not candidates.empty:
         top = candidates["tsp_stability"].max()
-        caution = f"no set of points is stable (best {top:.2f}, asked {rule.min_tsp_stability:g})"
+        caution = f"no set of points is stable (best {top:.2f}, required {rule.min_tsp_stability:g})"
         stable = candidates
     floor = baselines["score_um"].min() if len(baselines) else np.inf
     if stable.empty or stable["score_um"].min() >= floor:
         winner = _simplest(baselines[baselines["score_um"] <= floor])
         other = "" if stable.empty else f" (best other: {stable['score_um'].min():.2f} µm)"
         return _picked(winner, rule, [], f"nothing beats {winner['family']}{other}")
-    best = stable.loc[stable["score_um"].idxmin()]
+    best = stable.nsmallest(1, "score_um").iloc[0]
     limit = best["score_um"] * (1 + rule.tie_percent / 100)
     tied = stable[(stable["score_um"] <= limit) & (stable["score_um"] < floor)]
     picked = _simplest(tied)
@@ -131,8 +175,8 @@ def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
             f"({_cell_words(best['family'], best['n_tsp'], best['selector'])}, {best['score_um']:.2f} µm)"
         )
     if len(baselines):
-        least = baselines.loc[baselines["score_um"].idxmin()]
-        notes.append(f"beats {least['family']} ({least['score_um']:.2f} µm)")
+        least = baselines.nsmallest(1, "score_um").iloc[0]
+        notes.append(f"{least['family']} has {least['score_um']:.2f} µm")
     return _picked(picked, rule, notes, caution)
 
 
@@ -140,102 +184,124 @@ def pick(cells: pd.DataFrame, rule: PromotionRule, cell: str) -> Choice:
     """A cell chosen by hand, as ``selector|family|n_tsp``.
 
     Raises:
-        InputError: no such cell under the rule's protocol, with the closest.
+        InputError: no such cell under the rule's protocols, with the closest; or as `judged`.
     """
-    table = cells[cells["protocol"] == rule.protocol]
+    table = judged(cells, rule)
     labels = table["selector"] + "|" + table["family"] + "|" + table["n_tsp"].astype(str)
     if cell not in set(labels):
         near = difflib.get_close_matches(cell, labels, n=3, cutoff=0.3) or list(labels[:3])
         raise InputError(
-            f"unknown cell {cell!r} of protocol {rule.protocol}; expected selector|family|n_tsp, such as "
-            f"{', '.join(near)}"
+            f"unknown cell {cell!r} of {', '.join(sorted(set(table['protocol'])))}; expected selector|family|n_tsp, "
+            f"such as {', '.join(near)}"
         )
-    row = table[labels == cell].iloc[0].copy()
-    row["score_um"] = score_um(table[labels == cell], rule).iloc[0]
+    row = table[labels == cell].iloc[0]
     caution = "a baseline, no model of the temperatures" if row["family"] in BASELINES else ""
     return _picked(row, rule, ["chosen by hand"], caution)
 
 
 def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
-    """The rule's choice (or the cell picked by hand) with what choosing itself costs: the nested score.
+    """The rule's choice (or the cell picked by hand), with its nested score, tested against the baselines.
 
-    Where the nested score is no better than the best baseline, the choice is not to be trusted: on these batches the
-    search cannot distinguish a good model from a lucky one.
+    The choice is trustworthy where the paired test shows it better than every baseline. The choice's own scores are
+    flattered by the search, so each batch enters the test with the nested score where there is one.
 
     Raises:
         InputError: as `choose` and `pick`.
     """
     choice = pick(result.cells, rule, cell) if cell else choose(result.cells, rule)
-    nested = score_of_choice(result, rule)
-    if nested.empty or cell:
-        return choice
-    mean, std = float(nested["S_um"].mean()), float(nested["S_um"].std())
-    words = f"{choice.summary}; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
-    cells = result.cells[(result.cells["protocol"] == rule.protocol) & result.cells["family"].isin(BASELINES)]
-    caution = choice.caution
-    if not caution and len(cells) and rule.score != "max_abs":
-        floor = cells.assign(score_um=score_um(cells, rule)).nsmallest(1, "score_um").iloc[0]
-        reached = mean + (std if rule.score == "S_mean + S_std" else 0.0)
-        if reached >= floor["score_um"]:
-            beaten_by = f"no better than {floor['family']} ({floor['S_mean_um']:.2f} ± {floor['S_std_um']:.2f} µm)"
-            caution = (
-                f"predicted by the cell that the other batches chose, each batch comes to {mean:.2f} ± {std:.2f} µm, "
-                f"by {rule.score} {beaten_by}"
-            )
-            words += f", {beaten_by}: do not trust"
-    return replace(choice, caution=caution, summary=words, nested_S_mean_um=mean, nested_S_std_um=std)
+    own = left_out(result, rule, choice.selector, choice.family, choice.n_tsp)
+    nested = pd.DataFrame() if cell else score_of_choice(result, rule)
+    words, caution = choice.summary, choice.caution
+    if len(nested):
+        S_um = nested.loc[nested["protocol"] == choice.protocol, "S_um"]
+        mean, std = float(S_um.mean()), float(S_um.std())
+        words += f"; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
+        choice = replace(choice, nested_S_mean_um=mean, nested_S_std_um=std)
+        own = nested.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
+    if not caution:
+        for baseline in BASELINES:
+            rest = left_out(result, rule, "none", baseline, 0)
+            if len(rest) and not (test := compare_paired(own, rest, rule)).better:
+                caution = f"not shown to be better than {baseline} ({test.evidence})"
+                words += f"; {caution}: no trustworthy model"
+                break
+    return replace(choice, caution=caution, summary=words)
 
 
-def left_out(result: GridResult, protocol: str, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
-    """Per-batch left-out S of one cell: batch_id, digest, S_um. For train-on-one a row is the batch trained on."""
+def left_out(result: GridResult, rule: PromotionRule, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
+    """Left-out S of one cell under the rule's protocols: batch_id, digest, protocol, S_um times the protocol's weight.
+
+    For train-on-one a row is the batch trained on.
+    """
     s = result.scores
-    rows = s[(s["protocol"] == protocol) & (s["selector"] == selector) & (s["family"] == family)]
+    rows = s[s["protocol"].isin(rule.protocols) & (s["selector"] == selector) & (s["family"] == family)]
     rows = rows[rows["n_tsp"] == n_tsp]
     ids = rows["batch_id"].where(rows["batch_id"] != "*", rows["fold"]).astype(str)
-    table = pd.DataFrame({"batch_id": ids.to_numpy(), "S_um": rows["S_um"].to_numpy(float)})
+    weight = rows["protocol"].map(rule.protocols).to_numpy(float)
+    table = pd.DataFrame({
+        "batch_id": ids.to_numpy(), "protocol": rows["protocol"].to_numpy(str),
+        "S_um": rows["S_um"].to_numpy(float) * weight,
+    })  # fmt: skip
     return table.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
 
 
 def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
-    """Every batch judged by the cell that the other batches would have chosen: batch_id, cell, S_um.
+    """Every batch judged by the cell that the other batches would have chosen: batch_id, protocol, cell, S_um.
 
     The best of many cells has been chosen for its left-out score, which flatters it (Varma & Simon 2006,
     BMC Bioinformatics 7:91). Here batch k is not used in the choice that predicts it. Empty for train-on-one, where a
     score belongs to the batch trained on, and for two batches, where the other one alone has no spread.
     """
-    columns = ["batch_id", "cell", "S_um"]
-    scores = result.scores[result.scores["protocol"] == rule.protocol]
+    columns = ["batch_id", "protocol", "cell", "S_um"]
+    offered = rule.offered(set(result.cells["protocol"]))
+    scores = result.scores[result.scores["protocol"].isin(offered)]
     if scores.empty or (scores["batch_id"] == "*").any() or scores["batch_id"].nunique() < 3:
         return pd.DataFrame(columns=columns)
-    cells = result.cells[result.cells["protocol"] == rule.protocol].reset_index(drop=True)
-    keys = ["selector", "family", "n_tsp"]
-    table = scores.pivot(index=keys, columns="batch_id", values="S_um")
-    table = table.loc[pd.MultiIndex.from_frame(cells[keys])]
-    worst = scores.pivot(index=keys, columns="batch_id", values="max_abs_um").loc[table.index]
+    parts = {p: _pivoted(result, p) for p in offered}
     rows = []
-    for batch_id in table.columns:
-        others = table.drop(columns=batch_id)
-        seen = cells.assign(
-            S_mean_um=others.mean(axis=1).to_numpy(),
-            S_std_um=others.std(axis=1).to_numpy(),
-            max_abs_um=worst.drop(columns=batch_id).max(axis=1).to_numpy(),
-        )
-        choice = choose(seen, rule)
-        rows.append((batch_id, choice.cell, table.loc[(choice.selector, choice.family, choice.n_tsp), batch_id]))
+    for batch_id in scores["batch_id"].unique():
+        seen = []
+        for cells, S_um, max_abs_um in parts.values():
+            others = S_um.drop(columns=batch_id, errors="ignore")
+            if others.shape[1] > 1:
+                worst = max_abs_um.drop(columns=batch_id, errors="ignore").max(axis=1)
+                seen.append(cells.assign(
+                    S_mean_um=others.mean(axis=1).to_numpy(), S_std_um=others.std(axis=1).to_numpy(),
+                    max_abs_um=worst.to_numpy(),
+                ))  # fmt: skip
+        choice = _choose(judged(pd.concat(seen), rule), rule)
+        for p, (_, S_um, _) in parts.items():
+            if batch_id in S_um:
+                own = S_um.loc[(choice.selector, choice.family, choice.n_tsp), batch_id] * rule.protocols[p]
+                rows.append((batch_id, p, choice.cell, own))
     return pd.DataFrame(rows, columns=columns)
+
+
+def _pivoted(result: GridResult, protocol: str) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """The cells of a protocol, and in their order S and max |e| by batch (C, K)."""
+    cells = result.cells[result.cells["protocol"] == protocol].reset_index(drop=True)
+    scores = result.scores[result.scores["protocol"] == protocol]
+    S_um, max_abs_um = (scores.pivot(index=KEYS, columns="batch_id", values=v) for v in ("S_um", "max_abs_um"))
+    order = pd.MultiIndex.from_frame(cells[KEYS])
+    return cells, S_um.loc[order], max_abs_um.loc[order]
 
 
 def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) -> Comparison:
     """Is the newcomer better on the same batches? One-sided paired sign-flip test of the mean difference of S.
 
-    Under "no difference" the sign of every batch's difference is a coin toss (Fisher 1935); all 2^n patterns are
-    counted up to 16 batches, above that a seeded draw. The 90 % interval is Student's over batches.
+    Batches are the independent samples: of several protocols a batch counts once, with the worst of its scores (or
+    their mean, as the rule combines them). Under "no difference" the sign of every batch's difference is a coin toss
+    (Fisher 1935); all 2^n patterns are counted up to 16 batches, above that a seeded draw. The 90 % interval is
+    Student's over batches.
 
     Args:
-        new, old: batch_id, digest, S_um (µm); a batch counts where id and digest agree and both S are finite.
+        new, old: batch_id, digest, protocol, S_um (µm) as from `left_out`; a row counts where batch, content and
+            protocol agree and both S are finite.
     """
-    both = new.merge(old, on=["batch_id", "digest"], suffixes=("_new", "_old")).sort_values("batch_id")
+    both = new.merge(old, on=["batch_id", "digest", "protocol"], suffixes=("_new", "_old"))
     both = both[np.isfinite(both["S_um_new"]) & np.isfinite(both["S_um_old"])]
+    by_batch = both.groupby("batch_id")[["S_um_new", "S_um_old"]]
+    both = by_batch.max() if rule.combine == "worst" else by_batch.mean()
     n = len(both)
     d = (both["S_um_old"] - both["S_um_new"]).to_numpy(float)
     new_mean = float(both["S_um_new"].mean()) if n else float("nan")
@@ -246,16 +312,15 @@ def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) ->
     better = n >= rule.min_batches and mean > 0 and p <= rule.significance
     n_better = int((d > 0).sum())
     if n < rule.min_batches:
-        words = f"{n} batches in common, need at least {rule.min_batches}: the champion stays"
+        evidence = f"{n} batches in common, need at least {rule.min_batches}"
     else:
         sign = "better" if mean >= 0 else "worse"
-        words = (
+        evidence = (
             f"S {new_mean:.2f} against {old_mean:.2f} µm over {n} batches, {abs(mean):.2f} µm {sign} on average "
             f"(90 % interval {mean - half:+.2f} to {mean + half:+.2f}), better on {n_better} of {n}, p = {p:.3g} "
-            f"{'≤' if p <= rule.significance else '>'} {rule.significance:g}: "
-            + ("the newcomer replaces the champion" if better else "not shown to be better, the champion stays")
+            f"{'≤' if p <= rule.significance else '>'} {rule.significance:g}"
         )
-    return Comparison(n, n_better, new_mean, old_mean, mean, mean - half, mean + half, p, better, words)
+    return Comparison(n, n_better, new_mean, old_mean, mean, mean - half, mean + half, p, better, evidence)
 
 
 def sign_flip_p(difference: NDArray[np.float64]) -> float:
@@ -282,15 +347,16 @@ def _simplest(table: pd.DataFrame) -> pd.Series:
 
 def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], caution: str) -> Choice:
     name = _cell_words(row["family"], row["n_tsp"], row["selector"])
-    if rule.score == "S_mean + S_std":
-        score = f"S_mean {row['S_mean_um']:.2f} + S_std {row['S_std_um']:.2f} = {row['score_um']:.2f} µm"
+    mean, std = row["S_mean_um"], row["S_std_um"]
+    if rule.score == "S_mean + S_std" and np.isclose(mean + std, row["score_um"]):
+        score = f"S_mean {mean:.2f} + S_std {std:.2f} = {row['score_um']:.2f} µm"
     else:
         score = f"{rule.score} {row['score_um']:.2f} µm"
-    words = f"{name}: {score}, {rule.protocol} over {int(row['n_batches'])} batches"
+    words = f"{name}: {score}, {row['protocol']} over {int(row['n_batches'])} batches"
     if caution:
-        notes = [*notes, f"{caution}: do not trust"]
+        notes = [*notes, f"{caution}: no trustworthy model"]
     return Choice(
-        protocol=rule.protocol,
+        protocol=str(row["protocol"]),
         selector=str(row["selector"]),
         family=str(row["family"]),
         n_tsp=int(row["n_tsp"]),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
+import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.batch import Batch
@@ -14,6 +15,9 @@ from data.errors import InputError, closest
 from features.rises import first_finite
 
 _SEASON_BOUNDS_DEGC = (10.0, 18.0, 25.0)
+FORWARD_BLOCKS = 4  # fewer blocks of later runs say little about the next season
+GAP_DAYS = 28.0  # `forward-gap`: a model that was trained a month ago, as between two retrainings
+_LEAST_PAST = 2  # runs before the first block: one run has no other to choose hyper-parameters by
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,70 @@ def leave_speed_out(batches: Sequence[Batch]) -> list[Fold]:
     return _leave_group_out([speed(b) for b in batches])
 
 
+def forward(batches: Sequence[Batch]) -> list[Fold]:
+    """Blocks of later runs, each predicted by a model of all runs before it (an expanding window).
+
+    The first half of the runs in order of time trains the first model; the others are cut into at least four blocks
+    of equal length (the last may be shorter). Empty where the order in time is not known, see `forward_obstacle`.
+    """
+    return [] if forward_obstacle(batches) else _forward(batches, gap_days=0.0)
+
+
+def forward_gap(batches: Sequence[Batch]) -> list[Fold]:
+    """As `forward`, by a model of the runs that are at least four weeks older than the block; empty without dates."""
+    known = all(b.start is not None for b in batches) and not forward_obstacle(batches)
+    return _forward(batches, GAP_DAYS) if known else []
+
+
+def _forward(batches: Sequence[Batch], gap_days: float) -> list[Fold]:
+    order = _in_time(batches)
+    first = max(_LEAST_PAST, min(len(order) // 2, len(order) - FORWARD_BLOCKS))
+    length = (len(order) - first) // FORWARD_BLOCKS
+    cuts = range(first, len(order), length)
+    names = _block_names([[batches[k] for k in order[at : at + length]] for at in cuts])
+    folds = []
+    for at, name in zip(cuts, names, strict=True):
+        block, past = order[at : at + length], order[:at]
+        start = batches[block[0]].start
+        if gap_days and start is not None:
+            latest = start - pd.Timedelta(days=gap_days)
+            past = [k for k in past if (then := batches[k].start) is not None and then <= latest]
+        if len(past) >= _LEAST_PAST:
+            folds.append(Fold(name, tuple(past), tuple(block)))
+    return folds
+
+
+def forward_obstacle(batches: Sequence[Batch]) -> str:
+    """Why no later run can be predicted from earlier ones; empty where it can."""
+    undated = [b.batch_id for b in batches if b.start is None]
+    least = _LEAST_PAST + FORWARD_BLOCKS
+    if undated and len({b.source for b in batches}) > 1:
+        return f"{len(undated)} of {len(batches)} batches have no start time (first: {undated[0]})"
+    if len(batches) < least:
+        return f"only {len(batches)} batches, need at least {least}"
+    return ""
+
+
+def _in_time(batches: Sequence[Batch]) -> list[int]:
+    """Indices in order of time; parts of one undated recording are in order as they come."""
+    order = list(range(len(batches)))
+    if any(b.start is None for b in batches):
+        return order
+    return sorted(order, key=lambda k: (batches[k].start, batches[k].batch_id))
+
+
+def _block_names(blocks: Sequence[Sequence[Batch]]) -> list[str]:
+    """First and last day of every block; its batches where they are undated or two blocks share these days."""
+    days = [" to ".join(dict.fromkeys(f"{b.start:%Y-%m-%d}" for b in (block[0], block[-1]) if b.start is not None))
+            for block in blocks]  # fmt: skip
+    if all(days) and len(set(days)) == len(days):
+        return days
+    return [" to ".join(dict.fromkeys(b.batch_id for b in (block[0], block[-1]))) for block in blocks]
+
+
 PROTOCOLS: dict[str, Callable[[Sequence[Batch]], list[Fold]]] = {
+    "forward": forward,
+    "forward-gap": forward_gap,
     "leave-batch-out": leave_batch_out,
     "train-on-one": train_on_one,
     "leave-season-out": leave_season_out,
@@ -110,20 +177,36 @@ def _leave_group_out(labels: Sequence[str]) -> list[Fold]:
 
 
 class PromotionRule(BaseModel):
-    """Which cell becomes the champion, and when a newcomer may replace one."""
+    """Which cell becomes the champion, and when a newcomer may replace one.
+
+    protocols: the protocols that judge, with weights of their scores; those that the recordings do not allow are left
+        out. combine: a cell's score is the worst of its weighted scores, or their weighted mean.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    protocol: str = "leave-batch-out"
+    protocols: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default={"forward": 1.0, "leave-season-out": 1.0, "leave-batch-out": 1.0}, min_length=1
+    )
+    combine: Literal["worst", "mean"] = "worst"
     score: Literal["S_mean + S_std", "S_mean", "max_abs"] = "S_mean + S_std"
     min_tsp_stability: Annotated[float, Field(ge=0, le=1)] = 0.7
     tie_percent: Annotated[float, Field(ge=0, lt=100)] = 2.0
     significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     min_batches: Annotated[int, Field(ge=2)] = 5
 
-    @field_validator("protocol")
+    @field_validator("protocols")
     @classmethod
-    def _known(cls, value: str) -> str:
-        if value not in PROTOCOLS:
-            raise ValueError(f"unknown protocol; {closest(value, PROTOCOLS)}")
+    def _known(cls, value: dict[str, float]) -> dict[str, float]:
+        for name in value:
+            if name not in PROTOCOLS:
+                raise ValueError(f"unknown protocol; {closest(name, PROTOCOLS)}")
         return value
+
+    def only(self, protocol: str) -> Self:
+        """The same rule, judging by one protocol."""
+        return self.model_copy(update={"protocols": {protocol: 1.0}})
+
+    def offered(self, run: Collection[str]) -> list[str]:
+        """The rule's protocols among those that were run."""
+        return [p for p in self.protocols if p in run]

@@ -26,7 +26,8 @@ class RandomForest(Family):
     inputs; leaves hold at least `leaf` rows; batches give at most `max_rows` rows each, or 480 together. `sd_um`:
     variance = a + b · (variance over the trees), a and b ≥ 0 fitted to the squared out-of-bag residuals.
 
-    A forest does not extrapolate: beyond the trained temperatures it stays constant.
+    A forest does not extrapolate: beyond the trained temperatures it stays constant. Each tree counts from its value at
+    the batch's start.
 
     Source: L. Breiman, Random forests, Machine Learning 45 (2001); its trees are scikit-learn's.
     """
@@ -66,7 +67,7 @@ class RandomForest(Family):
         return self._learned(design, {**trees.as_plain(), "variance_um2": constant, "factor": factor,
                                       "n_rows": len(rows)})  # fmt: skip
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing."""
         return [mean for mean, _ in self._moments(design, batches)]
 
@@ -87,6 +88,8 @@ class RandomForest(Family):
             values = trees.values(_as_grown(x))
             missing = ~np.isfinite(x).all(axis=1)
             values[:, missing] = np.nan
+            if self.zero_start:
+                values = np.stack([design.since_start(tree, k, self.target) for tree in values])
             out.append((values.mean(axis=0), values.var(axis=0)))
         return out
 

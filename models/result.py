@@ -33,8 +33,11 @@ class GridResult:
     - `predictions`: leave-batch-out, wide: batch_id, time_s, recorded_um, for a channel along an axis position_mm, and
       one float32 column per "selector|family|n_tsp" with the left-out prediction in µm.
     - `findings`: batch_id, check, channel, start_s, end_s, words, masks, overruled.
-    - `distances`: how far left-out batches were from the training of the chosen cell, and its S there, see
-      `models.trust`; empty without a chosen cell.
+    - `distances`: of the chosen cell's left-out batches what was known before their error, and S, see
+      `models.trust.left_out_runs`; empty without a chosen cell.
+    - `curves`: the chosen cell's left-out predictions, see `models.trust.LeftOut`; empty without one.
+    - `readings`: S of the chosen cell's later runs with readings of a touch probe, see `models.updating`; empty without
+      forward or a chosen cell.
     - `excluded`: channel, reason: channels that no cell may use.
     - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: known weaknesses of
       each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty
@@ -52,6 +55,8 @@ class GridResult:
     findings: pd.DataFrame
     excluded: pd.DataFrame
     distances: pd.DataFrame = field(default_factory=pd.DataFrame)
+    curves: pd.DataFrame = field(default_factory=pd.DataFrame)
+    readings: pd.DataFrame = field(default_factory=pd.DataFrame)
     selector_diagnostics: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def save(self, folder: Path) -> None:

@@ -13,7 +13,7 @@ from models.linear import Pool, Tuned
 
 
 class Ridge(Tuned):
-    """Least squares with the penalty alpha · |coef|², intercept free.
+    """Least squares with the penalty alpha · |coef|².
 
     The penalty is k times the mean variance of the inputs: alpha = k · trace(XᵀX)/p over the centred training
     rows, k from a logarithmic grid of `n_penalties` between `least` and `most`. `fitted` adds k and alpha (the

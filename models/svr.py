@@ -60,6 +60,7 @@ class SVR(KernelExpansion):
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """Raises InputError: fewer than 2 usable rows."""
+        design = self.started(design)  # the weights sum to 0, so that k may stand for the kernel from the start
         rows = self._kept(design, train, self.max_rows)
         if len(rows) < 2:
             raise too_few_rows(self.key, design, train, len(rows), 2)

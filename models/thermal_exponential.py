@@ -78,7 +78,7 @@ class ThermalExponential(Family):
                 out[f] = self._learned(design, plain)
         return [out[f] for f in range(len(folds))]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch: 0 at its start, from time and speed alone."""
         taus_s, amplitudes = np.atleast_1d(self.fitted["tau_s"]), np.atleast_1d(self.fitted["amplitude_um"])
         name = self.fitted["speed_channel"]

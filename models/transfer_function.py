@@ -35,7 +35,7 @@ _ENOUGH_BATCHES = 3
 
 
 class TransferFunction(Family):
-    """`y = c + Σ_i [ k_i u_i + Σ_l K_il / (τ_il s + 1) u_i ]`, at most two poles per input, from rest, running free.
+    """`y = Σ_i [ k_i u_i + Σ_l K_il / (τ_il s + 1) u_i ]`, at most two poles per input, from rest, running free.
 
     Two poles stand as the sum of their partial fractions, which contains the cascade K / ((τ1 s + 1)(τ2 s + 1)):
     K τ1 / (τ1 − τ2) and K τ2 / (τ2 − τ1). Inputs are the chosen sensors; their direct term is near a lead. With
@@ -84,7 +84,8 @@ class TransferFunction(Family):
         masks = fold_masks(self.key, design, folds, counts, _FEWEST_ROWS)
         drivers = drivers_of(design) if self.drivers else []
         gaps = gaps_of(design) if self.gaps else []
-        dictionary = Dictionary(design, (*(Source("input", i) for i in design.inputs), *drivers, *gaps))
+        sources = (*(Source("input", i) for i in design.inputs), *drivers, *gaps)
+        dictionary = Dictionary(design, sources, about_start=self.zero_start)
         best, penalty = self._chosen(dictionary, masks)
         out: dict[int, Self] = {}
         for candidate in dict.fromkeys(best):
@@ -92,7 +93,7 @@ class TransferFunction(Family):
             out |= zip(some, self._fitted(dictionary, masks[some], candidate, penalty[some]), strict=True)
         return [out[f] for f in range(len(folds))]
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing, and throughout a batch that lacks a driver the model needs."""
         f, some = self.fitted, only(design, batches)
         parts = zip(f["kinds"], f["names"], f["exponents"], strict=True)
@@ -110,11 +111,14 @@ class TransferFunction(Family):
         NaN throughout where fewer than three batches were learned from.
         """
         a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
-        return [np.sqrt(a + b * mean_square(design.x[design.rows(k)], design)) for k in batches]
+        x = self.started(design).x
+        return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
     def n_parameters(self) -> int:
-        """Gains, time constants and the intercept."""
-        return len(self.fitted["names"]) + 2 * int(np.size(self.fitted["tau_s"])) + 1 if self.fitted else 0
+        """Gains, time constants, and the intercept where the level is free."""
+        if not self.fitted:
+            return 0
+        return len(self.fitted["names"]) + 2 * int(np.size(self.fitted["tau_s"])) + (not self.zero_start)
 
     def _chosen(self, dictionary: Dictionary, masks: Mask) -> tuple[list[Candidate], Array]:
         """Candidate and penalty of every fold."""
@@ -164,7 +168,7 @@ class TransferFunction(Family):
         """Coefficients for `sd_um`, from left-out residuals with the poles where the candidate has them."""
         names = map(str, dictionary.places(candidate.sources(dictionary), candidate.poles))
         tried, chosen = np.unique(penalty, return_inverse=True)
-        square = mean_square(dictionary.design.x, dictionary.design)
+        square = mean_square(self.started(dictionary.design).x, dictionary.design)
         spread = left_out_spread(
             dictionary.table.subset(tuple(names)), square, masks, False, lambda pool: gains(pool, tried), chosen
         )

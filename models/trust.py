@@ -1,10 +1,11 @@
-"""Region of the training data, and the growth of a model's error with the distance from it on left-out batches."""
+"""What is known of a run before its error: its distance from the training data, and how far like models disagree."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -13,10 +14,13 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
+from features.design import Design
 from features.rises import feature, feature_unit
 from models import FAMILIES
-from models.crossing import Crossing
+from models.base import Family
+from models.crossing import Crossing, with_target
 from models.metrics import residual_std_um
+from models.protocols import Fold
 
 Watched = Mapping[str, Array]  # quantity -> (n,) of one batch
 
@@ -96,6 +100,18 @@ class Region:
         known = np.array([np.isfinite(far) for far in every]).any(axis=0)
         return np.where(known, np.max([np.nan_to_num(far, nan=0.0) for far in every], axis=0), np.nan)
 
+    def excess(self, name: str, values: Watched) -> str:
+        """How a quantity of a batch leaves the region, as "room 31 degC, trained 18 to 27"."""
+        if name == PATTERN:
+            return f"{PATTERN} unlike the training"
+        low, high = self.ranges[name]
+        channel, _, kind = name.partition("@")
+        known = values[name][np.isfinite(values[name])]
+        value = known[np.argmax(_excess(known, low, high))]
+        rise = " rise" if not kind and self.units.get(name) == "K" else ""
+        what = f"{channel}{rise}{' at ' if kind == 'start' else ' ' if kind else ''}{kind}"
+        return f"{what} {value:.3g} {self.units.get(name, '')}, trained {low:.3g} to {high:.3g}"
+
     def as_plain(self) -> dict[str, Any]:
         """Everything as numbers, strings, lists and arrays."""
         ranges = {name: [low, high] for name, (low, high) in self.ranges.items()}
@@ -125,101 +141,103 @@ def _excess(values: Array, low: Array | float, high: Array | float) -> Array:
     return np.maximum(np.maximum(low - values, values - high), 0.0)
 
 
-COLUMNS = ["cell", "protocol", "fold", "batch_id", "distance", "farthest", "S_um"]
-EDGES = (0.05, 0.25, 0.5, 1.0, 2.0, np.inf)  # upper ends of the bands, in trained widths
-_LEAST_PAIRS = 3  # left-out batches that a band needs to be stated
-_FAR = ("leave-season-out", "leave-speed-out")
+SIBLINGS = ("ridge", "distributed_lag")  # linear in the present and in the past of the inputs: cheap, small, unlike
+COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "predicted_rms_um",
+           "disagreement_um", "S_um"]  # fmt: skip
+DRAWN = ("forward", "leave-season-out", "leave-batch-out")  # protocols whose predictions are kept
 
 
-def error_against_distance(crossing: Crossing, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
-    """One row per protocol, fold and left-out batch of a cell, with the columns `COLUMNS`.
+class LeftOut(NamedTuple):
+    """`runs`: a row per protocol, fold and left-out batch with the columns `COLUMNS`. `curves`: of the protocols
+    `DRAWN` protocol, fold, batch_id, time_s, along an axis position_mm, recorded_um and predicted_um on every row."""
 
-    cell: "selector|family|n_tsp"; distance: how far the batch went beyond the region of the fold's training batches,
-    in trained widths (`Region.distance`; the 95 % quantile over its rows); farthest: in which quantity; S_um: the
-    fold's error there. Folds that cannot be fitted are left out, and models of one batch where a fit is slow.
+    runs: pd.DataFrame
+    curves: pd.DataFrame
+
+
+def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) -> LeftOut:
+    """Every left-out batch of a cell with what was known of it before its error.
+
+    cell: "selector|family|n_tsp"; start: of the batch (NaT where unknown); distance: how far it went beyond the region
+    of the fold's training batches, in trained widths (`Region.distance`; the 95 % quantile over its rows); farthest:
+    in which quantity; predicted_rms_um: of the prediction; disagreement_um: see `disagreement_um`, NaN without
+    siblings; S_um: the fold's error. Folds that cannot be fitted are left out, and models of one batch where a fit is
+    slow.
     """
-    rows, cell = [], f"{selector}|{family}|{n_tsp}"
+    runs, curves, cell = [], [], f"{selector}|{family}|{n_tsp}"
     for protocol, folds in crossing.folds.items():
         if protocol == "train-on-one" and not FAMILIES[family].closed_form:
             continue
         for design, which in crossing.needed(folds, [(selector, n_tsp)]):
-            values = [watched(b, design.inputs) for b in crossing.batches]
-            units = {name: feature_unit(b, name) for b, v in zip(crossing.batches, values, strict=True) for name in v}
+            own = [folds[i] for i in which]
             try:
-                fitted = FAMILIES[family]().fit_folds(design, [folds[i].train for i in which])
-                predicted = fitted[0].predict_folds(design, fitted, [folds[i].test for i in which])
+                predicted = _predicted(design, family, own)
             except InputError:
                 continue
-            for i, errors in zip(which, predicted, strict=True):
-                region = Region.of_values([values[k] for k in folds[i].train], design.inputs, units)
-                for k, error_um in zip(folds[i].test, errors, strict=True):
-                    S_um = float(residual_std_um(design.y_um[design.rows(k)] - error_um))
-                    distance, farthest = _farthest(region.beyond(values[k]))
-                    rows.append((cell, protocol, folds[i].name, design.batch_ids[k], distance, farthest, S_um))
-    return pd.DataFrame(rows, columns=COLUMNS)
+            siblings = [p for key in siblings_of(family, design.inputs) if (p := _sibling(design, key, own))]
+            values = [watched(b, design.inputs) for b in crossing.batches]
+            units = {name: feature_unit(b, name) for b, v in zip(crossing.batches, values, strict=True) for name in v}
+            for i, fold in enumerate(own):
+                region = Region.of_values([values[k] for k in fold.train], design.inputs, units)
+                for j, k in enumerate(fold.test):
+                    batch, error_um, recorded_um = crossing.batches[k], predicted[i][j], design.y_um[design.rows(k)]
+                    apart_um = disagreement_um(error_um, [s[i][j] for s in siblings])
+                    S_um = float(residual_std_um(recorded_um - error_um))
+                    runs.append((cell, protocol, fold.name, batch.batch_id, batch.start,
+                                 *farthest(region.beyond(values[k])), _rms(error_um), apart_um, S_um))  # fmt: skip
+                    if protocol in DRAWN:
+                        at = {"position_mm": design.position_mm(design.along)[design.rows(k)]} if design.along else {}
+                        curves.append(pd.DataFrame({
+                            "protocol": protocol, "fold": fold.name, "batch_id": batch.batch_id,
+                            "time_s": batch.time_s, **at, "recorded_um": recorded_um, "predicted_um": error_um,
+                        }))  # fmt: skip
+    table = pd.DataFrame(runs, columns=COLUMNS).astype({"start": "datetime64[ns]"})
+    return LeftOut(table, pd.concat(curves, ignore_index=True) if curves else pd.DataFrame())
 
 
-@dataclass(frozen=True)
-class Rise:
-    """How many times larger S is in bands of distance than on the same batches predicted by their neighbours.
+def siblings_of(family: str, inputs: Sequence[str]) -> tuple[str, ...]:
+    """The families whose disagreement with a family is a measure of its error; none without inputs to learn from."""
+    return tuple(key for key in SIBLINGS if inputs and key != family)
 
-    inside_um: the median S by leave-batch-out. Per band the upper edge (B,) in widths, the number of predicted batches,
-    the median and the 90 % quantile of the factor S / S by leave-batch-out: the same batch near and far, so that
-    batches of large errors do not count as distant ones. From seasons and speeds left out, that is from models that
-    learned from many batches; bands with fewer than 3 predictions are not among them.
+
+def fit_siblings(family: Family, batches: Sequence[Batch]) -> tuple[Family, ...]:
+    """The siblings of a fitted family on the batches that it was fitted on; those that cannot be fitted are left out.
+
+    A batch without a usable error is not learned from.
     """
-
-    inside_um: float
-    edge: tuple[float, ...]
-    count: tuple[int, ...]
-    factor: tuple[float, ...]
-    high: tuple[float, ...]
-
-    @classmethod
-    def of(cls, table: pd.DataFrame) -> Self:
-        """From the table of `error_against_distance`."""
-        near = table[table["protocol"] == "leave-batch-out"].set_index("batch_id")["S_um"]
-        far = table[table["protocol"].isin(_FAR)]
-        factor = far["S_um"].to_numpy(float) / far["batch_id"].map(near).to_numpy(float)
-        ok = np.isfinite(factor) & np.isfinite(far["distance"].to_numpy(float))
-        band = np.searchsorted(EDGES, far["distance"].to_numpy(float), side="left")
-        found = []
-        for b, edge in enumerate(EDGES):
-            own = factor[ok & (band == b)]
-            if len(own) >= _LEAST_PAIRS:
-                found.append((edge, len(own), float(np.median(own)), float(np.quantile(own, 0.9))))
-        inside_um = float(near.median()) if near.notna().any() else float("nan")
-        return cls(inside_um, *(list(zip(*found, strict=True)) or [(), (), (), ()]))
-
-    @classmethod
-    def of_cell(cls, table: pd.DataFrame, cell: str) -> Self | None:
-        """The same of one cell; None where the table knows another or none."""
-        own = table[table["cell"] == cell] if len(table) else table
-        return cls.of(own) if len(own) else None
-
-    def expected_um(self, distance: Array) -> Array:
-        """S (n,) to be expected at a distance: the median by leave-batch-out times the band's factor, at least 1 and
-        never falling with the distance. NaN in bands that were not measured."""
-        factor = np.full(len(EDGES) + 1, np.nan)
-        if self.edge:
-            factor[np.searchsorted(EDGES, self.edge)] = np.maximum.accumulate(np.maximum(self.factor, 1.0))
-        factor[0] = 1.0
-        band = np.searchsorted(EDGES, distance, side="left")
-        return np.asarray(self.inside_um * np.where(np.isfinite(distance), factor[band], np.nan))
-
-    def as_plain(self) -> dict[str, Any]:
-        """Numbers and lists; the upper edge of the last band is "beyond"."""
-        return {"inside_um": self.inside_um, "edge": [e if np.isfinite(e) else "beyond" for e in self.edge],
-                "count": list(self.count), "factor": list(self.factor), "high": list(self.high)}  # fmt: skip
-
-    @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> Self:
-        """The inverse of `as_plain`."""
-        edge = tuple(np.inf if e == "beyond" else float(e) for e in plain["edge"])
-        return cls(float(plain["inside_um"]), edge, *(tuple(plain[k]) for k in ("count", "factor", "high")))
+    batches = with_target(batches, family.target) if batches else []
+    fitted = []
+    for key in siblings_of(family.key, family.inputs) if batches else ():
+        with suppress(InputError):
+            fitted.append(FAMILIES[key]().fit(batches, family.inputs, family.target))
+    return tuple(fitted)
 
 
-def _farthest(beyond: Mapping[str, Array]) -> tuple[float, str]:
+def disagreement_um(predicted_um: Array, siblings_um: Sequence[Array]) -> float:
+    """Root mean square difference (µm) of a prediction (n,) and those of its siblings; NaN without any."""
+    return _rms(np.concatenate([s - predicted_um for s in siblings_um])) if siblings_um else float("nan")
+
+
+def _predicted(design: Design, family: str, folds: Sequence[Fold]) -> list[list[Array]]:
+    fitted = FAMILIES[family]().fit_folds(design, [f.train for f in folds])
+    predicted: list[list[Array]] = fitted[0].predict_folds(design, fitted, [f.test for f in folds])
+    return predicted
+
+
+def _sibling(design: Design, key: str, folds: Sequence[Fold]) -> list[list[Array]]:
+    """The same, empty where one of the folds cannot be fitted."""
+    try:
+        return _predicted(design, key, folds)
+    except InputError:
+        return []
+
+
+def _rms(values_um: Array) -> float:
+    known = values_um[np.isfinite(values_um)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
+
+def farthest(beyond: Mapping[str, Array]) -> tuple[float, str]:
     """How far a batch went (95 % quantile over the rows), and in which quantity; ("", 0) inside everywhere."""
     far = {name: float(np.nanquantile(d, 0.95)) for name, d in beyond.items() if np.isfinite(d).any()}
     name = max(far, key=lambda n: far[n], default="")

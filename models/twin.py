@@ -82,12 +82,12 @@ class Twin(Family):
         except WorkError as error:
             raise InputError(f"family {self.key}: {error}") from None
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Error_um (n_k,) per batch, 0 at its start; NaN where a batch lacks a driver or surrounding."""
         run = TwinRun.of(self.network, [design.batches[k] for k in batches])
         return np.split(self._simulated(run, [self])[0][0], np.cumsum(run.n_rows)[:-1])
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         run = run_of(design, fitted[0].fitted["machine"])

@@ -68,13 +68,13 @@ class TwinResidual(Twin):
             out.append(self._learned(design, {**twin.fitted, **learned}))
         return out
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row where an input is missing, or where a batch lacks a driver or surrounding."""
         some = _of_batches(design, batches)
         total = self._total(some, TwinRun.of(self.network, some.batches), [self])[:, 0]
         return [total[some.rows(k)] for k in range(some.n_batches)]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         return by_batch(design, self._total(design, run_of(design, fitted[0].fitted["machine"]), fitted), wanted)
@@ -129,7 +129,8 @@ class TwinResidual(Twin):
         return replace(design, x=x, _parent=None, _columns=None)
 
     def _regression(self) -> Family:
-        return Ridge() if self.residual == "ridge" else GaussianProcess()
+        regression: Family = Ridge() if self.residual == "ridge" else GaussianProcess()
+        return regression if self.zero_start else regression.as_published()
 
     def _fitted_regression(self) -> Family:
         out = self._regression()

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from data.batch import Batch, Channel
-from data.checks import check_batch, check_machine
+from data.checks import check_machine, checked
 from data.machine import ChannelPart, Machine, Recording, load_machine
 from data.recording import read_batches, recording_files
 from plants.options import stream
@@ -209,7 +209,7 @@ def _read(machine: str, data: Path, step_s: float) -> tuple[Machine, list[Batch]
     reading = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
     files, _ = recording_files(data / ORIGINS[machine].folder, reading)
     found = [b for f in files for b in read_batches(f, reading)]
-    return given, check_machine([b.with_findings(check_batch(b, reading)) for b in found], reading)
+    return given, check_machine([checked(b, reading) for b in found], reading)
 
 
 def _column(part: ChannelPart) -> ChannelPart:

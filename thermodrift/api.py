@@ -46,12 +46,12 @@ def read(recordings: Paths, machine: AnyMachine, *, need_error: bool = True) -> 
     Raises:
         InputError: no recording there, or one that cannot be used.
     """
-    from data.checks import check_batch, check_machine
+    from data.checks import check_machine, checked
     from pipelines.recordings import read_files
 
     known = _machine(machine)
     batches = [b for path in _paths(recordings) for b in read_files(known, path, need_error)]
-    return check_machine([b.with_findings(check_batch(b, known)) for b in batches], known)
+    return check_machine([checked(b, known) for b in batches], known)
 
 
 def ingest(recordings: Paths, machine: AnyMachine, lake: Lake | None = None) -> IngestReport:
@@ -128,7 +128,7 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
 
     Returns:
         batch_id, time_s (s), predicted_um (µm, relative to the batch's start), outside_region, outside_of, distance,
-        expected_S_um, simulated; for an error along an axis position_mm as well.
+        expected_S_um, bound90_S_um, flagged, simulated; for an error along an axis position_mm as well.
 
     Raises:
         InputError: a model or file that cannot be used, or a missing input.

@@ -8,6 +8,7 @@ which are shown less their first value, remember.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,16 +61,24 @@ class Filtered:
 
 @dataclass(frozen=True)
 class _Linear:
-    """The linearised network, per batch and interval; n states as in `_layout`.
+    """The linearised network, per batch and interval between the rows in use; n states as in `_linearised`.
 
-    move (B, K - 1, n, n), noise (B, K - 1, n, n), sensor (B, K, n_sensors, n), error (B, K, n_errors, n).
+    move (B, K - 1, n, n), noise (B, K - 1, n, n) for a heat noise of 1 W, sensor (B, K, n_sensors, n), error (B, K,
+    n_errors, n), start (B, n, N + H): how the first state follows from cells and factors.
     """
 
     move: Array
     noise: Array
     sensor: Array
     error: Array
-    first: Array  # covariance (B, n, n) at the first row
+    start: Array
+
+    def first(self, doubt: Doubt, n_cells: int, n_heats: int) -> Array:
+        """Covariance (B, n, n) at the first row."""
+        own = np.zeros((n_cells + n_heats, n_cells + n_heats))
+        own[:n_cells, :n_cells] = doubt.start_K2
+        own[n_cells:, n_cells:] = np.eye(n_heats) * doubt.heat_spread**2
+        return np.asarray(self.start @ own @ self.start.swapaxes(-1, -2))
 
 
 def filtered(
@@ -83,52 +92,86 @@ def filtered(
     Raises:
         InputError: readings or a covariance of another shape; a sensor whose law remembers more than a lag.
     """
-    _check(network, inputs, readings, doubt)
+    return filtered_each(network, values, inputs, readings, [doubt], start_degC)[0]
+
+
+def filtered_each(
+    network: Network,
+    values: Array,
+    inputs: Inputs,
+    readings: Array,
+    doubts: Sequence[Doubt],
+    start_degC: Array | None = None,
+    thin: int = 1,
+) -> list[Filtered]:
+    """`filtered` under each of several uncertainties, which share the simulation and its linearisation.
+
+    Only every `thin`-th row's readings are used, from the first on; the rows behind it keep its corrections.
+    """
+    for doubt in doubts:
+        _check(network, inputs, readings, doubt)
     if start_degC is None:
         start_degC = start_of(network, values, inputs, settled=True)
     solved = solved_balance(network, values[None], inputs, start_degC[None], TOLERANCE_K)
     rows = rows_of(solved, 1)
     nominal = simulation_of(solved, *shown(rows, network)[:2], TOLERANCE_K, 1)
     used = np.flatnonzero(np.isfinite(readings).any(axis=(0, 1)))
-    linear = _linearised(solved, rows, nominal, used, doubt)
-    return _run(network, linear, nominal, readings, nominal.valid)
+    linear = _linearised(solved, rows, nominal, used, thin)
+    return [_run(network, linear, nominal, readings, used, doubt, thin) for doubt in doubts]
 
 
-def _run(network: Network, linear: _Linear, nominal: Simulation, readings: Array, valid: NDArray[np.bool_]) -> Filtered:
+def _run(
+    network: Network,
+    linear: _Linear,
+    nominal: Simulation,
+    readings: Array,
+    used: NDArray[np.int64],
+    doubt: Doubt,
+    thin: int,
+) -> Filtered:
     assert nominal.cells_degC is not None
-    n_batches, n_rows = readings.shape[:2]
     n_cells, n_heats = network.n_cells, len(network.heats)
-    given = np.where(valid[..., None], readings - nominal.readings[0], np.nan)
-    noise = np.array([r.noise for r in network.readings]) ** 2
-    cov = linear.first.copy()
-    state = np.zeros((n_batches, cov.shape[-1]))
-    states = np.empty((n_batches, n_rows, cov.shape[-1]))
-    error_var = np.empty((n_batches, n_rows, len(network.errors)))
-    innovation, likelihood = np.full(readings.shape, np.nan), np.zeros(n_batches)
-    for k in range(n_rows):
+    given = np.where(nominal.valid[..., None], readings - nominal.readings[0], np.nan)[:, ::thin, used]
+    there = np.isfinite(given)
+    given = np.where(there, given, 0.0)
+    variance = np.where(there, np.array([r.noise for r in network.readings])[used] ** 2, 1.0)
+    cov = linear.first(doubt, n_cells, n_heats)
+    state = np.zeros(cov.shape[:2])
+    states = np.empty((*given.shape[:2], cov.shape[-1]))
+    error_var = np.empty((*given.shape[:2], len(network.errors)))
+    news, likelihood = np.full(given.shape, np.nan), np.zeros(len(given))
+    for k in range(given.shape[1]):
         if k:
             move = linear.move[:, k - 1]
-            state = np.einsum("bij,bj->bi", move, state)
-            cov = move @ cov @ move.swapaxes(-1, -2) + linear.noise[:, k - 1]
-        for j in np.flatnonzero(np.isfinite(given[:, k]).any(axis=0)):
-            there = np.isfinite(given[:, k, j])
-            row = linear.sensor[:, k, j]
-            spread = np.einsum("bij,bj->bi", cov, row)
-            var = np.einsum("bi,bi->b", row, spread) + noise[j]
-            news = np.where(there, given[:, k, j] - np.einsum("bi,bi->b", row, state), 0.0)
-            gain = np.where(there[:, None], spread / var[:, None], 0.0)
-            state = state + gain * news[:, None]
-            cov = cov - gain[:, :, None] * spread[:, None, :]
-            innovation[there, k, j] = (news / np.sqrt(var))[there]
-            likelihood -= np.where(there, 0.5 * (news**2 / var + np.log(2 * np.pi * var)), 0.0)
+            state = (move @ state[..., None])[..., 0]
+            cov = move @ cov @ move.swapaxes(-1, -2) + doubt.heat_W**2 * linear.noise[:, k - 1]
+        if there[:, k].any():
+            # With S = L Lᵀ, L⁻¹ (reading − expected) is what each sensor adds after those before it, over its own sd.
+            row = linear.sensor[:, k][:, used] * there[:, k, :, None]
+            spread = row @ cov
+            own = spread @ row.swapaxes(-1, -2)
+            np.einsum("bii->bi", own)[:] += variance[:, k]
+            root = np.linalg.cholesky(own)
+            away = given[:, k, :, None] - row @ state[..., None]
+            solved = np.linalg.solve(root, np.concatenate([spread, np.where(there[:, k, :, None], away, 0.0)], axis=2))
+            gain, own_news = solved[..., :-1], solved[..., -1]
+            state = state + (own_news[:, None] @ gain)[:, 0]
+            cov = cov - gain.swapaxes(-1, -2) @ gain
+            news[:, k] = np.where(there[:, k], own_news, np.nan)
+            each = 0.5 * (own_news**2 + np.log(2 * np.pi)) + np.log(np.einsum("bii->bi", root))
+            likelihood -= np.where(there[:, k], each, 0.0).sum(axis=1)
         states[:, k] = state
         row = linear.error[:, k]
         error_var[:, k] = np.einsum("bei,bij,bej->be", row, cov, row)
-    moved = np.einsum("bkei,bki->bke", linear.error, states)
+    innovation = np.full(readings.shape, np.nan)
+    innovation[:, ::thin, used] = news
+    held = np.arange(readings.shape[1]) // thin
+    moved = np.einsum("bkei,bki->bke", linear.error, states)[:, held]
+    states = states[:, held]
     return Filtered(
         network,
         nominal.errors[0] + moved,
-        np.sqrt(np.maximum(error_var, 0.0)),
+        np.sqrt(np.maximum(error_var, 0.0))[:, held],
         nominal.cells_degC[0] + states[..., :n_cells],
         states[..., n_cells : n_cells + n_heats],
         innovation,
@@ -136,21 +179,22 @@ def _run(network: Network, linear: _Linear, nominal: Simulation, readings: Array
     )
 
 
-def _linearised(solved: Solved, rows: Rows, nominal: Simulation, used: NDArray[np.int64], doubt: Doubt) -> _Linear:
+def _linearised(solved: Solved, rows: Rows, nominal: Simulation, used: NDArray[np.int64], thin: int) -> _Linear:
     """States: cells (N), factors on heats (H), what lagging sensors show (L), what errors remember (E)."""
     network, values = solved.balance.network, solved.balance.values[0]
-    d_readings, d_errors = _slopes(solved, rows)  # (B, K, n_sensors, N), (B, K, n_errors, N)
+    d_readings, d_errors = (d[:, ::thin] for d in _slopes(solved, rows))  # (B, K, n_sensors, N), (B, K, n_errors, N)
+    time_s, valid = nominal.time_s[:, ::thin], nominal.valid[:, ::thin]
     lags = _lags_s(network, values, used)
     n_cells, n_heats, n_lags, n_errors = network.n_cells, len(network.heats), len(lags), len(network.errors)
     at_lag = n_cells + n_heats
     at_error, n = at_lag + n_lags, at_lag + n_lags + n_errors
-    n_batches, n_rows = nominal.valid.shape
-    dt_s = np.diff(nominal.time_s, axis=1)
+    n_batches, n_rows = valid.shape
+    dt_s = np.diff(time_s, axis=1)
     rate = np.zeros((n_batches, n_rows - 1, n, n))
-    rate[..., :n_cells, :n_cells] = _cell_rates(solved)
+    rate[..., :n_cells, :n_cells] = _cell_rates(solved, thin)
     capacity = network.capacity_J_per_K(values)
     for h, heat in enumerate(network.heats):
-        watts = np.diff(nominal.heat_J[heat.law.name][0], axis=1) / dt_s
+        watts = np.diff(nominal.heat_J[heat.law.name][0][:, ::thin], axis=1) / dt_s
         rate[..., :n_cells, n_cells + h] = watts[..., None] * heat.direction(values) / capacity
     sensor = np.zeros((n_batches, n_rows, len(network.readings), n))
     sensor[..., :n_cells] = d_readings
@@ -162,27 +206,24 @@ def _linearised(solved: Solved, rows: Rows, nominal: Simulation, used: NDArray[n
     error = np.zeros((n_batches, n_rows, n_errors, n))
     error[:, 1:, :, :n_cells] = d_errors[:, 1:]
     error[:, 1:, np.arange(n_errors), at_error + np.arange(n_errors)] = -1.0
-    part, white = expm(rate * (dt_s[..., None, None] / 4)), _white(network, capacity, doubt.heat_W, n)
+    part, white = expm(rate * (dt_s[..., None, None] / 4)), _white(network, capacity, n)
     noise, move = white / 12, np.eye(n)
     for weight in (4, 2, 4, 1):  # Simpson's rule over the interval
         move = part @ move
         noise = noise + move @ white @ move.swapaxes(-1, -2) * (weight / 12)
     noise = noise * dt_s[..., None, None]
-    behind = ~nominal.valid[:, 1:]
+    behind = ~valid[:, 1:]
     move[behind], noise[behind] = np.eye(n), 0.0
-    start = np.zeros((n_batches, n, n_cells + n_heats))  # how the first state follows from cells and factors
+    start = np.zeros((n_batches, n, n_cells + n_heats))
     start[:, : n_cells + n_heats] = np.eye(n_cells + n_heats)
     for place, j in enumerate(lags, at_lag):
         start[:, place, :n_cells] = d_readings[:, 0, j]
     start[:, at_error:, :n_cells] = d_errors[:, min(1, n_rows - 1)]
-    own = np.zeros((n_cells + n_heats, n_cells + n_heats))
-    own[:n_cells, :n_cells] = doubt.start_K2
-    own[n_cells:, n_cells:] = np.eye(n_heats) * doubt.heat_spread**2
-    return _Linear(move, noise, sensor, error, start @ own @ start.swapaxes(-1, -2))
+    return _Linear(move, noise, sensor, error, start)
 
 
-def _cell_rates(solved: Solved) -> Array:
-    """d (dT/dt) / dT of the cells (B, K - 1, N, N), mean over each interval between two rows."""
+def _cell_rates(solved: Solved, thin: int) -> Array:
+    """d (dT/dt) / dT of the cells (B, K - 1, N, N), mean over each interval between two rows in use."""
     b = solved.balance
     inverse = 1.0 / b.capacity_J_per_K[0]
     own = -b.conductance_W_per_K[0] * inverse[:, None]
@@ -194,8 +235,9 @@ def _cell_rates(solved: Solved) -> Array:
             into = source.direction[0] * inverse
             for place, slope in source.slopes(solved.coupled.borders, slice(0, out.shape[1])).items():
                 out = out + slope[0].mean(axis=1)[..., None, None] * np.outer(into, solved.places.rows[place])
-    every = b.inputs.every
-    return np.asarray(out.reshape(len(out), -1, every, *out.shape[2:]).mean(axis=2))
+    every = b.inputs.every * thin
+    whole = out[:, : out.shape[1] // every * every]
+    return np.asarray(whole.reshape(len(out), -1, every, *out.shape[2:]).mean(axis=2))
 
 
 def _slopes(solved: Solved, rows: Rows) -> tuple[Array, Array]:
@@ -234,11 +276,11 @@ def _lags_s(network: Network, values: Array, used: NDArray[np.int64]) -> dict[in
     return out
 
 
-def _white(network: Network, capacity: Array, heat_W: float, n: int) -> Array:
-    """Spectral density (n, n) of the noise in dT/dt, K²/s: each body's own heat, even over its cells."""
+def _white(network: Network, capacity: Array, n: int) -> Array:
+    """Spectral density (n, n) of the noise in dT/dt at 1 W, K²/s: each body's own heat, even over its cells."""
     out = np.zeros((n, n))
     for cells in network.bodies.values():
-        rate = heat_W / len(cells) / capacity[cells]
+        rate = 1.0 / len(cells) / capacity[cells]
         out[np.ix_(cells, cells)] = np.outer(rate, rate) * _HOUR_S
     return out
 

@@ -227,7 +227,11 @@ def choices(design: Design, selector: str, trains: Sequence[Sequence[int]], n_ts
 
 
 def predictions_um(design: Design, family: Family, trains: Sequence[Sequence[int]], inputs: Sequence[Inputs]) -> Array:
-    """Predictions (n, F) on all rows by F models, model f fitted on the batches `trains[f]` with `inputs[f]`."""
+    """Predictions (n, F) on all rows by F models, model f fitted on the batches `trains[f]` with `inputs[f]`.
+
+    The family in its published form, with a free level.
+    """
+    family = family.as_published()
     everything = range(design.n_batches)
     out = np.empty((len(design.y_um), len(trains)))
     for same in dict.fromkeys(inputs):

@@ -202,7 +202,7 @@ def _taught(family: Family, x: Array, y_um: Array, rows: range) -> Array:
     known = np.full(len(y_um), np.nan)
     known[list(rows)] = y_um[list(rows)]
     design = _rows(x, known)
-    return family.fit_design(design, [0]).predict_design(design, [0])[0]
+    return family.as_published().fit_design(design, [0]).predict_design(design, [0])[0]
 
 
 def _scores(y_um: Array, predicted_um: Array) -> dict[str, float]:

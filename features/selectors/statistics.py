@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
+from data.checks import why_missing
 from data.errors import InputError
 from features.design import Design
 
@@ -105,7 +106,8 @@ def _too_few(design: Design, rows: NDArray[np.int64], n: int, selector: str) -> 
     missing = [*np.count_nonzero(~np.isfinite(values), axis=0), np.count_nonzero(~np.isfinite(target))]
     worst = int(np.argmax(missing))
     name = (*design.inputs, design.target)[worst]
+    why = why_missing(design.batches[rows[0]], name) if ids and design.batches else ""
     return (
         f"selector {selector}: {n} usable rows in the training batches ({named or 'none given'}), expected at least 3; "
-        f"{name!r} is missing in {missing[worst]} of {len(values)} rows: leave it out or give more batches"
+        f"{name!r} is missing in {missing[worst]} of {len(values)} rows{why}: leave it out or give more batches"
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array, Mask, Numeric
 from data.batch import Batch
+from data.checks import why_missing
 from data.errors import InputError
 from features.design import Design
 from features.rises import hold_last
@@ -75,8 +76,9 @@ def too_few_rows(key: str, design: Design, train: Sequence[int], got: int, need:
     """The error of a training set with too few usable rows."""
     names = [design.batch_ids[k] for k in train]
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    why = why_missing(design.batches[train[0]], design.target) if names and design.batches else ""
     return InputError(
-        f"family {key}: got {got} usable rows of {design.target or 'the target'} in {shown or 'no batch'}, "
+        f"family {key}: got {got} usable rows of {design.target or 'the target'} in {shown or 'no batch'}{why}, "
         f"need at least {need}; give more batches, drop inputs that are missing, or overrule a check in the machine "
         "file"
     )

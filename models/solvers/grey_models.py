@@ -132,7 +132,8 @@ def corrected(outputs_um: Array, y_um: Array, fit: range, tuning: str = "particl
     known = np.full(len(y_um), np.nan)
     known[list(fit)] = y_um[list(fit)]
     design = layer_design(_batch(outputs_um, known), outputs_um)
-    return LSSVM(max_rows=len(fit), tuning=tuning, seed=seed).fit_design(design, [0]).predict_design(design, [0])[0]
+    family = LSSVM(max_rows=len(fit), tuning=tuning, seed=seed).as_published()
+    return family.fit_design(design, [0]).predict_design(design, [0])[0]
 
 
 def _batch(x: Array, y_um: Array) -> Design:

@@ -26,18 +26,19 @@ class KernelExpansion(Family):
     """`ŷ(u) = b + Σ_s α_s k(u_s, u)`, u the p inputs over a fixed scale per unit (`SCALES`).
 
     `k(u, v) = exp(−|u − v|²/(2 p σ²))`, plus `10 u·v/p` with `linear`. `fitted` has support (s, p), alpha (s,), bias,
-    sigma and scale (p,).
+    sigma and scale (p,). u is relative to the batch's start, where it is 0, and so is ŷ: the kernel that is fitted is
+    `k(u, v) − k(u, 0) − k(0, v) + k(0, 0)`, and b has no part (`as_published`: the inputs as they are, k and b).
     """
 
     closed_form = False
     linear: bool
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        f = self.fitted
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        f, x = self.fitted, self.started(design).x
         scale, support, alpha = (np.asarray(f[k], float) for k in ("scale", "support", "alpha"))
         out = []
         for k in batches:
-            u = design.x[design.rows(k)] / scale
+            u = x[design.rows(k)] / scale
             parts = [
                 kernel(u[i : i + _ROWS_AT_ONCE], support, f["sigma"], self.linear) @ alpha
                 for i in range(0, len(u), _ROWS_AT_ONCE)
@@ -45,10 +46,11 @@ class KernelExpansion(Family):
             out.append(np.concatenate([*parts, np.empty(0)]) + f["bias"])
         return out
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         """Models that share σ share the kernel of their united support rows."""
+        x = fitted[0].started(design).x
         out = np.empty((len(design.x), len(fitted)))
         rows = np.flatnonzero(np.isin(design.group, sorted({k for batches in wanted for k in batches})))
         by_kernel: dict[tuple[float, bytes], list[int]] = {}
@@ -64,7 +66,7 @@ class KernelExpansion(Family):
             bias = np.array([m.fitted["bias"] for m in models])
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 some = rows[start : start + _ROWS_AT_ONCE]
-                values = kernel(design.x[some] / scale, support, sigma, self.linear) @ alpha + bias
+                values = kernel(x[some] / scale, support, sigma, self.linear) @ alpha + bias
                 out[some[:, None], members] = values
         return by_batch(design, out, wanted)
 
@@ -93,6 +95,19 @@ def kernel_of(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
     if linear:
         omega += LINEAR_WEIGHT * dot
     return omega
+
+
+def kernel_from_origin(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
+    """`k(u, v) − k(u, 0) − k(0, v) + k(0, 0)` (n, n) between n rows u, from what `products` gives."""
+    omega = kernel_of(half, dot, sigma, linear)
+    to_origin = np.exp(-np.einsum("ii->i", dot) / (2.0 * sigma**2))
+    omega += 1.0 - to_origin[:, None] - to_origin
+    return omega
+
+
+def from_origin(support: Array, alpha: Array) -> tuple[Array, Array]:
+    """Support rows and weights of the plain kernel that answer as those of `kernel_from_origin`, but for the level."""
+    return np.vstack([support, np.zeros(support.shape[1])]), np.append(alpha, -alpha.sum())
 
 
 def unit_scale(design: Design) -> Array:
@@ -163,6 +178,8 @@ class Kernel:
 class Bordered:
     """S systems `[[0, kᵀ], [k, Ω + I/γ]] [b; α] = [0; y]` over G groups of m rows, n = G m; k is 0 on padding, else 1.
 
+    Without `bias` b is 0 and its row and column are gone: the border of the inverse is 0.
+
     The inverse is `[[corner, onesᵀ], [ones, inverse]]`: (S,), (S, n), (S, n, n). Ω and y (S, n) are 0 on padding, so
     that α = inverse y and every residual are too. Where Ω + I/γ is not positive definite, everything is NaN.
     """
@@ -177,7 +194,7 @@ class Bordered:
     alpha: Array
 
     @classmethod
-    def of(cls, kernels: list[Kernel], known: Array, y: Array, gamma: float) -> Self:
+    def of(cls, kernels: list[Kernel], known: Array, y: Array, gamma: float, bias: bool = True) -> Self:
         n = y.shape[1]
         inverse = np.empty((len(kernels), n, n))
         for s, kernel in enumerate(kernels):
@@ -186,7 +203,7 @@ class Bordered:
             except np.linalg.LinAlgError:
                 inverse[s] = np.nan
         u = (inverse @ known[:, :, None])[..., 0]
-        corner = -1.0 / (u * known).sum(axis=1)
+        corner = -1.0 / (u * known).sum(axis=1) if bias else np.zeros(len(kernels))
         ones = -corner[:, None] * u
         for s in range(len(kernels)):
             inverse[s] -= u[s][:, None] * ones[s]

@@ -105,11 +105,12 @@ def responses(design: Design, signals: Array, tau_s: Array) -> Array:
 class Dictionary:
     """The columns of S sources on a design: first the signals themselves, then their responses to every τ.
 
-    Column `(t + 1) S + s` is source s behind `TAUS_S[t]`.
+    Column `(t + 1) S + s` is source s behind `TAUS_S[t]`; with `about_start` relative to its value at the start.
     """
 
     design: Design
     sources: tuple[Source, ...]
+    about_start: bool = False
 
     @cached_property
     def table(self) -> Design:
@@ -119,8 +120,9 @@ class Dictionary:
         columns = [signals, *(responses(own, signals, np.full(len(self.sources), tau)) for tau in TAUS_S)]
         x = np.nan_to_num(np.column_stack(columns))
         y_um = np.where(own.usable, own.y_um, np.nan)
-        return replace(own, inputs=tuple(map(str, range(x.shape[1]))), x=x, y_um=y_um, input_units=(), _columns=None,
-                       _parent=None)  # fmt: skip
+        table = replace(own, inputs=tuple(map(str, range(x.shape[1]))), x=x, y_um=y_um, input_units=(), _columns=None,
+                        _parent=None)  # fmt: skip
+        return table.started if self.about_start else table
 
     def places(self, which: Sequence[int], poles: Sequence[int]) -> list[int]:
         """Columns of some sources: the direct ones, then all behind each pole of the grid."""

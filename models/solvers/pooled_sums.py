@@ -43,7 +43,10 @@ class Pool:
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sums over B blocks of rows, each about its own mean, so that pooling them cancels nothing."""
+    """Sums over B blocks of rows, each about its own mean, so that pooling them cancels nothing.
+
+    Of moments about the start the means are 0 here and in every `Pool`: fits have no intercept.
+    """
 
     count: Array
     mean_x: Array
@@ -58,6 +61,8 @@ class Blocks:
     def of(cls, m: Moments) -> Blocks:
         n = np.maximum(m.count, 1.0)
         mean_x, mean_y = m.sum_x / n[:, None], m.sum_y / n
+        if m.about_start:
+            mean_x, mean_y = np.zeros_like(mean_x), np.zeros_like(mean_y)
         xx = m.xx - m.sum_x[:, :, None] * mean_x[:, None, :]
         xy = m.xy - m.sum_x * mean_y[:, None]
         raw = np.einsum("bjj->bj", m.xx)

@@ -134,10 +134,10 @@ class SequenceNet(Family):
                     yield errors.get(done) or [self._learned(designs[done], net) for net in nets]
                 lessons, first = [], d + 1
 
-    def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        return self.predict_folds(design, [self], [batches])[0]
+    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
+        return self.respond_folds(design, [self], [batches])[0]
 
-    def predict_folds(
+    def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
         """Error_um (n_k,) per copy and batch.
@@ -152,7 +152,7 @@ class SequenceNet(Family):
             by_kind.setdefault(key, []).append(f)
         lengths = np.diff(design.offsets)
         for (spacing_s, drivers, n_wanted), which in by_kind.items():
-            sequences = Sequences.of(design, self._stride(design, spacing_s), drivers)
+            sequences = Sequences.of(fitted[0].started(design), self._stride(design, spacing_s), drivers)
             at_once = max(1, _STACK_VALUES // max(1, self.hidden * n_wanted * sequences.row[0].size))
             for start in range(0, len(which), at_once):
                 some = which[start : start + at_once]
@@ -162,8 +162,9 @@ class SequenceNet(Family):
         return out
 
     def n_parameters(self) -> int:
-        """Weights of the net and its readout, coefficients and intercept of the linear part."""
-        return 1 + sum(int(np.size(self.fitted[name])) for name in (*self.weights, "readout_um", "linear_um"))
+        """Weights of the net and its readout, coefficients of the linear part, intercept where the level is free."""
+        learned = (self.fitted[name] for name in (*self.weights, "readout_um", "linear_um"))
+        return (not self.zero_start) + sum(int(np.size(values)) for values in learned)
 
     def _spacing(self, design: Design, fold: Sequence[int]) -> tuple[int, float]:
         """Rows per step of the net, and the step in s, that a fold is learned with."""
@@ -198,6 +199,7 @@ class SequenceNet(Family):
                 "least one, e.g. the spindle speed with role driver in the machine file; or set drivers=False"
             )
         drivers = design.driver_names if self.drivers else ()
+        design = self.started(design)
         by_spacing: dict[tuple[int, float], list[int]] = {}
         for f, fold in enumerate(folds):
             by_spacing.setdefault(self._spacing(design, fold), []).append(f)
@@ -209,7 +211,7 @@ class SequenceNet(Family):
                 if got < _LEAST_ROWS:
                     raise too_few_rows(self.key, design, folds[f], got, _LEAST_ROWS)
             columns = memory_columns(sequences.x)
-            coef, intercept_um = fit_memories(sequences, columns, [folds[f] for f in which])
+            coef, intercept_um = fit_memories(sequences, columns, [folds[f] for f in which], self.zero_start)
             rest_um = sequences.y_um[..., None] - columns @ coef.T - intercept_um
             frame = {"spacing_s": spacing_s, "drivers": list(drivers)}
             for some in alike([len(folds[f]) for f in which], [1] * len(which), self._most(*sequences.row[0].shape)):

@@ -232,17 +232,22 @@ def memory_columns(x: Array) -> Array:
     return out.reshape(*x.shape[:-1], -1)
 
 
-def fit_memories(sequences: Sequences, columns: Array, folds: Sequence[Sequence[int]]) -> tuple[Array, Array]:
+def fit_memories(
+    sequences: Sequences, columns: Array, folds: Sequence[Sequence[int]], zero_start: bool
+) -> tuple[Array, Array]:
     """Ridge on the columns of the sequences' x: coefficients (F, (L + 1) p), µm per unit of x, and intercepts (F,).
+
+    With `zero_start` the intercepts are 0: columns that are 0 at rest answer 0.
 
     The lags act on the 6 leading principal directions of the inputs. The penalty, and how much stronger it is on the
     lags, are chosen by leave-batch-out inside each fold; a fold of one or two batches has the lags' share fixed.
     """
-    design = sequences.as_design(columns)
+    design = replace(sequences.as_design(columns), about_start=zero_start)
     coef, intercept_um = np.empty((len(folds), columns.shape[-1])), np.empty(len(folds))
     for few, shares in ((False, _SHARES), (True, _SHARE_OF_FEW)):
         which = [f for f, fold in enumerate(folds) if (len(fold) < 3) == few]
-        for f, fitted in zip(which, _MemoryRidge(shares).fit_folds(design, [folds[f] for f in which]), strict=True):
+        ridge = _MemoryRidge(shares) if zero_start else _MemoryRidge(shares).as_published()
+        for f, fitted in zip(which, ridge.fit_folds(design, [folds[f] for f in which]), strict=True):
             coef[f], intercept_um[f] = fitted.fitted["coef_um_per_K"], fitted.fitted["intercept_um"]
     return coef, intercept_um
 

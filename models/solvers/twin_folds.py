@@ -21,6 +21,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from features.rises import hold_last
 from twin.calibration.arrow import Arrow, assemble
 from twin.calibration.fit_problem import Block, Noise, estimate
 from twin.calibration.least_squares import State, descend, x_of, z_bounds
@@ -33,10 +34,12 @@ from twin.simulation.start import start_of
 
 SUBSTEPS_K = 0.03  # what the time step may cost; a third of a common sensor's last digit
 FAR = 16.0  # squared way, in posterior standard deviations, beyond which derivatives are taken anew
-CLOSE = 1e-4  # expected gain in cost per degree of freedom below which a fit has arrived
-SETTLED = 3e-3  # relative change of the channels' weights
+NEAR = 0.1  # the same, beyond which derivatives are taken anew where a step brings less than they promise
+CLOSE = 1e-2  # expected gain in cost below which a fit has arrived: a step of a tenth of a posterior standard deviation
+SETTLED = 1e-2  # relative change of the channels' weights
 ROUNDS = 60
 _SHARES = (1.0, 0.5, 0.2, 0.05)
+_KEPT = 0.25  # of the gain that a step promises
 _PATIENCE = 6  # rounds in which the noise follows the residuals at once
 _ROUNDING = 1e-3  # of a cost, from the iterations within a simulation
 _TOGETHER = 4
@@ -91,7 +94,8 @@ class Calibrations:
         if not len(self.network.free):
             raise InputError(f"machine {machine.machine}: no parameter of the twin is free; give one a prior spread")
         self.batches = tuple(batches)
-        self.refused = _refused(self.network, batches, every_s, channels)
+        self._coarse = [_thinned(b, every_s) for b in batches]
+        self.refused = _refused(self.network, self._coarse, every_s, channels)
         self._options = every_s, channels
         self._done: dict[tuple[int, ...], Calibrated] = {}
         self._ends: dict[tuple[int, ...], _Point] = {}
@@ -105,12 +109,20 @@ class Calibrations:
 
     @cached_property
     def problem(self) -> CalibrationProblem:
-        kept = [self.batches[k] for k in self.used]
-        inputs = inputs_of(self.network, kept)
+        kept = [self._coarse[k] for k in self.used]
+        inputs = _fine_enough(self.network, kept)
         start = start_of(self.network, self.network.values, inputs)
-        inputs = inputs.refined(choose_substeps(self.network, self.network.values, inputs, start[None], SUBSTEPS_K))
         seen = tuple(measured(self.network, kept, self._options[0], self._options[1] or None))
         return _InParts(self.network, inputs, seen, start, Nuisances.of(self.network))
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        """What drives the same batches at all their rows."""
+        return _fine_enough(self.network, [self.batches[k] for k in self.used])
+
+    def thinned(self, k: int) -> tuple[Batch, Inputs]:
+        """Batch k on the rows that are calibrated on, and what drives it there."""
+        return self._coarse[k], self.problem.inputs.batch([self.used[k]])
 
     def of(self, train: Sequence[int], near: Sequence[int] | None = None) -> Calibrated:
         """Calibrated on the batches `train`, the work begun where the fit on `near`, a larger set, has ended.
@@ -138,7 +150,7 @@ class Calibrations:
             if (key, usual) not in self._left_out:
                 out = {}
                 for k, (values, start_K) in self._done[key].left_out.items():
-                    inputs = self.problem.inputs.batch([self.used[k]])
+                    inputs = self._inputs.batch([self.used[k]])
                     start = start_of(self.network, values, inputs, settled=True) + (start_K if usual else 0.0)
                     done = simulate(self.network, values, inputs, start[None])
                     n = self.batches[k].n_rows
@@ -172,6 +184,25 @@ class Calibrations:
         return Calibrated(key, values, typical, scatter, left_out, rounds, message), point
 
 
+def _thinned(batch: Batch, every_s: float) -> Batch:
+    """The batch on rows `every_s` apart, or its own where they are farther apart; drivers are means until the next."""
+    stride = round(every_s / batch.step_s) if batch.step_s else 1
+    if stride < 2 or batch.n_rows <= stride:
+        return batch
+    table = batch.table.iloc[::stride].reset_index(drop=True)
+    for name in set(batch.names("driver")) & set(table.columns):
+        held = hold_last(batch.masked(name))
+        ends = np.full(-len(held) % stride, held[-1])
+        table[name] = np.concatenate([held, ends]).reshape(-1, stride).mean(axis=1)
+    return replace(batch, table=table)
+
+
+def _fine_enough(network: Network, batches: Sequence[Batch]) -> Inputs:
+    inputs = inputs_of(network, batches)
+    start = start_of(network, network.values, inputs)
+    return inputs.refined(choose_substeps(network, network.values, inputs, start[None], SUBSTEPS_K))
+
+
 def _refused(network: Network, batches: Sequence[Batch], every_s: float, channels: tuple[str, ...]) -> dict[int, str]:
     """Batches that no calibration can use, and why."""
     out = {}
@@ -198,9 +229,8 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
     """The optimum under noise that follows from its own residuals."""
     low, high = z_bounds(problem.unknowns)
     channels = [b.channel for b in point.blocks]
-    rows = sum(map(len, channels))
     residuals = problem.residuals(x_of(problem.unknowns, point.z), point.nuisance)
-    noise, determined = Noise.as_given(len(problem.channels)), float(len(point.z))
+    noise, determined, stalled = Noise.as_given(len(problem.channels)), float(len(point.z)), False
     for number in range(1, ROUNDS + 1):
         before, noise = noise, estimate(residuals, channels, len(problem.channels), determined)
         noise = _towards(before, noise, min(1.0, _PATIENCE / number))
@@ -208,17 +238,19 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         arrow = assemble(blocks, point.nuisance, point.z, problem.unknowns, noise.weight)
         determined = arrow.effective_parameters()
         dz = arrow.step(0.0, low - point.z, high - point.z)
-        cost = _cost(point.z, point.nuisance, residuals, blocks, noise)
-        small = arrow.gain(dz) <= CLOSE * max(1.0, cost / max(1.0, rows - determined))
+        gain, cost = arrow.gain(dz), _cost(point.z, point.nuisance, residuals, blocks, noise)
         way = float(np.sum((arrow.root @ (point.z - point.taken_at)) ** 2))
+        small = gain <= CLOSE
         if small and noise.change(before) < SETTLED and way <= FAR:
             return replace(point, blocks=blocks), noise, number, f"arrived after {number} rounds"
-        if way > FAR and (small or number % 3 == 0):
+        if (way > FAR and (small or number % 3 == 0)) or (stalled and way > NEAR and not small):
             point = replace(point, blocks=_linearised(problem, point.z, point.nuisance), taken_at=point.z)
+            stalled = False
             continue
         moved = _step(problem, point, arrow, dz, blocks, noise, cost)
         if moved is None and way > 0:
             point = replace(point, blocks=_linearised(problem, point.z, point.nuisance), taken_at=point.z)
+            stalled = False
             continue
         if moved is None:
             state = descend(problem, State.at(problem, point.z, point.nuisance, noise), ROUNDS, CLOSE)
@@ -226,6 +258,7 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
             moved = state.z, state.nuisance, [b.residual for b in fresh]
             point = replace(point, blocks=fresh, taken_at=state.z)
         z, nuisance, residuals = moved
+        stalled = cost - _cost(z, nuisance, residuals, blocks, noise) < _KEPT * gain
         point = replace(point, z=z, nuisance=nuisance)
     return replace(point, blocks=blocks), noise, ROUNDS, f"still moving after {ROUNDS} rounds"
 

@@ -84,18 +84,18 @@ def test_first_step_is_the_damped_gauss_newton_step():
 
 
 def test_a_trained_model_predicts_without_torch(tmp_path):
-    model = BP().fit_design(make_design(), [0, 1])
+    model = BP().as_published().fit_design(make_design(), [0, 1])
     np.savez(tmp_path / "net.npz", **model.fitted)
     code = (
         "import sys, numpy as np; from models.base import family_from_plain; from features.design import Design; "
         "fitted = dict(np.load(sys.argv[1])); plain = dict(family='bp', options={}, inputs=['t0', 't1'], target='z'); "
-        "model = family_from_plain(plain | dict(fitted=fitted)); x = np.array([[1.0, 2.0]]); "
-        "design = Design(('t0', 't1'), '', ('a',), x, x[:, 0], x[:, 0], np.array([0, 1])); "
-        "print(float(model.predict_design(design, [0])[0][0]), 'torch' in sys.modules)"
+        "model = family_from_plain(plain | dict(fitted=fitted)); x = np.array([[0.0, 0.0], [1.0, 2.0]]); "
+        "design = Design(('t0', 't1'), '', ('a',), x, x[:, 0], x[:, 0], np.array([0, 2])); "
+        "print(float(model.predict_design(design, [0])[0][1]), 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "net.npz")], capture_output=True, text=True)
-    x = np.array([[1.0, 2.0]])
-    want = model.predict_design(Design(("t0", "t1"), "", ("a",), x, x[:, 0], x[:, 0], np.array([0, 1])), [0])[0][0]
+    x = np.array([[0.0, 0.0], [1.0, 2.0]])
+    want = model.predict_design(Design(("t0", "t1"), "", ("a",), x, x[:, 0], x[:, 0], np.array([0, 2])), [0])[0][1]
     assert done.stdout.split() == [str(float(want)), "False"], done.stderr
 
 
@@ -103,7 +103,7 @@ def test_torch_keeps_its_thread_count():
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        BP().fit_design(make_design(), [0, 1])
+        BP().as_published().fit_design(make_design(), [0, 1])
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
@@ -114,7 +114,7 @@ def test_recovers_a_net_of_its_own_shape():
         return 20 * np.tanh(0.15 * x[:, 0] - 0.1 * x[:, 1]) + 5
 
     design = make_design(law=law)
-    model = BP(decay=0.0, iterations=200, max_rows=100).fit_design(design, [0, 1, 2])
+    model = BP(decay=0.0, iterations=200, max_rows=100).as_published().fit_design(design, [0, 1, 2])
     left = model.predict_design(design, [3])[0] - design.y_um[design.rows(3)]
     assert np.sqrt(np.mean(left**2)) < 0.02 * np.std(design.y_um)
 
@@ -122,8 +122,8 @@ def test_recovers_a_net_of_its_own_shape():
 def test_padding_and_neighbours_change_nothing():
     design = make_design()
     folds = [[0, 1, 2], [1], [0, 3], [3], [0, 1, 2, 3]]
-    for fold, model in zip(folds, BP().fit_folds(design, folds), strict=True):
-        alone = BP().fit_design(design, fold)
+    for fold, model in zip(folds, BP().as_published().fit_folds(design, folds), strict=True):
+        alone = BP().as_published().fit_design(design, fold)
         for k in range(4):
             np.testing.assert_allclose(
                 model.predict_design(design, [k])[0], alone.predict_design(design, [k])[0], atol=1e-6
@@ -132,21 +132,23 @@ def test_padding_and_neighbours_change_nothing():
 
 def test_small_stacks_give_what_one_stack_gives(monkeypatch):
     design, folds = make_design(), [[0, 1, 2], [1, 2, 3], [0, 2, 3]]
-    want = BP().fit_folds(design, folds)
+    want = BP().as_published().fit_folds(design, folds)
     monkeypatch.setattr("models.bp._STACK_VALUES", 1)
-    for a, b in zip(want, BP().fit_folds(design, folds), strict=True):
+    for a, b in zip(want, BP().as_published().fit_folds(design, folds), strict=True):
         np.testing.assert_allclose(a.predict_design(design, [3])[0], b.predict_design(design, [3])[0], atol=1e-6)
 
 
 def test_same_seed_same_net_other_seed_other_net_whatever_the_threads():
     design = make_design(p=4)
-    predict = [BP(seed=s).fit_design(design, [0, 1, 2]).predict_design(design, [3])[0] for s in (0, 0, 1)]
+    predict = [
+        BP(seed=s).as_published().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0] for s in (0, 0, 1)
+    ]
     np.testing.assert_array_equal(predict[0], predict[1])
     assert np.abs(predict[0] - predict[2]).max() > 1e-6
     with threadpool_limits(limits=1):
-        one = BP().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
+        one = BP().as_published().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
     with threadpool_limits(limits=2):
-        two = BP().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
+        two = BP().as_published().fit_design(design, [0, 1, 2]).predict_design(design, [3])[0]
     np.testing.assert_allclose(one, two, atol=1e-6)
 
 
@@ -154,7 +156,7 @@ def test_same_seed_same_net_other_seed_other_net_whatever_the_threads():
 def test_a_season_never_seen_does_not_explode(train):
     """Trained on small summer rises, asked for winter's of ten times their size, and the other way round."""
     design = make_design(sizes=(60, 60, 60, 60), ambient=(1.0, 1.2, 10.0, 12.0), p=4)
-    model = BP().fit_design(design, train)
+    model = BP().as_published().fit_design(design, train)
     keep = np.isin(design.group, train)
     width = np.ptp(design.y_um[keep])
     for part in model.predict_design(design, range(4)):
@@ -171,7 +173,7 @@ def test_rows_are_decimated_evenly_and_holes_left_out():
     x, y = design.x.copy(), design.y_um.copy()
     x[5, 0], y[110:125] = np.nan, np.nan
     holed = Design(design.inputs, "z", design.batch_ids, x, y, design.time_s, design.offsets, 60.0)
-    model = BP(max_rows=20).fit_design(holed, [0, 1])
+    model = BP(max_rows=20).as_published().fit_design(holed, [0, 1])
     assert model.fitted["n_rows"] == 20 + 15
     got = np.concatenate(model.predict_design(holed, [0, 1]))
     assert np.flatnonzero(np.isnan(got)).tolist() == [5]
@@ -183,14 +185,14 @@ def test_a_sensor_that_never_moved_and_a_flat_error_do_no_harm():
     x[design.group == 0, 1] = 0.0
     still = Design(design.inputs, "z", design.batch_ids, x, np.where(design.group == 0, 0.0, design.y_um),
                    design.time_s, design.offsets, 60.0)  # fmt: skip
-    for part in BP().fit_design(still, [0]).predict_design(still, range(4)):
+    for part in BP().as_published().fit_design(still, [0]).predict_design(still, range(4)):
         assert np.abs(part).max() < 1.0
 
 
 def test_too_few_rows_in_words():
     design = make_design()
     with pytest.raises(InputError, match="family bp: got 0 usable rows of z in no batch, need at least 2"):
-        BP().fit_design(design, [])
+        BP().as_published().fit_design(design, [])
 
 
 def test_linear_transfer_is_least_squares_with_a_penalty_on_the_length_of_the_slope():
@@ -212,8 +214,8 @@ def test_linear_transfer_is_least_squares_with_a_penalty_on_the_length_of_the_sl
 
 def test_without_decay_a_linear_net_is_multiple_regression():
     design = make_design()
-    net = BPLinear(decay=0.0, iterations=200, max_rows=1000).fit_design(design, [0, 1, 2])
-    plain = MLR().fit_design(design, [0, 1, 2])
+    net = BPLinear(decay=0.0, iterations=200, max_rows=1000).as_published().fit_design(design, [0, 1, 2])
+    plain = MLR().as_published().fit_design(design, [0, 1, 2])
     np.testing.assert_allclose(net.predict_design(design, [3])[0], plain.predict_design(design, [3])[0], atol=1e-4)
     assert net.options()["transfer"] == "linear" and BP().options()["transfer"] == "tanh"
 
@@ -222,7 +224,9 @@ def test_linear_transfer_cannot_bend():
     design = make_design(law=lambda x: 20 * np.tanh(0.15 * x[:, 0] - 0.1 * x[:, 1]) + 5)
     left = {}
     for transfer in TRANSFERS:
-        model = BP(decay=1e-6, iterations=200, max_rows=100, transfer=transfer).fit_design(design, [0, 1, 2])
+        model = (
+            BP(decay=1e-6, iterations=200, max_rows=100, transfer=transfer).as_published().fit_design(design, [0, 1, 2])
+        )
         left[transfer] = np.std(model.predict_design(design, [3])[0] - design.y_um[design.rows(3)])
     assert left["tanh"] < 0.2 * left["linear"]
 

@@ -133,7 +133,7 @@ def test_no_lag_where_none_is():
 @pytest.mark.parametrize("fold", [[0, 1, 2, 3, 4], [0, 2, 4], [1]])
 def test_the_choice_is_the_brute_force_choice(fold):
     design = make_design(lambda x: x[:, 0] + 2 * shifted(x[:, 1], 6), noise_um=2.0, seed=7)
-    fitted = DistributedLag("free", lag_min=15, max_lags=3).fit_design(design, fold).fitted
+    fitted = DistributedLag("free", lag_min=15, max_lags=3).as_published().fit_design(design, fold).fitted
     parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in fold]
     if len(fold) < 3:
         parts = [part[(np.arange(len(part)) * 4) // len(part) == q] for part in parts for q in range(4)]
@@ -159,7 +159,11 @@ def test_the_choice_is_the_brute_force_choice(fold):
 
 def test_almon_weights_lie_on_a_polynomial_and_equal_regression_on_its_terms():
     design = make_design(lambda x: sum(shifted(x, 2 * lag) @ [1.0, -0.3] * lag for lag in range(7)), noise_um=1, seed=8)
-    model = DistributedLag("almon", lag_min=10, max_lags=6, degree=2, order_by="aic").fit_design(design, range(5))
+    model = (
+        DistributedLag("almon", lag_min=10, max_lags=6, degree=2, order_by="aic")
+        .as_published()
+        .fit_design(design, range(5))
+    )
     weights, lag = model.fitted["weights_um_per_K"], np.arange(7)
     assert len(weights) == 7
     for column in weights.T:
@@ -238,7 +242,9 @@ def test_a_model_learned_at_one_step_holds_at_another(lags):
 
 def test_lags_are_never_closer_than_a_step():
     design = make_design(step_s=900.0)
-    fitted = DistributedLag("free", lag_min=5, max_lags=2, order_by="aic").fit_design(design, range(5)).fitted
+    fitted = (
+        DistributedLag("free", lag_min=5, max_lags=2, order_by="aic").as_published().fit_design(design, range(5)).fitted
+    )
     assert set(np.diff(fitted["delays_s"])) <= {900.0}
 
 

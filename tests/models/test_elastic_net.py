@@ -41,7 +41,7 @@ def scikit(x, y, alpha, mixing) -> np.ndarray:
 
 def test_every_fold_is_scikit_learns_model_at_the_chosen_setting():
     design = make_design()
-    for fold, model in zip(FOLDS, ElasticNet().fit_folds(design, FOLDS), strict=True):
+    for fold, model in zip(FOLDS, ElasticNet().as_published().fit_folds(design, FOLDS), strict=True):
         x, y, _ = design.stacked(fold)
         other = scikit(x, y, model.fitted["alpha"], model.fitted["mixing"])
         np.testing.assert_allclose(model.fitted["coef_um_per_K"], other.coef_, rtol=0, atol=1e-6)
@@ -66,7 +66,7 @@ def _pool(design):
 
 def test_the_choice_is_the_brute_force_choice():
     design = make_design(2)
-    family = ElasticNet((1.0, 0.5), 1e-3, 7)
+    family = ElasticNet((1.0, 0.5), 1e-3, 7).as_published()
     for fold in ([0, 1, 2, 3, 4], [1, 2, 5]):
         fitted = family.fit_design(design, fold).fitted
         S_um = {}
@@ -122,7 +122,7 @@ def test_a_warm_start_ends_at_the_same_minimum():
 def test_the_lasso_finds_the_planted_sensors():
     rng = np.random.default_rng(5)
     design = make_design(5, x=rng.normal(0, 3, (K * N, P)))
-    model = ElasticNet((1.0,)).fit_design(design, range(K))
+    model = ElasticNet((1.0,)).as_published().fit_design(design, range(K))
     assert set(np.argsort(-np.abs(model.fitted["coef_um_per_K"]))[:3]) == {0, 2, 5}
     sparse = ElasticNet((1.0,), 0.2, 2)._path(_pool(design))[0, :, 1]
     assert set(np.flatnonzero(sparse)) == {0, 2, 5}
@@ -133,13 +133,13 @@ def test_inputs_of_another_unit_are_scaled_so_that_their_unit_does_not_matter():
     x[:, 5] *= 1000
     scaled = Design(plain.inputs, "z", plain.batch_ids, x, plain.y_um, plain.time_s, plain.offsets, 300.0,
                     input_units=plain.input_units)  # fmt: skip
-    a, b = (ElasticNet().fit_design(d, range(K)) for d in (plain, scaled))
+    a, b = (ElasticNet().as_published().fit_design(d, range(K)) for d in (plain, scaled))
     np.testing.assert_allclose(a.predict_design(plain, [0])[0], b.predict_design(scaled, [0])[0], atol=1e-6)
 
 
 def test_n_active_counts_what_is_left():
     design = make_design(7)
-    for model in ElasticNet((1.0,), 0.05, 4).fit_folds(design, FOLDS):
+    for model in ElasticNet((1.0,), 0.05, 4).as_published().fit_folds(design, FOLDS):
         assert model.fitted["n_active"] == np.count_nonzero(model.fitted["coef_um_per_K"])
 
 

@@ -163,10 +163,44 @@ def test_a_prediction_never_sees_the_recorded_error(batches, design, fitted):
     np.testing.assert_array_equal(fitted.predict_design(blind, [4])[0], fitted.predict_design(design, [4])[0])
 
 
-def test_starts_near_zero_as_its_training_did(key, design, fitted):
-    for k in range(5):
-        y_um = design.y_um[design.rows(k)]
-        assert abs(fitted.predict_design(design, [k])[0][0]) < 0.15 * np.ptp(y_um)
+def test_a_prediction_is_zero_where_the_recorded_error_is(key, batches, design, fitted):
+    """Exactly, at the first row; along an axis throughout the first sweep."""
+    start = 4 if FAMILIES[key].needs_position else 1
+    one_by_one = [fitted.predict(b) for b in batches]
+    (at_once,) = fitted.predict_folds(design, [fitted], [range(5)])
+    for predicted in (*one_by_one, *at_once, *fitted.predict_design(design, range(5))):
+        assert (predicted[:start] == 0.0).all()
+        assert key == "zero" or np.abs(predicted).max() > 1.0
+
+
+def test_without_its_first_readings_a_prediction_is_zero_at_its_first_row(key, batches, fitted):
+    table = batches[4].table.copy()
+    table.loc[:2, "front"] = np.nan
+    table.loc[:1, "column"] = np.nan
+    late = Batch("vmc", "late", table, batches[4].channels)
+    predicted = fitted.predict(late)
+    known = np.isfinite(predicted)
+    assert known.sum() >= N - 3 and predicted[np.argmax(known)] == 0.0
+    model = FAMILIES[key]().fit([*batches[:3], late], INPUTS, "z", MACHINE)
+    again = model.predict(late)
+    assert again[np.argmax(np.isfinite(again))] == 0.0
+
+
+def test_the_published_form_has_a_level_of_its_own_and_keeps_it_in_store(key, design):
+    free = FAMILIES[key]().as_published().fit_design(design, [0, 1, 2, 3])
+    back = family_from_plain(free.as_plain())
+    assert not free.zero_start and not back.zero_start and FAMILIES[key]().zero_start
+    np.testing.assert_array_equal(back.predict_design(design, [4])[0], free.predict_design(design, [4])[0])
+    (own,) = free.respond(design, [4])
+    np.testing.assert_array_equal(free.predict_design(design, [4])[0], own)
+
+
+def test_the_stated_sd_does_not_shrink_from_the_start_on(key, design, fitted):
+    if not fitted.has_sd:
+        return
+    sd_um = fitted.sd_um(design, [4])[0]
+    assert np.isfinite(sd_um).all() and sd_um[0] > 0
+    assert sd_um[0] <= 1.02 * np.median(sd_um)
 
 
 def test_folds_at_once_are_the_folds_one_by_one(key, design, fitted):

@@ -34,14 +34,14 @@ def make_design(batches=8, rows=30, seed=0, own_slope=0.0, curve_um=0.0):
 
 
 def covariance(u, group, setting):
-    half, dot = products(u, u)
-    return setting.shared(half, dot) + (group[:, None] == group) * setting.own(dot) + np.eye(len(u))
+    dot = products(u, u)[1]
+    return setting.shared(u, u, free=True) + (group[:, None] == group) * setting.own(dot) + np.eye(len(u))
 
 
 def test_without_batches_of_their_own_it_is_scikit_learns(monkeypatch):
     monkeypatch.setattr(Setting, "own", lambda self, dot: np.zeros_like(dot))
     design, setting = make_design(3, 20, curve_um=4.0), Setting(100.0, 30.0, 0.7, 0.0)
-    model = GaussianProcess()._made(design, np.arange(60), setting, 1.0)
+    model = GaussianProcess().as_published()._made(design, np.arange(60), setting, 1.0)
     # |u|²/p in the line and 2 p length² below the exponent: scikit-learn's with scaled variances and lengths.
     kernel = (
         ConstantKernel(30.0) * RBF(0.7 * np.sqrt(2))
@@ -79,7 +79,7 @@ def test_the_choice_is_that_of_refits_done_one_by_one(monkeypatch):
     monkeypatch.setattr(gaussian_process, "OWN_LINES", (0.1,))
     design = make_design(6, 12, seed=3, curve_um=5.0)
     folds = [[j for j in range(6) if j != k] for k in range(6)]
-    for fold, model in zip(folds, GaussianProcess().fit_folds(design, folds), strict=True):
+    for fold, model in zip(folds, GaussianProcess().as_published().fit_folds(design, folds), strict=True):
         scores = {}
         for line in (1e2, 1e4):
             for curve in (0.0, 10.0):
@@ -104,7 +104,7 @@ def test_the_stated_interval_holds_on_batches_that_it_never_saw(own_slope):
     inside, sd_um = [], []
     for seed in range(6):
         design = make_design(20, 24, seed=seed, own_slope=own_slope)
-        model = GaussianProcess().fit_design(design, range(12))
+        model = GaussianProcess().as_published().fit_design(design, range(12))
         for k in range(12, 20):
             error = design.y_um[design.rows(k)] - model.predict_design(design, [k])[0]
             sd = model.sd_um(design, [k])[0]
@@ -120,7 +120,7 @@ def test_the_stated_interval_holds_on_batches_that_it_never_saw(own_slope):
 
 def test_a_curve_is_learned_and_far_from_all_rows_it_says_so():
     design = make_design(10, 30, curve_um=6.0)
-    model = GaussianProcess().fit_design(design, range(9))
+    model = GaussianProcess().as_published().fit_design(design, range(9))
     assert model.fitted["curve"] > 0
     assert np.std(model.predict_design(design, [9])[0] - design.y_um[design.rows(9)]) < 1.0
     far = replace(design, x=design.x * 4)
@@ -130,8 +130,8 @@ def test_a_curve_is_learned_and_far_from_all_rows_it_says_so():
 def test_folds_are_the_fits_done_one_by_one():
     design = make_design(7, 26, curve_um=4.0, own_slope=0.1)
     folds = [[1, 2, 3, 4, 5, 6], [0, 1, 2, 4, 5, 6], [0, 3], [2], [0, 1, 2, 3, 4, 5, 6]]
-    for fold, model in zip(folds, GaussianProcess().fit_folds(design, folds), strict=True):
-        alone = GaussianProcess().fit_design(design, fold)
+    for fold, model in zip(folds, GaussianProcess().as_published().fit_folds(design, folds), strict=True):
+        alone = GaussianProcess().as_published().fit_design(design, fold)
         np.testing.assert_allclose(
             model.predict_design(design, [0])[0], alone.predict_design(design, [0])[0], atol=1e-6
         )
@@ -140,8 +140,8 @@ def test_folds_are_the_fits_done_one_by_one():
 
 def test_one_batch_tells_nothing_of_how_batches_differ():
     design = make_design(3)
-    assert np.isnan(GaussianProcess().fit_design(design, [0, 1]).sd_um(design, [2])[0]).all()
-    assert np.isfinite(GaussianProcess().fit_design(design, [0, 1, 2]).sd_um(design, [2])[0]).all()
+    assert np.isnan(GaussianProcess().as_published().fit_design(design, [0, 1]).sd_um(design, [2])[0]).all()
+    assert np.isfinite(GaussianProcess().as_published().fit_design(design, [0, 1, 2]).sd_um(design, [2])[0]).all()
 
 
 def test_rows_are_drawn_evenly_and_holes_stay_holes():
@@ -149,7 +149,7 @@ def test_rows_are_drawn_evenly_and_holes_stay_holes():
     x = design.x.copy()
     x[5, 0] = np.nan
     holed = replace(design, x=x)
-    model = GaussianProcess(max_rows=60).fit_design(holed, range(6))
+    model = GaussianProcess(max_rows=60).as_published().fit_design(holed, range(6))
     assert len(model.fitted["alpha"]) == 60 and model.fitted["factor"].shape == (60, 60)
     assert np.flatnonzero(np.isnan(model.predict_design(holed, [0])[0])).tolist() == [5]
     assert np.flatnonzero(np.isnan(model.sd_um(holed, [0])[0])).tolist() == [5]
@@ -159,6 +159,6 @@ def test_what_cannot_be_learned_from_is_told():
     design = make_design(3)
     empty = replace(design, y_um=np.full_like(design.y_um, np.nan))
     with pytest.raises(InputError, match="family gaussian_process: got 0 usable rows of z in b1, need at least 4"):
-        GaussianProcess().fit_design(empty, [1])
+        GaussianProcess().as_published().fit_design(empty, [1])
     with pytest.raises(InputError, match=r"inputs reach 2e\+07 times their scale, expected about 1: check their units"):
-        GaussianProcess().fit_design(replace(design, x=np.full_like(design.x, 2e8)), range(3))
+        GaussianProcess().as_published().fit_design(replace(design, x=np.full_like(design.x, 2e8)), range(3))

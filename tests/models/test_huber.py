@@ -38,7 +38,7 @@ def criterion(x, y, beta, sigma, epsilon) -> float:
 @pytest.mark.parametrize("epsilon", [1.1, 1.35, 2.5])
 def test_every_fold_is_scikit_learns_or_nearer_to_the_minimum(epsilon):
     design = make_design(spoiled=0.1)
-    for fold, model in zip(FOLDS, Huber((epsilon,), 1e-12).fit_folds(design, FOLDS), strict=True):
+    for fold, model in zip(FOLDS, Huber((epsilon,), 1e-12).as_published().fit_folds(design, FOLDS), strict=True):
         x, y, _ = design.stacked(fold)
         z, f = (x - x.mean(0)) / x.std(0), model.fitted
         other = HuberRegressor(epsilon=epsilon, alpha=0.0, tol=1e-8, max_iter=5000).fit(z, y)
@@ -69,8 +69,8 @@ def test_the_criterion_has_its_minimum_there_ridge_included():
 
 def test_nothing_far_off_is_ridge_least_squares():
     design = make_design(2)
-    model = Huber((100.0,), 1e-12).fit_design(design, range(K))
-    other = MLR().fit_design(design, range(K))
+    model = Huber((100.0,), 1e-12).as_published().fit_design(design, range(K))
+    other = MLR().as_published().fit_design(design, range(K))
     np.testing.assert_allclose(model.fitted["coef_um_per_K"], other.fitted["coef_um_per_K"], rtol=0, atol=1e-8)
     x, y, _ = design.stacked(range(K))
     residual = y - x @ other.fitted["coef_um_per_K"] - other.fitted["intercept_um"]
@@ -83,7 +83,7 @@ def test_spoiled_rows_move_least_squares_but_not_this():
     true = clean.x[clean.rows(5)] @ COEF + 4
     worst = {}
     for family in (MLR, Huber):
-        model = family().fit_design(spoiled, range(5))
+        model = family().as_published().fit_design(spoiled, range(5))
         worst[family] = np.abs(model.predict_design(clean, [5])[0] - true).max()
     assert worst[Huber] < 3.0 < 7.0 < worst[MLR]
 
@@ -103,10 +103,10 @@ def test_the_choice_of_epsilon_is_the_brute_force_choice():
             for e, epsilon in enumerate(epsilons):
                 alone = Design(design.inputs, "z", ("rest",), design.x[rest], design.y_um[rest],
                                np.arange(len(rest)) * 300.0, np.array([0, len(rest)]), 300.0)  # fmt: skip
-                f = Huber((epsilon,)).fit_design(alone, [0]).fitted
+                f = Huber((epsilon,)).as_published().fit_design(alone, [0]).fitted
                 residual = design.y_um[left] - design.x[left] @ f["coef_um_per_K"] - f["intercept_um"]
                 S_um[e] += np.sqrt(residual @ residual / (len(residual) - 1))
-        chosen = Huber(epsilons).fit_design(design, fold).fitted["epsilon"]
+        chosen = Huber(epsilons).as_published().fit_design(design, fold).fitted["epsilon"]
         assert chosen == epsilons[int(np.argmin(S_um))]
 
 
@@ -114,7 +114,7 @@ def test_an_exact_law_is_found_exactly_and_the_scale_is_nothing():
     design = make_design(5)
     exact = Design(design.inputs, "z", design.batch_ids, design.x, design.x @ COEF - 7, design.time_s, design.offsets,
                    300.0)  # fmt: skip
-    fitted = Huber((1.35,), 1e-12).fit_design(exact, range(K)).fitted
+    fitted = Huber((1.35,), 1e-12).as_published().fit_design(exact, range(K)).fitted
     np.testing.assert_allclose(fitted["coef_um_per_K"], COEF, atol=1e-6)
     assert fitted["scale_um"] < 1e-4
 
@@ -124,7 +124,10 @@ def test_sensors_that_tell_nothing_take_no_part():
     x = np.column_stack([design.x, np.full(len(design.x), 21.3), design.x[:, 1]])
     wide = Design((*design.inputs, "dead", "twin"), "z", design.batch_ids, x, design.y_um, design.time_s,
                   design.offsets, 300.0)  # fmt: skip
-    model, narrow = Huber().fit_design(wide, range(K)), Huber().fit_design(design, range(K))
+    model, narrow = (
+        Huber().as_published().fit_design(wide, range(K)),
+        Huber().as_published().fit_design(design, range(K)),
+    )
     assert model.fitted["coef_um_per_K"][4] == 0
     assert model.fitted["coef_um_per_K"][5] == pytest.approx(model.fitted["coef_um_per_K"][1], rel=1e-3)
     np.testing.assert_allclose(model.predict_design(wide, [0])[0], narrow.predict_design(design, [0])[0], atol=1e-3)
@@ -134,7 +137,7 @@ def test_inputs_of_another_unit_are_scaled_so_that_their_unit_does_not_matter():
     plain = make_design(7, units=("K",) * 3 + ("rpm",))
     other = Design(plain.inputs, "z", plain.batch_ids, plain.x * [1, 1, 1, 1000], plain.y_um, plain.time_s,
                    plain.offsets, 300.0, input_units=plain.input_units)  # fmt: skip
-    a, b = (Huber(ridge=0.1).fit_design(d, range(K)).predict_design(d, [0])[0] for d in (plain, other))
+    a, b = (Huber(ridge=0.1).as_published().fit_design(d, range(K)).predict_design(d, [0])[0] for d in (plain, other))
     np.testing.assert_allclose(a, b, atol=1e-6)
 
 

@@ -38,10 +38,9 @@ def refitted(design: Design, train: list[int], penalty: float) -> tuple[float, f
     for k in train:
         rest, rows = [j for j in train if j != k], design.rows(k)
         x, y, _ = design.stacked(rest)
-        centred = x - x.mean(axis=0)
-        matrix = centred.T @ centred
-        coef = np.linalg.solve(matrix + penalty * np.trace(matrix) / 2 * np.eye(2), centred.T @ (y - y.mean()))
-        error = design.y_um[rows] - y.mean() - (design.x[rows] - x.mean(axis=0)) @ coef
+        matrix = x.T @ x
+        coef = np.linalg.solve(matrix + penalty * np.trace(matrix) / 2 * np.eye(2), x.T @ y)
+        error = design.y_um[rows] - design.x[rows] @ coef
         squared.append(error**2)
         grows.append(((design.x[rows] / 10) ** 2).mean(axis=1))
     s, q = np.concatenate(squared), np.concatenate(grows)

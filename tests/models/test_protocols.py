@@ -3,13 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from data.batch import Batch
 from data.errors import InputError
-from models.protocols import PROTOCOLS, folds_of, leave_batch_out, season, speed, train_on_one
+from models.protocols import PROTOCOLS, folds_of, forward_obstacle, leave_batch_out, season, speed, train_on_one
+
+FORWARD = ("forward", "forward-gap")
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", [p for p in PROTOCOLS if p not in FORWARD])
 def test_training_and_test_never_overlap_and_every_batch_is_tested(protocol, toy_batches) -> None:
     batches = toy_batches(9)
     folds = folds_of(protocol, batches)
@@ -18,6 +22,47 @@ def test_training_and_test_never_overlap_and_every_batch_is_tested(protocol, toy
         assert fold.train and not set(fold.train) & set(fold.test)
         assert set(fold.train) | set(fold.test) <= set(range(9))
     assert {i for f in folds for i in f.test} == set(range(9))
+
+
+def dated(batches: list[Batch], *days: int) -> list[Batch]:
+    """Starts so many days after the first of the year."""
+    first = pd.Timestamp("2026-01-01 08:00")
+    return [replace(b, start=first + pd.Timedelta(days=d)) for b, d in zip(batches, days, strict=True)]
+
+
+def test_forward_predicts_later_runs_from_earlier_ones(toy_batches) -> None:
+    """Batches 9 … 0 in order of time: the first five train, then blocks of one."""
+    batches = dated(toy_batches(10), *range(90, -10, -10))
+    folds = folds_of("forward", batches)
+    assert [f.test for f in folds] == [(4,), (3,), (2,), (1,), (0,)]
+    assert [sorted(f.train) for f in folds] == [list(range(k + 1, 10)) for k in (4, 3, 2, 1, 0)]
+    assert folds[0].name == "2026-02-20"
+
+
+def test_forward_blocks_are_equal_and_their_names_unique(toy_batches) -> None:
+    folds = folds_of("forward", dated(toy_batches(24), *range(0, 240, 10)))
+    assert [len(f.test) for f in folds] == [3, 3, 3, 3] and len(folds[0].train) == 12
+    same_day = folds_of("forward", dated(toy_batches(8), *[0] * 8))
+    assert len({f.name for f in same_day}) == 4
+
+
+def test_a_gap_leaves_out_the_weeks_before_the_block(toy_batches) -> None:
+    batches = dated(toy_batches(10), *range(0, 100, 10))
+    for near, far in zip(folds_of("forward", batches), folds_of("forward-gap", batches), strict=True):
+        assert near.test == far.test
+        start = batches[far.test[0]].start
+        assert set(far.train) == {k for k in near.train if batches[k].start <= start - pd.Timedelta(days=28)}
+        assert len(far.train) < len(near.train)
+
+
+def test_without_dates_forward_is_not_offered_unless_one_recording_gives_the_order(toy_batches) -> None:
+    undated = [replace(b, start=None, source=f"{i}.csv") for i, b in enumerate(toy_batches(9))]
+    assert folds_of("forward", undated) == []
+    assert forward_obstacle(undated) == f"9 of 9 batches have no start time (first: {undated[0].batch_id})"
+    parts = [replace(b, source="one.csv") for b in undated]
+    assert [f.test for f in folds_of("forward", parts)] == [(4,), (5,), (6,), (7,), (8,)]
+    assert folds_of("forward-gap", parts) == []
+    assert forward_obstacle(parts[:5]) == "only 5 batches, need at least 6"
 
 
 def test_train_on_one_mirrors_leave_batch_out(toy_batches) -> None:

@@ -89,7 +89,7 @@ def test_linear_memory_recovers_a_law_of_lagged_inputs() -> None:
     columns = memory_columns(s.x)
     law = np.random.default_rng(1).normal(size=columns.shape[-1])
     taught = Sequences(s.design, s.units, s.x, columns @ law + 4.0, s.known, s.row)
-    coef, intercept_um = fit_memories(taught, columns, [[0, 1, 2], [0, 1, 2, 3]])
+    coef, intercept_um = fit_memories(taught, columns, [[0, 1, 2], [0, 1, 2, 3]], zero_start=False)
     for f in range(2):
         told = columns[3, 0] @ coef[f] + intercept_um[f]
         assert np.std(told - taught.y_um[3, 0]) < 1e-2 * np.std(taught.y_um[3, 0])
@@ -100,7 +100,7 @@ def test_more_inputs_than_directions_still_use_every_input_itself() -> None:
     s = Sequences.of(design, 1)
     columns = memory_columns(s.x)
     taught = Sequences(s.design, s.units, s.x, s.x @ np.arange(1.0, 10.0), s.known, s.row)
-    coef, _ = fit_memories(taught, columns, [[0, 1, 2]])
+    coef, _ = fit_memories(taught, columns, [[0, 1, 2]], zero_start=False)
     np.testing.assert_allclose(coef[0], np.concatenate([np.arange(1.0, 10.0), np.zeros(36)]), atol=1e-2)
 
 

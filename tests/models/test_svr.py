@@ -25,7 +25,7 @@ def make_design(seed=0, sizes=(14, 9, 12, 11, 13), p=2, units=()) -> Design:
 
 def test_predicts_as_scikit_learn_with_its_own_rbf_does():
     design = make_design()
-    model = SVR(**ONE).fit_design(design, [0, 1, 2, 3])
+    model = SVR(**ONE).as_published().fit_design(design, [0, 1, 2, 3])
     rows = design.group < 4
     u, y = design.x / 10.0, design.y_um
     mean, spread = y[rows].mean(), y[rows].std()
@@ -39,7 +39,7 @@ def test_predicts_as_scikit_learn_with_its_own_rbf_does():
 
 def test_the_solution_meets_the_conditions_of_its_optimum():
     design = make_design(1)
-    model = SVR(**ONE).fit_design(design, range(5))
+    model = SVR(**ONE).as_published().fit_design(design, range(5))
     f, spread = model.fitted, design.y_um.std()
     residual = (design.y_um - np.concatenate(model.predict_design(design, range(5)))) / spread
     alpha = f["alpha"] / spread
@@ -56,7 +56,7 @@ def test_the_solution_meets_the_conditions_of_its_optimum():
 def test_the_choice_is_the_setting_of_least_left_out_error():
     design = make_design(2, sizes=(20, 18, 22, 19, 21, 20))
     sigmas, costs, epsilons = (0.3, 1.0), (30.0, 3e3), (0.05, 0.3)
-    fitted = SVR(10_000, sigmas, costs, epsilons).fit_design(design, range(6)).fitted
+    fitted = SVR(10_000, sigmas, costs, epsilons).as_published().fit_design(design, range(6)).fitted
     u, y, group = design.x / 10.0, design.y_um, design.group % 3
 
     def rms(sigma, cost, epsilon):
@@ -78,7 +78,7 @@ def test_the_choice_is_the_setting_of_least_left_out_error():
 
 def test_decimation_is_even_and_stated():
     design = make_design(3, sizes=(40, 5, 60))
-    model = SVR(30, **ONE).fit_design(design, range(3))
+    model = SVR(30, **ONE).as_published().fit_design(design, range(3))
     assert model.fitted["n_rows"] == 10 + 5 + 10 and model.fitted["n_usable_rows"] == 105
     long = design.x[design.rows(2)] / 10.0
     kept = {tuple(row) for row in long[np.round(np.linspace(0, 59, 10)).astype(int)]}
@@ -92,7 +92,7 @@ def test_a_bend_that_no_straight_line_follows():
     x = np.concatenate([np.sort(rng.uniform(0, 40, n)) for n in sizes])[:, None]
     y = 20 * np.tanh((x[:, 0] - 20) / 6) + rng.normal(0, 0.5, len(x))
     design = Design(("t",), "z", tuple("ABCDE"), x, y, np.tile(np.arange(60.0), 5), np.arange(6) * 60, 1.0)
-    model = SVR().fit_design(design, [0, 1, 2, 3])
+    model = SVR().as_published().fit_design(design, [0, 1, 2, 3])
     left = model.predict_design(design, [4])[0] - y[240:]
     assert np.sqrt(np.mean(left**2)) < 1.0
     slope = np.polyfit(x[:240, 0], y[:240], 1)
@@ -101,7 +101,7 @@ def test_a_bend_that_no_straight_line_follows():
 
 def test_far_outside_it_falls_back_to_its_bias():
     design = make_design(5)
-    model = SVR(**ONE).fit_design(design, range(5))
+    model = SVR(**ONE).as_published().fit_design(design, range(5))
     far = Design(
         design.inputs, "", ("far",), np.full((3, 2), 500.0), np.full(3, np.nan), np.arange(3.0), np.array([0, 3])
     )
@@ -110,7 +110,7 @@ def test_far_outside_it_falls_back_to_its_bias():
 
 def test_units_have_their_own_scale():
     design = make_design(6, units=("rpm", "K"))
-    np.testing.assert_array_equal(SVR(**ONE).fit_design(design, [0, 1]).fitted["scale"], [1000.0, 10.0])
+    np.testing.assert_array_equal(SVR(**ONE).as_published().fit_design(design, [0, 1]).fitted["scale"], [1000.0, 10.0])
 
 
 def test_a_trained_model_predicts_without_scikit_learn():
@@ -133,6 +133,6 @@ def test_too_few_rows_and_impossible_options_are_told():
     design = make_design(7)
     design.y_um[:] = np.nan
     with pytest.raises(InputError, match="family svr: got 0 usable rows of z in K2, K3, need at least 2"):
-        SVR().fit_design(design, [1, 2])
+        SVR().as_published().fit_design(design, [1, 2])
     with pytest.raises(InputError, match=r"svr: max_rows 1,.* expected at least 2 rows and values above 0"):
         SVR(max_rows=1)

@@ -41,7 +41,7 @@ def test_a_tree_that_never_splits_is_its_value() -> None:
 
 def test_boosting_equals_scikit_learns_prediction() -> None:
     design = make_design()
-    family = HistGradientBoosting(max_rows=30)
+    family = HistGradientBoosting(max_rows=30).as_published()
     fitted = family.fit_design(design, range(7))
     x, y, _ = design.stacked(range(7))
     theirs = HistGradientBoostingRegressor(max_iter=60, max_leaf_nodes=8, min_samples_leaf=8, early_stopping=False,
@@ -52,14 +52,16 @@ def test_boosting_equals_scikit_learns_prediction() -> None:
 
 def test_bags_are_of_batches_so_that_a_batchs_own_part_is_seen_as_doubt() -> None:
     alike, own = make_design(own_um=0.0), make_design(own_um=12.0)
-    sure, unsure = (RandomForest(max_rows=30).fit_design(d, range(8)).sd_um(d, [0])[0].mean() for d in (alike, own))
+    sure, unsure = (
+        RandomForest(max_rows=30).as_published().fit_design(d, range(8)).sd_um(d, [0])[0].mean() for d in (alike, own)
+    )
     assert unsure > 10 > 2.5 * sure  # 12 µm that no sensor shows
 
 
 @pytest.mark.parametrize("own_um", [0.0, 6.0])
 def test_stated_intervals_hold_on_batches_that_were_never_seen(own_um: float) -> None:
     design = make_design(batches=40, own_um=own_um)
-    fitted = RandomForest(max_rows=30).fit_design(design, range(20))
+    fitted = RandomForest(max_rows=30).as_published().fit_design(design, range(20))
     inside = []
     for k in range(20, 40):
         error = design.y_um[design.rows(k)] - fitted.predict_design(design, [k])[0]
@@ -70,7 +72,7 @@ def test_stated_intervals_hold_on_batches_that_were_never_seen(own_um: float) ->
 @pytest.mark.parametrize("cls", [RandomForest, HistGradientBoosting])
 def test_a_missing_input_is_no_prediction_and_far_away_is_the_edge(cls: type[Family]) -> None:
     design = make_design()
-    fitted = cls().fit_design(design, range(8))
+    fitted = cls().as_published().fit_design(design, range(8))
     x = design.x.copy()
     x[3, 1] = np.nan
     x[5], x[6] = 50.0, 5000.0
@@ -84,4 +86,4 @@ def test_rows_are_thinned_evenly() -> None:
     design = make_design()
     assert training_rows("any", design, [1], 4).tolist() == [30, 40, 49, 59]
     assert len(training_rows("any", design, [0, 1], 4, together=40)) == 40
-    assert RandomForest(max_rows=10).fit_design(make_design(20), range(20)).fitted["n_rows"] == 480
+    assert RandomForest(max_rows=10).as_published().fit_design(make_design(20), range(20)).fitted["n_rows"] == 480

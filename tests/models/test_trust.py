@@ -1,54 +1,19 @@
-"""The rise of the error with the distance from the training: planted, found, and silent where nothing was measured."""
+"""Left-out runs of a cell: what is known before their error, their curves, and the siblings that disagree."""
 
-import json
+from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from models.crossing import Plan, prepare
-from models.trust import COLUMNS, Rise, error_against_distance
+from models import FAMILIES
+from models.crossing import Plan, cross_family, prepare
+from models.trust import COLUMNS, DRAWN, disagreement_um, fit_siblings, left_out_runs, siblings_of
 
 
-def table(factor_per_width: float) -> pd.DataFrame:
-    """Twenty batches of their own S, each also predicted from a distance."""
-    rng = np.random.default_rng(3)
-    rows = []
-    for k in range(20):
-        own = rng.uniform(1, 30)
-        distance = 0.08 * k
-        rows.append(("cell", "leave-batch-out", f"b{k}", f"b{k}", 0.0, "", own))
-        rows.append(("cell", "leave-season-out", "s", f"b{k}", distance, "t0", own * (1 + factor_per_width * distance)))
-        rows.append(("cell", "train-on-one", "b0", f"b{k}", 5.0, "t0", 1e3))
-    return pd.DataFrame(rows, columns=COLUMNS)
-
-
-def test_a_planted_rise_is_found_whatever_the_batches_own_size() -> None:
-    rise = Rise.of(table(2.0))
-    assert rise.edge == (0.25, 0.5, 1.0, 2.0)  # only one prediction lies inside: that band says nothing
-    assert rise.factor == pytest.approx([1.32, 1.8, 2.52, 3.56], abs=0.01)
-    assert sum(rise.count) == 19
-    expected = rise.expected_um(np.array([0.0, 0.1, 1.5, 9.0, np.nan]))
-    np.testing.assert_allclose(expected[:3], rise.inside_um * np.array([1.0, 1.32, 3.56]), rtol=0.01)
-    assert np.isnan(expected[3:]).all()
-
-
-def test_expected_error_never_falls_with_the_distance_nor_below_the_inside() -> None:
-    rise = Rise.of(table(-0.5))
-    expected = rise.expected_um(np.linspace(0, 2, 30))
-    assert (np.diff(expected) >= 0).all() and expected[0] == rise.inside_um
-
-
-def test_plain_and_back() -> None:
-    rise = Rise.of(table(1.0).assign(distance=lambda t: 3 * t["distance"]))
-    back = Rise.from_plain(json.loads(json.dumps(rise.as_plain(), allow_nan=False)))
-    assert back == rise and back.edge[-1] == np.inf
-
-
-def test_every_left_out_batch_of_every_protocol_has_its_distance(toy_batches) -> None:
+def test_every_left_out_batch_of_every_protocol_has_its_row(toy_batches) -> None:
     batches = toy_batches(5)
     crossing = prepare(batches, "z", Plan(("correlation",), ("ridge",), ("leave-batch-out", "train-on-one")))
-    found = error_against_distance(crossing, "correlation", "ridge", 2)
+    found = left_out_runs(crossing, "correlation", "ridge", 2).runs
     assert list(found) == COLUMNS
     assert found.groupby("protocol").size().to_dict() == {"leave-batch-out": 5, "train-on-one": 20}
     near, far = (found[found["protocol"] == p]["distance"].median() for p in ("leave-batch-out", "train-on-one"))
@@ -56,12 +21,30 @@ def test_every_left_out_batch_of_every_protocol_has_its_distance(toy_batches) ->
     assert found[found["distance"] > 0]["farthest"].ne("").all()
     outermost = found[(found["protocol"] == "leave-batch-out") & (found["distance"] > 0.05)]
     assert len(outermost) < 5  # the middle of the year lies between its neighbours
+    assert found["start"].notna().all() and (found["disagreement_um"] > 0).all()
 
 
-def test_the_left_out_error_is_the_grids(toy_batches) -> None:
-    from models.crossing import cross_family
+def test_rows_and_curves_agree_with_the_grid(toy_batches) -> None:
+    plan = Plan(("correlation",), ("ridge",), ("forward", "leave-batch-out"), (2,))
+    crossing = prepare(toy_batches(8), "z", plan)
+    scores = cross_family(crossing, "ridge").scores.set_index(["protocol", "batch_id"])["S_um"]
+    runs, curves = left_out_runs(crossing, "correlation", "ridge", 2)
+    found = runs.set_index(["protocol", "batch_id"])["S_um"].reindex(scores.index)
+    np.testing.assert_allclose(found, scores, rtol=1e-9)
+    assert set(curves["protocol"]) == {"forward", "leave-batch-out"} <= set(DRAWN)
+    for (protocol, batch_id), own in curves.groupby(["protocol", "batch_id"]):
+        S_um = np.sqrt(np.sum((own["recorded_um"] - own["predicted_um"]) ** 2) / (len(own) - 1))
+        assert S_um == pytest.approx(scores[protocol, batch_id], rel=1e-9)
 
-    crossing = prepare(toy_batches(5), "z", Plan(("correlation",), ("ridge",), ("leave-batch-out",), (2,)))
-    scores = cross_family(crossing, "ridge").scores.set_index("batch_id")["S_um"]
-    found = error_against_distance(crossing, "correlation", "ridge", 2).set_index("batch_id")["S_um"]
-    np.testing.assert_allclose(found[scores.index], scores, rtol=1e-9)
+
+def test_siblings_are_other_models_of_the_same_inputs(toy_batches) -> None:
+    batches = toy_batches(5)
+    ridge = FAMILIES["ridge"]().fit(batches[:4], ("t0", "t4"), "z")
+    assert [s.key for s in fit_siblings(ridge, batches[:4])] == ["distributed_lag"]
+    assert siblings_of("pls", ("t0",)) == ("ridge", "distributed_lag") and siblings_of("zero", ()) == ()
+    assert fit_siblings(ridge, ()) == () == fit_siblings(ridge, batches[:1] and [])
+    strange = replace(batches[4], table=batches[4].table.assign(t0=lambda t: t["t0"] + np.linspace(0, 60, len(t))))
+    usual, unlike = (disagreement_um(ridge.predict(b), [s.predict(b) for s in fit_siblings(ridge, batches[:4])])
+                     for b in (batches[4], strange))  # fmt: skip
+    assert unlike > 2 * usual
+    assert np.isnan(disagreement_um(np.ones(3), []))

@@ -78,8 +78,9 @@ def test_a_masked_stretch_is_a_gap_and_a_long_one_is_told() -> None:
     with pytest.raises(InputError) as caught:
         inputs_of(network(), [batch(40, batch_id="good"), masked])
     assert str(caught.value) == (
-        "batch b1: channel 'room' has no value from 120 s to 1260 s, longer than the 900 s that may be bridged; cut "
-        "the batch there, overrule the mask, or widen max_gap_s"
+        "batch b1: channel 'room' has no value from 120 s to 1260 s, longer than the 900 s that may be bridged "
+        "(masked by stuck; if the values are right, add to overrule: - {batch: b1, channel: room, check: stuck, "
+        "reason: ...}); cut the batch there, or widen max_gap_s"
     )
     inputs = inputs_of(network(), [masked], max_gap_s=1200)
     np.testing.assert_allclose(inputs.recorded["room"][0], 20 + np.arange(40.0))

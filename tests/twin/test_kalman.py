@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from data.errors import InputError
 from tests.twin.machines import machine
 from twin.compile import compile_network
-from twin.kalman import Doubt, filtered
+from twin.kalman import Doubt, filtered, filtered_each
 from twin.network import Network
 from twin.simulation import simulate
 from twin.simulation.inputs import Inputs
@@ -235,3 +235,20 @@ def test_mistakes_are_told():
     readings = np.full(good.shape, 20.0)
     with pytest.raises(InputError, match="sensor 't_head' has stuck, which remembers more than one lag"):
         filtered(stuck, stuck.values, given, readings, Doubt(np.eye(2)))
+
+
+def test_thinned_readings_give_a_filter_of_longer_steps_whose_corrections_hold_in_between():
+    network, given = two_bodies(), inputs()
+    start = np.full((1, 2), 20.0)
+    readings = no_readings(network, given)
+    readings[:, :, :1] = truth(network, given, start + 1.0)[0][:, :, :1]
+    few = np.full_like(readings, np.nan)
+    few[:, ::3] = readings[:, ::3]
+    doubt = Doubt(np.eye(2), 0.1, 5.0)
+    whole = filtered(network, network.values, given, few, doubt, start)
+    one, loud = filtered_each(network, network.values, given, readings, [doubt, Doubt(np.eye(2), 0.1, 50.0)], start, 3)
+    np.testing.assert_allclose(one.cells_degC[:, ::3], whole.cells_degC[:, ::3], atol=0.05)
+    assert np.isnan(one.innovation[:, 1::3]).all() and np.isfinite(one.innovation[:, 3::3, 0]).all()
+    again = filtered_each(network, network.values, given, few, [doubt], start, 3)[0]
+    np.testing.assert_array_equal(again.cells_degC, one.cells_degC)
+    assert np.abs(loud.cells_degC - one.cells_degC).max() > 1e-3

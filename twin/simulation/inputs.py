@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array, Numeric
 from data.batch import Batch
+from data.checks import why_missing
 from data.errors import InputError, closest
 from twin.mechanisms.base import View
 from twin.network import Heat, Law
@@ -328,13 +329,16 @@ def _filled(batch: Batch, channel: str, max_gap_s: float, hold: bool) -> Array:
     """
     values = batch.masked(channel)
     if np.isnan(values).all():
-        raise InputError(f"batch {batch.batch_id}: channel {channel!r} has no value at all; leave the batch out")
+        raise InputError(
+            f"batch {batch.batch_id}: channel {channel!r} has no value at all{why_missing(batch, channel)}; leave the "
+            "batch out"
+        )
     for start_s, end_s in _gaps(np.isnan(values), batch.time_s):
         if end_s - start_s > max_gap_s * (1 + 1e-9):
             raise InputError(
                 f"batch {batch.batch_id}: channel {channel!r} has no value from {start_s:g} s to {end_s:g} s, longer "
-                f"than the {max_gap_s:g} s that may be bridged; cut the batch there, overrule the mask, or widen "
-                "max_gap_s"
+                f"than the {max_gap_s:g} s that may be bridged{why_missing(batch, channel)}; cut the batch there, "
+                "or widen max_gap_s"
             )
     return fill_short_gaps(values, batch.time_s, math.inf, hold, "")
 

@@ -19,6 +19,7 @@ from typing import Any
 from uuid import uuid4
 
 from data.errors import InputError, WorkError
+from data.processes import ending, without_interrupt
 from evidence.proof.sealing.examinee import FINDINGS, PLAN, REPLIES, SERIES, STATUS
 from evidence.proof.sealing.folder import Ledger, ProofFolder, State, folder_digest, now, source_digest, state_of
 from evidence.proof.sealing.isolation import own_source
@@ -89,9 +90,11 @@ def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
     task = {"place": str(place), "diagnose": by.diagnose, "baselines": by.baselines, "import_from": by.import_from}
     command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
     with (place / "output").open("wb") as output:
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=output, stderr=output, cwd=place / "case", env=_environment(place)
-        )
+        with without_interrupt():
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=output, cwd=place / "case",
+                env=_environment(place),
+            )  # fmt: skip
         try:
             assert process.stdin is not None
             process.stdin.write(json.dumps(task).encode())
@@ -191,7 +194,12 @@ def run(
 def _in_parallel(cases: list[str], answer: Answerer, answered: Answered, workers: int) -> None:
     """At most `workers` cases under way; the first failure stops the others."""
     stop, waiting = Event(), iter(cases)
-    with ThreadPoolExecutor(workers) as pool:
+
+    def end() -> None:  # no killed process may pass for an answer
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+
+    with ThreadPoolExecutor(workers) as pool, ending(end):
         try:
             under_way = {pool.submit(answer, case, stop): case for case in islice(waiting, workers)}
             while under_way:

@@ -1,0 +1,179 @@
+"""Updating by rare readings: planted drifts and gains are followed, no row sees a later reading, stream equals run."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data.errors import InputError
+from features.design import Design
+from models.crossing import Plan, cross_family, prepare
+from models.updating import (
+    COLUMNS,
+    COUNTS,
+    SCHEDULES,
+    Readings,
+    Track,
+    Updater,
+    held_um,
+    learn_updater,
+    out_of_fold,
+    updated_scores,
+)
+
+TIME_S = np.arange(0.0, 6 * 3600 + 1, 300.0)
+HOURS = TIME_S / 3600
+
+
+def tracks(seed: int, runs: int, drift: float = 0.0, gain: float = 0.0, noise: float = 0.1) -> list[Track]:
+    """Runs whose residual is a drift (µm/h) and a gain of the first of two inputs, both drawn once a run."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(runs):
+        inputs = np.column_stack([1 - np.exp(-HOURS / rng.uniform(0.5, 3)), 0.1 * np.sin(HOURS * rng.uniform(1, 2))])
+        predicted_um = 20 * inputs[:, 0]
+        residual_um = drift * rng.normal() * HOURS + gain * rng.normal() * inputs[:, 0] + noise * rng.normal(size=73)
+        out.append(Track(TIME_S, predicted_um, predicted_um + residual_um - residual_um[0], inputs))
+    return out
+
+
+def rms_um(updater: Updater, judged: list[Track], readings: Readings) -> tuple[float, float]:
+    """Without and with readings, over all rows of all runs."""
+    done = [t.recorded_um - updater.run(t, readings.rows(TIME_S, TIME_S >= 0), updater.begin()).corrected_um
+            for t in judged]  # fmt: skip
+    free = np.concatenate([t.residual_um for t in judged])
+    return float(np.sqrt(np.mean(free**2))), float(np.sqrt(np.mean(np.concatenate(done) ** 2)))
+
+
+@pytest.mark.parametrize("plant", [{"drift": 3.0}, {"gain": 8.0}])
+def test_one_reading_tells_a_planted_drift_or_gain_for_the_hours_to_come(plant) -> None:
+    updater = Updater.learn(tracks(1, 20, **plant))
+    free_um, updated_um = rms_um(updater, tracks(2, 20, **plant), SCHEDULES["one a shift"])
+    assert updated_um < 0.25 * free_um
+
+
+def test_the_learned_variances_are_the_planted_ones() -> None:
+    variance_um2 = Updater.learn(tracks(1, 40, drift=2.0, noise=0.3)).variance_um2
+    assert variance_um2["drift"] == pytest.approx(4.0, rel=0.5)
+    assert variance_um2["noise"] == pytest.approx(0.09, rel=0.5)
+    assert variance_um2["gain"] < 0.5 and variance_um2["walk"] < 0.1
+
+
+def test_more_readings_serve_better() -> None:
+    updater, judged = Updater.learn(tracks(1, 20, 2.0, 6.0, 0.3)), tracks(2, 20, 2.0, 6.0, 0.3)
+    once, hourly = (rms_um(updater, judged, SCHEDULES[s])[1] for s in ("one a shift", "one reading an hour"))
+    assert hourly < 0.8 * once
+
+
+def test_stated_spread_holds_nine_tenths() -> None:
+    updater = Updater.learn(tracks(1, 30, 2.0, 6.0, 0.5))
+    inside = []
+    for track in tracks(2, 30, 2.0, 6.0, 0.5):
+        done = updater.run(track, SCHEDULES["one a shift"].rows(TIME_S, TIME_S >= 0), updater.begin())
+        inside.append(np.abs(track.recorded_um - done.corrected_um)[1:] <= 1.645 * done.sd_um[1:])
+    assert 0.8 < np.mean(inside) < 0.98
+
+
+def test_a_row_uses_only_readings_before_it() -> None:
+    updater, track = Updater.learn(tracks(1, 10, 2.0)), tracks(2, 1, 2.0)[0]
+    rows = SCHEDULES["one reading an hour"].rows(TIME_S, TIME_S >= 0)
+    corrected_um = updater.run(track, rows, updater.begin()).corrected_um
+    np.testing.assert_array_equal(corrected_um[: rows[0] + 1], track.predicted_um[: rows[0] + 1])
+    assert (corrected_um[rows[0] + 1 :] != track.predicted_um[rows[0] + 1 :]).all()
+    later = track.recorded_um.copy()
+    later[rows[1] :] += 50.0
+    later[np.setdiff1d(np.arange(73), rows)] = np.nan
+    other_um = updater.run(replace(track, recorded_um=later), rows, updater.begin()).corrected_um
+    np.testing.assert_array_equal(other_um[: rows[1] + 1], corrected_um[: rows[1] + 1])
+
+
+def test_row_by_row_equals_the_run_also_with_holes() -> None:
+    updater, track = Updater.learn(tracks(1, 10, 2.0, 4.0)), tracks(2, 1, 2.0, 4.0)[0]
+    predicted_um, inputs = track.predicted_um.copy(), track.inputs.copy()
+    predicted_um[[0, 1, 30]], inputs[40, 1] = np.nan, np.nan
+    track = replace(track, predicted_um=predicted_um, inputs=inputs)
+    rows = np.array([12, 30, 50, 72])  # nothing was predicted at row 30
+    whole, state, done = updater.run(track, rows, updater.begin()), updater.begin(), []
+    for i in range(73):
+        read_um = track.recorded_um[i] if i in rows else np.nan
+        corrected_um, sd_um, state = updater.step(state, TIME_S[i], predicted_um[i], inputs[i], read_um)
+        done.append((corrected_um, sd_um))
+    np.testing.assert_allclose(np.array(done), np.column_stack([whole.corrected_um, whole.sd_um]), atol=1e-9)
+    np.testing.assert_allclose(state.cov, whole.state.cov, atol=1e-9)
+    assert np.isnan(done[30]).all() and whole.corrected_um[2] == predicted_um[2]
+
+
+def test_a_reading_due_in_a_hole_is_taken_behind_it_unless_the_next_is_due() -> None:
+    known = np.ones(73, bool)
+    known[11:15] = False
+    known[23:40] = False
+    rows = SCHEDULES["one reading an hour"].rows(TIME_S, known)
+    assert rows.tolist() == [15, 40, 48, 60]
+    assert SCHEDULES["one a shift"].rows(TIME_S, known).tolist() == [15]
+    assert SCHEDULES["one a shift"].rows(TIME_S[:10], known[:10]).tolist() == []
+    assert Readings.evenly(2, TIME_S[-1]).rows(TIME_S, TIME_S >= 0).tolist() == [24, 48]
+
+
+def test_plain_and_back() -> None:
+    updater = Updater.learn(tracks(1, 5, 2.0))
+    assert Updater.from_plain(json.loads(json.dumps(updater.as_plain()))) == updater
+
+
+def drifting(toy_batches, k: int):
+    """Batches whose z drifts away by a rate of its own in each."""
+    rng = np.random.default_rng(5)
+    out = []
+    for batch in toy_batches(k):
+        table = batch.table.assign(z=batch.table["z"] + 4.0 * rng.normal() * batch.time_s / 3600)
+        out.append(replace(batch, table=table))
+    return out
+
+
+def test_scores_of_a_cell_by_schedule(toy_batches) -> None:
+    crossing = prepare(
+        drifting(toy_batches, 10), "z", Plan(("correlation",), ("ridge", "zero"), ("forward",), n_tsps=(3,))
+    )
+    found = updated_scores(crossing, "correlation", "ridge", 3)
+    assert list(found) == COLUMNS and set(found["schedule"]) == {*SCHEDULES, *(f"{n} evenly" for n in COUNTS)}
+    curve = found[~found["schedule"].isin(SCHEDULES)].groupby("n_readings")["S_um"].mean()
+    assert curve.index.tolist() == [0, 1, 2, 4, 8] and (np.diff(curve) < 0).all()
+    found = found[found["schedule"].isin(SCHEDULES)]
+    assert found.groupby("schedule")["n_readings"].first().to_dict() == {"one reading an hour": 4, "one a shift": 1}
+    free = cross_family(crossing, "ridge").scores.set_index("batch_id")["S_um"]
+    hourly = found[found["schedule"] == "one reading an hour"].set_index("batch_id")
+    np.testing.assert_allclose(hourly["free_S_um"], free[hourly.index], rtol=1e-9)
+    assert hourly["S_um"].mean() < 0.5 * hourly["free_S_um"].mean()
+    assert hourly["coverage90"].between(0.5, 1.0).all()
+
+
+def test_the_last_residual_is_held_until_the_next_reading() -> None:
+    time_s = np.arange(6) * 60.0
+    track = Track(time_s, np.zeros(6), np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0]), np.zeros((6, 1)))
+    np.testing.assert_array_equal(held_um(track, np.array([1, 4])), [0, 0, 1, 1, 1, 4])
+
+
+def test_training_runs_are_predicted_from_the_runs_before_them(toy_batches) -> None:
+    batches = toy_batches(7)
+    design = Design.build(batches, ("t0", "t4"), "z")
+    changed = Design.build([*batches[:-1], drifting(toy_batches, 7)[-1]], ("t0", "t4"), "z")
+    one, other = (out_of_fold(d, "ridge", range(7)) for d in (design, changed))
+    assert len(one) == len(other) == 4
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.predicted_um, b.predicted_um)
+
+
+def test_what_cannot_be_learned_is_refused_in_one_line(toy_batches) -> None:
+    with pytest.raises(InputError, match=r"got 1 run\(s\) with known residuals, need at least 2"):
+        Updater.learn(tracks(1, 1))
+    with pytest.raises(InputError, match=r"readings: got first_s=0\.0"):
+        Readings(0.0)
+    crossing = prepare(toy_batches(4), "z", Plan(("correlation",), ("ridge",), ("leave-batch-out",)))
+    with pytest.raises(InputError, match="updating by readings of z: no protocol forward in time"):
+        learn_updater(crossing, "correlation", "ridge", 2)
+
+
+def test_the_updater_for_runs_to_come_knows_all_batches(toy_batches) -> None:
+    crossing = prepare(drifting(toy_batches, 8), "z", Plan(("correlation",), ("ridge",), ("forward",), n_tsps=(3,)))
+    updater = learn_updater(crossing, "correlation", "ridge", 3)
+    assert updater.variance_um2["drift"] > updater.variance_um2["noise"] and updater.n_inputs == 3
