@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,6 +48,28 @@ def picture_bytes(figure: Figure, kind: str, dpi: int = 160) -> bytes:
     with mpl.rc_context({"svg.hashsalt": "thermodrift"}):
         figure.savefig(out, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
     return out.getvalue()
+
+
+def inline_svg(figure: Figure, prefix: str) -> str:
+    """The figure as an svg element of an HTML page, whose font sets its text; `prefix` keeps ids apart on the page.
+
+    Coordinates are cut to a hundredth of a point, and names that nothing refers to are left out.
+    """
+    out = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "thermodrift", "svg.fonttype": "none"}):
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue().decode("utf-8")
+    text = re.sub(r"\s*\n\s*", " ", text[text.index("<svg") :])
+    text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text)
+    ids = {name: f"{prefix}-{k}" for k, name in enumerate(dict.fromkeys(re.findall(r'(?:href="|url\()#(\w+)', text)))}
+
+    def lean(tag: re.Match[str]) -> str:
+        short = re.sub(r' font-family: [^;"]*;?| transform="rotate\(-0 [^"]*"', "", tag[0])
+        short = re.sub(r' id="([^"]*)"', lambda m: f' id="{ids[m[1]]}"' if m[1] in ids else "", short)
+        short = re.sub(r'(?:xlink:)?(href="|url\()#(\w+)', lambda m: f"{m[1]}#{ids[m[2]]}", short)
+        return re.sub(r"(?<=[:;]) ", "", re.sub(r"(\.\d\d)\d+", r"\1", short))
+
+    return re.sub(r"<[^>]*>", lean, text)
 
 
 def panel(fig: Figure, left_in: float, top_in: float, wide_in: float, tall_in: float) -> Axes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from html import escape
 
 from models import FAMILIES
 
@@ -66,11 +65,6 @@ def unit_label(unit: str) -> str:
 def three_digits(value: float) -> str:
     """Three significant digits, without a power of ten up to a million."""
     return (f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}").replace("-", "−")
-
-
-def plain(text: str) -> str:
-    """A name that stands in a figure: plotly reads < and & as markup, and $ as mathematics."""
-    return escape(str(text), quote=False).replace("$", "&#36;")
 
 
 def count(n: int, noun: str) -> str:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
-import plotly.graph_objects as go
+from matplotlib.figure import Figure
+
+from reports.drawing import inline_svg
 
 _MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
 _CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
@@ -71,12 +73,21 @@ class Strip:
 
 
 @dataclass(frozen=True)
+class Shade:
+    """A cell of a heat map: its text, a smaller line below, and the share 0..1 of the full colour."""
+
+    text: str
+    below: str
+    share: float
+
+
+@dataclass(frozen=True)
 class Column:
     """A column's head and how its cells stand."""
 
     title: str
     unit: str = ""
-    kind: Literal["text", "number", "strip", "wide"] = "text"
+    kind: Literal["text", "number", "strip", "wide", "shade"] = "text"
     name: str = ""  # what a row's maker calls it; the title where empty
 
     @property
@@ -88,11 +99,11 @@ class Column:
 class Row:
     """A row's cells; `mark` says in a word why it stands out."""
 
-    cells: tuple[str | Strip, ...]
+    cells: tuple[str | Strip | Shade, ...]
     mark: str = ""
 
     @classmethod
-    def of(cls, *cells: str | Strip, mark: str = "") -> Row:
+    def of(cls, *cells: str | Strip | Shade, mark: str = "") -> Row:
         """From the cells one by one."""
         return cls(cells, mark)
 
@@ -115,27 +126,29 @@ class Key:
 
     label: str
     color: str
-    symbol: str = "line"  # line, dot, dash, dashdot; circle, square, diamond, triangle-up on a line; ring, disc
+    symbol: str = "line"  # line, dot, dash, dashdot; circle, square, diamond, triangle-up on a line
+    alone: bool = False  # the symbol without a line
+
+
+_PX_PER_IN = 108  # a label of 7.5 points is 11 px high
 
 
 @dataclass(frozen=True)
 class Plot:
     """A figure; `size` says how much of the page's width it takes."""
 
-    figure: go.Figure
+    figure: Figure
     title: str
     size: Literal["full", "half", "third"] = "full"
 
     @property
-    def height(self) -> int:
-        """Height on the page, px."""
-        return int(self.figure.layout.height)
+    def width_px(self) -> int:
+        """Width at which its text has the size of the page's notes."""
+        return round(_PX_PER_IN * float(self.figure.get_figwidth()))
 
-    @property
-    def json(self) -> str:
-        """The figure for a script element: no < can end it early."""
-        text: str = self.figure.to_json()
-        return text.replace("<", "\\u003c")
+    def svg(self, anchor: str) -> str:
+        """The figure as an svg element with ids that begin with `anchor`."""
+        return inline_svg(self.figure, anchor)
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ from pathlib import Path
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from data.errors import InputError, check_suffix
 from data.files import write_atomic
-from reports.layout import Strip
+from reports.layout import Shade, Strip
 
 FORMATS = (".html", ".md")
 _TEMPLATES = Path(__file__).with_name("templates")
@@ -54,11 +53,9 @@ def template_environment(html: bool) -> Environment:
         lstrip_blocks=True, keep_trailing_newline=True, finalize=None if html else _markdown,
     )  # fmt: skip
     env.tests["strip"] = lambda cell: isinstance(cell, Strip)
+    env.tests["shade"] = lambda cell: isinstance(cell, Shade)
     if html:
         env.globals["style"] = Markup((_TEMPLATES / "style.css").read_text(encoding="utf-8"))
-        env.globals["script"] = Markup((_TEMPLATES / "figures.js").read_text(encoding="utf-8"))
-        env.globals["plotly_js"] = Markup(get_plotlyjs().replace("</script", "<\\/script"))
-        env.filters["raw"] = Markup
         env.filters["unbroken"] = _unbroken
     return env
 

@@ -1,4 +1,4 @@
-"""Certainty of the models: stated intervals, errors outside the trained region, weaknesses of the selectors."""
+"""Certainty of the models: stated intervals, the error to expect of a run, weaknesses of the selectors."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pandas as pd
-import plotly.graph_objects as go
 
+from models.conformal import RunBound
 from models.promotion import Choice
 from models.result import CELL_KEYS, GridResult
-from models.trust import EDGES, Rise
-from reports.comparison.figures import base_layout
+from models.trust import SLACK
+from reports.comparison.figures import Cloud, S_against_S
 from reports.comparison.tables import S_by_batch, best_per
 from reports.labels import (
     BLUE,
@@ -22,7 +22,6 @@ from reports.labels import (
     family_label,
     number,
     percent,
-    plain,
     plus_minus,
     selector_label,
 )
@@ -115,107 +114,81 @@ def _inside_of_seasons(result: GridResult, rows: pd.DataFrame) -> list[float]:
 
 
 _MARKERS = {
-    "leave-season-out": ("season left out", BLUE, "circle"),
-    "leave-speed-out": ("speed left out", ORANGE, "square"),
-    "train-on-one": ("trained on one batch", "#b5bec8", "diamond"),
+    "forward": ("later run", BLUE, "circle"),
+    "leave-season-out": ("season left out", ORANGE, "square"),
+    "leave-speed-out": ("speed left out", "#8a5fbf", "diamond"),
+    "leave-batch-out": ("run left out", "#b5bec8", "circle"),
 }
-_TIMES = {0.25: "¼", 0.5: "½", 1: "1", 2: "2", 4: "4", 8: "8", 16: "16", 32: "32"}
 
 
-def rise_panel(name: str, distances: pd.DataFrame, simulated: bool) -> Panel | None:
-    """Every left-out batch by its distance, S against S predicted by its neighbours; None where nobody measured it."""
-    if distances.empty or not len(factors := _factors(distances)):
+def bound_panel(name: str, left_out: pd.DataFrame, simulated: bool) -> Panel | None:
+    """S of every left-out run over the S expected from its inputs, with the bound; None where nobody measured it.
+
+    Args:
+        left_out: of `models.trust.left_out_runs`.
+    """
+    expected = _expected(left_out)
+    if expected is None:
         return None
-    rise = Rise.of(distances)
-    shown = [p for p in _MARKERS if (factors["protocol"] == p).any()]
-    figure = rise_figure(factors, rise, shown, simulated)
-    keys = [Key(_MARKERS[p][0], _MARKERS[p][1], _MARKERS[p][2]) for p in shown]
-    if rise.edge:
-        keys.append(Key("median of a band (seasons and speeds left out)", INK))
+    runs, bound = expected
+    by = dict(list(runs.groupby("protocol")))
+    clouds = [
+        Cloud(by[p]["expected_um"].to_numpy(float), by[p]["S_um"].to_numpy(float), Key(*_MARKERS[p], alone=True))
+        for p in reversed(_MARKERS) if p in by
+    ]  # fmt: skip
+    lines = [(1.0, GREEN), (bound.bound_um / bound.expected_um, INK)]
+    figure = S_against_S(clouds, lines, "expected S", "S", simulated)
+    keys = [c.key for c in reversed(clouds)] + [Key("as expected", GREEN), Key("90 % bound", INK)]
     notes = (
-        "Distance 1 is as far outside the trained range as that range is wide (at least 5 K, 1000 rpm or 1000 mm/min), "
-        "in the quantity that is farthest out. Factor 1 is the error that the same batch has when its neighbours are "
-        "in the training. A model of one batch is far from all others and knows little: it is shown, not counted.",
+        "The expected S rises with the disagreement of similar models about the run and with its distance from the "
+        "trained region, as far as the left-out runs show it. Runs above the upper line are worse than their bound.",
     )
-    return Panel(f"{name}: how the error rises with the distance from the training", (Plot(figure, name),),
+    return Panel(f"{name}: S of left-out runs against the S expected from their inputs", (Plot(figure, name, "half"),),
                  simulated, tuple(keys), notes)  # fmt: skip
 
 
-def rise_table(name: str, distances: pd.DataFrame, digits: int, simulated: bool) -> Table | None:
-    """The bands of distance: batches, factor, expected S."""
-    if distances.empty or not (rise := Rise.of(distances)).edge:
+def bound_table(name: str, left_out: pd.DataFrame, digits: int, simulated: bool) -> Table | None:
+    """A row per protocol: its left-out runs against the expected S and the 90 % bound."""
+    expected = _expected(left_out)
+    if expected is None:
         return None
+    runs, bound = expected
     rows = []
-    for edge, count, factor, high in zip(rise.edge, rise.count, rise.factor, rise.high, strict=True):
-        inner = [e for e in EDGES if e < edge]
-        label = "inside" if not inner else f"{inner[-1]:g} to {edge:g}" if np.isfinite(edge) else f"above {inner[-1]:g}"
-        expected = float(rise.expected_um(np.array([inner[-1] * 1.0001 if inner else 0.0]))[0])
-        rows.append(Row.of(label, str(count), number(factor, 2), number(high, 2), number(expected, digits)))
-    far = distances[
-        distances["protocol"].isin(("leave-season-out", "leave-speed-out")) & (distances["distance"] > 0.05)
-    ]
-    common = far["farthest"].value_counts()
-    notes = [f"Inside, by leave-batch-out, S is {number(rise.inside_um, digits)} µm in the median."]
-    if len(common):
-        notes.append("Farthest out most often: " + ", ".join(f"{q} ({n})" for q, n in common.head(3).items()) + ".")
+    for protocol in [p for p in _MARKERS if (runs["protocol"] == p).any()]:
+        own = runs[runs["protocol"] == protocol]
+        most = own["expected_um"] * bound.bound_um / bound.expected_um
+        values = (number(own[c].mean(), digits) for c in ("S_um", "expected_um"))
+        below = percent(float((own["S_um"] <= most).mean()))
+        rows.append(Row.of(protocol, str(len(own)), *values, number(most.mean(), digits), below))
     columns = (
-        Column("distance", "trained widths"),
-        Column("left-out batches", "", "number"),
-        Column("error grows", "times", "number"),
-        Column("one in ten more than", "times", "number"),
-        Column("S to expect", "µm", "number"),
+        Column("protocol"),
+        Column("left-out runs", "", "number"),
+        Column("S_mean", "µm", "number"),
+        Column("expected", "µm", "number"),
+        Column("90 % bound", "µm", "number"),
+        Column("below the bound", "", "number"),
     )
-    return Table(
-        f"{name}: error to expect outside the trained region", columns, tuple(rows), simulated, None, tuple(notes)
-    )
+    notes = [
+        f"S grows with the disagreement of similar models to the power {number(bound.slopes[0], 2)} and with "
+        f"(1 + distance from the trained region) to the power {number(bound.slopes[1], 2)}; a run whose factor is "
+        f"above {number(bound.unusual, 2)} or whose distance is above {number(bound.tested, 2)} trained widths is "
+        "flagged. The bound comes from these runs: its share below is no test of it."
+    ]
+    far = left_out.loc[(left_out["protocol"] == "forward") & (left_out["distance"] > SLACK), "farthest"].value_counts()
+    if len(far):
+        common = ", ".join(f"{q} ({n})" for q, n in far.head(3).items())
+        notes.append(f"Later runs left the trained region most often in {common}.")
+    return Table(f"{name}: error to expect of a run", columns, tuple(rows), simulated, None, tuple(notes))
 
 
-def rise_figure(factors: pd.DataFrame, rise: Rise, shown: list[str], simulated: bool) -> go.Figure:
-    """A marker per left-out batch, factor over distance (both logarithmic, the inside at the left edge).
-
-    Args:
-        factors: protocol, batch_id, distance, farthest, factor.
-    """
-    data = []
-    for protocol in reversed(shown):
-        own = factors[factors["protocol"] == protocol]
-        label, color, symbol = _MARKERS[protocol]
-        data.append({
-            "type": "scatter", "mode": "markers", "x": _at(own["distance"].to_numpy(float)),
-            "y": own["factor"].to_numpy(float), "name": label,
-            "marker": {"color": color, "symbol": symbol, "size": 7,
-                       "opacity": 0.45 if protocol == "train-on-one" else 0.85},
-            "customdata": [f"{plain(b)}: {d:.2f} widths{f' in {plain(q)}' if q else ''}" for b, d, q in
-                           zip(own["batch_id"], own["distance"], own["farthest"], strict=True)],
-            "hovertemplate": "%{customdata}<br>%{y:.2f} times<extra></extra>",
-        })  # fmt: skip
-    low = [0.0, *EDGES]
-    for edge, factor in zip(rise.edge, rise.factor, strict=True):
-        start = max(low[low.index(edge) - 1], 0.0)
-        ends = _at(np.array([start * 1.001 if start else 0.0, min(edge, 8.0)]))
-        data.append({"type": "scatter", "mode": "lines", "x": ends, "y": [factor, factor], "hoverinfo": "skip",
-                     "line": {"color": INK, "width": 3}})  # fmt: skip
-    layout = base_layout(360, simulated)
-    ticks = [0.05, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0]
-    layout["xaxis"] |= {"title": {"text": "distance from the training, trained widths"}, "type": "log",
-                        "tickvals": [0.03, *ticks], "ticktext": ["inside", *(f"{t:g}" for t in ticks)]}  # fmt: skip
-    layout["yaxis"] |= {"title": {"text": "S, times its S by leave-batch-out"}, "type": "log",
-                        "tickvals": list(_TIMES), "ticktext": list(_TIMES.values())}  # fmt: skip
-    layout["shapes"] = [{"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1,
-                         "line": {"color": GREEN, "width": 1, "dash": "dot"}}]  # fmt: skip
-    return go.Figure({"data": data, "layout": layout})
-
-
-def _factors(distances: pd.DataFrame) -> pd.DataFrame:
-    near = distances[distances["protocol"] == "leave-batch-out"].set_index("batch_id")["S_um"]
-    far = distances[distances["protocol"].isin(_MARKERS)]
-    far = far.assign(factor=far["S_um"].to_numpy(float) / far["batch_id"].map(near).to_numpy(float))
-    return far[np.isfinite(far["factor"]) & np.isfinite(far["distance"])]
-
-
-def _at(distance: np.ndarray) -> np.ndarray:
-    """Where a distance stands on the logarithmic axis: all that is inside at its left edge."""
-    return np.maximum(distance, 0.03)
+def _expected(left_out: pd.DataFrame) -> tuple[pd.DataFrame, RunBound] | None:
+    """The runs that a bound is learned from with expected_um; None without any."""
+    if left_out.empty or not (known := left_out["protocol"].isin(_MARKERS) & (left_out["S_um"] > 0)).any():
+        return None
+    runs, bound = left_out[known], RunBound.of(left_out[known])
+    apart = runs["disagreement_um"] if "disagreement_um" in runs else [math.nan] * len(runs)
+    factor = [bound.factor(*pair) for pair in zip(apart, runs["distance"], strict=True)]
+    return runs.assign(expected_um=bound.expected_um * np.array(factor)), bound
 
 
 _STABILITY = "stability over batches"

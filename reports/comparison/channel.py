@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 
 from models.promotion import Choice, compare_paired, left_out
@@ -13,37 +13,33 @@ from models.protocols import PromotionRule
 from models.result import GridResult, Training
 from reports.comparison import figures, tables
 from reports.comparison import story as records
-from reports.comparison.certainty import certainty_table, diagnostics_table, rise_panel, rise_table
-from reports.comparison.figures import fan_panel
+from reports.comparison.certainty import bound_panel, bound_table, certainty_table, diagnostics_table
+from reports.comparison.headline import Headline, headline
+from reports.comparison.readings import readings_panel, readings_table
 from reports.comparison.story import Verdict, comparison_rows, mark_of
 from reports.comparison.tables import (
     LeftOut,
     Promoted,
     best_per,
-    frequencies,
-    is_baseline,
     left_out_batches,
     paths,
     protocols_of,
     scored,
-    zero_um,
 )
+from reports.drawing import MUTED
 from reports.labels import (
     BLUE,
+    GREEN,
     INK,
     ORANGE,
-    cell_label,
     count,
     decimals,
     family_label,
     family_style,
     listed,
-    number,
     selector_label,
 )
 from reports.layout import Key, Panel, Plot, Table
-
-_MOST_POINTS_SHOWN = 24
 
 
 @dataclass(frozen=True)
@@ -55,19 +51,21 @@ class Channel:
     simulated: bool
     protocol: str
     verdict: Verdict
+    headline: Headline
     inputs: str
     boards: tuple[Table, ...]
     certainty: Table | None
-    heat: Panel | None
+    heat: Table | None
     points: Panel | None
-    frequency: Panel | None
+    frequency: Table | None
     weaknesses: Table | None
     left_out: Panel | None
-    fan: Panel | None
     protocols: tuple[Table, ...]
     batches: Table
     rise: Panel | None
     rises: Table | None
+    readings: Table | None
+    reading_curve: Panel | None
     comparison: tuple[tuple[str, str], ...]
     trainings: Table | None
     changes: tuple[str, ...]
@@ -88,7 +86,6 @@ def channel_part(
     cells = scored(result, protocol, rule)
     digits = decimals(choice.S_std_um, choice.n_batches)
     mark = mark_of(group[0])
-    shown = left_out_batches(result, choice)
     promoted = Promoted(choice, rule, digits, mark)
     boards = tuple(
         tables.leaderboard(result, cells, key, promoted, f"{name}: best cell of every {key}, {protocol}")
@@ -100,48 +97,32 @@ def channel_part(
         if len(own):
             caption = f"{name}: best cell of every family, {other}"
             others.append(tables.leaderboard(result, own, "family", promoted, caption))
-    changes, change = _changes(name, group, choices)
+    changes, change = _changes(name, group, choices, rule)
     return Channel(
         anchor=anchor,
         name=name,
         simulated=result.simulated,
         protocol=protocol,
         verdict=outcome,
+        headline=headline(name, group[0], choice, outcome, digits),
         inputs=", ".join(choice.inputs),
         boards=boards,
         certainty=certainty_table(name, result, cells, choice, digits, mark),
-        heat=_heat(name, result, cells, digits),
+        heat=tables.heat_map(name, result, cells, digits),
         points=_points(name, result, cells, choice),
-        frequency=_frequency(name, result, cells, protocol),
+        frequency=tables.point_frequency(name, result, cells, protocol),
         weaknesses=diagnostics_table(name, result),
-        left_out=_left_out(name, result, choice, shown, digits),
-        fan=fan_panel(name, shown, result.target, digits, result.simulated),
+        left_out=left_out_panel(name, result, left_out_batches(result, choice), digits),
         protocols=tuple(others),
         batches=tables.batches(result, choice, digits),
-        rise=rise_panel(name, result.distances, result.simulated),
-        rises=rise_table(name, result.distances, digits, result.simulated),
+        rise=bound_panel(name, result.distances, result.simulated),
+        rises=bound_table(name, result.distances, digits, result.simulated),
+        readings=readings_table(name, result, digits),
+        reading_curve=readings_panel(name, result),
         comparison=tuple(comparison_rows(group[0].promotion)),
         trainings=_trainings(group, choices) if len(group) > 1 else None,
         changes=changes,
         change=change,
-    )
-
-
-def _heat(name: str, result: GridResult, cells: pd.DataFrame, digits: int) -> Panel | None:
-    best = best_per(cells[~is_baseline(cells) & (cells["n_tsp"] > 0)], "selector", "family")
-    if best.empty:
-        return None
-    nothing = zero_um(cells)
-    figure = figures.heat_map(best, nothing if math.isfinite(nothing) else math.inf, digits, result.simulated)
-    levels = [
-        f"{family_label(r['family'])} {number(r['S_mean_um'], digits)} µm"
-        for r in best_per(cells[cells["n_tsp"] == 0], "family").to_dict("records")
-    ]
-    note = "For each pair the number of points n with the least score. The darker, the smaller the error left."
-    notes = (note, f"Without temperature points: {listed(levels)}.") if levels else (note,)
-    title = f"{name} selectors and families"
-    return Panel(
-        f"{name}: S_mean of every selector and family, µm", (Plot(figure, title),), result.simulated, (), notes
     )
 
 
@@ -164,7 +145,7 @@ def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) 
         for column, short in (("S_mean_um", "Accuracy S_mean"), ("S_std_um", "Robustness S_std"))
     )
     keys = [Key(f"{family_label(f)}, {selector_label(s)}", *family_style(f)) for f, s in at.items()]
-    keys += [Key(family_label(f), "#5a6572", figures.flat_dash(f)) for f in flat["family"]]
+    keys += [Key(family_label(f), MUTED, figures.flat_dash(f)) for f in flat["family"]]
     return Panel(
         f"{name}: accuracy and robustness against the number of points",
         plots,
@@ -175,54 +156,58 @@ def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) 
     )  # fmt: skip
 
 
-def _frequency(name: str, result: GridResult, cells: pd.DataFrame, protocol: str) -> Panel | None:
-    found = frequencies(result, cells, protocol)
-    if not found:
-        return None
-    figure = figures.point_frequency(found, _MOST_POINTS_SHOWN, result.simulated)
-    total = len({p for f in found for p in f.share})
-    stable = [f"{selector_label(f.selector)} {number(f.stability, 2)} ({f.n_tsp} points)" for f in found]
-    notes = [
-        f"Share of the folds that chose a point, at each selector's best n short of all. Mean Jaccard similarity: "
-        f"{listed(stable)}."
-    ]
-    if total > _MOST_POINTS_SHOWN:
-        notes.append(f"The {_MOST_POINTS_SHOWN} most often chosen of {total} points.")
-    title = f"{name} chosen points"
-    return Panel(f"{name}: how often each point is chosen", (Plot(figure, title),), result.simulated, (), tuple(notes))
+_TRAINED_ON = {"forward": "the runs before its block", "leave-batch-out": "all others"}
+_NICE_H = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
+_MOST_KEYS = 6
 
 
-def _left_out(name: str, result: GridResult, choice: Choice, shown: Sequence[LeftOut], digits: int) -> Panel | None:
+def left_out_panel(name: str, result: GridResult, shown: Sequence[LeftOut], digits: int) -> Panel | None:
+    """The curves of the batches that are shown, or along an axis their fans; None where no prediction was kept."""
     if not shown:
         return None
-    limits = figures.residual_range_um(shown)
+    along_axis = shown[0].position_mm is not None
+    draw = figures.fan if along_axis else figures.curves
     plots = tuple(
-        Plot(
-            figures.left_out(b, result.target, limits, result.simulated),
-            f"{b.place}: {b.batch_id}, S = {number(b.S_um, digits)} µm",
-            "third",
-        )
+        Plot(draw([b], shown, result.target, digits, result.simulated), figures.place(b, digits, most=200), "third")
         for b in shown
     )
-    every = max(b.every for b in shown)
-    symbol = "disc" if shown[0].position_mm is not None else "line"
-    entries = (("recorded", INK), ("predicted, batch left out", BLUE), ("residual", ORANGE))
-    keys = tuple(Key(text, color, symbol) for text, color in entries)
-    notes = [
-        "Batches by S; every prediction comes from a model that never saw the batch. "
-        "Residual axes are equal; the recording stops where it is masked."
-    ]
-    if every > 1:
+    protocol = shown[0].protocol
+    which = "later runs" if protocol == "forward" else "batches"
+    trained_on = _TRAINED_ON[protocol]
+    notes = [f"Best, median and worst of the {which} by S, each by a model of {trained_on}. Residual axes are equal."]
+    if along_axis:
+        keys, more = _fan_legend(shown)
+        notes += more
+    else:
+        keys = [Key("recorded", INK), Key("predicted", BLUE), Key("residual", ORANGE)]
+        notes.append("The recording stops where it is masked.")
+    if (every := max(b.every for b in shown)) > 1:
         notes.append(f"Drawn: up to every {every}th sample.")
-    label = cell_label(choice.selector, choice.family, choice.n_tsp)
-    return Panel(f"{name}: recording and left-out prediction, {label}", plots, result.simulated, keys, tuple(notes))
+    caption = f"{name}: recorded and predicted{' along the axis' if along_axis else ''}, {protocol}"
+    return Panel(caption, plots, result.simulated, tuple(keys), (" ".join(notes),))
+
+
+def _fan_legend(shown: Sequence[LeftOut]) -> tuple[list[Key], list[str]]:
+    """The colours of the time, and what a fan's zero is."""
+    last_h = figures.longest_h(shown)
+    step_h = next((h for h in _NICE_H if last_h / h <= _MOST_KEYS), _NICE_H[-1])
+    keys = [Key("recorded", INK, "circle", alone=True), Key("predicted", INK)]
+    keys += [
+        Key(f"{h:g} h", figures.time_colour(h / last_h), "circle", alone=True)
+        for h in np.arange(0.0, last_h + 1e-9, step_h)
+    ]
+    notes = ["The error less that of the batch's first sweep, which is the line at zero. Colours: time since start."]
+    most, drawn = (max(len(of(b)) for b in shown) for of in (figures.sweeps, figures.drawn_sweeps))
+    return keys, notes + ([f"Drawn: {drawn} of up to {most} sweeps."] if most > drawn else [])
 
 
 def _trainings(group: Sequence[Training], choices: Sequence[Choice]) -> Table:
     return records.trainings([(t, c, decimals(c.S_std_um, c.n_batches)) for t, c in zip(group, choices, strict=True)])
 
 
-def _changes(name: str, group: Sequence[Training], choices: Sequence[Choice]) -> tuple[tuple[str, ...], Panel | None]:
+def _changes(
+    name: str, group: Sequence[Training], choices: Sequence[Choice], rule: PromotionRule
+) -> tuple[tuple[str, ...], Panel | None]:
     """What the newest training has that the one before it had not, and both on the batches they share."""
     if len(group) < 2:
         return (), None
@@ -232,20 +217,27 @@ def _changes(name: str, group: Sequence[Training], choices: Sequence[Choice]) ->
     if gone:
         remarks.append(f"No longer in the training: {listed(gone)}.")
     c, d = choices[0], choices[1]
-    a = left_out(now, c.protocol, c.selector, c.family, c.n_tsp)
-    b = left_out(before, d.protocol, d.selector, d.family, d.n_tsp)
-    if c.protocol != d.protocol:
+    run = [set(r.cells["protocol"]) for r in (now, before)]
+    shared = [p for p in (tables.MAIN_PROTOCOL, *rule.protocols) if p in run[0] & run[1]]
+    if not shared:
         return (*remarks, "The trainings were judged by different protocols and are not compared."), None
+    rule = rule.only(shared[0]).model_copy(update={"min_batches": 2})
+    a = left_out(now, rule, c.selector, c.family, c.n_tsp)
+    b = left_out(before, rule, d.selector, d.family, d.n_tsp)
     both = a.merge(b, on=["batch_id", "digest"], suffixes=("_new", "_old"))
     if len(both) < 2:
         return (*remarks, f"{count(len(both), 'batch')} in common: nothing to compare."), None
-    paired = compare_paired(a, b, PromotionRule(min_batches=2))
+    paired = compare_paired(a, b, rule)
     remarks.append(
         f"On the {count(len(both), 'batch')} that both know the newest model is "
         f"{records.interval_label(paired.as_dict())} on average, better on {paired.n_better}."
     )
-    order = {b: i for i, b in enumerate(now.batches["batch_id"])}
-    both = both.sort_values("batch_id", key=lambda ids: ids.map(order), kind="stable")
-    plot = Plot(figures.before_and_after(both, now.simulated), f"{name} before and after")
-    keys = (Key("earlier training", "#5a6572", "ring"), Key("newest training", BLUE, "disc"))
+    cloud = figures.Cloud(
+        both["S_um_old"].to_numpy(float),
+        both["S_um_new"].to_numpy(float),
+        Key("a shared batch", BLUE, "circle", alone=True),
+    )
+    figure = figures.S_against_S([cloud], [(1.0, GREEN)], "S, earlier training", "S, newest training", now.simulated)
+    keys = (cloud.key, Key("no change", GREEN))
+    plot = Plot(figure, f"{name} before and after", "half")
     return tuple(remarks), Panel(f"{name}: S of the shared batches, before and after", (plot,), now.simulated, keys)

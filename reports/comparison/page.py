@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +16,10 @@ from models import FAMILIES
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
 from reports.comparison import story as records
-from reports.comparison import tables
 from reports.comparison.channel import Channel, channel_part
-from reports.comparison.story import Verdict, promoted_cell, verdict
-from reports.comparison.tables import protocols_of, scored
+from reports.comparison.headline import overview
+from reports.comparison.story import promoted_cell, verdict
+from reports.comparison.tables import group_order, protocols_of, scored
 from reports.labels import count, decimals, family_label, listed, number, selector_label
 from reports.layout import Table
 from reports.rendering import FORMATS, write_page
@@ -36,8 +35,7 @@ class Page:
     machines: str
     simulated: bool
     facts: tuple[tuple[str, str], ...]
-    verdicts: tuple[Verdict, ...]
-    overview: Table
+    overview: Table | None
     channels: tuple[Channel, ...]
     findings_summary: str
     findings: tuple[Table, ...]  # a summary where there are many, then every finding
@@ -61,17 +59,16 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     machines = list(dict.fromkeys(t.result.machine for t in trainings))
     newest = [group[0] for group in groups]
     names = [_name(t, len(machines) > 1) for t in newest]
-    channels, overview, verdicts = [], [], []
+    channels, rows = [], []
     for i, (name, group) in enumerate(zip(names, groups, strict=True)):
         protocol = protocols_of(group[0].result)[0]
         cells = scored(group[0].result, protocol, rule)
         if cells.empty:
             raise InputError(f"report: training {group[0].training_id} has no cell with a finite score; train again")
-        choices = [promoted_cell(t, rule, protocols_of(t.result)[0], t is group[0]) for t in group]
+        choices = [promoted_cell(t, rule, t is group[0]) for t in group]
         digits = decimals(choices[0].S_std_um, choices[0].n_batches)
         said = verdict(name, group[0], choices[0])
-        verdicts.append(said)
-        overview.append((name, cells, choices[0], digits))
+        rows.append((name, group[0], choices[0], said, digits))
         channels.append(channel_part(f"c{i + 1}", name, group, choices, said, rule))
     results = [t.result for t in newest]
     simulated = any(t.simulated or t.result.simulated for t in trainings)
@@ -84,9 +81,8 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
         title=f"Thermal error models of {listed(machines)}",
         machines=listed(machines),
         simulated=simulated,
-        facts=_facts(newest, names, n_batches),
-        verdicts=tuple(verdicts),
-        overview=tables.overview(overview, protocols_of(results[0])[0], simulated),
+        facts=_facts(newest, n_batches),
+        overview=overview(rows, simulated) if len(rows) > 1 else None,
         channels=tuple(channels),
         findings_summary=records.findings_summary(found, n_batches),
         findings=many + every,
@@ -123,34 +119,27 @@ def _name(training: Training, several: bool) -> str:
     return f"{training.result.machine} {training.result.target}" if several else training.result.target
 
 
-def _facts(newest: Sequence[Training], names: Sequence[str], n_batches: int) -> tuple[tuple[str, str], ...]:
+def _facts(newest: Sequence[Training], n_batches: int) -> tuple[tuple[str, str], ...]:
     batches = pd.concat([t.result.batches for t in newest], ignore_index=True)
     starts = sorted(str(s)[:10] for s in batches.get("start", pd.Series(dtype=str)).dropna() if str(s))
     span = f", {starts[0]} to {starts[-1]}" if starts else ""
     ambient = batches.get("start_ambient_degC", pd.Series(dtype=float)).to_numpy(float)
     ambient = ambient[np.isfinite(ambient)]
-    speeds = sorted(set(batches.get("speed", pd.Series(dtype=str)).astype(str)), key=_speed_order)
-    protocols = list(dict.fromkeys(p for t in newest for p in protocols_of(t.result)))
+    speeds = sorted(set(batches.get("speed", pd.Series(dtype=str)).astype(str)), key=group_order)
     trained = sorted(f"{t.started:%Y-%m-%d %H:%M}" for t in newest)
     facts = [
-        ("Error channels" if len(names) > 1 else "Error channel", listed(list(names))),
         ("Recordings", f"{count(n_batches, 'batch')}{span}"),
         ("Start ambient", f"{number(ambient.min())} to {number(ambient.max())} °C" if len(ambient) else ""),
         ("Spindle", listed([s for s in speeds if s != "unknown"])),
-        ("Judged by", listed(protocols)),
         ("Trained", trained[0] + (f" to {trained[-1]}" if trained[-1] != trained[0] else "") + " UTC"),
     ]
     return tuple((k, v) for k, v in facts if v)
 
 
-def _speed_order(label: str) -> tuple[float, str]:
-    first = label.split(" ")[0]
-    return (float(first), label) if first.replace(".", "", 1).isdigit() else (math.inf, label)
-
-
 def _rule_sentence(r: PromotionRule) -> str:
     return (
-        f"The rule takes the cell of least {r.score} by {r.protocol} among those whose points are stable "
+        f"The rule takes the cell whose {'worst' if r.combine == 'worst' else 'mean'} {r.score} by "
+        f"{listed(list(r.protocols))} is least among those whose points are stable "
         f"(at least {r.min_tsp_stability:g}); within {r.tie_percent:g} % the simpler one. "
         "A newcomer replaces the champion only if it is better on the same batches "
         f"(paired sign-flip test, {100 * r.significance:g} %, at least {r.min_batches} batches)."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,11 +12,11 @@ import numpy as np
 import pandas as pd
 
 from data.errors import InputError
-from models.promotion import Choice, decide, pick
+from models.promotion import Choice, choose, decide, pick
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
-from reports.comparison.tables import picked
-from reports.labels import between, cell_label, count, decimals, number, p_label, plus_minus
+from reports.comparison.tables import protocols_of
+from reports.labels import between, cell_label, count, decimals, family_label, number, p_label, plus_minus
 from reports.layout import Column, Row, Table
 
 _FINDING_KEYS = ["batch_id", "check", "channel", "start_s", "end_s", "words", "masks", "overruled"]
@@ -179,7 +180,7 @@ _CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unch
 
 @dataclass(frozen=True)
 class Verdict:
-    """One channel's outcome: a chip, a sentence, a caution (empty where there is none)."""
+    """One channel's outcome: a chip, what was promoted and why, a caution (empty where there is none)."""
 
     channel: str
     outcome: str
@@ -188,21 +189,26 @@ class Verdict:
     caution: str = ""
 
 
-def promoted_cell(training: Training, rule: PromotionRule, protocol: str, nested: bool = False) -> Choice:
+def promoted_cell(training: Training, rule: PromotionRule, nested: bool = False) -> Choice:
     """The cell that was promoted; without a promotion the one that the rule would take.
+
+    A grid without any of the rule's protocols is judged by the first that it has.
 
     Args:
         nested: with the score of choosing itself, as recorded at the promotion, else computed now.
     """
+    result = training.result
+    if not rule.offered(set(result.cells["protocol"])):
+        rule = rule.only(protocols_of(result)[0])
     mean, std = (float(training.promotion.get(f"nested_S_{n}_um", math.nan)) for n in ("mean", "std"))
-    if nested and not math.isfinite(mean) and protocol == rule.protocol:
-        own = decide(training.result, rule)
+    if nested and not math.isfinite(mean):
+        own = decide(result, rule)
     else:
-        own = replace(picked(training.result, rule, protocol), nested_S_mean_um=mean, nested_S_std_um=std)
+        own = replace(choose(result.cells, rule), nested_S_mean_um=mean, nested_S_std_um=std)
     cell = str(training.promotion.get("cell", ""))
     if cell and cell != own.cell:
         try:
-            return pick(training.result.cells, rule.model_copy(update={"protocol": protocol}), cell)
+            return pick(result.cells, rule, cell)
         except InputError:
             pass  # promoted from another grid: the rule's own choice is shown instead
     return own
@@ -221,20 +227,26 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     if outcome == "champion":
         summary = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
     elif outcome == "challenger":
-        summary = (
-            f"Version {p['champion_version']} stays champion; version {p['version']}, {model}, is challenger: "
-            f"{score}; {_why_challenger(p)}."
-        )
+        summary = f"{_champion_now(p)}; version {p['version']}, {model}, is challenger: {score}; {_why_challenger(p)}."
     elif outcome == "unchanged":
         summary = (
             f"Nothing new: batches, cell and machine file are those of version {p['version']}, {model}: {score}. "
-            f"Version {p['champion_version']} is champion."
+            f"{_champion_now(p)}."
         )
     else:
         summary = f"Nothing was promoted. The rule would take {model}: {score}."
     why = str(p.get("caution", "")) if p else choice.caution
-    caution = f"Do not trust this model: {why}." if why else ""
-    return Verdict(channel, outcome, _CHIPS.get(outcome, outcome), summary, caution)
+    why = re.sub(r"\b(zero|mean_curve)\b", lambda m: family_label(m[0]), why)
+    short = why.partition(" (")[0]
+    caution = f"No trustworthy model: {short}." if why else ""
+    summary += f" Not trustworthy: {why}." if why != short else ""
+    chip = "no trustworthy model" if why and not p.get("champion_version") else _CHIPS.get(outcome, outcome)
+    return Verdict(channel, "untrusted" if why else outcome, chip, summary, caution)
+
+
+def _champion_now(p: dict[str, Any]) -> str:
+    now = p.get("champion_version")
+    return f"Version {now} is champion" if now else "There is no champion"
 
 
 def mark_of(training: Training) -> str:
@@ -277,6 +289,8 @@ def _why_champion(p: dict[str, Any]) -> str:
 
 def _why_challenger(p: dict[str, Any]) -> str:
     c = p.get("comparison")
+    if p.get("caution"):
+        return "it is not trustworthy"
     if not c:
         return "it could not be compared with the champion" + (f" ({p['obstacle']})" if p.get("obstacle") else "")
     if "need at least" in str(c.get("words", "")):

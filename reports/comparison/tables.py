@@ -1,4 +1,4 @@
-"""Extracts of a training's result, and tables of scores: overview, leaderboards, one per protocol, batches."""
+"""Extracts of a training's result, and tables of scores: leaderboards, one per protocol, batches."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pandas as pd
 
 from data.arrays import Array
 from features.stability import tsp_frequency
-from models.promotion import BASELINES, Choice, choose, score_um
+from models.promotion import BASELINES, Choice, score_um
 from models.protocols import PROTOCOLS, PromotionRule
 from models.result import CELL_KEYS, GridResult
-from reports.labels import NOTHING, cell_label, count, family_label, number, percent, plus_minus, selector_label
-from reports.layout import Column, Row, Scale, Strip, Table
+from reports.labels import NOTHING, cell_label, count, family_label, listed, number, percent, selector_label
+from reports.layout import Column, Row, Scale, Shade, Strip, Table
 
 MAIN_PROTOCOL = "leave-batch-out"
 _MOST_POINTS = 400
@@ -24,11 +24,12 @@ _MOST_POINTS = 400
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One batch's left-out prediction, thinned for drawing; arrays (n,) with NaN where masked.
+    """One batch's left-out prediction under a protocol, thinned for drawing; arrays (n,) with NaN where masked.
 
     Of a channel along an axis only the readings, with their positions, all of them.
     """
 
+    protocol: str
     batch_id: str
     place: str  # best, median or worst
     S_um: float
@@ -50,7 +51,7 @@ class Frequency:
 
 
 def protocols_of(result: GridResult) -> list[str]:
-    """The protocols that were run, leave-batch-out first."""
+    """The protocols that were run, forward first."""
     run = set(result.cells["protocol"])
     return [p for p in PROTOCOLS if p in run] + sorted(run - set(PROTOCOLS))
 
@@ -61,11 +62,6 @@ def scored(result: GridResult, protocol: str, rule: PromotionRule) -> pd.DataFra
     cells["score_um"] = score_um(cells, rule)
     order = ["score_um", "n_inputs", "rank", "selector", "family"]
     return cells[np.isfinite(cells["score_um"])].sort_values(order, kind="stable").reset_index(drop=True)
-
-
-def picked(result: GridResult, rule: PromotionRule, protocol: str) -> Choice:
-    """The cell that the promotion rule takes under a protocol."""
-    return choose(result.cells, rule.model_copy(update={"protocol": protocol}))
 
 
 def best_per(cells: pd.DataFrame, *keys: str) -> pd.DataFrame:
@@ -118,23 +114,29 @@ def frequencies(result: GridResult, cells: pd.DataFrame, protocol: str) -> list[
 
 
 def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
-    """The best, the median and the worst batch by S of a cell; empty where no left-out prediction was kept."""
-    table = result.predictions
-    if choice.cell not in table.columns:
+    """The best, the median and the worst batch by S of a cell; empty where no left-out prediction was kept.
+
+    Of the later runs, predicted forward in time, where the training kept them, else of all, left out one by one.
+    """
+    table, protocol, column = result.predictions, MAIN_PROTOCOL, choice.cell
+    if len(result.curves) and (result.distances["cell"] == choice.cell).all():
+        later = result.curves[result.curves["protocol"] == "forward"]
+        table, protocol, column = (later, "forward", "predicted_um") if len(later) else (table, protocol, column)
+    if column not in table.columns:
         return []
     s = result.scores
-    rows = s[(s["protocol"] == MAIN_PROTOCOL) & (s["selector"] == choice.selector) & (s["family"] == choice.family)]
+    rows = s[(s["protocol"] == protocol) & (s["selector"] == choice.selector) & (s["family"] == choice.family)]
     rows = rows[(rows["n_tsp"] == choice.n_tsp) & np.isfinite(rows["S_um"])].sort_values("S_um", kind="stable")
     ids, values = list(rows["batch_id"]), list(rows["S_um"])
     places = dict(zip(_three(len(ids)), ("best", "median", "worst"), strict=False))
-    return [_left_out(table, choice.cell, ids[i], place, float(values[i])) for i, place in places.items()]
+    return [_left_out(table, protocol, column, ids[i], place, float(values[i])) for i, place in places.items()]
 
 
 def _three(n: int) -> Sequence[int]:
     return list(dict.fromkeys([0, (n - 1) // 2, n - 1])) if n else []
 
 
-def _left_out(table: pd.DataFrame, cell: str, batch_id: str, place: str, S_um: float) -> LeftOut:
+def _left_out(table: pd.DataFrame, protocol: str, column: str, batch_id: str, place: str, S_um: float) -> LeftOut:
     rows = table[table["batch_id"] == batch_id]
     along_axis = "position_mm" in table.columns
     if along_axis:
@@ -142,12 +144,13 @@ def _left_out(table: pd.DataFrame, cell: str, batch_id: str, place: str, S_um: f
     every = 1 if along_axis else max(1, -(-len(rows) // _MOST_POINTS))
     shown = rows.iloc[::every]
     return LeftOut(
+        protocol,
         batch_id,
         place,
         S_um,
         shown["time_s"].to_numpy(float) / 3600.0,
         shown["recorded_um"].to_numpy(float),
-        shown[cell].to_numpy(float),
+        shown[column].to_numpy(float),
         every,
         shown["position_mm"].to_numpy(float) if along_axis else None,
     )
@@ -156,39 +159,6 @@ def _left_out(table: pd.DataFrame, cell: str, batch_id: str, place: str, S_um: f
 _MOST_GROUPS = 6
 _MAX = "max\u00a0|e|"
 _WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
-
-
-def overview(rows: Sequence[tuple[str, pd.DataFrame, Choice, int]], protocol: str, simulated: bool) -> Table:
-    """A row per channel: name, its cells from `scored`, the promoted cell, decimals."""
-    out = []
-    for name, cells, choice, digits in rows:
-        zero = cells[cells["family"] == "zero"]
-        nothing = float(zero["S_mean_um"].iloc[0]) if len(zero) else math.nan
-        own = _row_of(cells, choice)
-        out.append(
-            Row.of(
-                name,
-                plus_minus(nothing, float(zero["S_std_um"].iloc[0]), digits) if len(zero) else NOTHING,
-                plus_minus(choice.S_mean_um, choice.S_std_um, digits),
-                plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits),
-                number(float(own["max_abs_um"]), 1) if own is not None else NOTHING,
-                percent(1 - choice.S_mean_um / nothing) if nothing else NOTHING,
-                cell_label(choice.selector, choice.family, choice.n_tsp),
-                ", ".join(choice.inputs) or "none",
-            )
-        )
-    columns = (
-        Column("error channel"),
-        Column("no model", "µm", "number"),
-        Column("chosen model", "µm", "number"),
-        Column("nested", "µm", "number"),
-        Column(_MAX, "µm", "number"),
-        Column("removed", "", "number"),
-        Column("model"),
-        Column("points", "", "wide"),
-    )
-    caption = f"S_mean ± S_std on left-out batches ({protocol})"
-    return Table(caption, columns, tuple(out), simulated)
 
 
 @dataclass(frozen=True)
@@ -222,7 +192,7 @@ def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Pro
     nothing = zero_um(cells)
     scale = Scale.over(np.concatenate(per_batch).tolist(), 2.5 * nothing if nothing > 0 else math.inf)
     groups = _groups(result, rows, protocol)
-    names = sorted({g for row in groups for g in row}, key=_group_order)
+    names = sorted({g for row in groups for g in row}, key=group_order)
     columns = _columns(key, protocol, names)
     body = []
     for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
@@ -271,6 +241,56 @@ def _columns(key: str, protocol: str, groups: Sequence[str]) -> tuple[Column, ..
         Column("S per model" if protocol == "train-on-one" else "S per batch", "µm", "strip", "strip"),
         *last,
     )
+
+
+def heat_map(name: str, result: GridResult, cells: pd.DataFrame, digits: int) -> Table | None:
+    """S_mean of every family and selector at the best number of points; the darker, the smaller (logarithmic)."""
+    best = best_per(cells[~is_baseline(cells) & (cells["n_tsp"] > 0)], "family", "selector")
+    if best.empty:
+        return None
+    log_um = np.log10(np.maximum(best["S_mean_um"].to_numpy(float), 1e-3))
+    nothing = zero_um(cells)
+    low = float(log_um.min())
+    high = max(min(float(log_um.max()), math.log10(nothing) if nothing > 0 else math.inf), low + 0.1)
+    share = np.clip((high - log_um) / (high - low), 0.0, 1.0)
+    shades = {
+        (r["family"], r["selector"]): Shade(number(r["S_mean_um"], digits), f"n = {r['n_tsp']}", float(v))
+        for r, v in zip(best.to_dict("records"), share, strict=True)
+    }
+    families, selectors = (list(dict.fromkeys(best[k])) for k in ("family", "selector"))
+    rows = [Row((family_label(f), *(shades.get((f, s), NOTHING) for s in selectors))) for f in families]
+    columns = (Column("family"), *(Column(selector_label(s), "", "shade") for s in selectors))
+    levels = [
+        f"{family_label(r['family'])} {number(r['S_mean_um'], digits)} µm"
+        for r in best_per(cells[cells["n_tsp"] == 0], "family").to_dict("records")
+    ]
+    notes = ["For each pair the number of points n with the least score. The darker, the smaller the error left."]
+    notes += [f"Without temperature points: {listed(levels)}."] if levels else []
+    caption = f"{name}: S_mean of every family and selector, µm"
+    return Table(caption, columns, tuple(rows), result.simulated, None, tuple(notes))
+
+
+_MOST_POINTS_SHOWN = 24
+
+
+def point_frequency(name: str, result: GridResult, cells: pd.DataFrame, protocol: str) -> Table | None:
+    """How often the folds of each selector chose each point, most often chosen first; None where there is no choice."""
+    found = frequencies(result, cells, protocol)
+    if not found:
+        return None
+    total = {point: sum(f.share.get(point, 0.0) for f in found) for f in found for point in f.share}
+    points = sorted(total, key=lambda p: (-total[p], p))
+    rows = [
+        Row((p, *(Shade(percent(v) if v else "", "", v) for f in found for v in [f.share.get(p, 0.0)])))
+        for p in points[:_MOST_POINTS_SHOWN]
+    ]
+    columns = (Column("point"), *(Column(selector_label(f.selector), f"n = {f.n_tsp}", "shade") for f in found))
+    stable = [f"{selector_label(f.selector)} {number(f.stability, 2)}" for f in found]
+    notes = [f"Share of the folds, at each selector's best n short of all. Mean Jaccard similarity: {listed(stable)}."]
+    if len(points) > _MOST_POINTS_SHOWN:
+        notes.append(f"The {_MOST_POINTS_SHOWN} most often chosen of {len(points)} points.")
+    caption = f"{name}: how often each point is chosen"
+    return Table(caption, columns, tuple(rows), result.simulated, None, tuple(notes))
 
 
 def batches(result: GridResult, choice: Choice, digits: int) -> Table:
@@ -333,10 +353,16 @@ def _groups(result: GridResult, rows: pd.DataFrame, protocol: str) -> list[dict[
     parts = [part.groupby("fold", sort=False)["S_um"].mean() for part in S_by_batch(result, rows)]
     if max((len(p) for p in parts), default=0) > _MOST_GROUPS:
         return [{} for _ in range(len(rows))]
-    return [{str(k): float(v) for k, v in part.items()} for part in parts]
+    return [{_short(str(k)): float(v) for k, v in part.items()} for part in parts]
 
 
-def _group_order(name: str) -> tuple[int, float, str]:
+def _short(fold: str) -> str:
+    """A block of runs by its first day."""
+    first, _, last = fold.partition(" to ")
+    return f"from {first}" if last else first
+
+
+def group_order(name: str) -> tuple[int, float, str]:
     """Seasons from cold to warm, speeds from slow to fast, other names last."""
     found = re.search(r"[\d.]+", name)
     side = {"below": -1, "above": 1}.get(name.split(" ")[0], 0)

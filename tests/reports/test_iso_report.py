@@ -126,7 +126,7 @@ def test_a_test_sheet_is_read_and_its_mistakes_are_told() -> None:
     sheet = parse_yaml(text, TestSheet, "test sheet t.yml")
     assert sheet.tool_stick_out == "120 mm" and sheet.pairs[0].distance_mm == 120
     with pytest.raises(
-        InputError, match=r"test sheet t\.yml: unknown key 'tool_stickout'; did you mean 'tool_stick_out'"
+        InputError, match=r"test sheet t\.yml line 1: unknown key 'tool_stickout'; did you mean 'tool_stick_out'"
     ):
         parse_yaml("tool_stickout: 120 mm", TestSheet, "test sheet t.yml")
     with pytest.raises(InputError, match=r"key 'tilts\.A\.distance_mm': got 0; Input should be greater than 0"):

@@ -97,7 +97,7 @@ def test_the_page_shows_it_for_families_that_tell_and_marks_the_promoted(result:
     assert sum("(champion)" in f for f in column(rows, "family")) == 1
     every = ("honest", "honest, but too sure of a new season", "too sure", "too careful")
     assert {words.removeprefix("perhaps ") for words in column(rows, "it is")} <= set(every)
-    assert "<h3>How sure the models say they are</h3>" in text_of(result, tmp_path, "html")
+    assert "z: how sure the models say they are" in text_of(result, tmp_path, "html")
 
 
 def test_where_no_family_tells_or_an_old_training_has_no_column_nothing_is_shown(

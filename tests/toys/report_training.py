@@ -11,10 +11,12 @@ from typing import Any
 import pandas as pd
 
 from data.batch import Batch, Finding
-from models.crossing import Plan
+from models.crossing import Crossing, Plan
 from models.grid import run_grid
+from models.promotion import choose
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
+from models.trust import left_out_runs
 from pipelines.settings import NamesPart, Settings
 
 Maker = Callable[..., list[Batch]]
@@ -42,7 +44,14 @@ def results(make: Maker, k: int = 6, simulated: bool = True, findings: bool = Fa
         )
         batches[1] = batches[1].with_findings(found)
     plan = Plan(selectors=("none", "correlation", "pca_elimination"), families=FAMILIES, n_tsps=(1, 2, 4))
-    return {t: result for t, (_, result) in run_grid(batches, ["z", "x"], plan).items()}
+    return {t: judged(crossing, result) for t, (crossing, result) in run_grid(batches, ["z", "x"], plan).items()}
+
+
+def judged(crossing: Crossing, result: GridResult) -> GridResult:
+    """With the left-out runs and curves of the cell that the rule takes, as a training keeps them."""
+    cell = choose(result.cells, PromotionRule())
+    kept = left_out_runs(crossing, cell.selector, cell.family, cell.n_tsp)
+    return replace(result, distances=kept.runs, curves=kept.curves)
 
 
 def training(
