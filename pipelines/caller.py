@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from data.processes import in_threads
+
 T = TypeVar("T")
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 Say = Callable[[str], None]  # one line of progress
 Done = Callable[[str, int, int], None]  # step, finished, of how many
 LANES = max(2, os.cpu_count() or 1)  # concurrent steps: no fewer than the processes of `workers_for`
@@ -32,28 +33,26 @@ class DirectCaller:
         self.done = done
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
-        if len(items) == 1:  # in this thread, so that Ctrl-C ends it at once
-            with threadpool_limits(limits=1):
-                only = work(items[0])
-            if self.done:
-                self.done(step, 1, 1)
-            return [only]
-        with threadpool_limits(limits=1), ThreadPoolExecutor(LANES) as pool:
-            return gather(step, [pool.submit(work, item) for item in items], self.done)
+        work = counted(step, work, len(items), self.done)
+        with threadpool_limits(limits=1):
+            if len(items) == 1:  # in this thread, so that Ctrl-C ends it at once
+                return [work(items[0])]
+            return in_threads(work, items, LANES)
 
 
-class Future(Protocol[R_co]):
-    """A submitted step, in a thread pool or in Prefect."""
+def counted(step: str, work: Callable[[T], R], of: int, done: Done | None) -> Callable[[T], R]:
+    """`work` that reports each item as it is finished, in whatever order and thread."""
+    if done is None:
+        return work
+    lock, finished = threading.Lock(), 0
 
-    def result(self) -> R_co:
-        """Wait for the step; raises what it raised."""
+    def counting(item: T) -> R:
+        nonlocal finished
+        result = work(item)
+        label = " ".join(item) if isinstance(item, tuple) and all(isinstance(part, str) for part in item) else ""
+        with lock:
+            finished += 1
+            done(f"{step} {label}".rstrip(), finished, of)
+        return result
 
-
-def gather(step: str, futures: Sequence[Future[R]], done: Done | None) -> list[R]:
-    """Results in the order of submission; `done` hears of each."""
-    results: list[R] = []
-    for future in futures:
-        results.append(future.result())
-        if done:
-            done(step, len(results), len(futures))
-    return results
+    return counting

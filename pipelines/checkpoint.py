@@ -6,41 +6,75 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from models.crossing import Crossing, FamilyResult
+from pipelines.caller import Say
 
 Job = tuple[str, str]  # error channel, family
 _SOURCES = ("data", "features", "models", "twin")
+_LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
+_SUMS = "sums.json"  # the digest of every other file of a kept job
 
 
 class Checkpoint:
     """Finished jobs of one training below `folder`.
 
-    The folder's name is a digest of all that decides the numbers: rows, inputs, plan, machine file and the program's
-    own source. So a changed recording, mask, option or line of code starts anew.
+    The folder's name is a digest of all that decides the numbers: rows, inputs, plan, machine file, libraries and the
+    program's own source. So a changed recording, mask, option or line of code starts anew.
     """
 
-    def __init__(self, folder: Path, crossings: Mapping[str, Crossing]) -> None:
-        self._folder = folder / _digest(crossings)
+    def __init__(self, folder: Path, crossings: Mapping[str, Crossing], jobs: Sequence[Job]) -> None:
+        self._folder, self._jobs = folder / _digest(crossings), jobs
+
+    def kept(self, say: Say = lambda text: None) -> dict[Job, FamilyResult]:
+        """The jobs that an interrupted training finished; `say` receives how many, and what cannot be read."""
+        results, ended_s = {}, []
+        for job in self._jobs:
+            held = self._held(job)
+            if not held.is_dir():
+                continue
+            time_s = held.stat().st_mtime
+            try:
+                results[job] = _read(held)
+            except (OSError, ValueError, KeyError) as error:
+                say(f"{held}: is damaged ({error}); {' '.join(job)} is crossed again")
+                shutil.rmtree(held)
+            else:
+                ended_s.append(time_s)
+        if results:
+            last = datetime.fromtimestamp(max(ended_s))
+            say(f"resumes: {self._count(len(results))} were crossed on {last:%Y-%m-%d %H:%M}")
+        return results
 
     def crossed(self, cross: Callable[[Job], FamilyResult]) -> Callable[[Job], FamilyResult]:
-        """`cross` with a memory: a kept job is read, a new one is written."""
+        """`cross` that keeps what it returns."""
 
         def work(job: Job) -> FamilyResult:
-            held = self._folder / "__".join(job)
-            if held.is_dir():
-                return _read(held)
             result = cross(job)
-            _write(result, held)
+            _write(result, self._held(job))
             return result
 
         return work
+
+    def summary(self) -> str:
+        """How many jobs are kept where."""
+        n = sum(self._held(job).is_dir() for job in self._jobs)
+        return f"{self._count(n)} are kept in {self._folder}; run the same command to go on"
+
+    def _held(self, job: Job) -> Path:
+        return self._folder / "__".join(job)
+
+    def _count(self, n: int) -> str:
+        channels = len({target for target, _ in self._jobs})
+        return f"{n} of {len(self._jobs)} families" + (f" (of {channels} error channels)" if channels > 1 else "")
 
     def remove(self) -> None:
         """Remove the kept jobs, once they are tracked."""
@@ -55,6 +89,7 @@ def _write(result: FamilyResult, held: Path) -> None:
     result.cells.to_parquet(scratch / "cells.parquet", index=False)
     np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
     (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
+    (scratch / _SUMS).write_text(json.dumps(_sums(scratch)), encoding="utf-8")
     try:
         scratch.rename(held)
     except OSError:  # another process was quicker
@@ -62,6 +97,9 @@ def _write(result: FamilyResult, held: Path) -> None:
 
 
 def _read(held: Path) -> FamilyResult:
+    """Raises OSError or ValueError where a file is missing or not as it was written."""
+    if json.loads((held / _SUMS).read_text(encoding="utf-8")) != _sums(held):
+        raise ValueError("a file is not as it was written")
     with np.load(held / "predictions.npz", allow_pickle=False) as stored:
         predictions = {name: stored[name] for name in stored.files}
     failures = [(a, b) for a, b in json.loads((held / "failures.json").read_text(encoding="utf-8"))]
@@ -69,8 +107,12 @@ def _read(held: Path) -> FamilyResult:
     return FamilyResult(scores, cells, predictions, failures)
 
 
+def _sums(folder: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.iterdir()) if p.name != _SUMS}
+
+
 def _digest(crossings: Mapping[str, Crossing]) -> str:
-    digest = hashlib.sha256(_source().encode())
+    digest = hashlib.sha256(f"{_source()} {[version(name) for name in _LIBRARIES]}".encode())
     for target, crossing in sorted(crossings.items()):
         d = crossing.design
         twin = d.machine.model_dump_json() if d.machine is not None else ""

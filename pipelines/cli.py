@@ -1,18 +1,21 @@
-"""The command line. Exit codes: 0 done, 1 the work failed, 2 bad arguments or input (one clear line)."""
+"""The command line. Exit codes: 0 done, 1 the work failed, 2 bad arguments or input (one clear line), 130 and 143
+stopped by Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Callable
 
 import typer
 
 from data.errors import InputError, WorkError
-from pipelines import console
+from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
 from pipelines.commands.describe import describe
 from pipelines.commands.diagnose import diagnose
 from pipelines.commands.ingest import ingest
+from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
 from pipelines.commands.promote import promote, rollback
 from pipelines.commands.prove import app as prove
@@ -37,12 +40,14 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 for command in COMMANDS:
     app.command()(command)
 app.add_typer(prove, name="prove")
+app.add_typer(lake, name="lake")
 
 
 def main() -> None:
-    """Entry point: input errors are one line and exit code 2, failed work exit code 1."""
+    """Entry point: input errors are one line and exit code 2, failed work exit code 1, a stop 128 + signal."""
     try:
-        code = app(standalone_mode=False)
+        with stopping.prompt():
+            code = app(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except InputError as error:
         console.error(error)
@@ -52,6 +57,11 @@ def main() -> None:
         sys.exit(1)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        console.error(f"{str(error.filename)[:60]}…: the path is too long; give a shorter one")
+        sys.exit(2)
     except Exception as error:
         # typer vendors click, so a usage error is recognised by its method instead of its class.
         if not hasattr(error, "format_message"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from data.processes import ending
 from pipelines.caller import Done, Say
 
 if TYPE_CHECKING:
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 out = Console(soft_wrap=True)
 err = Console(stderr=True, soft_wrap=True)
+PLAIN_EVERY_S = 30.0  # between two lines of progress in a log: a long night gives a thousand
+MIN_FINISHED = 2  # items from which on an estimate is shown: the first may have waited for imports
 
 
 def line(text: object) -> None:
@@ -33,22 +37,68 @@ def error(text: object) -> None:
     err.print(f"thermodrift: {escape(str(text))}", highlight=False)
 
 
+def note(text: object) -> None:
+    """One line for the user's attention on standard error, without markup."""
+    err.print(escape(str(text)), highlight=False)
+
+
+class Pace:
+    """Estimates the time that a step still needs from the times at which its items were finished.
+
+    The remaining items are taken to come as fast as the later half of the finished ones did: where the slow ones go
+    first, the early ones say too much.
+    """
+
+    def __init__(self, now_s: float) -> None:
+        self._of, self._marks = 0, [(0, now_s)]  # (finished, when)
+
+    def left(self, n: int, of: int, now_s: float) -> str:
+        """Note that `n` of `of` are finished; "about 3 min left", or empty where nothing can be said yet."""
+        last, when_s = self._marks[-1]
+        if of != self._of or n < last:  # another step
+            self._of, self._marks = of, [(0, when_s)]
+        self._marks.append((n, now_s))
+        if not MIN_FINISHED <= n < of:
+            return ""
+        then, then_s = max(mark for mark in self._marks if mark[0] <= n // 2)
+        return f"about {_duration((of - n) * (now_s - then_s) / (n - then))} left"
+
+
+def _duration(time_s: float) -> str:
+    """Rounded up, since an estimate has one digit to give."""
+    unit, size_s = next(((u, s) for u, s in (("h", 3600), ("min", 60)) if time_s > 1.5 * s), ("s", 1))
+    return f"{math.ceil(time_s / size_s) if size_s > 1 else 10 * max(1, math.ceil(time_s / 10))} {unit}"
+
+
 @contextmanager
 def progress(quiet: bool) -> Iterator[tuple[Say, Done]]:
-    """One live line with the present step and its progress; plain lines where standard error is no terminal."""
+    """A line per step; below, on a terminal, a bar with what was finished last and an estimate of the time left.
+
+    Where standard error is no terminal, a line every `PLAIN_EVERY_S` takes the bar's place.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
-        current = bar.add_task("starting", total=None)
+    columns = (TextColumn("{task.description}"), BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn(),
+               TextColumn("{task.fields[left]}"))  # fmt: skip
+    pace, printed_s = Pace(time.monotonic()), time.monotonic()
+    with Progress(*columns, console=err, transient=True, disable=quiet or not err.is_terminal) as bar, ending(bar.stop):
+        current = bar.add_task("starting", total=None, left="")
 
         def say(text: str) -> None:
-            if not quiet and not err.is_terminal:
+            nonlocal pace, printed_s
+            pace, printed_s = Pace(time.monotonic()), time.monotonic()
+            if not quiet:
                 err.print(escape(text), highlight=False)
-            bar.reset(current, description=escape(text), total=None)
+            bar.reset(current, description=escape(text), total=None, left="")
 
         def done(step: str, n: int, of: int) -> None:
-            bar.update(current, description=escape(step), completed=n, total=of)
+            nonlocal printed_s
+            now_s = time.monotonic()
+            left = pace.left(n, of, now_s)
+            bar.update(current, description=escape(step), completed=n, total=of, left=left)
+            if not quiet and not err.is_terminal and of and now_s - printed_s > PLAIN_EVERY_S:
+                printed_s = now_s
+                err.print(escape(f"{step}: {n} of {of}" + f", {left}" * bool(left)), highlight=False)
 
         yield say, done
 

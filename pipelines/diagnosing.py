@@ -25,7 +25,7 @@ from diagnosis.export.machine_file import diagnosed_text, drafted_text
 from diagnosis.findings.schema import Findings, as_json
 from diagnosis.result import Diagnosis
 from models import FAMILIES
-from models.promotion import left_out, score_um
+from models.promotion import judged, left_out
 from models.protocols import PromotionRule
 from models.result import GridResult
 from pipelines import tracking
@@ -36,6 +36,7 @@ from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
 
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
+_EVERY_BATCH = "leave-batch-out"  # the one protocol that predicts every batch, so that trainings can be compared
 FILES = (REPORT, PLAN, MACHINE, FINDINGS)  # the last one says that the others are complete
 
 
@@ -370,12 +371,12 @@ def _last_result(result: GridResult, settings: Settings, ids: Mapping[str, str])
 
 def _left_out_of(result: GridResult, family: str, rule: PromotionRule) -> list[tuple[str, float]] | None:
     """Digest and left-out S of every batch, by the family's best cell."""
-    cells = result.cells[(result.cells["protocol"] == rule.protocol) & (result.cells["family"] == family)]
-    cells = cells.assign(score_um=score_um(cells, rule))
-    cells = cells[np.isfinite(cells["score_um"])]
-    if cells.empty:
+    rule = rule.only(_EVERY_BATCH)
+    try:
+        cells = judged(result.cells[result.cells["family"] == family], rule)
+    except InputError:  # the family has no finite score
         return None
     best = cells.nsmallest(1, "score_um").iloc[0]
-    table = left_out(result, rule.protocol, str(best["selector"]), family, int(best["n_tsp"]))
+    table = left_out(result, rule, str(best["selector"]), family, int(best["n_tsp"]))
     rows = [(str(d), float(s)) for d, s in zip(table["digest"], table["S_um"], strict=True) if np.isfinite(s)]
     return rows or None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 from zoneinfo import ZoneInfo, available_timezones
@@ -23,7 +25,9 @@ from prefect.types.entrypoint import EntrypointType
 from threadpoolctl import threadpool_limits
 
 from data.errors import InputError, WorkError
-from pipelines.caller import LANES, Done, Say, gather
+from data.processes import at_end, without_interrupt
+from pipelines import stopping
+from pipelines.caller import LANES, Done, Say, counted
 from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
 from pipelines.settings import Settings, load
 from pipelines.training import TrainOutcome, TrainRequest, train
@@ -31,6 +35,7 @@ from pipelines.training import TrainOutcome, TrainRequest, train
 T = TypeVar("T")
 R = TypeVar("R")
 RETRY_DELAY_S = 2.0
+POPEN_S = 1.0  # for the operating system to start a process
 
 
 class PrefectCaller:
@@ -42,8 +47,10 @@ class PrefectCaller:
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
         # Items travel in a closure: Prefect would otherwise walk through every data frame looking for futures.
         # The lake's hashes are the cache, so Prefect keeps none.
+        reported = counted(step, work, len(items), self.done)
+
         def one(i: int) -> R:
-            return work(items[i])
+            return reported(items[i])
 
         unit = task(
             one,
@@ -56,7 +63,8 @@ class PrefectCaller:
             retry_condition_fn=_can_succeed,
         )
         with threadpool_limits(limits=1):
-            return gather(step, [unit.submit(i) for i in range(len(items))], self.done)
+            futures = [unit.submit(i) for i in range(len(items))]
+            return [future.result() for future in futures]
 
 
 def _can_succeed(task: Any, run: Any, state: Any) -> bool:
@@ -78,9 +86,31 @@ def start_server() -> threading.Thread | None:
     """
     if prefect_settings.PREFECT_API_URL.value():
         return None
-    thread = threading.Thread(target=SubprocessASGIServer().start, kwargs={"timeout": 60}, daemon=True)
+    thread = threading.Thread(target=_serve, daemon=True)
     thread.start()
+    at_end(partial(_kill_server, thread))
     return thread
+
+
+def _serve() -> None:
+    with without_interrupt():
+        SubprocessASGIServer().start(timeout=60)
+
+
+def _kill_server(starting: threading.Thread) -> None:
+    """Its own way to stop may take 5 s, and lets a client that misses it start another one.
+
+    Its store is SQLite, which a kill leaves in order.
+    """
+    server = SubprocessASGIServer()
+    server.running = True  # so that none is started from now on
+    atexit.unregister(server.stop)
+    end_s = time.monotonic() + POPEN_S
+    while server.server_process is None and starting.is_alive() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    if server.server_process is not None:
+        server.server_process.kill()
+        server.server_process.wait()
 
 
 def train_in_flow(
@@ -119,6 +149,8 @@ def retrain(machine_file: str, recordings: list[str]) -> str:
     summary = outcome.stopped or "; ".join(p.summary for p in outcome.promotions.values())
     quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
     summary += f" (files in quarantine: {quarantined})" if quarantined else ""
+    waiting = len(outcome.ingested.waiting) if outcome.ingested else 0
+    summary += f" (files still being written: {waiting})" if waiting else ""
     summary += f"; {outcome.diagnosis_summary}" if outcome.diagnosis_summary else ""
     print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {summary}", flush=True)
     return summary
@@ -172,6 +204,7 @@ def serve_schedule(
     parameters = {"machine_file": str(machine_file.resolve()), "recordings": [str(r.resolve()) for r in recordings]}
     if prefect_settings.PREFECT_API_URL.value():
         say(f"retraining of {machine_file.stem} at '{cron}' ({zone.key}); Ctrl-C ends it")
+        stopping.release()  # Prefect ends its runs and pauses the schedule on the server
         retrain.serve(
             name=f"retrain-{machine_file.stem}",
             schedule=schedule,
@@ -185,7 +218,10 @@ def serve_schedule(
         due = next(CronSim(cron, datetime.now(zone)))  # from now on: a run may last past the next date
         say(f"retraining of {machine_file.stem} next at {due:%Y-%m-%d %H:%M %Z}; Ctrl-C ends it")
         _wait_until(due)
+        server = start_server()
         try:
+            if server is not None:
+                server.join()
             retrain(**parameters)
         except (InputError, WorkError):
             pass  # the flow has printed it

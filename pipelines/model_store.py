@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -22,10 +22,21 @@ from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
-from models.trust import Region, Rise, watched
+from models.conformal import RunBound
+from models.trust import SLACK, Region, disagreement_um, farthest, watched
 
-SCHEMA = "thermodrift.model/2"
+SCHEMA = "thermodrift.model/3"
+_READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run
 FILES = ("model.json", "arrays.npz", "machine.yml")
+
+
+class RunError(NamedTuple):
+    """Expected S of a run and the bound that nine runs in ten stay below, µm; `flagged` is why the run is unlike the
+    left-out runs that both come from (then the error may exceed the bound), empty where it is not."""
+
+    expected_S_um: float
+    bound90_S_um: float
+    flagged: str
 
 
 @dataclass(frozen=True)
@@ -36,7 +47,8 @@ class StoredModel:
     machine: Machine
     region: Region
     info: dict[str, Any] = field(default_factory=dict)  # training_id, cell, n_batches, simulated, …
-    rise: Rise | None = None  # of the error with the distance from the region, where it was measured
+    bound: RunBound | None = None  # of the error of a run
+    siblings: tuple[Family, ...] = ()  # whose disagreement with `family` the bound follows
 
     @property
     def simulated(self) -> bool:
@@ -84,9 +96,22 @@ class StoredModel:
         """Distance of each row (n,) from the trained region, in trained widths; 0 inside."""
         return self.region.distance(watched(batch, self.family.inputs))
 
-    def expected_S_um(self, distance: Array) -> Array:
-        """Expected S (n,) at these distances, µm; NaN where it was not measured."""
-        return np.full(len(distance), np.nan) if self.rise is None else self.rise.expected_um(distance)
+    def run_error(self, batch: Batch, predicted_um: Array) -> RunError:
+        """The error to expect of a run from its inputs and its prediction (n,)."""
+        distance, quantity = farthest(self.region.beyond(values := watched(batch, self.family.inputs)))
+        apart_um = disagreement_um(predicted_um, [s.predict(batch) for s in self.siblings])
+        bound = self.bound
+        if bound is None:
+            expected_um, most_um = (float(self.info.get(f"expected_S_{k}um", math.nan)) for k in ("", "bound90_"))
+            return RunError(expected_um, most_um, self.region.excess(quantity, values) if distance > SLACK else "")
+        factor, reasons = bound.factor(apart_um, distance), []
+        if distance > max(bound.tested, SLACK):
+            reasons.append(self.region.excess(quantity, values))
+        if factor > bound.unusual:
+            disagree = f"similar models differ by {apart_um:.2g} µm, usually {bound.typical_um:.2g}"
+            by_distance = bound.factor(math.nan, distance) ** 2 > factor
+            reasons.append(self.region.excess(quantity, values) if by_distance else disagree)
+        return RunError(bound.expected_um * factor, bound.bound_um * factor, "; ".join(dict.fromkeys(reasons)))
 
     def _column(self, channel: str) -> str | int:
         part = self.machine.channels.get(channel)
@@ -99,7 +124,8 @@ def save(
     machine_yaml: str,
     region: Region,
     info: Mapping[str, Any] | None = None,
-    rise: Rise | None = None,
+    bound: RunBound | None = None,
+    siblings: Sequence[Family] = (),
 ) -> None:
     """Write the three files; `machine_yaml` is the text of the machine file."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +135,8 @@ def save(
         "schema": SCHEMA,
         **plain,
         "region": _to_json(region.as_plain(), arrays),
-        "rise": None if rise is None else _to_json(rise.as_plain(), arrays),
+        "bound": None if bound is None else _to_json(bound.as_plain(), arrays),
+        "siblings": [_to_json(s.as_plain(), arrays) for s in siblings],
         "info": dict(info or {}),
     }
     (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -133,13 +160,15 @@ def load(folder: Path) -> StoredModel:
         raise InputError(
             f"model folder {folder}: not a stored model ({error}); expected the files {', '.join(FILES)}"
         ) from None
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+    if not isinstance(document, dict) or document.get("schema") not in _READABLE:
         got = document.get("schema") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"model folder {folder}: got schema {got!r}, expected {SCHEMA!r}; train the model again")
     plain = _from_json(document, arrays)
     machine = parse_machine(machine_yaml, str(inner / "machine.yml"))
-    rise = None if plain["rise"] is None else Rise.from_plain(plain["rise"])
-    return StoredModel(family_from_plain(plain), machine, Region.from_plain(plain["region"]), plain["info"], rise)
+    bound = RunBound.from_plain(plain["bound"]) if plain.get("bound") else None
+    siblings = tuple(family_from_plain(s) for s in plain.get("siblings", ()))
+    region = Region.from_plain(plain["region"])
+    return StoredModel(family_from_plain(plain), machine, region, plain["info"], bound, siblings)
 
 
 def frame_to_batch(model: StoredModel, table: pd.DataFrame, batch_id: str = "frame") -> Batch:

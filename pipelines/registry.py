@@ -28,10 +28,12 @@ from data.batch import Batch
 from data.errors import InputError, closest
 from features.rises import zeroed_error_um
 from models.base import Family
+from models.conformal import RunBound
 from models.metrics import residual_std_um
+from models.outlook import Outlook, outlook
 from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
-from models.trust import Region, Rise
+from models.trust import Region, fit_siblings
 from pipelines import model_store, pyfunc_model
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
@@ -42,7 +44,8 @@ Outcome = Literal["champion", "challenger", "unchanged"]
 
 @dataclass(frozen=True)
 class Promotion:
-    """The outcome for a training's best cell. `version` holds its model; `champion_version` is the champion now.
+    """The outcome for a training's best cell. `version` holds its model; `champion_version` is the champion now, None
+    where no model is trustworthy. `outlook` is the error to expect in the next season.
 
     `against` is the version that it was compared with, `obstacle` the reason why no comparison was possible; `caution`
     and the nested score are the choice's (see `promotion.Choice`).
@@ -51,7 +54,7 @@ class Promotion:
     outcome: Outcome
     name: str
     version: int
-    champion_version: int
+    champion_version: int | None
     cell: str
     caution: str
     summary: str
@@ -61,6 +64,7 @@ class Promotion:
     forced: bool = False
     nested_S_mean_um: float = float("nan")
     nested_S_std_um: float = float("nan")
+    outlook: Outlook | None = None
 
     @property
     def trusted(self) -> bool:
@@ -72,7 +76,8 @@ class Promotion:
 
     def as_dict(self) -> dict[str, Any]:
         kept = asdict(self)
-        return {**kept, "words": kept.pop("summary")}
+        own = {k: v.as_dict() for k in ("comparison", "outlook") if (v := getattr(self, k)) is not None}
+        return {**kept, **own, "words": kept.pop("summary")}
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,10 @@ class Newcomer:
     batches: Sequence[Batch] = ()
 
     @property
+    def outlook(self) -> Outlook:
+        return outlook(self.result, self.choice)
+
+    @property
     def fingerprint(self) -> str:
         """Same batches (id and content), same cell, same meaning of the machine file: same fingerprint."""
         table, choice = self.result.batches, self.choice
@@ -108,8 +117,8 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
 
     The newcomer replaces a champion only if `promotion.compare_paired` finds it better on the same batches: the
     left-out S of both on the batches that both trainings share, and, where `Newcomer.batches` are given, the
-    champion's own prediction on batches that it has not seen against the newcomer's left-out one. The same data, cell
-    and machine file again make no new version.
+    champion's own prediction on batches that it has not seen against the newcomer's left-out one. A choice that is not
+    trustworthy becomes no champion. The same data, cell and machine file again make no new version.
 
     Args:
         force: make it the champion whatever the comparison says; the reason says so.
@@ -123,8 +132,8 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
         champion = _by_alias(client, name, CHAMPION)
         fingerprint = new.fingerprint
         same = [v for v in _versions(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags]
-        if same and (champion is not None or force):
-            done = _keep(client, same[0], champion, new.choice, force)
+        if same and (champion is not None or force or not new.choice.trusted):
+            done = _keep(client, same[0], champion, new, force)
         else:
             done = _register(client, name, champion, new, settings, force)
         record_promotion(client, new.training_id, done.as_dict())
@@ -132,20 +141,20 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
 
 
 def _keep(
-    client: MlflowClient, same: ModelVersion, champion: ModelVersion | None, choice: Choice, force: bool
+    client: MlflowClient, same: ModelVersion, champion: ModelVersion | None, new: Newcomer, force: bool
 ) -> Promotion:
     """No new version: one of the same fingerprint exists; by force it becomes the champion."""
-    name, version = same.name, same.version
+    name, version, choice = same.name, same.version, new.choice
     summary = f"{name}: same batches, cell and machine file as version {version}; nothing new registered"
     if force and (champion is None or champion.version != version):
         if champion is not None:
             client.set_model_version_tag(name, version, "replaces", champion.version)
         _crown(client, name, version, champion)
         summary += f"; version {version} is champion by force"
-    stays = version if champion is None or force else champion.version
+    stays = same if force else champion
     return Promotion(
-        "unchanged", name, int(version), int(stays), choice.cell, choice.caution, summary,
-        nested_S_mean_um=choice.nested_S_mean_um, nested_S_std_um=choice.nested_S_std_um,
+        "unchanged", name, int(version), None if stays is None else int(stays.version), choice.cell, choice.caution,
+        summary, nested_S_mean_um=choice.nested_S_mean_um, nested_S_std_um=choice.nested_S_std_um, outlook=new.outlook,
     )  # fmt: skip
 
 
@@ -157,11 +166,15 @@ def _register(
     comparison, obstacle, why = None, "", "first model of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
-        why = f"by force; {why}" if force else why
-    replaces = champion is None or force or (comparison is not None and comparison.better)
+    if not choice.trusted:
+        why = "no trustworthy model"
+    why = f"by force; {why}" if force and (champion is not None or not choice.trusted) else why
+    better = champion is None or (comparison is not None and comparison.better)
+    replaces = force or (choice.trusted and better)
     outcome: Outcome = "champion" if replaces else "challenger"
     info = _info(new)
-    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | {"reason": why}
+    reason = why if choice.trusted else f"{why}, {choice.caution}"
+    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | {"reason": reason}
     if champion is not None and replaces:
         tags["replaces"] = champion.version
     version = _log_version(client, name, new, info, tags)
@@ -174,17 +187,20 @@ def _register(
         client.set_registered_model_alias(name, CHALLENGER, version)
     client.set_model_version_tag(name, version, "outcome", outcome)  # last: what lacks it was interrupted
     return Promotion(
-        outcome, name, int(version), int(version if replaces or champion is None else champion.version), choice.cell,
-        choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
+        outcome, name, int(version), int(version) if replaces else None if champion is None else int(champion.version),
+        choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
-        choice.nested_S_std_um,
+        choice.nested_S_std_um, new.outlook,
     )  # fmt: skip
 
 
 def _info(new: Newcomer) -> dict[str, Any]:
-    """What is stored with the model."""
-    choice, result = new.choice, new.result
+    """What is stored with the model: the error to expect first."""
+    choice, result, expected = new.choice, new.result, new.outlook
     return {
+        "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um, "expected_by": expected.protocol,
+        "leave_batch_out_S_mean_um": expected.leave_batch_out_um,
+        "leave_batch_out_S_std_um": expected.leave_batch_out_std_um, "expected": expected.summary,
         "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
         "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary, "trained_at": _now(),
         "trusted": choice.trusted, "caution": choice.caution,
@@ -224,11 +240,14 @@ def rollback(name: str, settings: Settings) -> Promotion:
 
 
 def status(settings: Settings) -> pd.DataFrame:
-    """Every version of every model: name, version, aliases, cell, score_um, n_batches, trained_at, simulated, trusted,
-    reason, was_champion_until, training_id; newest version first within a name."""
+    """Every version of every model: name, version, aliases, expected_S_um, expected_S_bound90_um and expected_by (the
+    protocol) of a run in the next season, leave_batch_out_S_mean_um, cell, score_um, n_batches, trained_at, simulated,
+    trusted, reason, was_champion_until, training_id; newest version first within a name."""
     client = open_store(settings)
-    columns = ["name", "version", "aliases", "machine", "target", "cell", "score_um", "n_batches", "trained_at",
-               "simulated", "trusted", "reason", "was_champion_until", "training_id"]  # fmt: skip
+    numbers = ["expected_S_um", "expected_S_bound90_um", "leave_batch_out_S_mean_um", "score_um"]
+    columns = ["name", "version", "aliases", "machine", "target", *numbers[:2], "expected_by", *numbers[2:3], "cell",
+               "score_um", "n_batches", "trained_at", "simulated", "trusted", "expected", "reason",
+               "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
         for model in client.search_registered_models(max_results=1000):
@@ -237,7 +256,7 @@ def status(settings: Settings) -> pd.DataFrame:
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))
                 rows.append({
                     **{c: tags.get(c, "") for c in columns}, "name": model.name, "version": int(v.version),
-                    "aliases": ", ".join(aliases), "score_um": float(tags.get("score_um", "nan")),
+                    "aliases": ", ".join(aliases), **{n: float(tags.get(n, "nan")) for n in numbers},
                     "n_batches": int(tags.get("n_batches", 0)), "simulated": tags.get("simulated") == "true",
                     "trusted": tags.get("trusted") != "false",
                 })  # fmt: skip
@@ -262,6 +281,12 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     if which in model.aliases:
         return client.get_model_version_by_alias(name, which)
     versions = {str(v.version): v for v in _versions(client, name)}
+    if which == CHAMPION and versions:
+        newest = next(iter(versions.values()))
+        raise InputError(
+            f"model {name!r} has no champion: {newest.tags.get('reason', 'none was promoted')}; name a version "
+            f"({', '.join(versions)}), or promote one by force"
+        )
     if which not in versions:
         kind = "version" if which.isdigit() else "alias"
         raise InputError(f"model {name!r} has no {kind} {which!r}; {closest(which, [*model.aliases, *versions])}")
@@ -285,26 +310,29 @@ def _against(
     except InputError as error:
         why = f"the champion (version {champion.version}) cannot be compared ({error}); it stays"
         return None, str(error), why
-    new = left_out(result, choice.protocol, choice.selector, choice.family, choice.n_tsp)
-    old = left_out(then, choice.protocol, tags["selector"], tags["family"], int(tags["n_tsp"]))
+    rule = settings.promotion
+    new = left_out(result, rule, choice.selector, choice.family, choice.n_tsp)
+    old = left_out(then, rule, tags["selector"], tags["family"], int(tags["n_tsp"]))
     known = set(then.batches["batch_id"])
     unseen = [b for b in batches if b.batch_id not in known]
-    if unseen and choice.protocol != "train-on-one":
-        old = pd.concat([old, _score_unseen(champion, unseen, choice, result, settings)], ignore_index=True)
-    comparison = compare_paired(new, old, settings.promotion)
+    weights = pd.Series(rule.protocols, name="weight").drop("train-on-one", errors="ignore")
+    if unseen and len(weights):
+        own = _score_unseen(champion, unseen, result.target, settings)
+        every = own.merge(weights.rename_axis("protocol").reset_index(), how="cross")
+        every["S_um"] *= every.pop("weight")
+        old = pd.concat([old, every], ignore_index=True)
+    comparison = compare_paired(new, old, rule)
     fresh = f" ({len(unseen)} of them new to the champion)" if unseen else ""
     return comparison, "", f"against version {champion.version}: {comparison.words}{fresh}"
 
 
-def _score_unseen(
-    champion: ModelVersion, unseen: Sequence[Batch], choice: Choice, result: GridResult, settings: Settings
-) -> pd.DataFrame:
+def _score_unseen(champion: ModelVersion, unseen: Sequence[Batch], target: str, settings: Settings) -> pd.DataFrame:
     """S of the champion's own predictions on batches it was not trained on: batch_id, digest, S_um."""
     model = model_store.load(Path(local_folder(champion.source, settings)))
     rows = []
     for b in unseen:
         try:
-            error_um = zeroed_error_um(b, result.target) - model.predict(b)
+            error_um = zeroed_error_um(b, target) - model.predict(b)
         except InputError:  # an input of the champion is no longer recorded: no comparison on this batch
             continue
         rows.append({"batch_id": b.batch_id, "digest": str(b.digest), "S_um": residual_std_um(error_um)})
@@ -356,10 +384,12 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, info: dict[str,
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
-    rise = Rise.of_cell(new.result.distances, new.choice.cell)
+    choice, result = new.choice, new.result
+    bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)
+    siblings = fit_siblings(new.family, new.batches)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        model_store.save(folder, new.family, new.machine_yaml, new.region, info, rise)
+        model_store.save(folder, new.family, new.machine_yaml, new.region, info, bound, siblings)
         stored = model_store.load(folder)
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]

@@ -23,6 +23,7 @@ from typing import Any
 import mlflow
 import numpy as np
 import pandas as pd
+from filelock import FileLock
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
@@ -31,7 +32,8 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from diagnosis.result import Diagnosis
 from models import FAMILIES
-from models.promotion import choose, score_um
+from models.outlook import outlook
+from models.promotion import choose, judged
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
 from pipelines.caller import Say
@@ -132,12 +134,23 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
     with _OPENING, store_errors(settings):
         if file is not None and not file.exists():
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
+            _make_store(file)
         # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)
         mlflow.set_registry_uri(settings.store_uri)
         client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
         client.search_experiments(max_results=1)
     return client
+
+
+def _make_store(file: Path) -> None:
+    """All or nothing: MLflow cannot open a store whose first migration was interrupted."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{file}.lock"), tempfile.TemporaryDirectory(dir=file.parent, prefix=".making-") as scratch:
+        made = Path(scratch) / file.name
+        MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1)
+        if not file.exists():  # made by another process meanwhile
+            made.rename(file)
 
 
 @contextmanager
@@ -252,9 +265,14 @@ def _log_parent(
         "n_findings": len(result.findings),
     }
     tags: list[RunTag] = []
-    if rule.protocol in set(result.cells["protocol"]):
+    if rule.offered(set(result.cells["protocol"])):
         best = choose(result.cells, rule)
-        metrics |= {"best_score_um": best.score_um, "best_S_mean_um": best.S_mean_um, "best_S_std_um": best.S_std_um}
+        expected = outlook(result, best)
+        metrics |= {
+            "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,
+            "leave_batch_out_S_mean_um": expected.leave_batch_out_um, "best_score_um": best.score_um,
+            "best_S_mean_um": best.S_mean_um, "best_S_std_um": best.S_std_um,
+        }  # fmt: skip
         tags = [RunTag("best", best.name), RunTag("best_cell", best.cell)]
     client.log_batch(
         run_id,
@@ -293,11 +311,11 @@ def _log_cells(
                 metrics.append(Metric(f"{prefix}/{name}", float(row[name]), now, int(row["n_tsp"])))
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
-    judged = cells[cells["protocol"] == rule.protocol]
-    judged = judged.assign(score_um=score_um(judged, rule))
-    judged = judged[np.isfinite(judged["score_um"])]
-    if len(judged):
-        best = judged.loc[judged["score_um"].idxmin()]
+    try:
+        best = judged(cells, rule).nsmallest(1, "score_um").iloc[0]
+    except InputError:  # no score under the rule
+        best = None
+    if best is not None:
         params |= {"best_n_tsp": str(best["n_tsp"]), "best_inputs": str(best["inputs"])[:6000]}
         metrics.append(Metric("best_score_um", float(best["score_um"]), now, int(best["n_tsp"])))
         s = result.scores

@@ -20,13 +20,14 @@ from data.machine import Machine, load_machine
 from models import FAMILIES, promotion
 from models.crossing import Crossing, Plan, prepare, refit, with_target
 from models.grid import Workers, assemble, jobs_of, workers_for
+from models.outlook import Outlook, outlook
 from models.result import GridResult
 from models.trust import Region
-from pipelines import registry, tracking
+from pipelines import registry, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint
 from pipelines.diagnosing import DiagnosisOutcome, diagnose_if_grown
-from pipelines.recordings import home_lake, load_batches
+from pipelines.recordings import check_channels, home_lake, load_batches
 from pipelines.settings import Settings, home
 from reports.comparison import figure_pngs, write_report
 
@@ -62,11 +63,11 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
         raise InputError(f"recordings {', '.join(missing)}: no such file or folder; give existing ones")
     if request.report is not None:
         check_suffix("report", request.report, REPORT_SUFFIXES)
-    rule = settings.promotion.protocol
-    if request.promote and rule not in request.plan.protocols:
+    rule = settings.promotion
+    if request.promote and not rule.offered(request.plan.protocols):
         raise InputError(
-            f"protocols: got {', '.join(request.plan.protocols)}, but promotion judges by {rule}; add it, or train "
-            "without promotion (--no-promote)"
+            f"protocols: got {', '.join(request.plan.protocols)}, but promotion judges by {', '.join(rule.protocols)}; "
+            "add one of them, or train without promotion (--no-promote)"
         )
     if request.plan.families:
         request.plan.suited(machine, [machine.channel(t) for t in targets])
@@ -96,6 +97,7 @@ class TrainOutcome:
     results: dict[str, GridResult] = field(default_factory=dict)
     training_ids: dict[str, str] = field(default_factory=dict)
     choices: dict[str, promotion.Choice] = field(default_factory=dict)
+    outlooks: dict[str, Outlook] = field(default_factory=dict)  # the error of the choices to expect in the next season
     promotions: dict[str, registry.Promotion] = field(default_factory=dict)
     report: Path | None = None
     diagnosis: DiagnosisOutcome | None = None
@@ -131,24 +133,30 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs, checkpoint = jobs_of(plan, targets), Checkpoint(home() / "unfinished", crossings)
+    jobs = jobs_of(plan, targets)
+    checkpoint = Checkpoint(home() / "unfinished", crossings, jobs)
+    done = checkpoint.kept(say)
+    left = [job for job in jobs if job not in done]
+    stopping.note(checkpoint.summary)
     with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
-        done = dict(zip(jobs, caller.map("grid", checkpoint.crossed(workers.cross), jobs), strict=True))
+        done |= zip(left, caller.map("grid", checkpoint.crossed(workers.cross), left), strict=True)
         for t in targets:
             outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
         clock("grid")
-        if settings.promotion.protocol in plan.protocols:
+        if all(settings.promotion.offered(set(r.cells["protocol"])) for r in outcome.results.values()):
             say("trust")
             for t in targets:
                 outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
             chosen = [(t, c.selector, c.family, c.n_tsp) for t, c in outcome.choices.items()]
-            for t, distances in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
-                outcome.results[t] = replace(outcome.results[t], distances=distances)
+            for t, left_out in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
+                outcome.results[t] = replace(outcome.results[t], distances=left_out.runs, curves=left_out.curves)
+                outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
+            for t, readings in zip(targets, caller.map("readings", workers.readings, chosen), strict=True):
+                outcome.results[t] = replace(outcome.results[t], readings=readings)
             clock("trust")
     say("track")
     track = partial(_track, outcome.results, plan, settings, say)
     outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
-    checkpoint.remove()
     clock("track")
     if request.promote:
         say("promote")
@@ -160,6 +168,8 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
     outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
     clock("report")
+    checkpoint.remove()
+    stopping.note(None)
     if machine.twin is not None:
         diagnose = partial(
             diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
@@ -188,6 +198,7 @@ def promote_tracked(
         if digest not in held:
             raise InputError(f"the lake does not hold batch {batch_id} as training {training_id} saw it; train again")
         batches.append(lake.load(machine.machine, batch_id, held[digest]))
+    check_channels(batches, machine, lake)
     batches = check_machine(batches, machine)
     choice = promotion.decide(result, settings.promotion, cell)
     family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target, machine)

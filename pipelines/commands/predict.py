@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _REGISTERED = re.compile(r"^models:/(?P<name>[^/@]+)(?:@(?P<alias>.+)|/(?P<version>.+))?$")
 
+_NAMED = 3  # flagged runs in the summary line
+
 
 def load_model(model_uri: str, settings: Settings) -> StoredModel:
     """The model behind ``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/RUN/model`` or a local folder.
@@ -73,7 +75,8 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     from data.recording import read_batches
 
     model = load_model(model_uri, settings)
-    table = predict_batches(model, read_batches(Path(file), model.machine, need_error=False))
+    batches = read_batches(Path(file), model.machine, need_error=False, channels=model.channels())
+    table = predict_batches(model, batches)
     if table is None:
         raise InputError(f"recording {file}: no batch in it that machine {model.machine.machine} can read")
     return table
@@ -85,8 +88,9 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     Returns:
         batch_id, time_s (s), for an error along an axis position_mm, predicted_um (µm, relative to the batch's start;
         NaN where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
-        quantities), distance (in widths of the trained range), expected_S_um (S of left-out batches at that distance;
-        NaN where it was not measured), simulated (model or recording).
+        quantities), distance (in widths of the trained range), of the whole run expected_S_um, bound90_S_um (nine runs
+        in ten stay below) and flagged (why the run is unlike those that the bound comes from, empty where it is not),
+        simulated (model or recording).
 
     Raises:
         InputError: an input of the model is missing.
@@ -96,15 +100,46 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     tables = []
     for batch in batches:
         predicted = model.predict(batch)
-        outside, distance = model.outside(batch), model.distance(batch)
+        outside, distance, run = model.outside(batch), model.distance(batch), model.run_error(batch, predicted)
         along = str(model.family.fitted.get("along", ""))
         tables.append(pd.DataFrame({
             "batch_id": batch.batch_id, "time_s": batch.time_s,
             **({"position_mm": batch.masked(along)} if along else {}), "predicted_um": predicted,
             "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
-            "expected_S_um": model.expected_S_um(distance), "simulated": model.simulated or batch.simulated,
+            **run._asdict(), "simulated": model.simulated or batch.simulated,
         }))  # fmt: skip
     return pd.concat(tables, ignore_index=True) if tables else None
+
+
+def summary(table: pd.DataFrame) -> str:
+    """One line on the error to expect, and a warning where runs are flagged or rows lie outside the trained region.
+
+    Args:
+        table: of `predict_batches`.
+    """
+    from reports.labels import count
+
+    runs = table.groupby("batch_id", sort=False).first()
+    expected, most = (_between(runs[c]) for c in ("expected_S_um", "bound90_S_um"))
+    number = f"expect S {expected}, 90 % below {most}" if expected else "no expected error is stored; train again"
+    parts = [f"{count(len(runs), 'run')}: {number}"]
+    flagged = runs[runs["flagged"] != ""]
+    for run in flagged[:_NAMED].itertuples():
+        may = f": error may exceed {run.bound90_S_um:.2g} µm" if expected else ""
+        parts.append(f"run {run.Index} is unlike the training ({run.flagged}){may}")
+    if len(flagged) > _NAMED:
+        parts.append(f"and {len(flagged) - _NAMED} more, see column flagged")
+    if (rows := table["outside_region"]).any():
+        names = dict.fromkeys(n for text in table.loc[rows, "outside_of"].unique() for n in text.split(", "))
+        parts.append(f"{rows.sum()} of {len(rows)} rows are outside the trained range ({', '.join(names)})")
+    return ("warning: " if len(parts) > 1 else "") + "; ".join(parts)
+
+
+def _between(values_um: pd.Series) -> str:
+    """ "4.8 µm" or "4.8 to 7.2 µm"; empty where nothing is known."""
+    texts = dict.fromkeys(f"{v:.2g}" for v in sorted(values_um.dropna()))
+    ends = list(texts)[:: max(1, len(texts) - 1)]
+    return f"{' to '.join(ends)} µm" if ends else ""
 
 
 def predict(
@@ -112,7 +147,8 @@ def predict(
     model: Annotated[str, typer.Option("--model", help="models:/NAME@champion, models:/NAME/3, runs:/… or a folder")],
     to: Annotated[Path | None, typer.Option("--out", help=".csv or .parquet; default: CSV on standard output")] = None,
 ) -> None:
-    """Predict the error of a recording; rows outside the trained region are marked."""
+    """Predict the error of a recording, with the error to expect; runs unlike the training are flagged."""
+    from pipelines import console
     from pipelines.settings import configure_environment, load
 
     configure_environment()
@@ -123,3 +159,4 @@ def predict(
         table.to_parquet(to, index=False)
     else:
         table.to_csv(sys.stdout if to is None else to, index=False)
+    console.note(summary(table))

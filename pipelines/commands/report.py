@@ -76,7 +76,7 @@ def write_thermal_tests(
 
 
 def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> Iterator[Batch]:
-    from pipelines.recordings import read_files
+    from pipelines.recordings import load_batches, read_files
 
     held = lake.batch_ids(machine.machine)
     if not recordings:
@@ -84,7 +84,7 @@ def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> 
             raise InputError(
                 f"the lake holds no batch of {machine.machine}; name recordings, or call `thermodrift ingest` first"
             )
-        yield from lake.load_all(machine.machine)
+        yield from load_batches(lake, machine)
     for name in recordings:
         if Path(name).exists():
             yield from read_files(machine, Path(name))

@@ -27,8 +27,8 @@ def print_status(tables: Mapping[str, pd.DataFrame], lake: Mapping[str, Mapping[
     for m in models.itertuples():
         alias = f" {m.aliases}" if m.aliases else ""
         console.line(
-            f"  {m.name}/{m.version}{alias}: {m.cell}, {m.score_um:.2f} µm over {m.n_batches} batches{_label(m)}"
-            f"{'' if m.trusted else ', not to be trusted'}; {m.reason}"
+            f"  {m.name}/{m.version}{alias}: {m.expected or f'score {m.score_um:.2f} µm'}; {m.cell} over "
+            f"{m.n_batches} batches{_label(m)}{'' if m.trusted else ', no trustworthy model'}; {m.reason}"
         )
     if models.empty:
         console.line("  none; `thermodrift train` promotes the first")

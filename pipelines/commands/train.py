@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from pipelines.training import TrainOutcome
 
 SHOWN = 8  # families on the leaderboard
+_SHOWN_PROTOCOLS = {"forward": "forward", "leave-season-out": "season out", "leave-batch-out": "batch out"}
 
 
 def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
-    """The outcome for other programs; `best` are the five best cells by S_mean."""
+    """The outcome for other programs: the error to expect in the next season, and the five best cells by S_mean."""
     best = {
         t: r.cells[r.cells["protocol"] == _shown_protocol(r.cells)].nsmallest(5, "S_mean_um").to_dict(orient="records")
         for t, r in outcome.results.items()
@@ -31,6 +32,7 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
         "simulated": outcome.simulated,
         "ingested": ingest_totals(outcome.ingested) if outcome.ingested else None,
         "trainings": outcome.training_ids,
+        "expected": {t: o.as_dict() for t, o in outcome.outlooks.items()},
         "best": best,
         "promotions": {t: p.summary for t, p in outcome.promotions.items()},
         "report": str(outcome.report) if outcome.report else None,
@@ -55,9 +57,11 @@ def print_training(outcome: TrainOutcome) -> None:
         console.line("findings")
         print_findings(pd.concat(found).drop_duplicates())
     label = "  (simulated recordings)" if outcome.simulated else ""
+    for target, expected in outcome.outlooks.items():
+        trusted = outcome.choices[target].trusted
+        console.line(f"{target}: {'' if trusted else 'no trustworthy model; '}{expected.summary}")
     for target, result in outcome.results.items():
-        protocol = _shown_protocol(result.cells)
-        _print_leaderboard(f"{outcome.machine} {target}: {protocol}{label}", result.cells, protocol)
+        _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells)
     for target, training in outcome.training_ids.items():
         promotion = outcome.promotions.get(target)
         console.line(promotion.summary if promotion else f"training {target} {training}")
@@ -68,23 +72,33 @@ def print_training(outcome: TrainOutcome) -> None:
 
 
 def _shown_protocol(cells: pd.DataFrame) -> str:
-    ran = list(cells["protocol"].unique())
-    return "leave-batch-out" if "leave-batch-out" in ran else str(ran[0])
+    """The protocol nearest to the next season."""
+    from models.protocols import PROTOCOLS
+
+    return next(p for p in PROTOCOLS if p in set(cells["protocol"]))
 
 
-def _print_leaderboard(title: str, cells: pd.DataFrame, protocol: str) -> None:
-    """The best cell of each family, in µm; the baseline without a model is always shown."""
-    rows = cells[cells["protocol"] == protocol]
-    rows = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"]).sort_values("score").drop_duplicates("family")
-    columns = ("family", "selector", "n", "S mean", "S std", "max |e|", "stable")
-    table = console.table(f"{title}, µm", *columns, left=columns[:2])
-    shown = rows[(rows["family"] == "zero") | (rows["family"].isin(rows["family"].head(SHOWN)))]
-    for row in shown.to_dict("records"):
-        table.add_row(
-            row["family"], row["selector"], str(row["n_inputs"]), f"{row['S_mean_um']:.2f}", f"{row['S_std_um']:.2f}",
-            f"{row['max_abs_um']:.1f}", f"{row['tsp_stability']:.2f}",
-        )  # fmt: skip
+def _print_leaderboard(title: str, cells: pd.DataFrame) -> None:
+    """The best cell of each family, S_mean ± S_std in µm by protocol; the baseline without a model is always shown."""
+    protocols = [p for p in _SHOWN_PROTOCOLS if (cells["protocol"] == p).any()] or [_shown_protocol(cells)]
+    keys = ["selector", "family", "n_tsp"]
+    rows = cells[cells["protocol"].isin(protocols)]
+    worst = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"].fillna(0.0)).groupby(keys, sort=False)["score"].max()
+    best = worst.sort_values().reset_index().drop_duplicates("family")
+    heads = [_SHOWN_PROTOCOLS.get(p, p) for p in protocols]
+    table = console.table(f"{title}, S mean ± std, µm", "family", "selector", "n", *heads, left=("family", "selector"))
+    for row in best[(best["family"] == "zero") | best["family"].isin(best["family"].head(SHOWN))].to_dict("records"):
+        own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
+        scores = [_score(own, p) for p in protocols]
+        table.add_row(row["family"], row["selector"], str(own["n_inputs"].iloc[0]), *scores)
     console.out.print(table)
+
+
+def _score(own: pd.DataFrame, protocol: str) -> str:
+    if protocol not in own.index:
+        return "–"
+    mean_um, std_um = (float(own[c][protocol]) for c in ("S_mean_um", "S_std_um"))
+    return f"{mean_um:.2f} ± {std_um:.2f}"
 
 
 def train(

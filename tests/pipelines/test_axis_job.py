@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
 from pathlib import Path
 
@@ -27,9 +25,9 @@ from pipelines.commands.predict import predict_file
 from pipelines.training import TrainRequest, check_request
 from plants.sample.sample_axis import write_sample_axis
 from reports.comparison import figure_pngs, write_report
-from reports.comparison.figures import fan_panel
+from reports.comparison.channel import left_out_panel
 from reports.comparison.tables import left_out_batches
-from tests.reports.test_report_browser import CHROMIUM, console, open_page
+from tests.reports.test_report_browser import CHROMIUM, console, measured, open_page
 from tests.toys.report_training import settings, training
 
 MACHINE_FILE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
@@ -61,50 +59,42 @@ def page(result: GridResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_fan_shows_every_reading_and_the_lines_of_the_left_out_model(result: GridResult) -> None:
     shown = left_out_batches(result, choose(result.cells, PromotionRule()))
     assert [b.place for b in shown] == ["best", "median", "worst"]
-    panel = fan_panel("x_axis", shown, "x_axis", 1, True)
+    panel = left_out_panel("x_axis", result, shown, 1)
     assert panel is not None and len(panel.plots) == 3
+    assert panel.caption == f"x_axis: recorded and predicted along the axis, {shown[0].protocol}"
     for batch, plot in zip(shown, panel.plots, strict=True):
         assert batch.position_mm is not None and batch.every == 1
-        sweeps = len(batch.time_h) // 12
-        lines = [t for t in plot.figure.data if t.mode == "lines"]
-        recorded, residual = (t for t in plot.figure.data if t.mode == "markers")
-        assert len(lines) == sweeps - 1  # the first sweep is zero
-        assert np.array_equal(recorded.y, batch.recorded_um[12:]) and np.array_equal(recorded.x, batch.position_mm[12:])
-        assert np.allclose(residual.y, (batch.recorded_um - batch.predicted_um)[12:])
-        for k, line in enumerate(lines, 1):
-            assert np.array_equal(line.y, batch.predicted_um[12 * k : 12 * k + 12])
-            straight = np.polyval(np.polyfit(line.x, line.y, 1), line.x)
-            assert np.abs(line.y - straight).max() < 1.5  # one line a sweep, but for what warms meanwhile
-    labels = [k.label for k in panel.keys]
-    assert labels[:2] == ["recorded", "predicted, batch left out"] and labels[2:4] == ["0 h", "1 h"]
-
-
-def test_a_channel_without_an_axis_has_no_fan(toy_batches) -> None:
-    plain = run_grid(toy_batches(4), ["z"], Plan(("none",), ("zero", "mlr"), ("leave-batch-out",)))["z"][1]
-    shown = left_out_batches(plain, choose(plain.cells, PromotionRule()))
-    assert shown and shown[0].position_mm is None
-    assert fan_panel("z", shown, "z", 1, False) is None
+        upper, lower = plot.figure.axes
+        sweeps = [line for line in upper.lines if len(line.get_xdata()) == 12]
+        lines, recorded = sweeps[::2], sweeps[1::2]
+        residual = [line for line in lower.lines if len(line.get_xdata()) == 12]
+        assert len(lines) == len(residual) == len(batch.time_h) // 12 - 1  # the first sweep is zero
+        for k, (line, dots, rest) in enumerate(zip(lines, recorded, residual, strict=True), 1):
+            rows = slice(12 * k, 12 * k + 12)
+            order = np.argsort(batch.position_mm[rows], kind="stable")
+            assert np.array_equal(dots.get_xdata(), batch.position_mm[rows][order])
+            assert np.array_equal(dots.get_ydata(), batch.recorded_um[rows][order])
+            assert np.array_equal(line.get_ydata(), batch.predicted_um[rows][order])
+            assert np.allclose(rest.get_ydata(), (batch.recorded_um - batch.predicted_um)[rows][order])
+            straight = np.polyval(np.polyfit(line.get_xdata(), line.get_ydata(), 1), line.get_xdata())
+            assert np.abs(line.get_ydata() - straight).max() < 1.5  # one line a sweep, but for what warms meanwhile
+    assert [k.label for k in panel.keys][:4] == ["recorded", "predicted", "0 h", "1 h"]
 
 
 def test_the_page_and_the_small_pictures_are_made(result: GridResult, page: Path, tmp_path: Path) -> None:
     html = page.read_text(encoding="utf-8")
-    assert "x_axis: error against position, sweep after sweep" in html and 'id="c1-fan-3"' in html
-    specs = dict(re.findall(r'<script type="application/json" id="([\w-]+)-data">(.*?)</script>', html, re.S))
-    in_time = json.loads(specs["c1-left-out-1"])
-    assert {t["mode"] for t in in_time["data"]} == {"markers"}  # a line through readings would be a zigzag
+    assert "x_axis: recorded and predicted along the axis" in html and 'id="c1-left-out-3"' in html
     assert figure_pngs(result)["left_out.png"].startswith(b"\x89PNG")
     text = write_report([training(result)], tmp_path / "r.md", settings(tmp_path).promotion).read_text(encoding="utf-8")
     assert "axis coupled" in text
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium or google-chrome on the path to open the page in")
-def test_every_figure_is_drawn_in_a_browser(page: Path, tmp_path: Path) -> None:
-    dom, log = open_page(page, tmp_path)
-    assert re.search(r'<html[^>]* data-errors=""', dom) and console(log) == []
-    for k in (1, 2, 3):
-        part = dom.split(f'id="c1-fan-{k}"', 1)[1].split(f'id="c1-fan-{k}-data"', 1)[0]
-        assert len(re.findall(r'class="js-line"[^>]* d="M[^"]+L', part)) >= 8
-        assert len(re.findall(r'class="point"', part)) >= 2 * 8 * 12
+def test_no_label_of_a_fan_is_cut_or_covered_in_a_browser(page: Path, tmp_path: Path) -> None:
+    _, log = open_page(page, tmp_path)
+    assert console(log) == []
+    fans = [p for p in measured(page, 390, tmp_path)["pictures"] if "left-out" in p["id"]]
+    assert len(fans) == 3 and all(p["cut"] == p["covered"] == [] and p["width"] > 300 for p in fans)
 
 
 def test_a_stored_model_predicts_a_raw_recording(recordings: list[Path], machine: Machine, tmp_path: Path) -> None:

@@ -215,7 +215,7 @@ def test_what_is_stored_stays_when_the_source_turns_bad(place: Place) -> None:
         ("resolution: 1,", "resolutoin: 1,", "unknown key 'channels.speed.resolutoin'; did you mean 'resolution'?"),
         ("role: ambient", "role: room", "key 'channels.room.role': got 'room'"),
         ("step_s: 300", "step_s: -1", "key 'recording.step_s': got -1"),
-        ("machine: small-bad", "machin: small-bad", "key 'machine' is missing"),
+        ("machine: small-bad", "machin: small-bad", "unknown key 'machin'; did you mean 'machine'?"),
         ("channels:", "channels: [", "not valid YAML"),
         ("unit: um", "unit: furlong", "channel 'x' (error) has the unknown unit 'furlong'; write unit: um"),
         ("unit: um", "unit: mm", "channel 'x' (error) has unit 'mm', expected 'um'; write unit: um and"),
@@ -304,6 +304,19 @@ def test_describe_of_what_is_no_recording(make: Callable[[Path], None], place: P
     code, out, err = place.call("describe", path)
     assert (code, out) == (2, "")
     assert trouble(err).startswith(path.name)
+
+
+def test_describe_writes_into_a_new_folder_or_says_why_not(place: Place) -> None:
+    source = place.folder / "20240101.csv"
+    recording(1).to_csv(source, index=False)
+    code, _, err = place.call("describe", source, "--out", place.folder / "new" / "m.yml")
+    assert (code, err) == (0, "") and (place.folder / "new" / "m.yml").read_text().startswith("# Drafted from")
+    (place.folder / "file").write_text("x")
+    code, _, err = place.call("describe", source, "--out", place.folder / "file" / "m.yml")
+    assert code == 2 and trouble(err).startswith(f"--out {place.folder}/file/m.yml: cannot be written (")
+    for args in (["a" * 5000], [source, "--out", "b" * 5000]):
+        code, _, err = place.call("describe", *args)
+        assert code == 2 and len(trouble(err)) < 200
 
 
 def test_describe_of_what_is_no_file(place: Place) -> None:

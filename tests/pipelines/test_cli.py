@@ -58,8 +58,9 @@ def test_training_shows_what_came_of_it(year: Path, call: Call) -> None:
     done = call("train", "--machine", year / "small.yml", "--channels", "z", "--direct", "--families", "zero, ridge",
                 "--selectors", "none", "--protocols", "leave-batch-out", "--report", year / "r.md")  # fmt: skip
     assert done.code == 0
-    assert f"{NAME} z: leave-batch-out  (simulated recordings)" in done.out
-    assert all(word in done.out for word in ("ridge", "zero", "S mean", f"report   {year / 'r.md'}"))
+    assert f"{NAME} z  (simulated recordings), S mean ± std, µm" in done.out
+    assert lines(done.out)[0].startswith("z: expected error by leave-batch-out: S ")
+    assert all(word in done.out for word in ("ridge", "zero", "batch out", f"report   {year / 'r.md'}"))
     assert "nothing new registered" in done.out
     assert (year / "r.md").exists()
     assert lines(done.err)[0] == "features and selectors of 6 batches"
@@ -73,6 +74,7 @@ def test_training_as_json_is_alone_on_standard_output(year: Path, call: Call) ->
     assert got["machine"] == NAME and got["simulated"] is True and got["stopped"] == ""
     assert got["best"]["z"][0]["family"] == "ridge" and Path(got["report"]).exists()
     assert set(got["trainings"]) == {"z"}
+    assert got["expected"]["z"]["summary"].startswith("expected error by leave-batch-out: S ")
 
 
 def test_ingest_says_what_it_did(year: Path, call: Call) -> None:
@@ -89,14 +91,15 @@ def test_status_names_what_runs_where(year: Path, call: Call, monkeypatch: pytes
     done = call("status")
     assert done.code == 0
     assert f"  {NAME}: 6 batches, files in quarantine: 0" in done.out
-    model = next(line for line in lines(done.out) if line.startswith(f"  {NAME}-z/2 champion: none|ridge|3, "))
-    assert "over 6 batches, simulated; against version 1" in model
+    model = next(line for line in lines(done.out) if line.startswith(f"  {NAME}-z/2 champion: expected error by leave"))
+    assert "none|ridge|3 over 6 batches, simulated; first model of this machine and channel" in model
     done = call("status", "--json")
     got = json.loads(done.out)
     assert (done.code, done.err) == (0, "")
     assert got["lake"][NAME] == {"batches": 6, "quarantined": 0}
     mine = [m for m in got["models"] if m["name"] == f"{NAME}-z"]
     assert [(m["version"], m["aliases"]) for m in mine] == [(2, "champion"), (1, "")]
+    assert mine[0]["expected_by"] == "leave-batch-out" and mine[0]["expected_S_um"] < mine[0]["expected_S_bound90_um"]
     training = next(t for t in got["trainings"] if t["machine"] == NAME)
     assert training["training_id"] and training["target"] == "z"
 
@@ -118,7 +121,7 @@ def test_predict_from_another_folder(year: Path, call: Call, tmp_path: Path, mon
     table = pd.read_csv(year / "in" / "20250314.csv")
     table.drop(columns=["x", "z"]).to_csv("run.csv", index=False)
     done = call("predict", "--model", f"models:/{NAME}-z@champion", "run.csv")
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0 and [line.partition(" S ")[0] for line in lines(done.err)] == ["1 run: expect"]
     got = pd.read_csv(StringIO(done.out))
     assert np.abs(got["predicted_um"] - law_um(table)).max() < 1.5
     for ending in (".csv", ".parquet"):
@@ -169,7 +172,7 @@ def test_describe_drafts_a_file_that_ingests(
         (["train", "--machine", "{yml}", "--recordings", "gone"], "recordings gone: no such file or folder"),
         (["train", "--machine", "{yml}", "--report", "r.pdf"],
          "report r.pdf: unsupported file extension '.pdf'; give .html"),
-        (["train", "--machine", "{yml}", "--protocols", "train-on-one"], "promotion judges by leave-batch-out; add it"),
+        (["train", "--machine", "{yml}", "--protocols", "train-on-one"], "promotion judges by forward, leave-season"),
         (["report", "--machine", "m", "--format", "pdf"], "--format: got 'pdf', expected html or md"),
         (["predict", "f.csv", "--model", "m", "--out", "p.xlsx"],
          "--out p.xlsx: unsupported file extension '.xlsx'; give .csv or .parquet"),
@@ -230,7 +233,7 @@ def test_help_is_quick_because_it_loads_nothing_heavy() -> None:
         "try:\n"
         "    cli.main()\n"
         "finally:\n"
-        "    heavy = {'torch', 'mlflow', 'prefect', 'numpy', 'pandas', 'scipy', 'sklearn', 'plotly', 'matplotlib'}\n"
+        "    heavy = {'torch', 'mlflow', 'prefect', 'numpy', 'pandas', 'scipy', 'sklearn', 'matplotlib'}\n"
         "    print('loaded', sorted(heavy & set(sys.modules)), file=sys.stderr)\n"
     )
     done = in_a_process(code, "--help")

@@ -71,5 +71,5 @@ def test_retraining_tells_of_the_diagnosis(
     monkeypatch.setattr(training, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
     machine = write_machine(tmp_path / "m.yml", "flow-season")
     words = flows.retrain(str(machine), [str(write_recordings(tmp_path / "in"))])
-    assert words.startswith("flow-season-z version 1 is champion")
+    assert words.startswith("flow-season-z version 1 is challenger: no trustworthy model")
     assert words.endswith("; z: left-out S has grown; diagnosed")

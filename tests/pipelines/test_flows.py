@@ -45,7 +45,7 @@ def test_same_numbers_with_prefect_and_without(flows: ModuleType, store: Any, ye
     assert flowed.promotions["z"].cell == direct.promotions["z"].cell
     assert flowed.promotions["z"].summary == direct.promotions["z"].summary.replace("flow-b", "flow-a")
     assert flowed.report is not None and flowed.report.exists()
-    assert ("grid", 3, 3) in steps and ("ingest", 1, 1) in steps and ("report", 1, 1) in steps
+    assert ("grid z pls", 3, 3) in steps and ("ingest", 1, 1) in steps and ("report", 1, 1) in steps
 
 
 def test_a_step_that_fails_once_is_tried_again(
@@ -109,7 +109,7 @@ def small_retrain(flows: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleT
 
 def test_retraining_learns_once(small_retrain: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     machine = write_machine(tmp_path / "m.yml", "flow-again")
-    write_year(tmp_path / "in", 4)
+    write_year(tmp_path / "in", 5)
     first = small_retrain.retrain(str(machine), [str(tmp_path / "in")])
     again = small_retrain.retrain(str(machine), [str(tmp_path / "in")])
     assert "flow-again-z version 1 is champion" in first

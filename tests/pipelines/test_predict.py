@@ -2,23 +2,30 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from data.errors import InputError
 from data.machine import parse_machine
 from models import FAMILIES
 from models.base import Family
+from models.conformal import RunBound
+from models.mlr import MLR
 from models.promotion import choose
-from models.trust import Region
+from models.trust import Region, fit_siblings
 from pipelines import model_store, registry, tracking
-from pipelines.commands.predict import load_model, predict_file
+from pipelines.cli import app
+from pipelines.commands.predict import load_model, predict_batches, predict_file, summary
 from tests.models.twin_year import recording, two_errors
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
@@ -57,10 +64,24 @@ def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monk
         uri = f"runs:/{training_id}/model"
     got = predict_file(uri.format(name=promotion.name, run=training_id), Path("run7.csv"), store)
     assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "distance",
-                         "expected_S_um", "simulated"]  # fmt: skip
+                         "expected_S_um", "bound90_S_um", "flagged", "simulated"]  # fmt: skip
     assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
     assert not got["outside_region"].any()
     assert got["simulated"].all()
+    assert (got["expected_S_um"] > 0.9).all() and (got["bound90_S_um"] > got["expected_S_um"]).all()  # S = 1 throughout
+
+
+def test_files_of_channels_that_the_model_does_not_use_are_not_needed(store, tmp_path):
+    batches = toy_batches("toy-schedule", 4)
+    model, region = toy_model(batches)
+    schedule = "{file: runs.csv, batch_column: b, stages: [{hours: h, drivers: {speed: n}}]}"
+    text = machine_yaml("toy-schedule").replace("step_s: 60", f"step_s: 60, schedule: {schedule}")
+    text = text.replace("unit: rpm,", "unit: rpm, source: schedule,")
+    model_store.save(tmp_path / "model", model, text, region, {})
+    batches[2].table.drop(columns=["z", "speed"]).to_csv(tmp_path / "run7.csv", index=False)
+    got = predict_file(str(tmp_path / "model"), tmp_path / "run7.csv", store)
+    assert np.allclose(got["predicted_um"], law_um(batches[2].table), atol=1e-6)
+    assert not got["outside_region"].any()
 
 
 def test_a_new_process_in_another_folder_finds_the_model(promoted, store, tmp_path):
@@ -123,10 +144,77 @@ def test_rows_beyond_the_training_are_marked_with_what(stored):
     assert set(model.outside(model_store.frame_to_batch(model, cold))) == {"front@start"}
 
 
+@pytest.fixture
+def bounded(tmp_path) -> model_store.StoredModel:
+    """A stored model with siblings, whose left-out runs had S = 5 µm and a disagreement of 0.1 µm."""
+    batches = toy_batches("toy-bound", 8)
+    model, region = toy_model(batches)
+    runs = pd.DataFrame({"protocol": "leave-batch-out", "fold": "", "batch_id": [b.batch_id for b in batches],
+                         "S_um": 5.0, "disagreement_um": 0.1, "distance": 0.0})  # fmt: skip
+    siblings = fit_siblings(model, batches)
+    model_store.save(tmp_path, model, machine_yaml("toy-bound"), region, {}, RunBound.of(runs), siblings)
+    loaded = model_store.load(tmp_path)
+    assert [s.key for s in loaded.siblings] == ["ridge", "distributed_lag"]
+    return loaded
+
+
+def test_a_run_has_one_expected_error_one_bound_and_one_line(bounded):
+    table = predict_batches(bounded, toy_batches("toy-bound", 3))
+    runs = table.groupby("batch_id")[["expected_S_um", "bound90_S_um", "flagged"]].nunique()
+    assert (runs == 1).all(axis=None)
+    assert (table["expected_S_um"] < table["bound90_S_um"]).all() and (table["flagged"] == "").all()
+    line = summary(table)
+    assert re.fullmatch(r"3 runs: expect S [\d.]+ µm, 90 % below [\d.]+ µm", line)
+
+
+def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be_worse(bounded):
+    usual, hot = toy_batches("toy-bound", 2)
+    hot = replace(hot, table=hot.table.assign(front=hot.table["front"] + 25, bed=hot.table["bed"] + 25))
+    table = predict_batches(bounded, [usual, hot])
+    runs = table.groupby("batch_id").first()
+    assert list(runs["flagged"]) == ["", "front at start 46 degC, trained 20 to 27"]
+    assert runs["expected_S_um"].iloc[1] > 1.1 * runs["expected_S_um"].iloc[0]
+    line = summary(table)
+    assert re.match(r"warning: 2 runs: expect S [\d.]+ to [\d.]+ µm, 90 % below [\d.]+ to [\d.]+ µm; ", line)
+    assert f"run {hot.batch_id} is unlike the training ({runs['flagged'].iloc[1]}): error may exceed" in line
+    assert "60 of 120 rows are outside the trained range (front@start, bed@start" in line
+
+
+def test_a_run_that_similar_models_disagree_about_is_flagged(bounded):
+    batches = toy_batches("toy-bound", 4)
+    double = MLR().fit([replace(b, table=b.table.assign(z=2 * b.table["z"])) for b in batches], ("front", "bed"), "z")
+    agreed, doubted = (model.run_error(batches[1], model.predict(batches[1]))
+                       for model in (bounded, replace(bounded, siblings=(double,))))  # fmt: skip
+    assert agreed.flagged == ""
+    assert re.fullmatch(r"similar models differ by \d+ µm, usually 0\.1", doubted.flagged)
+    assert doubted.bound90_S_um > 2 * agreed.bound90_S_um
+
+
+def test_the_command_warns_on_standard_error_and_succeeds(stored, tmp_path):
+    table = toy_batches("toy-folder", 1)[0].table.drop(columns="z")
+    table.assign(front=table["front"] + 30).to_csv(tmp_path / "hot.csv", index=False)
+    done = CliRunner().invoke(app, ["predict", str(tmp_path / "hot.csv"), "--model", str(stored)])
+    assert done.exit_code == 0
+    assert done.stderr.startswith("warning: 1 run: no expected error is stored; train again; run hot is unlike")
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert pd.read_csv(StringIO(done.stdout))["flagged"].notna().all()
+
+
+def test_a_model_stored_without_bounds_still_predicts(stored):
+    path = stored / "model.json"
+    document = json.loads(path.read_text())
+    document |= {"schema": "thermodrift.model/2", "rise": None}
+    del document["bound"], document["siblings"]
+    path.write_text(json.dumps(document))
+    batch = toy_batches("toy-folder", 4)[1]
+    table = predict_batches(model_store.load(stored), [batch])
+    assert np.allclose(table["predicted_um"], law_um(batch.table), atol=1e-6) and table["expected_S_um"].isna().all()
+
+
 def test_a_stored_model_is_plain_data_and_comes_back_equal(stored):
     assert {p.name for p in stored.iterdir()} == set(model_store.FILES)
     document = json.loads((stored / "model.json").read_text())
-    assert document["schema"] == "thermodrift.model/2"
+    assert document["schema"] == "thermodrift.model/3"
     assert document["region"]["ranges"]["speed"] == [4000.0, 4000.0]
     batch = toy_batches("toy-folder", 4)[1]
     before, _ = toy_model(toy_batches("toy-folder", 4))
@@ -176,7 +264,7 @@ def test_every_kind_of_plain_data_comes_back(tmp_path, monkeypatch):
         def fit_design(self, design, train):
             return self._learned(design, {})
 
-        def predict_design(self, design, batches):
+        def respond(self, design, batches):
             return [design.x[design.rows(k)].sum(axis=1) for k in batches]
 
     odd = Odd()
@@ -204,8 +292,8 @@ def test_a_damaged_or_foreign_folder_is_told(stored, store, tmp_path):
     with pytest.raises(InputError, match=r"no such folder; expected models:/NAME@champion"):
         load_model(str(tmp_path / "nowhere"), store)
     text = (stored / "model.json").read_text()
-    (stored / "model.json").write_text(text.replace("thermodrift.model/2", "thermodrift.model/9"))
-    with pytest.raises(InputError, match=r"got schema 'thermodrift.model/9', expected 'thermodrift.model/2'"):
+    (stored / "model.json").write_text(text.replace("thermodrift.model/3", "thermodrift.model/9"))
+    with pytest.raises(InputError, match=r"got schema 'thermodrift.model/9', expected 'thermodrift.model/3'"):
         load_model(str(stored), store)
     (stored / "model.json").write_text(text)
     np.savez(stored / "arrays.npz", a0=np.array([object()], dtype=object))

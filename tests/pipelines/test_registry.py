@@ -8,7 +8,8 @@ import pytest
 from mlflow.tracking import MlflowClient
 
 from data.errors import InputError
-from models.promotion import Choice, choose
+from models.promotion import Choice, choose, decide
+from models.protocols import PromotionRule
 from models.trust import Region
 from pipelines import registry, tracking
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
@@ -183,4 +184,35 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     new = registry.Newcomer(result, choice, zero, machine_yaml("toy-zero"), training_id, Region.of([], ()))
     got = registry.promote(new, store)
     assert not got.trusted
-    assert "nothing beats zero (best other: 9.00 µm): do not trust" in got.summary
+    assert "nothing beats zero (best other: 9.00 µm): no trustworthy model" in got.summary
+    assert (got.outcome, got.version, got.champion_version) == ("challenger", 1, None)
+    assert aliases(store, "toy-zero-z") == {"challenger": 1}
+    row = registry.status(store).set_index("name").loc["toy-zero-z"]
+    assert not row["trusted"] and row["reason"] == "no trustworthy model, nothing beats zero (best other: 9.00 µm)"
+    with pytest.raises(InputError, match="has no champion: no trustworthy model, nothing beats zero"):
+        registry.find_version(MlflowClient(store.store_uri, registry_uri=store.store_uri), "toy-zero-z", "champion")
+    again = registry.promote(new, store)
+    assert (again.outcome, again.version, again.champion_version) == ("unchanged", 1, None)
+    assert registry.promote(new, store, force=True).champion_version == 1
+
+
+def test_a_newcomer_that_is_not_trustworthy_never_replaces_a_champion(store):
+    train(store, "toy-doubt", [5.0] * 6)
+    batches = toy_batches("toy-doubt", 7)
+    result = toy_result(batches, {"none|zero|0": [4.5] * 7, "none|mlr|2": [1.0] * 3 + [4.6] * 4})
+    choice = decide(result, PromotionRule(score="S_mean"))
+    model, region = toy_model(batches)
+    new = registry.Newcomer(
+        result, choice, model, machine_yaml("toy-doubt"), tracking.log_training(result, store), region
+    )
+    got = registry.promote(new, store)
+    assert got.comparison is not None and got.comparison.better and not got.trusted
+    assert (got.outcome, got.champion_version) == ("challenger", 1)
+
+
+def test_the_error_to_expect_leads_the_tags(story, store):
+    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-story-z", "2").tags
+    assert (tags["expected_by"], float(tags["expected_S_um"])) == ("leave-batch-out", pytest.approx(33 / 7))
+    assert 5.5 < float(tags["expected_S_bound90_um"]) < 11 and "optimistic" in tags["expected"]
+    row = registry.status(store).set_index(["name", "version"]).loc["toy-story-z", 2]
+    assert row["expected_S_um"] == pytest.approx(33 / 7)

@@ -48,7 +48,7 @@ def test_names_follow_the_patterns(tmp_path):
     [
         ("promotion: {tie_precent: 3}", "unknown key 'promotion.tie_precent'; did you mean 'tie_percent'?"),
         ("promtion: {}", "unknown key 'promtion'; did you mean 'promotion'?"),
-        ("promotion: {protocol: leave-batch-in}", "did you mean 'leave-batch-out'?"),
+        ("promotion: {protocols: {leave-batch-in: 1}}", "did you mean 'leave-batch-out'?"),
         ("promotion: {significance: 2}", "key 'promotion.significance': got 2;"),
         ('names: {model: "{machine}"}', "placeholder {target} is missing"),
         ('names: {model: "{machine}/{target}"}', "must not contain / or :"),

@@ -118,7 +118,7 @@ def test_the_first_use_is_said_and_a_broken_store_is_told(tmp_path, monkeypatch)
     file = tmp_path / "mlflow.db"
     file.write_bytes(b"no database at all, but long enough to be looked at as one" * 40)
     settings = Settings(tmp_path, f"sqlite:///{file}", None, NamesPart(), PromotionRule())
-    monkeypatch.setattr(tracking, "MlflowClient", lambda *_, **__: FakeClient())
+    monkeypatch.setattr(tracking, "MlflowClient", FakeClient)
     tracking.open_store(settings, said.append)
     assert said == []
     file.unlink()
@@ -135,6 +135,9 @@ def test_the_first_use_is_said_and_a_broken_store_is_told(tmp_path, monkeypatch)
 
 class FakeClient:
     trouble = ""
+
+    def __init__(self, store: str, **_: object) -> None:
+        Path(store.removeprefix("sqlite:///")).touch()  # as the first use of a store makes its file
 
     def search_experiments(self, **_: object) -> list[object]:
         if self.trouble:

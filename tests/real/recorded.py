@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from data.batch import Batch
-from data.checks import check_batch, check_machine
+from data.checks import check_machine, checked
 from data.machine import Machine, load_machine
 from data.recording import read_batches, recording_files
 
@@ -25,4 +25,4 @@ def recorded(name: str, folder: str, step_s: float) -> tuple[Machine, list[Batch
     machine = given.model_copy(update={"recording": given.recording.model_copy(update={"step_s": step_s})})
     files, _ = recording_files(DATA / folder, machine)
     found = [b for f in files for b in read_batches(f, machine)]
-    return machine, check_machine([b.with_findings(check_batch(b, machine)) for b in found], machine)
+    return machine, check_machine([checked(b, machine) for b in found], machine)

@@ -92,7 +92,7 @@ def test_each_heater_of_the_board_warms_its_own_sensor(board: dict[str, Batch]) 
 def test_nothing_of_the_board_stays_masked(board: dict[str, Batch]) -> None:
     told = {(b, f.check, f.channel) for b, batch in board.items() for f in batch.findings}
     fast = {(b, "jump_no_return", "temperature1") for b in NAMES if b != "mhe2nl"}
-    assert told == fast | {("mhe2nl", "frozen", "temperature2")}
+    assert told == fast
     assert all(f.overruled for batch in board.values() for f in batch.findings)
 
 

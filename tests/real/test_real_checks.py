@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data.batch import Batch
-from data.checks import check_batch, check_machine, usable_channels
+from data.checks import check_machine, checked, usable_channels
 from data.machine import load_machine
 from data.recording import read_batches
 
@@ -25,7 +25,7 @@ HELD_AT_THE_STOP = {"20200723", "20200810"}
 def known(folder: Path, pattern: str, name: str) -> list[Batch]:
     machine = load_machine(ROOT / "machines" / f"{name}.yml")
     batches = [b for f in sorted(folder.glob(pattern)) for b in read_batches(f, machine)]
-    return check_machine([b.with_findings(check_batch(b, machine)) for b in batches], machine)
+    return check_machine([checked(b, machine) for b in batches], machine)
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +77,18 @@ def test_the_spindle_recording_is_clean() -> None:
     batches = known(SPINDLE, "*.csv", "spindle_fl")
     assert len(batches) == 6
     assert [f.message for b in batches for f in b.findings] == []
+
+
+def test_minutes_read_as_seconds_mask_no_good_sensor_of_the_lathe() -> None:
+    if not LATHE.is_dir():
+        pytest.skip("no ../shared/data/lathe_gv1203")
+    given = load_machine(ROOT / "machines" / "lathe_gv1203.yml")
+    time = given.recording.time.model_copy(update={"unit": "s"})
+    recording = given.recording.model_copy(update={"time": time, "step_s": 1.0, "max_gap_s": 5.0})
+    machine = given.model_copy(update={"recording": recording})
+    found = [checked(b, machine) for f in sorted(LATHE.glob("20*.csv")) for b in read_batches(f, machine)]
+    batches = check_machine(found, machine)
+    masked = {f.channel for b in batches for f in b.findings if f.masks and f.check == "jump_no_return"}
+    noted = [f for b in batches for f in b.findings if not f.masks and f.check == "jump_no_return"]
+    assert masked == {"PT10"} and len(noted) > 50
+    assert all("probably the time unit (recording.time.unit: s)" in f.message for f in noted)

@@ -1,0 +1,85 @@
+"""Progress: an estimate of the time left from what is finished, and few lines where there is no terminal."""
+
+from __future__ import annotations
+
+import io
+import threading
+
+import pytest
+from rich.console import Console
+
+from pipelines import console
+from pipelines.caller import DirectCaller
+
+
+def test_the_time_left_is_that_of_the_later_half() -> None:
+    pace = console.Pace(0.0)
+    said = [pace.left(n, 10, t) for n, t in enumerate([600.0, 1200.0, 1230.0, 1260.0, 1290.0, 1320.0], 1)]
+    # two slow ones first, then 30 s each: 8 · 600 s after two, 5 · 30 s after five
+    assert said == [
+        "", "about 80 min left", "about 37 min left", "about 3 min left", "about 3 min left", "about 2 min left",
+    ]  # fmt: skip
+    assert pace.left(10, 10, 1500.0) == ""
+
+
+def test_an_estimate_begins_anew_with_each_step_and_stands_a_repeated_count() -> None:
+    pace = console.Pace(0.0)
+    for n in (1, 2, 2, 3):
+        pace.left(n, 4, 100.0 * n)
+    assert pace.left(0, 0, 400.0) == "" and pace.left(1, 50, 410.0) == ""
+    assert pace.left(2, 50, 420.0) == "about 8 min left"
+
+
+@pytest.mark.parametrize(
+    ("time_s", "shown"), [(0.0, "10 s"), (11, "20 s"), (90, "90 s"), (91, "2 min"), (5399, "90 min"), (5401, "2 h")]
+)
+def test_durations_are_rounded_up(time_s: float, shown: str) -> None:
+    assert console._duration(time_s) == shown
+
+
+@pytest.fixture
+def log(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """Standard error that is no terminal, and a clock that goes on by 20 s at every look."""
+    written = io.StringIO()
+    monkeypatch.setattr(console, "err", Console(file=written, soft_wrap=True))
+    clock = iter(range(0, 10_000, 20))
+    monkeypatch.setattr(console.time, "monotonic", lambda: float(next(clock)))
+    return written
+
+
+def test_a_log_gets_a_line_now_and_then(log: io.StringIO) -> None:
+    with console.progress(False) as (say, done):
+        say("grid")
+        for n in range(1, 9):
+            done(f"grid z f{n}", n, 8)
+    lines = log.getvalue().splitlines()
+    assert lines[0] == "grid" and len(lines) == 5
+    assert lines[1:3] == ["grid z f2: 2 of 8, about 2 min left", "grid z f4: 4 of 8, about 80 s left"]
+    assert lines[4] == "grid z f8: 8 of 8"
+
+
+def test_quiet_is_quiet(log: io.StringIO) -> None:
+    with console.progress(True) as (say, done):
+        say("grid")
+        for n in range(1, 9):
+            done("grid", n, 8)
+    assert log.getvalue() == ""
+
+
+def test_progress_follows_the_order_of_finishing() -> None:
+    heard: list[tuple[str, int, int]] = []
+    others = threading.Event()
+
+    def work(job: tuple[str, str]) -> str:
+        if job[1] == "slow":
+            assert others.wait(30)
+        return job[1]
+
+    def done(step: str, n: int, of: int) -> None:
+        heard.append((step, n, of))
+        if n == 2:
+            others.set()
+
+    jobs = [("z", "slow"), ("z", "a"), ("z", "b")]
+    assert DirectCaller(done).map("grid", work, jobs) == ["slow", "a", "b"]
+    assert heard[2] == ("grid z slow", 3, 3) and {h[0] for h in heard[:2]} == {"grid z a", "grid z b"}
