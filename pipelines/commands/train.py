@@ -86,7 +86,8 @@ def _print_leaderboard(title: str, cells: pd.DataFrame) -> None:
     worst = rows.assign(score=rows["S_mean_um"] + rows["S_std_um"].fillna(0.0)).groupby(keys, sort=False)["score"].max()
     best = worst.sort_values().reset_index().drop_duplicates("family")
     heads = [_SHOWN_PROTOCOLS.get(p, p) for p in protocols]
-    table = console.table(f"{title}, S mean ± std, µm", "family", "selector", "n", *heads, left=("family", "selector"))
+    names = ("family", "selector")
+    table = console.table(f"{title}, S mean ± std, µm", *names, "n", *heads, left=names, wrap=names[1:])
     for row in best[(best["family"] == "zero") | best["family"].isin(best["family"].head(SHOWN))].to_dict("records"):
         own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
         scores = [_score(own, p) for p in protocols]
@@ -98,7 +99,7 @@ def _score(own: pd.DataFrame, protocol: str) -> str:
     if protocol not in own.index:
         return "–"
     mean_um, std_um = (float(own[c][protocol]) for c in ("S_mean_um", "S_std_um"))
-    return f"{mean_um:.2f} ± {std_um:.2f}"
+    return " ± ".join(f"{v:.2f}" if abs(v) < 9.995 else f"{v:.1f}" for v in (mean_um, std_um))
 
 
 def train(
