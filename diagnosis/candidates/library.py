@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +21,37 @@ KIND: Mapping[Target, Kind] = {
     "sensor": "sensor", "error": "error",
 }  # fmt: skip
 DRIVING = ("driver", "position")  # roles of channels that a law may be driven by
+
+# Stems of words, English and German, that hint at equipment; a stem of five letters or more also inside a word.
+HINTS: Mapping[str, tuple[str, ...]] = {
+    "battery cell": ("cell", "batter", "akku", "zelle", "anode", "cathode", "kathode", "electrode", "elektrode"),
+    "bearings": ("bearing", "lager", "spindle", "spindel", "shaft", "welle", "nose", "quill", "pinole", "rotor"),
+    "ball screw": ("screw", "ballscrew", "gewinde", "kgt", "nut", "mutter", "spindelmutter"),
+    "belt": ("belt", "riemen", "pulley"),
+    "cabinet": ("cabinet", "schrank", "electronic", "elektronik", "inverter", "umrichter", "auxiliar", "hilfsaggregat"),
+    "coolant jacket": ("coolant", "chiller", "cooler", "cooling", "kuehl", "jacket", "kuehlmantel", "pump"),
+    "cutting": ("cutting", "workpiece", "werkstueck", "tool", "werkzeug", "zerspan", "chuck", "spannfutter"),
+    "cutting fluid": ("coolant", "fluid", "emulsion", "kss", "kuehl", "schmierstoff", "flood", "tank", "pump"),
+    "enclosure": ("enclos", "hood", "cover", "sheet", "kabine", "haube", "verkleid", "einhaus", "arbeitsraum"),
+    "guides": ("guide", "guideway", "rail", "slide", "carriage", "saddle", "fuehrung", "schlitten", "schiene"),
+    "heater": ("heater", "heiz", "resistor", "transistor"),
+    "hydraulic unit": ("hydraul", "pump", "aggregat", "powerpack"),
+    "motor": ("motor", "stator", "antrieb"),
+    "rotating parts": ("spindle", "spindel", "shaft", "welle", "rotor", "turntable", "drehtisch", "drehzahl", "rpm"),
+    "test bar": ("mandrel", "testbar", "fixture", "probe", "nest", "dorn", "taster"),
+    "window": ("window", "fenster", "sun", "sonne", "skylight", "oberlicht"),
+}
+
+# What a driver implies: parts that turn stand in bearings and have a motor, axes that move have guides and screws, and
+# every machine with a control has its cabinet. What moves is measured against a bar or a fixture.
+BY_SPEED = frozenset({"rotating parts", "bearings", "motor", "belt", "cutting", "cabinet", "test bar"})
+BY_FEED = frozenset({"guides", "ball screw", "motor", "cutting", "cabinet", "test bar"})
+OF_MACHINES = (BY_SPEED | BY_FEED | {"coolant jacket", "cutting fluid", "hydraulic unit"}) - {"cabinet"}
+MOVING = frozenset({"rotating parts", "bearings", "guides", "ball screw"})
+
+# Machine files name the parts that their writer knew. A twentieth has what its file does not hint at; a board or a cell
+# without a moving part has no chiller, bearings or screws, short of a mistake in the file.
+LOG_ODDS_UNNAMED, LOG_ODDS_NO_MACHINE = math.log(1 / 20), math.log(1 / 1000)
 
 
 @dataclass(frozen=True)
@@ -54,6 +86,52 @@ def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISM
     return [out[name] for name in sorted(out)]
 
 
+def log_prior_odds(machine: Machine, part: TwinPart | None, candidate: Candidate) -> float:
+    """Natural logarithm of the odds that a machine has the equipment that a candidate needs, 0 where nothing is needed.
+
+    0 too where the machine file names the equipment or a driver implies it; `LOG_ODDS_UNNAMED` where nothing hints at
+    it, `LOG_ODDS_NO_MACHINE` where it belongs to machines that move and nothing moves here.
+    """
+    if candidate.mechanism not in MECHANISMS:
+        return 0.0
+    needs, named = MECHANISMS[candidate.mechanism].needs, equipment_named(machine, part)
+    if not needs or needs in named:
+        return 0.0
+    return LOG_ODDS_UNNAMED if needs not in OF_MACHINES or named & MOVING else LOG_ODDS_NO_MACHINE
+
+
+def equipment_named(machine: Machine, part: TwinPart | None) -> frozenset[str]:
+    """The equipment (of `twin.mechanisms.base.EQUIPMENT`) that a machine file hints at.
+
+    By the laws that it states, by drivers (a speed in rpm, a feed, a position), and by words in the names and the
+    `words` of channels, bodies, surroundings and mechanisms, English or German. `part` None: by the channels alone.
+    """
+    found = {MECHANISMS[given.law].needs for given in part.mechanisms.values()} - {""} if part else set()
+    found |= BY_SPEED if _driven_in(machine, "rpm") else frozenset()
+    found |= BY_FEED if _driven_in(machine, "mm/min", "mm") else frozenset()
+    words = _words_of(machine, part)
+    for equipment, stems in HINTS.items():
+        if any(w.startswith(s) or (len(s) >= 5 and s in w) for s in stems for w in words):
+            found.add(equipment)
+    return frozenset(found)
+
+
+def _driven_in(machine: Machine, *units: str) -> bool:
+    channels = (c for c in machine.channels.values() if c.role in DRIVING)
+    return any(same_dimension(c.unit, unit) for c in channels for unit in units)
+
+
+def _words_of(machine: Machine, part: TwinPart | None) -> set[str]:
+    """The words of a machine file, small letters, umlauts written out."""
+    texts = [*machine.channels]
+    for group in (part.bodies, part.surroundings, part.mechanisms) if part else ():
+        texts += [text for name, given in group.items() for text in (name, given.words)]
+    plain = " ".join(texts).lower()
+    for umlaut, written in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("ß", "ss")):
+        plain = plain.replace(umlaut, written)
+    return set(re.findall(r"[a-z]+", plain))
+
+
 def _at(
     machine: Machine, part: TwinPart, mechanism: type[Mechanism], target: Target, site: Site
 ) -> Iterator[Candidate]:
@@ -64,6 +142,7 @@ def _at(
             also = [*site.others, *drivers.values(), *(place for role, place in ports.items() if place != site.name)]
             name = re.sub(r"\W", "_", "_".join([mechanism.key, site.name, *also]))
             into = target in ("node", "start")
+            idle = {p for p, (port, _) in mechanism.of_port.items() if port not in ports}
             yield Candidate(
                 mechanism.key,
                 where,
@@ -75,27 +154,49 @@ def _at(
                     into=site.name if into and "expand" not in mechanism.effects() else None,
                     acts_on=None if into else (site.name, *site.others) if site.others else site.name,
                     drivers=drivers or None,
-                    parameters=_levels(machine, mechanism, drivers),
+                    parameters={**_levels(machine, mechanism, drivers), **_of_ports(mechanism, ports)},
                 ),
                 dict(mechanism.off or {}),
-                mechanism.shape,
+                tuple(p for p in mechanism.shape if p not in idle),
                 mechanism.fault,
             )
 
 
 def _variants(c: Candidate, mechanism: type[Mechanism]) -> Iterator[Candidate]:
-    """The candidate begun at every value at which its shape is looked for: what happens at another time has no trace
-    yet, and a floor at the temperature of a body takes no heat from it."""
+    """The candidate begun at every value at which it is looked for.
+
+    What happens at another time has no trace yet, and a floor at the temperature of a body takes no heat from it: the
+    amplitude is screened at each value. Where the value itself is the amplitude (a lag, a clock's skew) no slope says
+    what a large one does: each is a finite change, without amplitudes, and its value is free in a fit.
+    """
     yield c
-    if c.part is None or c.where.kind == "link":
+    if c.part is None or c.where.kind == "link" or set(c.part.drivers or ()) & mechanism.optional_drivers:
         return
-    for name, values in mechanism.scan.items():
-        unit = mechanism.spec(name).unit
-        for k, value in enumerate(values):  # a number in its name: what its fit comes to is another value
-            given = {**c.part.parameters, name: Value(value=f"{value:g} {unit}")}
-            part = c.part.model_copy(update={"parameters": given})
-            label = f"{c.label}, {name} begun at {value:g} {unit}"
-            yield replace(c, name=f"{c.name}_{k + 2}", label=label, part=part, variant_of=c.name)
+    points = [{name: value} for name, values in mechanism.scan.items() for value in values]
+    for k, point in enumerate([*points, *mechanism.scan_points]):
+        given = {name: _fixed(mechanism, name, value) for name, value in point.items()}
+        begun = [f"{name} begun at {value.value}" for name, value in given.items()]
+        finite = tuple(name for name in point if name in c.amplitudes)
+        yield replace(
+            c,
+            name=f"{c.name}_{k + 2}",  # a number: what its fit comes to is another value
+            label=", ".join([c.label, *begun]),
+            part=c.part.model_copy(update={"parameters": {**c.part.parameters, **given}}),
+            amplitudes={} if finite else c.amplitudes,
+            shape=(*finite, *c.shape),
+            variant_of=c.name,
+        )
+
+
+def _of_ports(mechanism: type[Mechanism], ports: Mapping[str, str]) -> dict[str, Value]:
+    """Values that go with the optional ports named: coolant that is said to follow a room follows it entirely."""
+    named = {p: value for p, (port, value) in mechanism.of_port.items() if port in ports and value is not None}
+    return {p: _fixed(mechanism, p, value) for p, value in named.items()}
+
+
+def _fixed(mechanism: type[Mechanism], parameter: str, number: float) -> Value:
+    unit = mechanism.spec(parameter).unit
+    return Value(value=number if unit == "1" else f"{number:g} {unit}")
 
 
 def _levels(machine: Machine, mechanism: type[Mechanism], drivers: Mapping[str, str]) -> dict[str, Value]:
@@ -126,6 +227,8 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
         "link": _own_links(part), "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
         "surrounding": part.surroundings,
     }  # fmt: skip
+    if target == "surrounding":  # ground that follows the season is no air
+        groups["surrounding"] = {name: s for name, s in part.surroundings.items() if s.follow is None}
     chosen = list(combinations(groups[target], mechanism.together))
     if target == "error" and mechanism.all_errors and len(groups[target]) > 1:
         chosen.append(tuple(groups[target]))
@@ -160,33 +263,35 @@ def _drivers(machine: Machine, mechanism: type[Mechanism]) -> Iterator[dict[str,
 
 
 def _ports(part: TwinPart, mechanism: type[Mechanism], target: Target, site: Site) -> Iterator[dict[str, str]]:
-    """Places by the law's ports, every combination that its roles allow; of two signed sides one order."""
-    choices = [
-        [(port, place) for place in _places(part, role, site, port not in mechanism.ports)]
-        for port, role in mechanism.port_roles.items()
-    ]
+    """Places by the law's ports, every combination that its roles allow, with at most one optional port and never
+    none; of two signed sides one order."""
+    choices: list[list[tuple[str, str | None]]] = []
+    for port, role in mechanism.port_roles.items():
+        left_out: list[tuple[str, str | None]] = [(port, None)] if port in mechanism.optional_ports else []
+        choices.append([*left_out, *((port, place) for place in _places(part, port, role, site))])
     seen: set[frozenset[str]] = set()
-    two_sides = len(mechanism.ports) == 2 and target == "error"  # of a body that bends: signed, so one order does
+    two_sides = target == "error" and "neighbour" in mechanism.port_roles.values()  # bending: signed, one order does
     for chosen in product(*choices):
-        places = [place for _, place in chosen]
-        if len(set(places)) < len(places):
+        ports = {port: place for port, place in chosen if place is not None}
+        places = list(ports.values())
+        if len(set(places)) < len(places) or len(ports.keys() & mechanism.optional_ports) > 1:
             continue
-        if mechanism.far_apart:
-            one, other = linked(part, places[0]), linked(part, places[-1])
-            if places[-1] in one or set(one) & set(other):  # linked, or with a common neighbour
-                continue
+        if mechanism.optional_ports and not ports:
+            continue
         if two_sides:
             if frozenset(places) in seen or places[1] not in linked(part, places[0]):
                 continue
             seen.add(frozenset(places))
-        yield dict(chosen)
+        yield ports
 
 
-def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) -> list[str]:
+def _places(part: TwinPart, port: str, role: PortRole, site: Site) -> list[str]:
     if role == "itself":
         return [site.name]
-    if role == "surrounding":
-        return [name for name, s in part.surroundings.items() if s.channel or not recorded]
+    if role == "surrounding":  # what follows a room follows one that is recorded
+        return [name for name, s in part.surroundings.items() if s.channel or port != "room"]
+    if role == "facing":
+        return [*part.surroundings, *_unlinked(part, site.name)]
     if role == "outlet":
         return list(site.outlets)
     if role == "neighbour" and site.kind == "sensor":
@@ -194,9 +299,15 @@ def _places(part: TwinPart, role: PortRole, site: Site, recorded: bool = False) 
     if role == "neighbour" and site.name in part.bodies:
         return linked(part, site.name)
     if role == "unlinked":
-        own = own_bodies(part)
-        return [name for name in own[own.index(site.name) + 1 :] if name not in linked(part, site.name)]
+        return _unlinked(part, site.name)
     return own_bodies(part)
+
+
+def _unlinked(part: TwinPart, body: str) -> list[str]:
+    """The bodies further down in the file that no link or exposure joins with a body: each pair comes once."""
+    own, near = own_bodies(part), linked(part, body)
+    exposed = {frozenset((e.of.partition("@")[0], e.to)) for e in part.exposures.values()}
+    return [n for n in own[own.index(body) + 1 :] if n not in near and frozenset((n, body)) not in exposed]
 
 
 def own_bodies(part: TwinPart) -> list[str]:
@@ -228,20 +339,39 @@ def ends_of(link: Link) -> list[str]:
 def _there_already(part: TwinPart, c: Candidate) -> bool:
     """Whether the machine file has this law at this place with these drivers: its values are the baseline's to fit."""
     assert c.part is not None
-    pieces = pieces_of(part)
+    own, pieces = _ends(c.part), pieces_of(part)
+    either_way = {"unlinked", "facing"} & set(MECHANISMS[c.mechanism].port_roles.values())
     for given in part.mechanisms.values():
         if given.law != c.mechanism or _channels(given) != _channels(c.part):
             continue
+        ends = _ends(given)
+        if either_way and set(ends.values()) == set(own.values()):
+            return True
         if c.part.into is not None:
-            if c.part.into in [pieces.get(name, name) for name in outlets_of(given)]:
+            alike = all(own[port] == ends.get(port, own[port]) for port in own if port in _exchanging(c))
+            if alike and c.part.into in [pieces.get(name, name) for name in outlets_of(given)]:
                 return True
-        elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and given.at in (None, c.part.at)) or (
-            c.part.acts_on is None and given.at == c.part.at
+        elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and (not ends or ends == own)) or (
+            c.part.acts_on is None and ends == own
         ):
             return True
     sensor = part.sensors.get(str(c.part.acts_on))
-    own = {"sensor_lag": "lag", "sensor_bonding": "bonding", "sensor_offset": "offset"}.get(c.mechanism)
-    return sensor is not None and own is not None and getattr(sensor, own) is not None
+    stated = {"sensor_lag": "lag", "sensor_bonding": "bonding", "sensor_offset": "offset"}.get(c.mechanism)
+    return sensor is not None and stated is not None and getattr(sensor, stated) is not None
+
+
+def _ends(given: MechanismPart) -> dict[str, object]:
+    """Places by port, bodies without the place in them; a bare place is that of the law's first port."""
+    at: Mapping[str, object] = given.at if isinstance(given.at, Mapping) else {}
+    if isinstance(given.at, str) and MECHANISMS[given.law].ports:
+        at = {MECHANISMS[given.law].ports[0]: given.at}
+    return {port: place.partition("@")[0] if isinstance(place, str) else place for port, place in at.items()}
+
+
+def _exchanging(c: Candidate) -> set[str]:
+    """The ports that tell two instances at one body apart: with what it exchanges heat."""
+    mechanism = MECHANISMS[c.mechanism]
+    return {port for port in mechanism.ports if port == mechanism.takes_from}
 
 
 def _fits(machine: Machine, mechanism: type[Mechanism], c: Candidate) -> bool:

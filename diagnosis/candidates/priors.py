@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.candidates.library import outlets_of
+from diagnosis.candidates.library import log_prior_odds, outlets_of
 from diagnosis.contracts import Candidate, Fitted, Scored
 from diagnosis.policy import POLICY
 from twin.mechanisms import MECHANISMS
@@ -38,6 +38,17 @@ def at_size(spec: Spec, size: float) -> Spec:
     ):
         return spec
     return replace(spec, value=float(np.clip(spec.value * size, spec.low, spec.high)))
+
+
+def usual_amplitude(c: Candidate, amplitude: str, size: float) -> tuple[float, float, float]:
+    """Prior of an amplitude counted from the value without an effect: centre, sd, and sd of its logarithm or 0."""
+    mechanism, off = MECHANISMS[c.mechanism], c.amplitudes[amplitude]
+    spec = at_size(mechanism.spec(amplitude), size)
+    if spec.scale == "linear" or mechanism.any_unit or spec.low < off:
+        spread = POLICY.signed_prior_sd_factor * (1.0 if spec.spread is None else spec.spread)
+        return 0.0, spread, 0.0
+    usual = abs((spec.value or 1.0) - off) or 1.0
+    return usual, 0.0, max(POLICY.amplitude_min_log_sd, spec.spread or 0.0)
 
 
 def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
@@ -141,6 +152,8 @@ def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> f
         return 0.0
     mechanism = MECHANISMS[c.mechanism]
     freedom = -POLICY.shape_parameter_cost_nats * len(c.shape)
+    if fitted is not None:
+        freedom += log_prior_odds(fitted.machine, fitted.part, c)
     if fitted is not None and mechanism.goes_with and _alone(c, fitted.part):
         freedom -= POLICY.missing_companion_cost_nats
     size = size_of(fitted) if fitted is not None else 1.0

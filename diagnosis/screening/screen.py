@@ -40,8 +40,13 @@ class Screen:
 
 
 def proposed(fitted: Fitted) -> list[Candidate]:
-    """All mechanisms at all places, and the alternatives that doubt the machine file's values."""
-    return candidates(fitted.machine, fitted.part) + alternatives(fitted.problem.network)
+    """All mechanisms at all places, and the alternatives that doubt the machine file's values.
+
+    Lags and skews are screened by their slope alone: at a value of their own they would compete with the slack that
+    every fit has for them.
+    """
+    every = candidates(fitted.machine, fitted.part) + alternatives(fitted.problem.network)
+    return [c for c in every if c.amplitudes or not c.variant_of]
 
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:

@@ -90,7 +90,7 @@ machines = pytest.mark.parametrize("small", SMALL.values(), ids=SMALL)
 
 
 def smooth(small: Small) -> list[Candidate]:
-    return [c for c in small.candidates if c.amplitudes]
+    return [c for c in small.candidates if c.amplitudes and not c.variant_of]
 
 
 def one_of_each(every: list[Candidate]) -> list[Candidate]:
@@ -132,7 +132,7 @@ def test_a_thermostats_derivative_is_right_in_fine_steps() -> None:
     small = SMALL["two bodies"]
     chosen = [c for c in smooth(small) if c.mechanism == "jacket_chiller"]
     gaps = compared(small, chosen, SWITCHING)
-    assert len(gaps) == 2 and max(gaps)[0] < 1e-3
+    assert len(gaps) == 4 and max(gaps)[0] < 1e-3
 
 
 @machines

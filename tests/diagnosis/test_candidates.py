@@ -14,18 +14,20 @@ import yaml
 from data.arrays import Numeric
 from data.machine import Machine, load_machine, parse_machine
 from data.registry import Registry
-from diagnosis.candidates.alternatives import alternatives, coarse_candidates
-from diagnosis.candidates.library import candidates, linked
-from diagnosis.contracts import Candidate, pieces_of
+from diagnosis.candidates.alternatives import alternatives
+from diagnosis.candidates.library import HINTS, candidates, equipment_named, linked, log_prior_odds
+from diagnosis.contracts import Candidate, Where
+from diagnosis.screening.linearisation import differences
 from diagnosis.search.search import search
 from tests.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
-from twin.mechanisms.base import Mechanism, View
+from twin.mechanisms.base import EQUIPMENT, Mechanism, View
 from twin.quantity import Spec
 from twin.schema import TwinPart, twin_part
 
-SAMPLE = load_machine(Path(__file__).parents[2] / "machines" / "sample_vmc.yml")
+MACHINES = Path(__file__).parents[2] / "machines"
+SAMPLE = load_machine(MACHINES / "sample_vmc.yml")
 BODIES = ("spindle", "head", "column", "bed")
 
 
@@ -46,21 +48,6 @@ def test_heat_goes_into_every_body_that_has_not_got_it() -> None:
     assert {c.variant_of for c in begun} == {found.name}  # at other temperatures
     assert found.part is not None and found.part.at == {"body": "bed", "room": "room"}
     assert found.where.kind == "node" and not found.fault
-
-
-def test_pieces_that_a_finer_network_invents_are_no_places() -> None:
-    now = fitted(four_bodies(), runs(four_bodies(), count=4))
-    before = {c.name for c in candidates(now.machine, now.part)}
-    for c in coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0])):
-        part = c.applied(now.part)
-        after = candidates(now.machine, part)
-        pieces = pieces_of(part)
-        for other in after:
-            ports = other.part.at if other.part is not None and isinstance(other.part.at, dict) else {}
-            assert other.where.name not in pieces and not pieces.keys() & set(ports.values()), other.name
-        assert all(linked(part, b) == linked(now.part, b) for b in BODIES) or not pieces
-        new = {o.name for o in after} - before
-        assert not any(o.startswith(("heat_bridge", "cabinet_heat")) for o in new), new
 
 
 def test_the_same_law_by_another_driver_is_news() -> None:
@@ -95,19 +82,85 @@ def test_ports_look_where_their_roles_say() -> None:
     assert places == {("t_spindle", "head"), ("t_head", "spindle"), ("t_head", "column"), ("t_bed", "column")}
     preload = {tuple(c.part.at.values()) for c in of(given, "preload_feedback") if c.part}  # type: ignore[union-attr]
     assert preload == {("spindle", "head"), ("head", "spindle")}  # the outlets of the heat that it multiplies
-    for c in of(given, "preload_feedback"):
-        assert c.part is not None and c.part.acts_on == "load"
+    assert {c.part.acts_on for c in of(given, "preload_feedback") if c.part} == {"load", "friction"}
+
+
+def test_optional_ports_are_named_one_at_a_time_or_not_at_all() -> None:
+    hall = {"surroundings": {"room": {"channel": "room"}, "hall": {"first": ["t_bed"]}}}
+    given = four_bodies(**hall)
+    bars = [c for c in of(given, "mandrel_fixture") if c.part]
+    at = [c.part.at for c in bars if c.part]
+    assert sorted(at, key=str) == sorted([*({"seat": b} for b in BODIES), {"air": "room"}, {"air": "hall"}], key=str)
+    shapes = {next(iter(c.part.at)): c.shape for c in bars if isinstance(c.part.at, dict)}  # type: ignore[union-attr]
+    assert shapes == {"seat": ("capacity", "conductance"), "air": ("capacity", "film")}
+    for key in ("jacket_chiller", "coolant_jacket"):
+        own = [c for c in of(given, key) if c.where.name == "head" and not c.variant_of]
+        ports = {tuple(c.part.at): c for c in own if c.part and isinstance(c.part.at, dict)}
+        assert set(ports) == {("jacket",), ("jacket", "room")}  # the hall is not recorded: nothing to follow
+        plain, following = ports["jacket",], ports["jacket", "room"]
+        assert "follow" not in plain.shape and "follow" in following.shape
+        assert plain.part and not plain.part.parameters and following.part
+        assert following.part.parameters["follow"].value == 1.0
+
+
+def test_a_neighbour_radiates_where_no_link_or_air_joins_them() -> None:
+    pairs = {tuple(c.part.at.values()) for c in of(four_bodies(), "radiation") if c.part}  # type: ignore[union-attr]
+    apart = {("spindle", "column"), ("spindle", "bed"), ("head", "bed")}
+    assert pairs == {*((b, "room") for b in BODIES), *apart}
+    own = {"law": "radiation", "at": {"body": "bed", "surrounding": "head"}, "into": "bed"}
+    left = {tuple(c.part.at.values()) for c in of(four_bodies(mechanisms__own=own), "radiation") if c.part}  # type: ignore[union-attr]
+    assert left == pairs - {("head", "bed")}  # either way round it is there
+
+
+def test_the_ground_is_no_air_that_a_gate_cools() -> None:
+    assert {c.where.name for c in of(SAMPLE, "draught") if c.where.kind == "node"} == {"room"}
+
+
+def test_every_value_that_is_looked_for_is_a_candidate_of_its_own() -> None:
+    gates = [c for c in of(four_bodies(), "draught") if c.plain == "draught_room"]
+    stated = [{k: v.value for k, v in c.part.parameters.items()} for c in gates if c.part]
+    hours = [s for s in stated if set(s) == {"start"}]
+    by_clock = [s for s in stated if set(s) == {"start", "clock"}]
+    assert len(gates) == 1 + len(hours) + len(by_clock) and len(hours) > 15 and len(by_clock) > 10
+    assert {"start": "20 h"} in hours and {"start": "6 h", "clock": 1.0} in by_clock
+    assert all(c.amplitudes == {"factor": 1.0, "drop": 0.0} for c in gates)
+    units = [c for c in of(equipped(), "hydraulic_unit") if c.where.name == "bed"]
+    assert {len([c for c in units if c.plain == p]) for p in ("hydraulic_unit_bed", "hydraulic_unit_bed_coolant")} == {
+        6, 1,
+    }  # fmt: skip
+
+
+def test_a_lag_and_a_skew_of_any_size_are_finite_changes() -> None:
+    now = fitted(two_bodies(), runs(two_bodies(), count=3))
+    every = [c for c in of(two_bodies(), "sensor_lag", "time_skew") if c.where.name == "t_head"]
+    finite = {c.name: c for c in every if c.variant_of}
+    assert [(c.amplitudes, c.shape) for c in finite.values()] == [({}, ("lag",))] * 6 + [({}, ("delay",))] * 8
+    changes, left_out = differences(now, every)
+    assert not left_out and set(changes) == set(finite)
+    head = now.problem.channels.index("t_head")
+
+    def size(c: Candidate) -> float:
+        for change, m in zip(changes[c.name], now.problem.measured, strict=True):
+            assert np.abs(change[m.channel != head]).max() < 1e-9  # one sensor shows it, the machine does not
+        return float(sum(np.sum(change**2) for change in changes[c.name]) ** 0.5)
+
+    lags = {str(c.part.parameters["lag"].value): size(c) for c in finite.values() if c.part and c.shape == ("lag",)}
+    assert list(lags) == ["30 s", "90 s", "240 s", "720 s", "2100 s", "7200 s"]
+    assert (np.diff(list(lags.values())) > 0).all()
+    skews = {str(c.part.parameters["delay"].value): size(c) for c in finite.values() if c.part and "delay" in c.shape}
+    assert skews["600 s"] > skews["60 s"] > skews["20 s"] > 0 and skews["-600 s"] > skews["-20 s"] > 0
 
 
 def test_what_multiplies_heat_goes_with_its_own_laws() -> None:
-    assert names(equipped(), "viscosity_feedback") == {f"viscosity_feedback_friction_{b}" for b in ("spindle", "head")}
+    oils = {"friction_spindle", "friction_head", "guides_column"}  # not that of the load
+    assert names(equipped(), "viscosity_feedback") == {f"viscosity_feedback_{place}" for place in oils}
     multiplied = {c.part.acts_on for c in of(equipped(), "supply_sag") if c.part}
     assert multiplied == {"friction", "load", "guides"}
 
 
 def test_what_a_sensor_states_is_fitted_and_not_proposed() -> None:
     given = four_bodies(sensors__t_bed__offset="0.1 K")
-    assert names(given, "sensor_lag") == {"sensor_lag_t_spindle", "sensor_lag_t_bed"}
+    assert {c.plain for c in of(given, "sensor_lag")} == {"sensor_lag_t_spindle", "sensor_lag_t_bed"}
     assert names(given, "sensor_bonding") == {"sensor_bonding_t_spindle_room", "sensor_bonding_t_bed_room"}
     assert names(given, "sensor_offset") == {"sensor_offset_t_spindle", "sensor_offset_t_head"}
 
@@ -142,6 +195,66 @@ def test_swaps_come_in_pairs() -> None:
     assert all(c.fault for c in swaps)
 
 
+NAMED = {  # what the files of machines/ hint at
+    "cell_30q": {"battery cell"},
+    "tclab_board": {"heater"},
+    "spindle_fl": {"rotating parts", "bearings", "motor", "belt", "cutting", "cabinet", "test bar"},
+    "sample_lathe": {"guides", "ball screw", "rotating parts", "bearings", "motor", "belt", "cutting", "cabinet",
+                     "test bar", "enclosure"},
+}  # fmt: skip
+NAMED |= {"sample_vmc": NAMED["sample_lathe"], "lathe_gv1203": NAMED["sample_lathe"]}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_equipment_that_a_file_hints_at(name: str) -> None:
+    machine = load_machine(MACHINES / f"{name}.yml")
+    part = twin_part(machine) if machine.twin else None
+    named = equipment_named(machine, part)
+    assert named == NAMED[name] and named <= EQUIPMENT == set(HINTS)
+    odds = {
+        key: log_prior_odds(machine, part, Candidate(key, Where("node", "bed"), key, key))
+        for key in (
+            "heat_bridge",
+            "sensor_lag",
+            "wrong_parameter",
+            "bearing_viscous",
+            "screw_bearing",
+            "coolant_jacket",
+            "sun",
+        )
+    }
+    assert odds["heat_bridge"] == odds["sensor_lag"] == odds["wrong_parameter"] == 0.0
+    assert odds["sun"] == pytest.approx(np.log(1 / 20))  # a window may be anywhere, and no file names one
+    still = name in ("cell_30q", "tclab_board")
+    assert odds["bearing_viscous"] == (pytest.approx(np.log(1 / 1000)) if still else 0.0)
+    assert odds["coolant_jacket"] == pytest.approx(np.log(1 / 1000 if still else 1 / 20))
+    assert odds["screw_bearing"] == (
+        0.0 if "ball screw" in named else pytest.approx(np.log(1 / 1000 if still else 1 / 20))
+    )
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "given", "equipment"),
+    [
+        ("bodies", "t", {"capacity": "1 kJ/K", "words": "Kühlmitteltank"}, {"coolant jacket", "cutting fluid"}),
+        ("bodies", "Schaltschrank", {"capacity": "1 kJ/K"}, {"cabinet"}),
+        ("bodies", "b", {"capacity": "1 kJ/K", "words": "Führung mit Kugelgewindetrieb"}, {"guides", "ball screw"}),
+        ("surroundings", "air", {"value": "20 degC", "words": "under the hood"}, {"enclosure"}),
+        ("mechanisms", "own", {"law": "hydraulic_unit", "into": "heater1"}, {"hydraulic unit"}),
+        ("mechanisms", "own", {"law": "cabinet_heat", "into": "heater1", "words": "Spindellager"}, {"bearings"}),
+        ("channels", "chiller_on", {"role": "driver", "unit": "1"}, {"coolant jacket"}),
+        ("channels", "travel", {"role": "position", "unit": "mm"}, {"guides", "ball screw", "cabinet"}),
+    ],
+)
+def test_words_laws_and_drivers_name_equipment(
+    group: str, name: str, given: dict[str, Any], equipment: set[str]
+) -> None:
+    raw = yaml.safe_load((MACHINES / "tclab_board.yml").read_text(encoding="utf-8"))
+    (raw if group == "channels" else raw["twin"])[group][name] = given
+    machine = parse_machine(yaml.safe_dump(raw), "board.yml")
+    assert equipment_named(machine, twin_part(machine)) >= {"heater", *equipment}
+
+
 def test_what_goes_to_an_error_fits_its_unit() -> None:
     given = four_bodies()
     assert {"spindle_growth_z_head", "column_bending_z_head_column", "speed_shift_z_rpm"} <= names(given)
@@ -158,7 +271,8 @@ def test_the_order_of_the_file_does_not_matter() -> None:
         update={g: dict(reversed(getattr(part, g).items())) for g in ("bodies", "links", "sensors", "mechanisms")}
     )
     both = [{c.name for c in candidates(given, p)} for p in (part, turned)]
-    signed = ("column_bending", "sensor_swap", "heat_bridge")  # of two places the first is the file's first
+    # of two places the first is the file's first
+    signed = ("column_bending", "sensor_swap", "heat_bridge", "radiation")
     one, other = ({n for n in every if not n.startswith(signed)} for every in both)
     assert one == other and len(both[0]) == len(both[1])
     listed = [c.name for c in candidates(given, part)]

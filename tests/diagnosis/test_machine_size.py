@@ -40,7 +40,8 @@ def _smaller(given: Any) -> Any:
 def standing(machine: Any) -> Fitted:
     """As much of a fit as a size needs."""
     network = compile_network(machine)
-    return cast(Fitted, SimpleNamespace(problem=SimpleNamespace(network=network), values=network.values))
+    given = {"problem": SimpleNamespace(network=network), "values": network.values}
+    return cast(Fitted, SimpleNamespace(**given, machine=machine, part=twin_part(machine)))
 
 
 def bridge(conductance_W_per_K: float) -> Scored:

@@ -13,7 +13,7 @@ from data.batch import Batch
 from data.errors import InputError
 from data.processes import Processes
 from diagnosis.candidates.discretisation import never_reported
-from diagnosis.contracts import Candidate, Scored, Tried, Where
+from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import proposed
 from diagnosis.search import decision
@@ -288,7 +288,7 @@ def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_c
 def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The shortlist passes the floor over, and what imitates it is refused."""
     asked: list[Round] = []
-    listing, real = search_module.shortlist, search_module.decided
+    listing, real, start = search_module.shortlist, search_module.decided, found("floor").baseline
 
     def passing_over(*given: Any) -> Shortlist:
         listed = listing(*given)
@@ -300,9 +300,15 @@ def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyP
         asked.append(done if asked else replace(done, accepted=False))
         return asked[-1]
 
+    others = ("coolant_jacket", "jacket_chiller", "sun", "hydraulic_unit", "draught")  # that imitate the floor
+
+    def without_imitators(fitted: Fitted) -> list[Candidate]:
+        return [c for c in proposed(fitted) if c.mechanism not in others]
+
+    monkeypatch.setattr(search_module, "proposed", without_imitators)
     monkeypatch.setattr(search_module, "shortlist", passing_over)
     monkeypatch.setattr(search_module, "decided", refusing_once)
-    done = one_round(found("floor").baseline, 0, Processes(), lambda *_: None)
+    done = one_round(start, 0, Processes(), lambda *_: None)
     assert done is asked[1] and done.accepted and done.best is not None
     assert done.best.candidate.plain == "floor_sink_head_room"
     assert asked[0].best is not None and asked[0].best.candidate.mechanism != "floor_sink"

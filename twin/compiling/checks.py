@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -81,20 +81,24 @@ def _open_chains(part: TwinPart) -> Iterator[str]:
 
 def _pointless(part: TwinPart) -> Iterator[str]:
     """Mechanisms whose `acts_on` is missing or names nothing that they can change."""
+    heats = list(_heats(part))
+    known: dict[frozenset[str], dict[str, None]] = {}  # of each set of effects what they can change, in order
     for name, given in part.mechanisms.items():
-        effects = set(mechanism_of(name, given).effects())
-        allowed = list(_targets(part, effects))
+        effects = frozenset(mechanism_of(name, given).effects())
+        if effects not in known:
+            known[effects] = dict.fromkeys(_targets(part, effects, heats))
+        allowed = known[effects]
         if "expand" not in effects and allowed and not several(given.acts_on):
-            yield f"mechanisms.{name}.acts_on is missing; name what {given.law} changes, e.g. {allowed[0]}"
+            yield f"mechanisms.{name}.acts_on is missing; name what {given.law} changes, e.g. {next(iter(allowed))}"
         for target in several(given.acts_on):
             if "expand" not in effects and target not in allowed:
                 yield f"mechanisms.{name}.acts_on: {given.law} cannot change {target!r}; {closest(target, allowed)}"
 
 
-def _targets(part: TwinPart, effects: set[str]) -> Iterator[str]:
+def _targets(part: TwinPart, effects: Collection[str], heats: Sequence[str]) -> Iterator[str]:
     """What mechanisms with these effects can change, by name."""
     if "factor" in effects:
-        yield from (*part.links, *part.exposures, *_heats(part))
+        yield from (*part.links, *part.exposures, *heats)
     if "reading" in effects:
         yield from (*part.sensors, *part.errors)
     if "displacement" in effects:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,9 +42,11 @@ def law_of(scope: Scope, name: str, given: MechanismPart) -> Law:
         s.name: scope.table.add(f"{key}.{s.name}", s, given.parameters.get(s.name), mechanism.source)
         for s in mechanism.parameters
     }
-    return Law(
-        name, mechanism, parameters, _drivers(scope, key, mechanism, given), _ports(scope, key, mechanism, given)
-    )
+    ports = _ports(scope, key, mechanism, given)
+    for p, (port, _) in mechanism.of_port.items():
+        if p in given.parameters and port not in ports:
+            raise ValueError(f"{key}.parameters.{p}: means nothing without at.{port}; name that place, or leave it out")
+    return Law(name, mechanism, parameters, _drivers(scope, key, mechanism, given), ports)
 
 
 def _drivers(scope: Scope, key: str, mechanism: Mechanism, given: MechanismPart) -> dict[str, str]:
@@ -71,8 +75,9 @@ def _ports(scope: Scope, key: str, mechanism: Mechanism, given: MechanismPart) -
     at = given.at or {}
     if isinstance(at, str):
         at = {mechanism.ports[0]: at} if mechanism.ports else {}
-    if set(at) != set(mechanism.ports):
-        raise ValueError(f"{key}.at: {mechanism.key} needs {', '.join(mechanism.ports) or 'none'}, got {list(at)}")
+    if set(at) - set(mechanism.ports) or set(mechanism.ports) - set(at) - mechanism.optional_ports:
+        named = ", ".join(p + " (optional)" * (p in mechanism.optional_ports) for p in mechanism.ports)
+        raise ValueError(f"{key}.at: {mechanism.key} needs {named or 'none'}, got {list(at)}")
     return {port: port_of(scope, place, f"{key}.at.{port}") for port, place in at.items()}
 
 
@@ -107,12 +112,15 @@ def acting(scope: Scope, effect: str, target: str) -> tuple[Law, ...]:
 
 
 def heats(scope: Scope) -> tuple[Heat, ...]:
-    heats = []
+    heats, multiplied = [], defaultdict(list)
+    for name, targets in acting_on(scope, scope.part.mechanisms, "factor").items():
+        for target in targets:
+            multiplied[target].append(scope.laws[name])
     for name, given in scope.part.mechanisms.items():
         if "heat_W" in scope.laws[name].mechanism.effects():
             law = scope.laws[name]
             loses = law.ports.get(law.mechanism.takes_from or "")
-            factors = acting(scope, "factor", name)
+            factors = tuple(replace(f, mechanism=f.mechanism.multiplying(given.law)) for f in multiplied[name])
             heats.append(Heat(law, _outlets(scope, name, given), factors, loses.cells if loses else None))
     return tuple(heats)
 

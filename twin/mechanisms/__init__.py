@@ -21,6 +21,7 @@ MECHANISMS = Registry(
         "joint_conductance": "twin.mechanisms.joints:JointConductance",
         "heat_bridge": "twin.mechanisms.joints:HeatBridge",
         "jacket_chiller": "twin.mechanisms.fluids:JacketChiller",
+        "coolant_jacket": "twin.mechanisms.fluids:CoolantJacket",
         "cutting_fluid": "twin.mechanisms.fluids:CuttingFluid",
         "enclosure_air": "twin.mechanisms.surroundings:EnclosureAir",
         "stratification": "twin.mechanisms.surroundings:Stratification",

@@ -28,10 +28,16 @@ if TYPE_CHECKING:
 Target = Literal["node", "link", "exposure", "heat", "sensor", "error", "surrounding", "start"]
 
 # Where a diagnosis places a port: at the target, at each surrounding, at each body linked with the target (of an error,
-# with the previous port), at any other body, at a body without a link to the target (each pair once), or where the
-# multiplied heat goes.
-PortRole = Literal["itself", "surrounding", "neighbour", "body", "unlinked", "outlet"]
+# with the previous port), at any other body, at a body without a link to the target (each pair once), at a surrounding
+# or such a body, or where the multiplied heat goes.
+PortRole = Literal["itself", "surrounding", "neighbour", "body", "unlinked", "facing", "outlet"]
 SURROUNDING_PORTS = ("air", "surrounding", "room", "supply")  # by these names a port is a surrounding
+
+# What a mechanism may need that not every machine has; see `Mechanism.needs`.
+EQUIPMENT = frozenset({
+    "battery cell", "bearings", "ball screw", "belt", "cabinet", "coolant jacket", "cutting", "cutting fluid",
+    "enclosure", "guides", "heater", "hydraulic unit", "motor", "rotating parts", "test bar", "window",
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ class Mechanism(ABC):
     any_unit: ClassVar[frozenset[str]] = frozenset()  # those of `drivers` whose channel may have any unit, its own
     takes_from: ClassVar[str | None] = None  # the port that loses the heat which `into` gains, where it is a body
     ports: ClassVar[tuple[str, ...]] = ()  # names of the temperatures that the law needs
+    optional_ports: ClassVar[frozenset[str]] = frozenset()  # those of `ports` that a machine file may leave out
     parameters: ClassVar[tuple[Spec, ...]] = ()
     along_time: ClassVar[bool] = False  # True: the effect at a time needs the times before it (lag, slip, hysteresis)
 
@@ -78,11 +85,17 @@ class Mechanism(ABC):
     fault: ClassVar[bool] = False  # True: of a sensor or a clock, no physics of the machine
     port_roles: ClassVar[Mapping[str, PortRole]] = {}  # of every port; the usual ones need not be stated
     together: ClassVar[int] = 1  # how many targets one instance acts on
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values of a shape at which a diagnosis evaluates it
+    needs: ClassVar[str] = ""  # the equipment without which it cannot be, one of `EQUIPMENT`; "": any machine
+    # Values, besides the usual one, at which a diagnosis evaluates it, by parameter. A parameter of `shape`: the
+    # amplitude is screened at each. A parameter of `off`: it is not linear in it, each value is a finite change.
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    scan_points: ClassVar[tuple[Mapping[str, float], ...]] = ()  # the same where several parameters go together
+    # Parameters that mean something only with an optional port: that port, and the value of a candidate that names it
+    # (None: the usual one).
+    of_port: ClassVar[Mapping[str, tuple[str, float | None]]] = {}
     all_errors: ClassVar[bool] = False  # True: one instrument shows all errors, so it may act on all of them together
     all_air: ClassVar[bool] = False  # True: it may act on all surroundings of one recorded channel together
     multiplies: ClassVar[tuple[str, ...]] = ()  # the heat laws that it makes sense on; none named: any
-    far_apart: ClassVar[bool] = False  # True: not between bodies with a common neighbour
     of_network: ClassVar[bool] = False  # True: a property of the network's discretisation, not of a real body
     goes_with: ClassVar[tuple[str, ...]] = ()  # laws of which one acts at the same place in every real machine
     only_driven: ClassVar[bool] = False  # True: proposed only with its optional driver
@@ -121,6 +134,10 @@ class Mechanism(ABC):
     def start_K(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         """Added to the start temperature of every place of `into`, K."""
         raise NotImplementedError
+
+    def multiplying(self, law: str) -> Mechanism:
+        """The mechanism as it multiplies the heat of this law; another object where the factor depends on the law."""
+        return self
 
     def at_work(self, view: View, p: Mapping[str, Numeric]) -> Numeric | None:
         """Activity, 0 to 1, for mechanisms with time windows; None: active while its drivers run, or always."""
@@ -173,6 +190,7 @@ def _effects(mechanism: type[Mechanism]) -> tuple[str, ...]:
 
 
 ZERO_DEGC_K = 273.15
+REFERENCE_DEGC = 20.0  # ISO 1
 
 
 def size(x: Any) -> Numeric:

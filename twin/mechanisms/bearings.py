@@ -17,6 +17,8 @@ from twin.quantity import Spec
 W_PER_RPM_NMM = 1.047e-4
 THIN_FILM = 2000.0  # nu n, mm²/s rpm: below it the viscous moment no longer depends on speed
 VISCOSITY_EXPONENT = 2.0 / 3.0
+VISCOUS_LOAD_EXPONENT = 0.54  # of the rolling moment of ball bearings
+LEAST_PRELOAD = 0.1  # of the preload at rest: weight and centrifugal load stay, and so does the lubricant
 
 COUNT = Spec("count", "1", "how many equal bearings", 2.0, 0.01, 1.0, 20.0)
 MEAN_DIAMETER = Spec("mean_diameter", "mm", "mean diameter of a bearing, (bore + outside) / 2", 77.5, 0.02, 5.0, 500.0)
@@ -32,6 +34,7 @@ class BearingViscous(Mechanism):
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
     )
     signature = "rise at the nose grows with speed as n^1.3 to n^1.7"
+    needs = "bearings"
     goes_with = ("bearing_load",)  # Palmgren 1959: M = M0 + M1, no bearing has one part alone
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
@@ -61,6 +64,7 @@ class BearingLoad(Mechanism):
         "Palmgren 1959, Ball and Roller Bearing Engineering, 3rd ed.; Harris 2001, Rolling Bearing Analysis, ch. 14"
     )
     signature = "rise proportional to speed"
+    needs = "bearings"
     goes_with = ("bearing_viscous",)
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
@@ -81,13 +85,15 @@ class BearingLoad(Mechanism):
 
 
 class ViscosityFeedback(Mechanism):
-    """The oil thins as it warms: multiplies a `bearing_viscous` heat whose viscosity holds at `reference`.
+    """The lubricant thins as it warms: multiplies a `bearing_viscous` heat whose viscosity holds at `reference`.
 
-    Right where nu n >= 2000; below, at a few turns a second, the moment does not depend on the viscosity.
+    Right where nu n >= 2000; below, at a few turns a second, the moment does not depend on the viscosity. Ball screws
+    and rolling guides follow the same law; of slides in mixed friction `slope` is an effective one. The losses of a
+    belt or a motor and the load's share of a bearing's friction do not depend on the viscosity.
     """
 
     key = "viscosity_feedback"
-    multiplies = ("bearing_viscous",)
+    multiplies = ("bearing_viscous", "nut_friction", "screw_bearing", "guide_friction")
     summary = "lubricant that thins as it warms"
     equation = (
         "nu = nu_ref exp(-slope (T_oil - reference)), so heat is multiplied by exp(-2/3 slope (T_oil - reference))"
@@ -108,17 +114,20 @@ class ViscosityFeedback(Mechanism):
 
 
 class PreloadFeedback(Mechanism):
-    """A shaft warmer than its housing tightens the bearing: multiplies a `bearing_load` heat.
+    """A shaft warmer than its housing tightens the bearing: multiplies a `bearing_load` or `bearing_viscous` heat.
 
-    M1 grows as F^(1 + y), so the load's heat does; a preload that is lost altogether gives no heat, never less.
+    M1 grows as F^(1 + y), so the load's heat does; a preload that is lost altogether gives no heat, never less. The
+    viscous moment grows as F^0.54 and stays below a tenth of the preload (rolling moment of ball bearings: SKF 2016,
+    Rolling bearings, p. 104).
     """
 
     key = "preload_feedback"
-    multiplies = ("bearing_load",)
+    multiplies = ("bearing_load", "bearing_viscous")
     summary = "preload that rises with the shaft's lead over the housing"
-    equation = "F = F0 [1 + kappa (T_shaft - T_housing)], so heat is multiplied by (F/F0)^(1 + y), and by 0 where F < 0"
-    source = "Stein and Tu 1994, J. Dyn. Syst. Meas. Control 116, thermally induced preload; Palmgren 1959 for 1 + y"
+    equation = "F = F0 [1 + kappa (T_shaft - T_housing)], heat times (F/F0)^(1 + y), 0 where F < 0; viscous: ^0.54"
+    source = "Stein and Tu 1994, J. Dyn. Syst. Meas. Control 116; Palmgren 1959 for 1 + y; SKF 2016 for 0.54"
     signature = "overshoot 10 to 40 min after a step of the speed"
+    needs = "bearings"
     acts_at = ("heat",)
     ports = ("shaft", "housing")
     parameters = (
@@ -128,6 +137,14 @@ class PreloadFeedback(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"kappa": 0.0}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"shaft": "outlet", "housing": "outlet"}
 
+    def __init__(self, viscous: bool = False) -> None:
+        self.viscous = viscous  # whether it multiplies a viscous heat
+
+    def multiplying(self, law: str) -> PreloadFeedback:
+        return PreloadFeedback(law == "bearing_viscous")
+
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         preload = 1.0 + p["kappa"] * (view.degC["shaft"] - view.degC["housing"])
+        if self.viscous:
+            return power(np.where(real(preload) > LEAST_PRELOAD, preload, LEAST_PRELOAD), VISCOUS_LOAD_EXPONENT)
         return power(np.where(real(preload) > 0, preload, 0.0), 1.0 + p["load_exponent"])

@@ -8,10 +8,11 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from twin.mechanisms.base import ZERO_DEGC_K, Mechanism, View, power, real, steps_s
+from twin.mechanisms.base import ZERO_DEGC_K, Mechanism, PortRole, View, power, real, steps_s
 from twin.quantity import Spec
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/m²/K⁴, CODATA 2018
+NEVER_S = -1e9
 
 
 class RotatingConvection(Mechanism):
@@ -25,6 +26,7 @@ class RotatingConvection(Mechanism):
     equation = "h = h_rest [1 + gain (n / rated)^exponent]"
     source = "Becker 1963, Int. J. Heat Mass Transfer 6, 1053: Nu = 0.133 Re^(2/3) Pr^(1/3)"
     signature = "time constants are shorter running than stopped"
+    needs = "rotating parts"
     acts_at = ("exposure", "link")
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (
@@ -67,7 +69,7 @@ class NaturalConvection(Mechanism):
 
 
 class Radiation(Mechanism):
-    """A grey surface facing a large or black surrounding, or a hot neighbour: the port `surrounding`.
+    """A grey surface facing a large or black surrounding, or another body: the port `surrounding`.
 
     The heat leaves that port where it is a body. About 5 W/m²K at a workshop's temperatures.
     """
@@ -85,6 +87,7 @@ class Radiation(Mechanism):
         Spec("emissivity", "1", "emissivity: 0.9 painted, 0.1 to 0.3 bare metal", 0.9, 0.5, 0.01, 1.0, "logit"),
     )
     off: ClassVar[Mapping[str, float]] = {"area": 0.0}
+    port_roles: ClassVar[Mapping[str, PortRole]] = {"surrounding": "facing"}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         body_K, other_K = view.degC["body"] + ZERO_DEGC_K, view.degC["surrounding"] + ZERO_DEGC_K
@@ -96,25 +99,33 @@ class Radiation(Mechanism):
 class Draught(Mechanism):
     """An open door or gate for a while: exposures exchange more, surroundings cool. `acts_on` names either or both.
 
-    The window counts from a batch's start; it opens and closes within one interval of the simulation.
+    The window counts from a batch's start or, with `clock`, is a time of every day, the same in all batches; none
+    where the time of day is not known. It opens and closes within one interval of the simulation.
     """
 
     key = "draught"
     all_air = True
     summary = "draught from an open door or gate"
-    equation = "within start <= t < start + duration: G = factor G0 and T_air = T_air0 - drop"
+    equation = "within start <= t < start + duration: G = factor G0, T_air = T_air0 - drop; t of the run or the day"
     source = "step model of a gate opening; h x 1.5 to 3 and 2 to 10 K for 5 to 30 min"
     signature = "short dips, thin parts first"
     acts_at = ("exposure", "surrounding")
     parameters = (
-        Spec("start", "h", "when it begins, from the batch's start", 1.0, 1.0, 0.0, 1e4, "linear"),
+        Spec("start", "h", "when it begins, from the batch's start or by the clock", 1.0, 1.0, 0.0, 1e4, "linear"),
         Spec("duration", "min", "how long it lasts", 15.0, 0.6, 0.0, 1e4),
         Spec("factor", "1", "what the exchange is multiplied by", 2.0, 0.4, 0.1, 20.0),
         Spec("drop", "K", "by how much the air is colder meanwhile", 4.0, 0.6, 0.0, 40.0),
+        Spec("clock", "1", "1: `start` is a time of day; 0: it counts from the batch", 0.0, 0.5, 0.0, 1.0, "linear"),
     )
     off: ClassVar[Mapping[str, float]] = {"factor": 1.0, "drop": 0.0}
     shape = ("start", "duration")
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"start": tuple(0.5 * k for k in range(1, 13))}
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {
+        "start": (0.5, *(0.5 * k for k in range(3, 13)), 7.0, 8.0, 9.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0, 22.0)
+    }
+    scan_points: ClassVar[tuple[Mapping[str, float], ...]] = tuple(
+        {"start": hour, "clock": 1.0} for hour in (5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0,
+                                                   18.0, 20.0, 22.0)
+    )  # fmt: skip
 
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         return np.asarray(1.0 + (p["factor"] - 1.0) * self.at_work(view, p))
@@ -127,8 +138,16 @@ class Draught(Mechanism):
         edge_s = np.fmax(steps_s(view), 1.0)  # where the step is not known, all but at once
         begin_s = 3600.0 * p["start"]
         end_s = begin_s + 60.0 * p["duration"]
-        begun, done = (_ramp(0.5 + (view.time_s - at_s) / edge_s) for at_s in (begin_s, end_s))
+        begun, done = (_ramp(0.5 + (_counted_s(view, p["clock"]) - at_s) / edge_s) for at_s in (begin_s, end_s))
         return np.asarray(begun - done)
+
+
+def _counted_s(view: View, clock: Numeric) -> Numeric:
+    """Time from the batch's start, or of the day, s; long before any window where that is not known."""
+    known = np.isfinite(view.clock_h)
+    ahead_s = 3600.0 * np.where(known, view.clock_h, 0.0) - view.time_s
+    unknown_s = np.where(real(clock) > 0, NEVER_S, view.time_s)
+    return np.asarray(np.where(known, view.time_s + clock * ahead_s, unknown_s))
 
 
 def _ramp(x: Numeric) -> Numeric:

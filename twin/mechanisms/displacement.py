@@ -17,7 +17,7 @@ from data.errors import closest
 from twin.compiling.cells import several
 from twin.mechanisms.base import Mechanism, PortRole, View, real
 from twin.quantity import Spec, Value
-from twin.schema import Body, ChainLink, ErrorChain, Link, MechanismPart, Tilt, TwinPart
+from twin.schema import Body, ChainLink, ErrorChain, Exposure, Link, MechanismPart, Tilt, TwinPart
 
 
 class ColumnBending(Mechanism):
@@ -75,25 +75,30 @@ class SpindleGrowth(Mechanism):
 class MandrelFixture(Mechanism):
     """A test bar in the spindle, or the probe's fixture on the table: an additional body without a sensor.
 
-    The body takes the instance's name, so that the file may expose it to the air: ``exposures: {NAME-air: 0.5 W/K}``.
+    It exchanges heat with its seat, with the air (any surrounding, or a body of air), or with both: `at` names one or
+    both. The body takes the instance's name, so that the file may expose it to more: ``exposures: {NAME-hall: 1 W/K}``.
     """
 
     key = "mandrel_fixture"
     summary = "growth of the test bar or of the probe's fixture"
-    equation = "capacity · dT/dt = conductance · (T_seat - T),  error = gain · θ,  gain = ± α · length"
+    equation = "capacity · dT/dt = conductance · (T_seat - T) + film · (T_air - T),  error = gain · θ"
     source = "ISO 230-3 (2020), test mandrel and fixture as part of the measuring set-up; linear expansion"
     signature = "looks like spindle growth but lags the nose by 5-30 min; every temperature is predicted well"
+    needs = "test bar"
     acts_at = ("error",)
-    ports = ("seat",)
+    ports = ("seat", "air")
+    optional_ports: ClassVar[frozenset[str]] = frozenset({"seat", "air"})
     parameters = (
         Spec("gain", "um/K", "displacement per kelvin of the bar's rise, signed", 2.3, 2.5, -50.0, 50.0, "linear"),
         Spec("capacity", "J/K", "heat capacity of the bar or fixture", 2000.0, 0.7, 1.0, 1e5),
         Spec("conductance", "W/K", "conductance from its seat", 3.0, 0.7, 1e-3, 200.0),
+        Spec("film", "W/K", "exchange with the air", 0.5, 0.7, 1e-4, 50.0),
     )
     off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
-    shape = ("capacity", "conductance")
+    shape = ("capacity", "conductance", "film")
     # a thousandth of the usual: as late as it
-    ghost: ClassVar[Mapping[str, float]] = {"capacity": 2.0, "conductance": 0.003}
+    ghost: ClassVar[Mapping[str, float]] = {"capacity": 2.0, "conductance": 0.003, "film": 0.0005}
+    of_port: ClassVar[Mapping[str, tuple[str, float | None]]] = {"conductance": ("seat", None), "film": ("air", None)}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"seat": "body"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:
@@ -101,21 +106,32 @@ class MandrelFixture(Mechanism):
         if name in twin.bodies:
             raise ValueError(f"mechanisms.{name}: a body is called {name!r} already; give the mechanism another name")
         words = part.words or self.summary
+        links, exposures = dict(twin.links), dict(twin.exposures)
+        if "seat" in at:
+            conductance = given["conductance"]
+            links[f"{name}-{at['seat']}"] = Link(between=(name, at["seat"]), conductance=conductance, words=words)
+        if "air" in at:
+            wall = f"{name}-{at['air']}"
+            if wall in exposures:
+                raise ValueError(f"exposures.{wall}: {self.key} adds this one; state it as mechanisms.{name}.film")
+            exposures[wall] = Exposure(of=name, to=at["air"], conductance=given["film"], words=words)
         bodies = {**twin.bodies, name: Body(capacity=given["capacity"], words=words)}
-        link = Link(between=(name, at["seat"]), conductance=given["conductance"], words=words)
-        links = {**twin.links, f"{name}-{at['seat']}": link}
-        grown = twin.model_copy(update={"bodies": bodies, "links": links})
+        grown = twin.model_copy(update={"bodies": bodies, "links": links, "exposures": exposures})
         return _on_errors(name, self, part, grown, ChainLink(body=name, gain=given["gain"], words=words))
 
 
 class SpeedShift(Mechanism):
-    """The shaft moves with the speed itself: the balls' centrifugal load against the preload, and a thinner shaft."""
+    """The shaft moves with the speed itself: the balls' centrifugal load against the preload, and a thinner shaft.
+
+    Either direction of rotation moves it the same way.
+    """
 
     key = "speed_shift"
     summary = "axial shift of the shaft with the speed"
     equation = "error = shift · (n / rated)²"
     source = "Harris and Kotzalas (2006), Rolling Bearing Analysis: centrifugal ball load, proportional to n²"
     signature = "step within seconds of a speed change, back at the stop, while temperatures do not move"
+    needs = "bearings"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (
@@ -140,6 +156,7 @@ class ScrewElongation(Mechanism):
     equation = "error = expansion · (θ_screw - pretension) · (position - fixed_end)"
     source = "Slocum (1992), Precision Machine Design: thermal growth of a pretensioned lead screw"
     signature = "proportional to the position, zero at the fixed end; absent with a linear scale"
+    needs = "ball screw"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = {"position": "mm"}
     ports = ("screw",)
@@ -197,22 +214,26 @@ def _within(a: Numeric, limit: Numeric) -> Numeric:
 
 
 def _places(name: str, mechanism: Mechanism, part: MechanismPart, twin: TwinPart) -> dict[str, str]:
-    """The body or point of every port; a mechanism with one port takes a bare place.
+    """The body or point of every port; a bare place is that of the first port.
 
     Raises:
-        ValueError: a port missing or unknown, several places for one, or an unknown body.
+        ValueError: a port missing or unknown, several places for one, or an unknown body or surrounding.
     """
     key, at = f"mechanisms.{name}.at", part.at or {}
     if isinstance(at, str):
         at = {mechanism.ports[0]: at}
-    if set(at) != set(mechanism.ports):
-        raise ValueError(f"{key}: {mechanism.key} needs {', '.join(mechanism.ports)}, got {list(at)}")
+    missing = set(mechanism.ports) - set(at) - mechanism.optional_ports
+    if missing or not at or set(at) - set(mechanism.ports):
+        named = (" or " if mechanism.optional_ports else ", ").join(mechanism.ports)
+        raise ValueError(f"{key}: {mechanism.key} needs {named}, got {list(at)}")
     out = {}
     for port, place in at.items():
         if not isinstance(place, str):
             raise ValueError(f"{key}.{port}: got {len(place)} places, expected one; give each a mechanism of its own")
-        if place.partition("@")[0] not in twin.bodies:
-            raise ValueError(f"{key}.{port}: no body {place!r}; {closest(place, twin.bodies)}")
+        airy = twin.surroundings if mechanism.port_roles[port] == "surrounding" else {}
+        if place.partition("@")[0] not in twin.bodies and place not in airy:
+            which = "body or surrounding" if airy else "body"
+            raise ValueError(f"{key}.{port}: no {which} {place!r}; {closest(place, [*twin.bodies, *airy])}")
         out[port] = place
     return out
 

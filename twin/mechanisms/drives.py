@@ -22,6 +22,7 @@ class NutFriction(Mechanism):
     equation = "P = 2 pi N M / 60, N = feed / lead"
     source = "ISO 3408-3:2006, drag moment of preloaded ball screws; moments of 0.2 to 1 N m"
     signature = "only while the axis moves, proportional to feed; nut and the screw's travelled length"
+    needs = "ball screw"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"feed": "mm/min"}
     parameters = (Spec("moment", "N*m", "friction moment", 0.5, 0.5, 0.0, 50.0), LEAD)
@@ -50,6 +51,7 @@ class GuideFriction(Mechanism):
     equation = "P = mu F v"
     source = "Coulomb 1785; mu 0.002 to 0.01 for rolling guides, 0.05 to 0.15 for slides"
     signature = "only while the axis moves, proportional to feed; along the guides"
+    needs = "guides"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"feed": "mm/min"}
     parameters = (
@@ -74,6 +76,7 @@ class MotorLoss(Mechanism):
     equation = "P = idle + linear x + quadratic x^2 with x = n / rated; 0 at rest"
     source = "Steinmetz 1892 and Bertotti 1988: hysteresis losses proportional to n, eddy currents to n^2"
     signature = "the motor leads, conducted to the head; some of it as soon as the spindle turns, whatever its speed"
+    needs = "motor"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (
@@ -97,6 +100,7 @@ class BeltLoss(Mechanism):
     equation = "P = power (n / rated)^exponent"
     source = "Gerbert 1999, Traction Belt Mechanics; exponent between 1 (hysteresis) and 2 to 3 (windage)"
     signature = "rear of the spindle, head and air; grows with speed as n^1.5"
+    needs = "belt"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"speed": "rpm"}
     parameters = (

@@ -8,18 +8,22 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from twin.mechanisms.base import ZERO_DEGC_K, Mechanism, PortRole, View, course, steps_s
+from twin.mechanisms.base import ZERO_DEGC_K, Mechanism, PortRole, View, course, size, steps_s
 from twin.quantity import Spec
 
 
 class ElectricalHeat(Mechanism):
-    """A heater: watts per unit of its driver, in the unit that the driver's channel has (per cent, or 0 and 1)."""
+    """A heater: watts per unit of its driver, in the unit that the driver's channel has (per cent, or 0 and 1).
+
+    A negative level cools, as a Peltier element does.
+    """
 
     key = "electrical_heat"
     summary = "electrical heater"
     equation = "P = gain level"
     source = "Joule 1841, energy balance of a resistive heater at constant supply"
     signature = "in step with the heater's setting, proportional to it"
+    needs = "heater"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"level": "1"}
     parameters = (Spec("gain", "W", "heat per unit of the driver", 1.0, 1.0, 0.0, 1e6),)
@@ -40,6 +44,7 @@ class SupplySag(Mechanism):
     equation = "P = P0 (1 - sag other / rated)"
     source = "Ohm 1827: inner resistance of a source, linear in the other load's current"
     signature = "a heater warms its place less while another one is on, in step with that one's setting"
+    needs = "heater"
     acts_at = ("heat",)
     drivers: ClassVar[Mapping[str, str]] = {"other": "1"}
     parameters = (
@@ -49,7 +54,7 @@ class SupplySag(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"sag": 0.0}
 
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        return np.asarray(1.0 - p["sag"] * view.driver["other"] / p["rated"])
+        return np.asarray(1.0 - p["sag"] * size(view.driver["other"]) / p["rated"])
 
 
 class OhmicHeat(Mechanism):
@@ -99,6 +104,7 @@ class VoltageLossHeat(Mechanism):
     equation = "P = I (V - U(q)), q = start - integral of I dt; spline U through u0 at 0 … u7 at capacity"
     source = "Bernardi, Pawlikowski and Newman 1985, J. Electrochem. Soc. 132, 5, eq. 21"
     signature = "grows with the current and, at the same current, with the charge drawn; most near the end"
+    needs = "battery cell"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"current": "A", "voltage": "V"}
     along_time = True
@@ -132,6 +138,7 @@ class ChargeStrain(Mechanism):
     equation = "strain = f(q) + θ g(q), q = start - integral of I dt; splines through 0, f1 … f12 and g0 … g4"
     source = "Louli, Ellis and Dahn 2019, Joule 3, 745: pressure over charge; with linear thermal expansion"
     signature = "the same course over the charge at every rate, and not over time or temperature"
+    needs = "battery cell"
     acts_at = ("error",)
     drivers: ClassVar[Mapping[str, str]] = {"current": "A"}
     ports = ("body",)

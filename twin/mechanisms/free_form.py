@@ -11,10 +11,9 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from twin.mechanisms.base import Mechanism, PortRole, View
+from twin.mechanisms.base import REFERENCE_DEGC, Mechanism, PortRole, View
 from twin.quantity import Spec
 
-REFERENCE_DEGC = 20.0  # ISO 1
 SECOND_ORDER = "Box and Wilson 1951, J. R. Stat. Soc. B 13, 1: second-order regression over what is known"
 ANY = {"level": "1", "other": "1"}
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from twin.mechanisms.base import Mechanism, PortRole, View
+from twin.mechanisms.base import Mechanism, PortRole, View, size
 from twin.quantity import Spec
 from twin.schema import Link, MechanismPart, TwinPart
 
@@ -35,7 +35,7 @@ class JointConductance(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"ratio": 1.0}
 
     def factor(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        return np.asarray(p["ratio"] ** view.driver.get("closed", 1.0))
+        return np.asarray(p["ratio"] ** size(view.driver.get("closed", 1.0)))
 
 
 class HeatBridge(Mechanism):
@@ -46,7 +46,6 @@ class HeatBridge(Mechanism):
     """
 
     key = "heat_bridge"
-    far_apart = True
     of_network = True
     summary = "heat path between two bodies"
     equation = "P = conductance (T_other - T_body)"

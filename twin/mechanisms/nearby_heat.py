@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from data.arrays import Numeric
-from twin.mechanisms.base import Mechanism, View, real, steps_s
+from twin.mechanisms.base import Mechanism, View, real, size, steps_s
 from twin.quantity import Spec
 
 
@@ -20,6 +20,7 @@ class CabinetHeat(Mechanism):
     equation = "P = heat running; running is 1 where no driver is named"
     source = "energy balance of a steady source; 0.2 to 1 kW a cabinet"
     signature = "one side of the column or bed, also with the spindle stopped"
+    needs = "cabinet"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"running": "1"}
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"running"})
@@ -27,7 +28,7 @@ class CabinetHeat(Mechanism):
     off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
-        return np.asarray(p["heat"] * view.driver.get("running", 1.0))
+        return np.asarray(p["heat"] * size(view.driver.get("running", 1.0)))
 
 
 class HydraulicUnit(Mechanism):
@@ -42,6 +43,7 @@ class HydraulicUnit(Mechanism):
     equation = "P = heat on running while frac(t / period) < duty, else 0; running is 1 where no driver is named"
     source = "energy balance of a cycled source; 0.2 to 1 kW a unit"
     signature = "one side of the column or bed, in cycles, also with the spindle stopped"
+    needs = "hydraulic unit"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"running": "1"}
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"running"})
@@ -53,11 +55,12 @@ class HydraulicUnit(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
     shape = ("duty", "period")
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"period": (3.0, 8.0, 20.0, 50.0, 120.0)}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         period_s, step_s = 60.0 * p["period"], steps_s(view)
         begun_s, done_s = (_run_s(t, p["duty"], period_s) for t in (view.time_s, view.time_s + step_s))
-        return np.asarray(p["heat"] * (done_s - begun_s) / step_s * view.driver.get("running", 1.0))
+        return np.asarray(p["heat"] * (done_s - begun_s) / step_s * size(view.driver.get("running", 1.0)))
 
 
 class Sun(Mechanism):
@@ -68,6 +71,7 @@ class Sun(Mechanism):
     equation = "P = irradiance area absorptivity sin(pi (t - rise) / (set - rise)) from rise to set, else 0"
     source = "Monteith and Unsworth 2013, Principles of Environmental Physics, ch. 5: half sine of a clear day"
     signature = "one face and a sideways tilt, at the same time of day"
+    needs = "window"
     acts_at = ("node",)
     # Within a midsummer's day at 60 degrees: with free hours a heat that goes on by night would pass for sunlight.
     parameters = (
@@ -79,6 +83,12 @@ class Sun(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"irradiance": 0.0}
     shape = ("rise", "set")
+    scan_points: ClassVar[tuple[Mapping[str, float], ...]] = (
+        {"rise": 5.0, "set": 11.0},
+        {"rise": 10.0, "set": 14.0},
+        {"rise": 12.0, "set": 18.0},
+        {"rise": 15.0, "set": 21.0},
+    )
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
         since_h, day_h = view.clock_h - p["rise"], p["set"] - p["rise"]
@@ -95,6 +105,7 @@ class CuttingHeat(Mechanism):
     equation = "P = share P_cut"
     source = "Loewen and Shaw 1954, Trans. ASME 76, 217, partition of cutting heat; 3 to 10 % into the spindle"
     signature = "follows load, not speed"
+    needs = "cutting"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"power": "W"}
     parameters = (Spec("share", "1", "share of the power that warms these places", 0.05, 0.7, 0.0, 1.0, "logit"),)

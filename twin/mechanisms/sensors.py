@@ -31,10 +31,11 @@ class SensorLag(Mechanism):
         "hysteresis loop of one sensor against the others while temperatures rise fast; gone in the steady state"
     )
     acts_at = ("sensor",)
-    parameters = (Spec("lag", "s", "time constant of the sensor in its place", 40.0, 0.7, 0.0, 3600.0),)
+    parameters = (Spec("lag", "s", "time constant of the sensor in its place", 40.0, 0.7, 0.0, 10800.0),)
     along_time = True
     linear_reading = True
     off: ClassVar[Mapping[str, float]] = {"lag": 0.0}
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"lag": (30.0, 90.0, 240.0, 720.0, 2100.0, 7200.0)}
     fault = True
 
     def reading(self, seen: Numeric, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -252,6 +253,9 @@ class TimeSkew(Mechanism):
     parameters = (Spec("delay", "s", "how far the channel runs ahead, signed", 0.0, 120.0, -3600.0, 3600.0, "linear"),)
     along_time = True
     off: ClassVar[Mapping[str, float]] = {"delay": 0.0}
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {
+        "delay": (-600.0, -180.0, -60.0, -20.0, 20.0, 60.0, 180.0, 600.0)
+    }
     fault = True
 
     def reading(self, seen: Numeric, view: View, p: Mapping[str, Numeric]) -> Numeric:

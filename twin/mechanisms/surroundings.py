@@ -30,6 +30,7 @@ class EnclosureAir(Mechanism):
     equation = "capacity dT_air/dt = sum of heat from the surfaces - conductance (T_air - T_room)"
     source = "energy balance of a stirred volume; 2 to 8 K above the room, time constant 5 to 30 min"
     signature = "all surfaces share a fast mode that the room's sensor does not show"
+    needs = "enclosure"
     acts_at = ("exposure", "surrounding")
     parameters = (
         Spec("capacity", "J/K", "heat capacity of the air with the sheet metal", 25e3, 0.7, 10.0, 1e7),
@@ -93,7 +94,7 @@ class FloorSink(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     shape = ("temperature", "follow")
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"temperature": (12.0,)}  # in addition to the default
+    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {"temperature": (12.0, 24.0)}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"body": "itself", "room": "surrounding"}
 
     def expand(self, name: str, part: MechanismPart, twin: TwinPart) -> TwinPart:

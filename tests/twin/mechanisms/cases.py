@@ -73,21 +73,23 @@ def _wall(q: SimpleNamespace) -> Any:
 
 def _open(q: SimpleNamespace) -> Any:
     step = q.t[1] - q.t[0]
+    counted = q.t + q.clock * (q.of_day - q.t)
 
     def since(t: Any) -> Any:
-        return np.clip(((q.t - t) / step).to("dimensionless") + 0.5, 0, 1)
+        return np.clip(((counted - t) / step).to("dimensionless") + 0.5, 0, 1)
 
     return since(q.start) - since(q.start + q.duration)
 
 
 def _chiller(q: SimpleNamespace) -> Any:
     """The jacket cools evenly until the thermostat closes; what then flowed too long is made up for at once."""
-    closes, jacket = q.set_point - q.hysteresis, q.T_jacket
+    shift, jacket = q.follow * (q.T_room - ZERO - 20 * K), q.T_jacket
+    supply, closes = q.supply + shift, q.set_point + shift - q.hysteresis
     opened = jacket > closes
-    heat = q.conductance * (q.supply - jacket) * opened
+    heat = q.conductance * (supply - jacket) * opened
     at = int(np.argmin(opened))
-    since = (closes - jacket[at]) / (jacket[at - 1] - jacket[at])
-    heat[at] = heat[at] - since * q.conductance * (q.supply - (closes + jacket[at]) / 2)
+    since = (closes[at] - jacket[at]) / (jacket[at - 1] - jacket[at])
+    heat[at] = heat[at] - since * q.conductance * (supply[at] - (closes[at] + jacket[at]) / 2)
     return heat
 
 
@@ -101,7 +103,7 @@ def _cycle(q: SimpleNamespace) -> Any:
 
 
 def _sun(q: SimpleNamespace) -> Any:
-    part = ((q.clock - q.rise) / (q.set - q.rise)).to("dimensionless")
+    part = ((q.of_day - q.rise) / (q.set - q.rise)).to("dimensionless")
     height = np.where((part > 0) & (part < 1), np.sin(np.pi * part), 0.0)
     return q.irradiance * q.area * q.absorptivity * height
 
@@ -166,12 +168,13 @@ CASES: Mapping[str, Case] = {
     "radiation": Case(lambda q: q.emissivity * SIGMA * q.area * (q.T_surrounding**4 - q.T_body**4)),
     "draught": Case(
         lambda q: 1 + (q.factor - 1) * _open(q),
-        {"start": 0.52, "duration": 45.0},
+        {"start": 2.3, "duration": 45.0},
         more={"surrounding_K": lambda q: -q.drop * _open(q)},
     ),
     "joint_conductance": Case(lambda q: q.ratio ** q.closed[0]),
     "heat_bridge": Case(None),
     "jacket_chiller": Case(_chiller, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
+    "coolant_jacket": Case(lambda q: q.conductance * (q.supply + q.follow * (q.T_room - ZERO - 20 * K) - q.T_jacket)),
     "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body)),
     "enclosure_air": Case(None),
     "stratification": Case(lambda q: q.gradient * q.height),

@@ -66,7 +66,7 @@ class Point:
         s0 = Q(SEEN_DEGC, "K") + ZERO
         q: dict[str, Any] = {
             "t": t,
-            "clock": Q(self.view.clock_h, "h"),
+            "of_day": Q(self.view.clock_h, "h"),
             "slope": slope,
             "s0": s0,
             "seen": s0 + slope * t,

@@ -137,6 +137,12 @@ def jacket_chiller(m: Mechanism) -> None:
     assert (np.diff(starts) > 180).all() and (np.diff(starts) < 900).all() and len(starts) > 10
 
 
+def coolant_jacket(m: Mechanism) -> None:
+    cold, warm = heat(m, {"jacket": 22.0, "room": np.array([15.0, 25.0])}, {"follow": 1.0})
+    assert (cold, warm) == pytest.approx((150.0 * -7.0, 150.0 * 3.0))  # drawn to the room
+    assert heat(m, {"jacket": 22.0}, {"follow": 1.0}) == heat(m, {"jacket": 22.0, "room": 35.0}) == -300.0
+
+
 def cutting_fluid(m: Mechanism) -> None:
     warm = {"body": 20.0, "tank": 25.0}
     assert heat(m, warm, flow=[0.0, 1.0, 1.0, 0.0]).tolist() == [0.0, 1000.0, 1000.0, 0.0]
@@ -245,7 +251,8 @@ def _discharge() -> View:
 HEAT: Mapping[str, Callable[[Mechanism], None]] = {
     **{f.__name__: f for f in (
         bearing_viscous, bearing_load, viscosity_feedback, preload_feedback, motor_loss, belt_loss, rotating_convection,
-        natural_convection, radiation, draught, joint_conductance, heat_bridge, jacket_chiller, cutting_fluid,
+        natural_convection, radiation, draught, joint_conductance, heat_bridge, jacket_chiller, coolant_jacket,
+        cutting_fluid,
         enclosure_air, stratification, floor_sink, cabinet_heat, hydraulic_unit, sun, cutting_heat, electrical_heat,
         ohmic_heat, supply_sag, voltage_loss_heat, free_flux,
     )},

@@ -50,7 +50,8 @@ def test_each_error_gets_its_own_gain_with_its_prior():
 
 
 def test_a_bar_in_the_spindle_is_a_body_of_its_own():
-    network = network_with(MandrelFixture(), {"gain": "2.3 um/K", "capacity": "1.6 kJ/K", "conductance": "9 W/K"})
+    given = {"gain": "2.3 um/K", "capacity": "1.6 kJ/K", "conductance": "9 W/K"}
+    network = network_with(MandrelFixture(), given, at="first")
     assert network.cells[-1] == "tried"
     conductance = network.conductance_W_per_K(network.values)
     assert conductance[-1].tolist() == [-9.0, 0.0, 0.0, 9.0]
@@ -58,11 +59,35 @@ def test_a_bar_in_the_spindle_is_a_body_of_its_own():
     assert z_um(network, tried=10.0) == pytest.approx(23.0)
 
 
-def test_the_file_may_expose_the_bar_to_the_air():
-    machine = machine_with(MandrelFixture())
+def test_a_bar_in_the_air_takes_its_temperature_alone_or_besides_that_of_its_seat():
+    for at, conductance_W_per_K in ({"air": "room"}, 0.7), ({"seat": "first", "air": "room"}, 9.7):
+        network = network_with(MandrelFixture(), {"conductance": "9 W/K", "film": "0.7 W/K"}, at=at)
+        assert network.surrounding_W_per_K(network.values)[0, -1] == 0.7
+        assert network.conductance_W_per_K(network.values)[-1, -1] == pytest.approx(conductance_W_per_K)
+
+
+def test_the_file_may_expose_the_bar_to_more_air():
+    machine = machine_with(MandrelFixture(), at="first")
     machine.twin["exposures"]["tried-room"] = "0.5 W/K"
     network = compile_network(machine)
     assert network.surrounding_W_per_K(network.values)[0, -1] == 0.5
+    machine.twin["mechanisms"]["tried"]["at"] = {"air": "room"}
+    with pytest.raises(InputError, match=r"exposures\.tried-room: mandrel_fixture adds this one; state it"):
+        compile_network(machine)
+
+
+@pytest.mark.parametrize(
+    ("at", "told"),
+    [
+        (None, r"tried\.at: mandrel_fixture needs seat or air, got \[\]"),
+        ({"nest": "first"}, r"tried\.at: mandrel_fixture needs seat or air, got \['nest'\]"),
+        ({"air": "rom"}, r"tried\.at\.air: no body or surrounding 'rom'; did you mean 'room'\?"),
+        ({"seat": "room"}, r"tried\.at\.seat: no body 'room'"),
+    ],
+)
+def test_a_bar_that_is_nowhere(at, told):
+    with pytest.raises(InputError, match=told):
+        network_with(MandrelFixture(), at=at)
 
 
 def test_a_bar_of_a_body_s_name_is_refused():

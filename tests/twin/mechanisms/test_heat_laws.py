@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_machine import machine_with
 
+from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, View
 
 HEATS = (
     "bearing_viscous", "bearing_load", "motor_loss", "belt_loss", "nut_friction", "guide_friction", "screw_bearing",
-    "natural_convection", "radiation", "jacket_chiller", "cutting_fluid", "cabinet_heat", "hydraulic_unit", "sun",
-    "cutting_heat", "electrical_heat", "ohmic_heat",
+    "natural_convection", "radiation", "jacket_chiller", "coolant_jacket", "cutting_fluid", "cabinet_heat",
+    "hydraulic_unit", "sun", "cutting_heat", "electrical_heat", "ohmic_heat",
 )  # fmt: skip
 FACTORS = ("viscosity_feedback", "preload_feedback", "rotating_convection", "joint_conductance", "draught")
 CALLS = [(k, "heat_W") for k in HEATS] + [(k, "factor") for k in FACTORS]
@@ -160,7 +162,7 @@ def test_no_driver_no_heat_and_more_driver_more_heat(key: str) -> None:
     values = np.array([one_minute(key, degC, **{role: s}) for s in np.linspace(0, largest, 40)])
     assert values[0] == 0.0
     assert (np.diff(values) > 0).all()
-    if law(key).drivers[role] in ("rpm", "mm/min"):
+    if key not in ("electrical_heat", "cutting_heat", "ohmic_heat"):  # it cools; braking; charging has its own heat
         assert one_minute(key, degC, **{role: -largest}) == pytest.approx(values[-1])
 
 
@@ -168,6 +170,50 @@ def one_minute(key: str, degC: Mapping[str, Any], **driver: float) -> float:
     """Heat in W over a batch's first minute."""
     view = seen({port: degC[port] for port in law(key).ports}, **driver)
     return float(np.squeeze(law(key).heat_W(View(**(vars(view) | {"step_s": 60.0})), usual(key))))
+
+
+def test_factors_and_windows_take_a_driver_of_either_sign() -> None:
+    for key, driver in ("rotating_convection", "speed"), ("joint_conductance", "closed"), ("supply_sag", "other"):
+        forth, back = (law(key).factor(seen(**{driver: s}), usual(key)) for s in (0.7, -0.7))
+        assert forth == back, key
+    forth, back = (law("speed_shift").displacement(seen(speed=s), usual("speed_shift")) for s in (5e3, -5e3))
+    assert forth == back > 0.0
+
+
+def test_a_viscous_heat_follows_the_preload_less_and_keeps_some() -> None:
+    """Ball bearings: rolling moment as F^0.54 (SKF 2016); a lead of 10 K at 0.05 /K is half as much preload again."""
+    load, viscous = law("preload_feedback"), law("preload_feedback").multiplying("bearing_viscous")
+    assert load.multiplying("bearing_load").factor(seen({"shaft": 30.0, "housing": 20.0}), usual(load.key)) == (
+        pytest.approx(1.5**1.33)
+    )
+    at = [seen({"shaft": 20.0 + lead, "housing": 20.0}) for lead in (10.0, 0.0, -18.0, -30.0)]
+    assert [float(viscous.factor(view, usual(load.key))) for view in at] == pytest.approx(
+        [1.5**0.54, 1.0, 0.1**0.54, 0.1**0.54]
+    )
+    assert float(load.factor(at[-1], usual(load.key))) == 0.0
+
+
+def test_one_preload_multiplies_each_heat_in_its_own_way() -> None:
+    friction = {"drivers": "motor_rpm", "into": "first"}
+    small = machine_with(load := law("preload_feedback"), acts_on=["load", "shear"])
+    small.twin["mechanisms"] |= {"load": {"law": "bearing_load", **friction}}
+    small.twin["mechanisms"] |= {"shear": {"law": "bearing_viscous", **friction}}
+    view = seen({"shaft": 30.0, "housing": 20.0})
+    heats = {h.law.name: h for h in compile_network(small).heats}
+    shown = {name: float(heats[name].factors[0].mechanism.factor(view, usual(load.key))) for name in ("load", "shear")}
+    assert shown == {"load": pytest.approx(1.5**1.33), "shear": pytest.approx(1.5**0.54)}
+
+
+def test_a_draught_by_the_clock_is_at_the_same_time_of_every_day() -> None:
+    draught, hours = law("draught"), np.arange(0.0, 40.0, 0.05)
+    late = View(time_s=3600.0 * hours, clock_h=(21.0 + hours) % 24.0)
+    cold = -draught.surrounding_K(late, usual("draught", start=6.0, clock=1.0)) > 2.0
+    begins = hours[1:][np.diff(cold.astype(int)) == 1]
+    assert begins == pytest.approx([9.0, 33.0], abs=0.06)  # six in the morning, twice
+    unknown = View(time_s=3600.0 * hours)
+    assert (draught.surrounding_K(unknown, usual("draught", start=6.0, clock=1.0)) == 0.0).all()
+    since = draught.surrounding_K(unknown, usual("draught", start=6.0))
+    assert hours[np.argmin(since)] == pytest.approx(6.0, abs=0.06)
 
 
 def test_braking_power_is_no_cutting_heat() -> None:
@@ -286,7 +332,8 @@ def test_derivatives_by_parameters(key: str, effect: str) -> None:
 
 @pytest.mark.parametrize("key, effect", [c for c in CALLS if MECHANISMS[c[0]].ports])
 def test_derivatives_by_temperatures(key: str, effect: str) -> None:
-    view, p = busy_view(key), usual(key) | ({"coefficient": np.asarray(0.004)} if key == "ohmic_heat" else {})
+    busy = {"ohmic_heat": {"coefficient": 0.004}, "jacket_chiller": {"follow": 0.3}, "coolant_jacket": {"follow": 0.3}}
+    view, p = busy_view(key), usual(key, **busy.get(key, {}))
     for port in law(key).ports:
 
         def vary(d: Any, port: str = port) -> Any:

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_machine import network_with
 
+from data.errors import InputError
 from twin.mechanisms.base import View
-from twin.mechanisms.fluids import JacketChiller
+from twin.mechanisms.fluids import CoolantJacket, JacketChiller
 
 C_J_PER_K, ROOM_W_PER_K, ROOM_DEGC, HEAT_W = 40e3, 10.0, 20.0, 500.0
 P = {"conductance": np.asarray(150.0), "supply": np.asarray(16.0), "set_point": np.asarray(22.0)}
@@ -91,6 +93,35 @@ def test_state_at_the_start_is_the_side_of_the_set_point(first_degC: float, flow
     heat_W = JacketChiller().heat_W(View(degC={"jacket": degC}, time_s=np.arange(3) * 10.0), P)
     assert (heat_W != 0).tolist() == [flows] * 3
     assert (heat_W <= 0).all()
+
+
+def test_a_chiller_that_follows_the_room_switches_with_it() -> None:
+    """On 20 degC in the room all is as stated; 5 K up and the whole sawtooth is 5 K up."""
+    time_s, degC = sawtooth(600.0, 7.0, 1.0)
+    stated = JacketChiller().heat_W(View(degC={"jacket": degC}, time_s=time_s), P)
+    for follow, shift_K in ((1.0, 5.0), (0.4, 2.0)):
+        view = View(degC={"jacket": degC + shift_K, "room": np.full(len(degC), 25.0)}, time_s=time_s)
+        heat_W = JacketChiller().heat_W(view, {**P, "follow": np.asarray(follow)})
+        np.testing.assert_allclose(heat_W, stated)
+    for room in ({}, {"room": np.full(len(degC), 20.0)}):
+        view = View(degC={"jacket": degC, **room}, time_s=time_s)
+        np.testing.assert_array_equal(JacketChiller().heat_W(view, {**P, "follow": np.asarray(1.0)}), stated)
+
+
+def test_a_file_may_name_the_room_or_leave_it_out() -> None:
+    for law in (JacketChiller(), CoolantJacket()):
+        for at, ports in ("first", {"jacket"}), ({"jacket": "first", "room": "room"}, {"jacket", "room"}):
+            tried = next(h.law for h in network_with(law, {"supply": 18.0}, at=at).heats if h.law.name == "tried")
+            assert set(tried.ports) == ports
+        with pytest.raises(InputError, match=r"tried\.at: \w+ needs jacket, room \(optional\), got \['room'\]"):
+            network_with(law, at={"room": "room"})
+
+
+def test_a_share_of_no_room_is_refused() -> None:
+    told = r"tried\.parameters\.follow: means nothing without at\.room; name that place"
+    for law in (JacketChiller(), CoolantJacket()):
+        with pytest.raises(InputError, match=told):
+            network_with(law, {"follow": 1.0}, at="first")
 
 
 def test_state_by_state_is_the_same_law() -> None:

@@ -12,7 +12,7 @@ from test_mechanisms import FREE_FORM, NOTHING, at_work, every, laws, made, stru
 
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
-from twin.mechanisms.base import Mechanism, PortRole
+from twin.mechanisms.base import EQUIPMENT, Mechanism, PortRole
 
 NEVER_OFF = {"enclosure_air", "voltage_loss_heat", "sensor_swap", "sensor_stuck"}
 
@@ -37,6 +37,19 @@ def test_what_is_named_is_a_parameter_within_its_bounds(key: str) -> None:
     assert not set(off) & set(m.shape) and not set(off) & set(m.ghost)
     for name, value in [*off.items(), *m.ghost.items()]:
         assert m.spec(name).low <= value <= m.spec(name).high, name
+
+
+@every
+def test_what_it_needs_and_where_it_is_looked_for_is_known(key: str) -> None:
+    m = made(key)
+    assert not m.needs or m.needs in EQUIPMENT
+    assert m.optional_ports <= set(m.ports) and {port for port, _ in m.of_port.values()} <= m.optional_ports
+    points = [{name: value} for name, values in m.scan.items() for value in values]
+    for point in [*points, *m.scan_points]:
+        for name, value in point.items():
+            assert m.spec(name).low <= value <= m.spec(name).high and value != m.spec(name).value, (name, value)
+    assert len({tuple(p.items()) for p in points}) == len(points)
+    assert set(m.of_port) <= {s.name for s in m.parameters}
 
 
 def test_only_these_cannot_be_switched_off() -> None:
