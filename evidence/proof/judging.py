@@ -23,6 +23,7 @@ from evidence.proof.sealing.isolation import own_source
 from evidence.proof.sealing.opening import Opened
 from evidence.proof.sealing.running import RUN, Examinee, examine
 from evidence.proof.sealing.seal import Done
+from evidence.proof.spec import CENTRES, KIND_PLANTS
 
 if TYPE_CHECKING:
     from evidence.proof.scoring.answer_key import Stored
@@ -53,17 +54,18 @@ def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Exam
 
 def _add(case: Path, plan: str, key: Mapping[str, Any]) -> None:
     """One more recording in a case's folder, and its machine file with the sensor that the plan requests."""
+    from evidence.proof.suite.other_kinds import executed_kind
     from plants.planned import execute
     from plants.plant import csv_text, machine_text
 
     drawn = key["redraw"]
-    done = execute(drawn["seed"], {**drawn["effects"], **drawn["decoys"]}, plan, drawn["plant"], **drawn["options"])
+    if drawn["plant"] in KIND_PLANTS:
+        done = executed_kind(drawn, plan)
+    else:
+        done = execute(drawn["seed"], {**drawn["effects"], **drawn["decoys"]}, plan, drawn["plant"], **drawn["options"])
     (case / "machine.yml").write_text(machine_text(done.machine), encoding="utf-8")
     text = csv_text(done.machine.machine, done.table)
     (case / "recordings" / f"{done.batch.batch_id}.csv").write_text(text, encoding="utf-8")
-
-
-REDRAWN = ("elements", "volumes")  # plants that can be drawn again without an effect
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tup
     from evidence.proof.scoring.true_model import true_model
 
     try:
-        return true_model(machine, batches, key, _redraw(key) if key["plant"] in REDRAWN else None), ""
+        return true_model(machine, batches, key, _redraw(key) if key["plant"] in CENTRES else None), ""
     except (InputError, WorkError) as error:
         return None, str(error)
 

@@ -17,11 +17,10 @@ from evidence.proof.sealing.folder import ProofFolder, files_digest, state_of
 from evidence.proof.sealing.opening import unseal
 from evidence.proof.sealing.running import Examinee, RunOutcome, run
 from evidence.proof.sealing.seal import Done, Suite, seal
-from evidence.proof.spec import PLANT_KINDS, CaseSpec, PlantKind
+from evidence.proof.spec import CENTRES, PLANT_KINDS, REAL, CaseSpec, PlantKind
 
 Which = Literal["development", "sealed"]
 SUITES: tuple[Which, ...] = get_args(Which)
-REAL: tuple[PlantKind, ...] = ("grafted", "withheld")  # their cases are those that the recordings give, each once
 SECRET_BYTES = 32
 SEED_BITS = 63  # of a development suite that nobody gave a seed
 
@@ -36,7 +35,7 @@ class ProofRequest:
     out: Path
     cases: int = 60
     suite: Which = "sealed"
-    plants: tuple[PlantKind, ...] = ("elements", "volumes")
+    plants: tuple[PlantKind, ...] = CENTRES
     seed: int | None = None
     data: Path | None = None
 

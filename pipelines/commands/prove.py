@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError, one_of
+from evidence.proof.spec import PLANT_KINDS
 from pipelines import console
 from pipelines.options import Json, Workers, processes, split
 from reports.labels import NOTHING, count
@@ -81,7 +82,7 @@ app = typer.Typer(help="Examine the diagnosis in public, on recordings in which 
 
 Cases = Annotated[int, typer.Option(help="how many cases")]
 Out = Annotated[Path | None, typer.Option("--out", help="folder of the proof; one that was begun continues")]
-Plants = Annotated[str, typer.Option(help="plants, comma separated")]
+Plants = Annotated[str, typer.Option(help=f"plants, comma separated: {', '.join(PLANT_KINDS)}")]
 Which = Annotated[str, typer.Option("--suite", help="sealed: from a secret; development: from a known seed")]
 Data = Annotated[Path | None, typer.Option("--data", help="folder of real recordings, for grafted and withheld")]
 Seed = Annotated[int | None, typer.Option(help="of a development suite; default: drawn, and printed")]

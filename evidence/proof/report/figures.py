@@ -19,7 +19,11 @@ from reports.drawing import picture as drawn
 from reports.labels import BLUE, GREEN, INK, ORANGE, number, tex_escaped, unit_label
 
 WIDE_IN, HALF_IN = 10.5, 5.5
-_PLANTS = {"elements": (BLUE, "o"), "volumes": (ORANGE, "s"), "grafted": (GREEN, "D"), "withheld": ("#8a4fa3", "^")}
+_PLANTS = {
+    "elements": (BLUE, "o"), "volumes": (ORANGE, "s"), "grafted": (GREEN, "D"), "withheld": ("#8a4fa3", "^"),
+    "lathe": ("#b5495b", "v"), "board": ("#3c7d8c", "P"), "horizontal": ("#7a6a2f", "X"), "gantry": ("#4f5d9e", "<"),
+    "bench": ("#a0622d", ">"), "battery": ("#5b8c3a", "*"),
+}  # fmt: skip
 
 
 def plant_style(plant: str) -> tuple[str, str]:
@@ -48,7 +52,7 @@ def keys(fig: Figure, entries: Sequence[tuple[str, str, str]], y_in: float) -> N
 
 def plant_keys(plants: Sequence[str]) -> list[tuple[str, str, str]]:
     """Legend entries: the plants' letters."""
-    marks = {"o": "●", "s": "■", "D": "◆", "^": "▲"}
+    marks = {"o": "●", "s": "■", "D": "◆", "^": "▲", "v": "▼", "P": "✚", "X": "✖", "<": "◀", ">": "▶", "*": "★"}
     return [(marks[plant_style(p)[1]], f"plant {plant_letter(p)}", plant_style(p)[0]) for p in plants]
 
 

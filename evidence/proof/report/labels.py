@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
+from evidence.proof.spec import UNSEEN
 from reports.labels import NOTHING, number
 
 # Letter, numerics, and how far the recordings are computed.
@@ -14,6 +15,10 @@ _PLANTS = {
     "elements": ("A", "finite elements", "SIMULATED"), "volumes": ("B", "finite volumes", "SIMULATED"),
     "grafted": ("C", "an effect grafted on real recordings", "partly SIMULATED"),
     "withheld": ("D", "real recordings, something kept back", "real"),
+    "lathe": ("E", "lathe", "SIMULATED"), "board": ("F", "laboratory board", "SIMULATED"),
+    "horizontal": ("G", "horizontal machining centre", "SIMULATED"), "gantry": ("H", "gantry", "SIMULATED"),
+    "bench": ("I", "spindle on a bench", "SIMULATED"), "battery": ("J", "battery", "SIMULATED"),
+    UNSEEN: ("unseen kinds", "not developed on", "SIMULATED"),
 }  # fmt: skip
 KIND_WORDS = {
     "nothing": "nothing missing", "decoy": "nothing missing, with a decoy", "one": "one effect", "two": "two effects",
@@ -33,8 +38,9 @@ NOT_SEALED = "A development suite: its seed is known, so these figures show the 
 PARTIAL = "Opened in part: some cases had no answer yet. These figures prove nothing."
 
 METHOD = (
-    "Plants A and B share no code with the twin and use other numerics; what they conceal, how much and where is drawn "
-    "by lot from the suite's seed. Plants C and D, if there, are every case that real recordings give.",
+    "Plants A and B, and E to J of other kinds of machines, share no code with the twin and use other numerics; what "
+    "they conceal, how much and where is drawn by lot from the suite's seed. Plants C and D, if there, are every case "
+    "that real recordings give.",
     "Each answer key gets a salt; the hash of both and of the case's files goes into one list, and the hash of that "
     "list, the root, is published before any case is answered.",
     "Every case is answered in a process of its own that can read its machine file and its recordings and nothing "

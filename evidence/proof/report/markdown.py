@@ -54,7 +54,7 @@ def proof_markdown(run: ProofRun | None) -> str:
         f"{len(run.failed)} failed (counted as wrong)",
         "",
     ]
-    lines += _table(goals, run.plants)
+    lines += _table(goals, run)
     short = shortfalls(goals)
     missed = [*(f"- {said}" for said in short), *_by_plant(goals, run.plants)]
     lines += ["", "Goals that are missed:", "", *missed] if missed else ["", "No goal is missed on any plant."]
@@ -62,9 +62,19 @@ def proof_markdown(run: ProofRun | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _table(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
+def _table(goals: pd.DataFrame, run: ProofRun) -> list[str]:
+    plants = run.goal_columns
     heads = [f"{labels.plant_label(p)} ({labels.plant_origin(p)})" for p in plants]
-    cells = ["measure", "goal", f"all plants ({labels.origin(plants)})", "90 %", "n", "met", labels.INFORMED, *heads]
+    cells = [
+        "measure",
+        "goal",
+        f"all plants ({labels.origin(run.plants)})",
+        "90 %",
+        "n",
+        "met",
+        labels.INFORMED,
+        *heads,
+    ]
     out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
     for g in goal_rows(goals, plants):
         met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)

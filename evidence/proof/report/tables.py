@@ -20,6 +20,7 @@ from evidence.proof.report.labels import (
     plant_origin,
     simulated,
 )
+from evidence.proof.spec import PLANT_KINDS, UNSEEN
 from reports.labels import NOTHING, number, p_label, percent
 from reports.layout import Column, Row, Table
 
@@ -98,11 +99,14 @@ class ProofRun:
 
     @property
     def plants(self) -> tuple[str, ...]:
-        """The plants with a case that counts, in the order of the proof: elements, volumes, grafted, withheld."""
-        from evidence.proof.spec import PLANT_KINDS
-
+        """The plants with a case that counts, in the order of `PLANT_KINDS`."""
         there = set(self.table("outcomes")["plant"])
         return tuple(p for p in PLANT_KINDS if p in there)
+
+    @property
+    def goal_columns(self) -> tuple[str, ...]:
+        """The groups of cases with a column of goals: the unseen kinds of machines together, then every plant."""
+        return (*([UNSEEN] if (self.table("goals")["plant"] == UNSEEN).any() else []), *self.plants)
 
 
 _RARE = 0.05

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from evidence.proof.scoring.goals import GOALS, Goal, Wanted, bootstrap, clopper_pearson, mean, of_groups
+from evidence.proof.spec import UNSEEN, is_unseen
 
 BINS, DRAWS = 10, 1000
 RELIABILITY_COLUMNS = ("low", "high", "n", "claimed", "right", "low90", "high90")
@@ -72,15 +73,20 @@ AHEAD = 0.15  # of the best baseline, in share of right answers
 
 
 def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Columns `GOAL_COLUMNS`, plant "all" first. Shares with exact intervals, the rest by a bootstrap over cases.
+    """Columns `GOAL_COLUMNS`, plant "all" first, then "unseen", kinds of machines that the diagnosis was not developed
+    on, if there are any, then every plant. Shares with exact intervals, the rest by a bootstrap over cases.
     `informed` is what an answer would reach that knows the truth (`goals.Goal`).
 
     `compared` (`evidence.proof.baselines.compared`) adds the lead over the best baseline, for all cases together.
     """
     rows: list[dict[str, Any]] = []
-    for plant in ["all", *sorted(outcomes["plant"].dropna().unique())]:
-        own = outcomes if plant == "all" else outcomes[outcomes["plant"] == plant]
-        parts = terms if plant == "all" else terms[terms["plant"] == plant]
+    there = sorted(outcomes["plant"].dropna().unique())
+    groups = {"all": there, UNSEEN: [p for p in there if is_unseen(p)], **{p: [p] for p in there}}
+    for plant, members in groups.items():
+        if plant == UNSEEN and not members:
+            continue
+        own = outcomes if plant == "all" else outcomes[outcomes["plant"].isin(members)]
+        parts = terms if plant == "all" else terms[terms["plant"].isin(members)]
         rows += [{**row, "plant": plant} for row in _measured(own, parts)]
         if plant == "all" and compared is not None:
             rows.append({**_lead(compared), "plant": plant})

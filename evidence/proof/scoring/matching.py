@@ -22,6 +22,7 @@ UNLISTED = "unlisted"
 FREE = ("free_flux", "free_shift")  # the regressions that stand in for physics of no listed mechanism
 SAME = (
     frozenset({"guide_friction", "nut_friction", "screw_bearing"}),  # heat in proportion to the feed
+    frozenset({"jacket_chiller", "coolant_jacket"}),  # a fluid at a set temperature that takes heat from a body
 )
 SAME_IF_SWITCHED = (
     frozenset({"cabinet_heat", "electrical_heat"}),  # constant heat while one channel is 1

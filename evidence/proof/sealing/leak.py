@@ -26,6 +26,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from threadpoolctl import threadpool_limits
 
+from evidence.proof.spec import SIMULATED
+
 RARE = 0.03  # of the cases; a word of the machine file that is present or absent in fewer carries no information
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?$", re.IGNORECASE)
 
@@ -131,7 +133,7 @@ def _sd(values: Any) -> float:
     return float(np.std(values)) if len(values) else float("nan")
 
 
-PLANTS = ("elements", "volumes")  # real recordings are public, and are no secret
+PLANTS = SIMULATED  # real recordings are public, and are no secret
 SOUND = ("nothing", "decoy")
 FOLDS = 5
 LEAST = 2 * FOLDS  # cases of a class

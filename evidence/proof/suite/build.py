@@ -16,7 +16,8 @@ from data.errors import InputError
 from data.files import write_atomic
 from data.machine import Machine
 from data.recording import read_batches
-from evidence.proof.spec import CaseSpec, PlantKind
+from evidence.proof.spec import KIND_PLANTS, REAL, CaseSpec, PlantKind
+from evidence.proof.suite.other_kinds import drawn_kind, kind_term
 from evidence.proof.suite.sizes import limit
 from evidence.proof.suite.suite import Which, alternatives_of, digits, number
 from plants.effects import EFFECTS
@@ -49,9 +50,6 @@ def batches_of(built: Built) -> list[Batch]:
         write_built(built, Path(place))
         files = sorted((Path(place) / "recordings").iterdir())
         return [batch for file in files for batch in read_batches(file, built.machine)]
-
-
-REAL: tuple[PlantKind, ...] = ("grafted", "withheld")
 
 
 def real_suite(
@@ -117,6 +115,9 @@ def build(spec: CaseSpec, data: Path | None = None) -> Built:
         if data is None:
             raise InputError(f"suite: {spec.name}: plant {spec.plant} needs real recordings; give their folder")
         return build_real(spec, data)
+    if spec.plant in KIND_PLANTS:
+        case = drawn_kind(spec)
+        return Built(case.machine, recording_texts(case), answer_of(spec, case))
     case = _drawn(spec)
     for _ in range(TIMES if any(spec.effects.get(key) for key in RUNS_AWAY) else 0):
         if not _seized(case):
@@ -152,7 +153,8 @@ def without(spec: CaseSpec, *keys: str) -> CaseSpec:
 
 def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
     """The answer key: plain data, `thermodrift.proof_answer/1`."""
-    terms = [_term(spec, term) for term in case.truth["terms"]]
+    term_of = kind_term if spec.plant in KIND_PLANTS else _term
+    terms = [term_of(spec, term) for term in case.truth["terms"]]
     return {
         "schema": SCHEMA,
         "case": spec.name,
@@ -172,9 +174,16 @@ def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
 
 def _idle(machine: Machine, terms: list[dict[str, Any]]) -> list[str]:
     """Drivers that neither the machine file nor anything left out of it depends on."""
-    stated = [part.get("drivers", ()) for part in (machine.twin or {})["mechanisms"].values()]
-    used = {name for drivers in stated for name in ([drivers] if isinstance(drivers, str) else drivers)}
+    stated = [part.get("drivers") or () for part in (machine.twin or {}).get("mechanisms", {}).values()]
+    used = {name for drivers in stated for name in _channels(drivers)}
     return [name for name in machine.names("driver") if name not in used | {t["driver"] for t in terms}]
+
+
+def _channels(drivers: Any) -> list[str]:
+    """Of a mechanism's drivers: one name, several, or one by role."""
+    if isinstance(drivers, str):
+        return [drivers]
+    return list(drivers.values() if isinstance(drivers, Mapping) else drivers)
 
 
 def _term(spec: CaseSpec, term: Mapping[str, Any]) -> dict[str, Any]:

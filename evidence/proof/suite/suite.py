@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from data.errors import InputError
-from evidence.proof.spec import CaseSpec, Kind, PlantKind
+from evidence.proof.spec import CENTRES, KIND_PLANTS, SIMULATED, CaseSpec, Kind, PlantKind
+from evidence.proof.suite.other_kinds import could_have, kind_case
 from evidence.proof.suite.setting import setting
 from evidence.proof.suite.sizes import size
 from plants.effects import EFFECTS
@@ -57,6 +58,8 @@ AMBIGUOUS = ("guide_friction",)  # another mechanism has the same equation: only
 
 def possible(key: str, options: Mapping[str, Any]) -> bool:
     """Whether the plant of these options can have the effect: `has` are the features that its file states."""
+    if "has" not in options or key not in EFFECTS:
+        return could_have(key, str(options.get("plant")))
     kind, stated = EFFECTS[key], set(options["has"])
     if kind.withholds:
         return kind.withholds not in stated and kind.has - {kind.withholds} <= stated
@@ -143,12 +146,11 @@ def ambiguous(options: Mapping[str, Any]) -> set[str]:
     return {effect for pair in PAIRS.values() if pair.holds(options) for effect in pair.truths}
 
 
-SIMULATED: tuple[PlantKind, ...] = ("elements", "volumes")
 HABITUAL = 0.2  # share of the cases that have what makes a pair alike, whatever they lack
 SECRET_BYTES = 16
 
 
-def suite(seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKind] = SIMULATED) -> list[CaseSpec]:
+def suite(seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKind] = CENTRES) -> list[CaseSpec]:
     """The cases of a suite; the same seed gives the same ones.
 
     `seed` is a secret of 128 bits or more for a sealed suite, any number for a development one. The two share no case.
@@ -170,6 +172,8 @@ def suite(seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKin
 
 def case(name: str, kind: Kind, plant: PlantKind, seed: int, which: Which) -> CaseSpec:
     """The case of a seed: first the setting, the same for every kind, then by lot what it lacks."""
+    if plant in KIND_PLANTS:
+        return kind_case(name, kind, plant, seed, which)
     lot = stream(seed, "lot")
     options = setting(seed, which)
     share = 1.0 if kind == "confounded" else _habitual(kind)
@@ -230,6 +234,7 @@ def _check(seed: bytes | int, cases: int, which: str, plants: Sequence[Any]) -> 
         raise InputError(f"suite: seed: got {got}, expected {8 * SECRET_BYTES} bits or more; draw a secret")
     for plant in plants or ("none",):
         if plant not in SIMULATED:
-            raise InputError(f"suite: plants: got {plant}, expected {' or '.join(SIMULATED)}; name those")
+            known = f"{', '.join(SIMULATED[:-1])} or {SIMULATED[-1]}"
+            raise InputError(f"suite: plants: got {plant}, expected {known}; name those")
     if cases < 1:
         raise InputError(f"suite: cases: got {cases}, expected 1 or more; request more")

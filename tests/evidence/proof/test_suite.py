@@ -65,8 +65,8 @@ def test_the_same_secret_gives_the_same_suite_and_another_shares_no_seed() -> No
         ((7, 10, "sealed"), "seed: got the number 7, expected 128 bits or more; draw a secret"),
         ((b"short", 10, "sealed"), "seed: got 40 bits, expected 128 bits or more"),
         ((7, 0, "development"), "cases: got 0, expected 1 or more"),
-        ((7, 9, "development", ()), "plants: got none, expected elements or volumes"),
-        ((7, 9, "development", ("grafted",)), "plants: got grafted, expected elements or volumes"),
+        ((7, 9, "development", ()), "plants: got none, expected elements, volumes, lathe"),
+        ((7, 9, "development", ("grafted",)), "plants: got grafted, expected elements, volumes, lathe"),
     ],
 )
 def test_what_is_asked_wrongly_is_told_in_one_line(given: tuple[Any, ...], words: str) -> None:
