@@ -5,9 +5,10 @@ READY := .venv/.ready
 
 .PHONY: run test lint prove bench clean lock
 
-run: $(READY)  ## the main job on the built-in sample year
+run: $(READY)  ## the main job on the built-in sample year, then a sealed demonstration of the diagnosis
 	$(BIN)/thermodrift simulate --sample-year --out var/sample_year
 	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year --effort quick
+	$(BIN)/thermodrift demonstrate
 
 test: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile

@@ -12,6 +12,7 @@ import typer
 from data.errors import InputError, WorkError
 from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
+from pipelines.commands.demonstrate import demonstrate
 from pipelines.commands.describe import describe
 from pipelines.commands.diagnose import diagnose
 from pipelines.commands.ingest import ingest
@@ -35,7 +36,7 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
     describe, ingest, train, report, promote, rollback, status, predict, schedule, simulate, calibrate, diagnose,
-    reproduce,
+    demonstrate, reproduce,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

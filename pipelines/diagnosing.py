@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Protocol
 
@@ -30,14 +31,16 @@ from models.protocols import PromotionRule
 from models.result import GridResult
 from pipelines import tracking
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
+from pipelines.inputs import INPUTS, Inputs
 from pipelines.recordings import Gathered, check_recordings, gather_batches
 from pipelines.settings import Settings, home
+from reports.diagnosis.first_screen import Continued
 from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
 
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
 _EVERY_BATCH = "leave-batch-out"  # the one protocol that predicts every batch, so that trainings can be compared
-FILES = (REPORT, PLAN, MACHINE, FINDINGS)  # the last one says that the others are complete
+FILES = (REPORT, PLAN, MACHINE, INPUTS, FINDINGS)  # the last one says that the others are complete
 
 
 class Diagnose(Protocol):
@@ -72,7 +75,8 @@ class DiagnosisRequest:
 class DiagnosisOutcome:
     """A diagnosis, the files in the folder `out` by name, and the run that tracks it.
 
-    `trouble`: why there is no new machine file though something was found, else empty.
+    `trouble`: why there is no new machine file though something was found, else empty. `continued`: the earlier
+    diagnosis that this one continues.
     """
 
     diagnosis: Diagnosis
@@ -81,6 +85,7 @@ class DiagnosisOutcome:
     run_id: str
     ingested: IngestReport | None = None
     trouble: str = ""
+    continued: Continued | None = None
 
     @property
     def summary(self) -> str:
@@ -119,15 +124,37 @@ def diagnose_file(
     caller = caller or DirectCaller()
     gather = partial(gather_batches, machine, batch_ids=request.batch_ids, say=say)
     gathered: Gathered = caller.map("ingest", gather, [request.recordings], retries=RETRIES)[0]
+    return finished(request, machine, text, gathered, settings, say, done, caller, work)
+
+
+def finished(
+    request: DiagnosisRequest,
+    machine: Machine,
+    text: str,
+    gathered: Gathered,
+    settings: Settings,
+    say: Say,
+    done: Done | None,
+    caller: Caller,
+    work: Diagnose | None,
+    continued: Continued | None = None,
+) -> DiagnosisOutcome:
+    """The work on batches that are there: diagnose, write OUT, track.
+
+    Args:
+        text: of the machine file that is diagnosed.
+        continued: the earlier diagnosis of OUT; its findings are kept there under another name.
+    """
     batches = list(gathered.batches)
     say(f"diagnose {machine.machine}: {len(batches)} batches")
     found = caller.map("diagnose", partial(_diagnosed, machine, batches, request.seed, say, done), [work])[0]
     say("write")
-    files, trouble = write_diagnosis(found, request.out, text, request.report)
+    inputs = Inputs.of(machine.machine, request.machine_file, text, request.seed, batches)
+    files, trouble = write_diagnosis(found, request.out, text, request.report, inputs, continued)
     say("track")
     track = partial(_track, found, batches, request, settings, say)
     run_id = caller.map("track", track, [files], retries=RETRIES)[0]
-    return DiagnosisOutcome(found, request.out, files, run_id, gathered.ingested, trouble)
+    return DiagnosisOutcome(found, request.out, files, run_id, gathered.ingested, trouble, continued)
 
 
 def check_diagnosis(request: DiagnosisRequest) -> tuple[Machine, str]:
@@ -152,11 +179,20 @@ def check_diagnosis(request: DiagnosisRequest) -> tuple[Machine, str]:
     return machine, request.machine_file.read_text(encoding="utf-8")
 
 
-def write_diagnosis(d: Diagnosis, out: Path, text: str, report: bool = True) -> tuple[dict[str, Path], str]:
+def write_diagnosis(
+    d: Diagnosis,
+    out: Path,
+    text: str,
+    report: bool = True,
+    inputs: Inputs | None = None,
+    continued: Continued | None = None,
+) -> tuple[dict[str, Path], str]:
     """Fill OUT, all files or none; returns them by name, and why the machine file is missing where one is due.
 
     Args:
         text: of the machine file that was diagnosed.
+        inputs: what a later diagnosis needs to continue this one; without them it cannot.
+        continued: the earlier diagnosis; its findings are kept as `findings.1.json`, `findings.2.json`, …
 
     Raises:
         WorkError: OUT cannot be written; what stood there is unchanged.
@@ -168,16 +204,27 @@ def write_diagnosis(d: Diagnosis, out: Path, text: str, report: bool = True) -> 
         machine_file = new_machine_file(d, text, f"machine file {out / MACHINE}", datetime.now().astimezone())
     except (InputError, WorkError) as error:  # the findings are written all the same
         trouble = str(error)
-    with staged(out, FILES) as scratch:
+    kept = [] if continued is None else [_free_name(out)]
+    with staged(out, [*kept, *FILES]) as scratch:
+        for name in kept:
+            (scratch / name).write_bytes((out / FINDINGS).read_bytes())
         (scratch / FINDINGS).write_text(as_json(_naming_plan(d)), encoding="utf-8")
         if machine_file is not None:
             (scratch / MACHINE).write_text(machine_file, encoding="utf-8")
         if d.plan_text is not None:
             (scratch / PLAN).write_text(d.plan_text, encoding="utf-8")
+        if inputs is not None:
+            (scratch / INPUTS).write_text(inputs.text, encoding="utf-8")
         if report:
-            write_diagnosis_report(scratch / REPORT, d)
-        names = [name for name in reversed(FILES) if (scratch / name).exists()]
+            write_diagnosis_report(scratch / REPORT, d, continued=continued)
+        names = [name for name in (*reversed(FILES), *kept) if (scratch / name).exists()]
     return {name: out / name for name in names}, trouble
+
+
+def _free_name(out: Path) -> str:
+    """``findings.1.json``, or the next number that is free."""
+    taken = {p.name for p in out.iterdir()}
+    return next(name for k in count(1) if (name := f"findings.{k}.json") not in taken)
 
 
 def new_machine_file(d: Diagnosis, text: str, where: str, when: datetime) -> str | None:

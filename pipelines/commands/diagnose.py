@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.errors import WorkError
+from data.errors import InputError, WorkError
 from pipelines import console
-from pipelines.options import Json, MachineFile, split
+from pipelines.options import Json, split
 from reports.labels import count, number, unit_label
 
 if TYPE_CHECKING:
@@ -32,6 +33,19 @@ def diagnosis_dict(outcome: DiagnosisOutcome) -> dict[str, Any]:
         "run_id": outcome.run_id,
         "quarantined": [r.reason for r in outcome.ingested.quarantined] if outcome.ingested else [],
         "trouble": outcome.trouble,
+        **({} if outcome.continued is None else {"continued": continued_dict(outcome)}),
+    }
+
+
+def continued_dict(outcome: DiagnosisOutcome) -> dict[str, Any]:
+    """What a continued diagnosis changed: new recordings, those that follow the proposed run, the earlier verdict."""
+    c = outcome.continued
+    assert c is not None
+    return {
+        "new": list(c.new),
+        "made": list(c.made),
+        "before": c.before.model_dump(mode="json", by_alias=True),
+        "changed": c.sentences(outcome.diagnosis.findings),
     }
 
 
@@ -47,6 +61,8 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
         FINDINGS: "the findings, for other programs",
     }
     d, f = outcome.diagnosis, outcome.diagnosis.findings
+    kept = {p for p in outcome.files if p.startswith("findings.") and p != FINDINGS}
+    contents |= dict.fromkeys(sorted(kept), "the findings of the earlier diagnosis")
     label = "  (simulated recordings)" if d.simulated else ""
     against = " against a drafted network: the machine file has no twin part" if d.drafted else ""
     console.line(f"{f.machine}: diagnosis of {count(len(f.batches), 'batch')}{against}{label}")
@@ -56,6 +72,8 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
     console.out.print(headline(f.verdict, [x.probability for x in f.findings]), style="bold", highlight=False)
     for line in sentences(d):
         console.line(line)
+    for line in outcome.continued.sentences(f) if outcome.continued is not None else ():
+        console.line(f"changed: {line}")
     if len(d.tables["rms"]):
         console.out.print(error_table(d))
     if f.findings:
@@ -71,21 +89,25 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
 
 def sentences(d: Diagnosis) -> list[str]:
     """A sentence a finding with its probability, numbered; without any, what the verdict means here."""
+    from reports.diagnosis.first_screen import limits_sentence, shortened
     from reports.diagnosis.tables import below_headline
 
     f = d.findings
     if f.findings:
         return [f"{k}. {_with_probability(x)}" for k, x in enumerate(f.findings, 1)]
     lead = f.statement or below_headline(f.verdict, f.fit.batches, len(d.tables["limits"]))
-    return [lead] if lead else []
+    limits = limits_sentence(f.detection_limits) if f.verdict == "consistent" else ""
+    return [text for text in (shortened(lead), limits) if text]
 
 
 def _with_probability(x: Finding) -> str:
     """The statement; an unsure one states its probability itself."""
+    from reports.diagnosis.first_screen import shortened
     from reports.diagnosis.tables import NARROW, probability_label
 
     percent = probability_label(x.probability).replace(NARROW, " ")
-    return x.statement if percent in x.statement else f"{x.statement} ({percent})"
+    said = shortened(x.statement)
+    return said if percent in said else f"{said} ({percent})"
 
 
 def error_table(d: Diagnosis) -> Table:
@@ -102,13 +124,17 @@ def error_table(d: Diagnosis) -> Table:
 
 
 def diagnose(
-    machine: MachineFile,
-    to: Annotated[Path, typer.Option("--out", help="folder of report, findings and the new machine file")],
+    machine: Annotated[Path | None, typer.Option("--machine", help="machine file (.yml)")] = None,
+    to: Annotated[Path | None, typer.Option("--out", help="folder of report, findings and new machine file")] = None,
     recordings: Annotated[
         list[Path] | None, typer.Option(help="files or folders to ingest and diagnose on; default: the lake")
     ] = None,
     batches: Annotated[str, typer.Option(help="batch ids, comma separated; default: all")] = "",
-    seed: Annotated[int, typer.Option(help="of all random draws")] = 0,
+    earlier: Annotated[
+        Path | None,
+        typer.Option("--continue", help="folder of an earlier diagnosis, to repeat with --recordings added to its own"),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="of all random draws; default: 0, or the earlier one's")] = None,
     report: Annotated[bool, typer.Option(help="write report.html")] = True,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace an earlier diagnosis of this machine")
@@ -119,14 +145,39 @@ def diagnose(
     from pipelines import settings
 
     settings.configure_environment()
+    from pipelines.continuing import ContinueRequest, continue_diagnosis
     from pipelines.diagnosing import DiagnosisRequest, diagnose_file
 
-    request = DiagnosisRequest(machine, to, tuple(recordings or ()), split(batches), seed, report, overwrite)
-    with console.progress(as_json) as (say, done):
-        outcome = diagnose_file(request, settings.load(), say, done)
+    given = tuple(recordings or ())
+    if earlier is not None:
+        _check_alone(earlier, {"--out": to, "--batches": batches, "--overwrite": overwrite})
+        more = ContinueRequest(earlier, given, machine, seed, report)
+        with console.progress(as_json) as (say, done):
+            outcome = continue_diagnosis(more, settings.load(), say, done)
+    else:
+        file, out = _needed("--machine", machine), _needed("--out", to)
+        request = DiagnosisRequest(file, out, given, split(batches), seed or 0, report, overwrite)
+        with console.progress(as_json) as (say, done):
+            outcome = diagnose_file(request, settings.load(), say, done)
     if as_json:
         console.print_json(diagnosis_dict(outcome))
     else:
         print_diagnosis(outcome)
     if outcome.trouble:
         raise WorkError(f"{outcome.trouble}; the findings stand in {outcome.out}")
+
+
+def _needed(option: str, given: Path | None) -> Path:
+    if given is None:
+        raise InputError(f"missing option {option}; give it, or --continue the folder of an earlier diagnosis")
+    return given
+
+
+def _check_alone(earlier: Path, others: Mapping[str, object]) -> None:
+    """Raises InputError where an option is given that --continue decides itself."""
+    used = [name for name, value in others.items() if value]
+    if used:
+        raise InputError(
+            f"{used[0]}: does not go with --continue, which takes all recordings of {earlier} and writes there; "
+            f"leave {used[0]} out"
+        )

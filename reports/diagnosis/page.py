@@ -11,6 +11,7 @@ from diagnosis.result import Diagnosis
 from reports.diagnosis import figures as evidence
 from reports.diagnosis import tables
 from reports.diagnosis.figures import before_after, by_run, left_out_batches
+from reports.diagnosis.first_screen import Continued, Unsealed, limits_sentence, shortened
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, telling
 from reports.drawing import Picture, picture
@@ -234,6 +235,11 @@ class DiagnosisPage:
     found: tuple[Found, ...]
     figures: tuple[KeyFigure, ...]
     settle: str  # the run that would distinguish tied causes
+    unsealed: Unsealed | None  # of a demonstration
+    changed: tuple[str, ...]  # by further recordings
+    improved: str  # how many left-out runs are predicted better, where something was found
+    mostly_better: bool
+    written: str  # the files next to the page
     remarks: tuple[str, ...]
     parts: tuple[Part, ...]
     method: tuple[str, ...]
@@ -241,21 +247,38 @@ class DiagnosisPage:
     seconds: str
 
 
-def write_diagnosis_report(path: Path, d: Diagnosis, pictures: bool = True) -> None:
+def write_diagnosis_report(
+    path: Path,
+    d: Diagnosis,
+    pictures: bool = True,
+    unsealed: Unsealed | None = None,
+    continued: Continued | None = None,
+) -> None:
     """Write the page. It is self-contained; it appears whole or not at all.
 
     Without `pictures` the tables and text alone.
 
+    Args:
+        unsealed: a demonstration's panel, above everything else.
+        continued: the diagnosis that this one continues; the page says what changed.
+
     Raises:
         InputError: another suffix than .html, or a place that cannot be written.
     """
-    write_page(Path(path), "diagnosis", diagnosis_page(d, pictures), (".html",))
+    write_page(Path(path), "diagnosis", diagnosis_page(d, pictures, unsealed, continued), (".html",))
 
 
-def diagnosis_page(d: Diagnosis, pictures: bool = True) -> DiagnosisPage:
+def diagnosis_page(
+    d: Diagnosis, pictures: bool = True, unsealed: Unsealed | None = None, continued: Continued | None = None
+) -> DiagnosisPage:
     """Collect the page; whatever table is empty leaves its section out."""
     f = d.findings
     lead = f.statement or tables.below_headline(f.verdict, f.fit.batches, bool(len(d.tables["limits"])))
+    if f.verdict == "consistent" and not f.findings:
+        lead = f"{shortened(lead)} {limits_sentence(f.detection_limits)}".strip()
+    written = "findings.json"
+    if f.findings and unsealed is None:
+        written += "; the machine file with what was found: machine.yml"
     return DiagnosisPage(
         title=f"Diagnosis of {f.machine}: {tables.CHIPS[f.verdict]}",
         machine=f.machine,
@@ -263,11 +286,16 @@ def diagnosis_page(d: Diagnosis, pictures: bool = True) -> DiagnosisPage:
         verdict=f.verdict,
         chip=tables.CHIPS[f.verdict],
         headline=tables.headline(f.verdict, [x.probability for x in f.findings]),
-        lead="" if f.findings else lead,  # the findings say it themselves
+        lead="" if f.findings else shortened(lead),  # the findings say it themselves
         drafted=_DRAFTED if d.drafted else "",
         found=tuple(_found(k, x) for k, x in enumerate(f.findings, 1)),
         figures=tuple(_figures(d)),
         settle="" if f.next_experiment is None else tables.experiment_sentence(f.next_experiment),
+        unsealed=unsealed,
+        changed=() if continued is None else tuple(continued.sentences(f)),
+        improved=f"{f.fit.batches_improved} of {f.fit.batches} left-out runs improve" if f.findings else "",
+        mostly_better=2 * f.fit.batches_improved > f.fit.batches,
+        written=written,
         remarks=d.remarks,
         parts=tuple(diagnosis_parts(d, pictures)),
         method=tables.METHOD,
@@ -281,7 +309,7 @@ def _found(k: int, x: Finding) -> Found:
     others = [(o.mechanism, o.where.kind, o.where.name, o.probability) for o in x.alternatives]
     return Found(
         k,
-        x.statement,
+        shortened(x.statement),
         what,
         tables.place_label(x.where.kind, x.where.name),
         x.when.regime,

@@ -1,0 +1,1 @@
+"""A sealed demonstration: an effect is concealed in simulated runs, diagnosed without the answer, and revealed."""

@@ -1,0 +1,298 @@
+"""The demonstration: conceal and seal, have it answered by a process that sees no answer, open, and judge.
+
+The case's folder (machine file, recordings) is all that the answering process sees; both walls of
+`evidence.proof.sealing.isolation` stand around it. What is concealed is committed to beforehand by a salted SHA-256.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from data.errors import InputError, WorkError
+from data.files import check_folder, write_atomic
+from data.machine import Machine, load_machine
+from data.processes import ending, without_interrupt
+from diagnosis.findings.schema import Finding, as_json
+from diagnosis.result import Diagnosis
+from evidence.demonstration.answering import DIAGNOSIS, STATUS
+from evidence.demonstration.plain import from_plain
+from evidence.proof.scoring.answer_key import SCHEMA, AnswerKey
+from evidence.proof.scoring.matching import matches, means
+from evidence.proof.sealing.folder import folder_digest, now, salted_digest
+from evidence.proof.sealing.isolation import allowed, own_source
+from evidence.proof.sealing.seal import SALT_BYTES
+from plants.sample.concealed import Case, conceal, write_case
+from reports.diagnosis.first_screen import Outcome, Unsealed
+from reports.diagnosis.page import write_diagnosis_report
+
+REPORT, PLAN, FINDINGS, SEALED, OPENED = "report.html", "next_run.yml", "findings.json", "sealed.json", "opened.json"
+CASE = "case"
+LIMIT_S = 900.0
+BEGIN = "import sys; sys.path.insert(0, sys.argv[1]); from evidence.demonstration.answering import main; main()"
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+Say = Callable[[str], None]
+Done = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Answerer:
+    """Who answers: a function as ``module:function``, called as `diagnose` is, and folders that it is imported from."""
+
+    diagnose: str = "diagnosis.diagnose:diagnose"
+    import_from: tuple[str, ...] = ()
+    limit_s: float = LIMIT_S
+
+
+@dataclass(frozen=True)
+class Seal:
+    """What was committed to before the diagnosis began: SHA-256 over salt ‖ answer, of the case, and when (UTC)."""
+
+    digest: str
+    case_digest: str
+    at: str
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """`outcome` as the page names it, in `reports.diagnosis.first_screen`.
+
+    `finding` is the one that counts for what was concealed, None where none does; `false` are claims that are not true.
+    """
+
+    outcome: Outcome
+    finding: Finding | None
+    false: tuple[Finding, ...]
+
+    @property
+    def right(self) -> bool:
+        """Whether the answer is right as a whole: all of what was concealed, and nothing else."""
+        return self.outcome in ("found", "nothing_right")
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """A demonstration that was opened; everything in it is simulated. `files` lie in `out`, by name."""
+
+    seed: int
+    seal: Seal
+    answer: Mapping[str, Any]
+    diagnosis: Diagnosis
+    judgement: Judgement
+    isolation: str
+    out: Path
+    files: Mapping[str, Path]
+
+
+def demonstrate(
+    seed: int,
+    out: Path,
+    say: Say = lambda text: None,
+    done: Done | None = None,
+    effect: str | None = None,
+    by: Answerer | None = None,
+) -> Demonstration:
+    """Conceal what the seed draws, seal it, have it diagnosed without the answer, open it, and write the page.
+
+    An earlier demonstration in `out` is replaced.
+
+    Args:
+        say: gets a line when the seal is on disk, when it was answered, and when it was opened.
+        done: progress of the diagnosis, (step, n, of).
+        effect: a key of `plants.sample.concealed.EFFECTS` or "nothing", instead of what the seed draws.
+
+    Raises:
+        InputError: a seed, effect or folder that cannot be used.
+        WorkError: the diagnosis failed, or its process did not start; what was concealed stays sealed.
+    """
+    by = by or Answerer()
+    case = conceal(seed, effect)
+    _emptied(out)
+    salt = secrets.token_hex(SALT_BYTES)
+    machine_file, _ = write_case(case, out / CASE)
+    seal = _sealed(case, salt, out)
+    say(f"sealed     sha256 {seal.digest} (simulated recordings, {len(case.recordings)} runs)")
+    machine = load_machine(machine_file)
+    diagnosis, isolation = answered(out / CASE, machine, by, done)
+    f = diagnosis.findings
+    say(f"answered   {f.verdict.replace('_', ' ')}: {_named(f.findings) or 'nothing named'} ({isolation})")
+    write_atomic(out / FINDINGS, as_json(f))
+    judgement = judged(diagnosis, case.answer, machine)
+    opened = {"seed": seed, "salt": salt, "answer": case.answer, "digest": seal.digest, "sealed": seal.at,
+              "opened": now(), "isolation": isolation, "outcome": judgement.outcome}  # fmt: skip
+    write_atomic(out / OPENED, _json(opened))
+    panel = unsealed(case.answer, diagnosis, judgement, seal, seed, isolation)
+    say(f"opened     {panel.headline}")
+    return Demonstration(seed, seal, case.answer, diagnosis, judgement, isolation, out, _written(out, diagnosis, panel))
+
+
+def answered(case: Path, machine: Machine, by: Answerer, done: Done | None = None) -> tuple[Diagnosis, str]:
+    """The diagnosis of the case in a folder by a process that sees a copy of it and nothing else; which walls stood.
+
+    Raises:
+        WorkError: the process did not start, failed, or did not end in time.
+    """
+    with tempfile.TemporaryDirectory(prefix="thermodrift-") as scratch:
+        place = Path(scratch).resolve()
+        if (seen := allowed().covers(place)) is not None:
+            raise InputError(
+                f"TMPDIR {place}: lies in {seen}, which the answering process may see; give another TMPDIR"
+            )
+        shutil.copytree(case, place / "case")
+        for path in (place / "case").rglob("*"):
+            os.utime(path, (0, 0))  # when a case was written is no part of it
+        (place / "answer").mkdir()
+        (place / "witness").write_text("not to be read\n", encoding="utf-8")
+        ended = _run(place, by, done)
+        file = place / "answer" / STATUS
+        status = json.loads(file.read_bytes()) if file.exists() else {"error": ended}
+        if status["error"]:
+            raise WorkError(f"demonstration: the diagnosis failed: {status['error']}")
+        text = (place / "answer" / DIAGNOSIS).read_text(encoding="utf-8")
+    return from_plain(text, machine, "demonstration: answer"), str(status["isolation"])
+
+
+def judged(diagnosis: Diagnosis, answer: Mapping[str, Any], machine: Machine) -> Judgement:
+    """The answer by the rules of the proof: the mechanism, at the place or one that touches it; all else is false."""
+    f = diagnosis.findings
+    sensors = (machine.twin or {}).get("sensors", {})
+    key = AnswerKey.from_json(
+        {
+            "schema": SCHEMA,
+            "case": "demonstration",
+            "kind": "one",
+            "plant": "sample",
+            "suite": "demonstration",
+            **answer,
+        }
+    )
+    found = matches(f, key, {name: str(part["at"]) for name, part in sensors.items()})
+    false = tuple(found.findings[n] for n in found.false)
+    if not key.terms:
+        silent = f.verdict == "consistent" and not f.findings
+        return Judgement("nothing_right" if silent else "false_alarm", None, false)
+    own = found.of_term[0]
+    if own is not None:
+        return Judgement("found_and_more" if false else "found", found.findings[own], false)
+    tied = [x for n, x in enumerate(found.findings) if n not in found.false]
+    if tied:
+        return Judgement("in_set", tied[0], false)
+    same = next((x for x in found.findings if means(x.mechanism, key.terms[0])), None)
+    if same is not None:
+        return Judgement("other_place", same, tuple(x for x in false if x is not same))
+    return Judgement("wrong" if false else "missed", None, false)
+
+
+def unsealed(
+    answer: Mapping[str, Any], d: Diagnosis, judgement: Judgement, seal: Seal, seed: int, isolation: str
+) -> Unsealed:
+    """The panel on top of the page: what was concealed, what was named, how it was sealed."""
+    first = judgement.finding or next(iter(d.findings.findings), None)
+    return Unsealed(
+        outcome=judgement.outcome,
+        concealed=str(answer["words"]),
+        finding=first,
+        false=tuple(x for x in judgement.false if x is not first),
+        verdict=d.findings.verdict,
+        digest=seal.digest,
+        sealed_at=seal.at,
+        seed=seed,
+        isolation=isolation,
+    )
+
+
+def _sealed(case: Case, salt: str, out: Path) -> Seal:
+    """Commit to the answer; it is on disk when this returns, and the answer itself is not."""
+    seal = Seal(salted_digest(salt, case.answer), folder_digest(out / CASE), now())
+    how = "SHA-256 over salt, then the answer as JSON with sorted keys and no blanks; opened.json has both"
+    plain = {"digest": seal.digest, "case": seal.case_digest, "sealed": seal.at, "how": how}
+    write_atomic(out / SEALED, _json(plain))
+    return seal
+
+
+def _emptied(out: Path) -> None:
+    """Make the folder, and take away what an earlier demonstration left there.
+
+    Raises:
+        InputError: it cannot be written, or holds a case of something else.
+    """
+    check_folder(out, [out / n for n in (REPORT, PLAN, FINDINGS, SEALED, OPENED)], overwrite=(out / SEALED).exists())
+    if (out / CASE).exists() and not (out / SEALED).exists():
+        raise InputError(f"{out / CASE}: is there, and is no demonstration's; give another --out")
+    shutil.rmtree(out / CASE, ignore_errors=True)
+    for name in (REPORT, PLAN, FINDINGS, SEALED, OPENED):
+        (out / name).unlink(missing_ok=True)
+
+
+def _written(out: Path, d: Diagnosis, panel: Unsealed) -> dict[str, Path]:
+    """The page and the plan of the next run; all files by name."""
+    write_diagnosis_report(out / REPORT, d, unsealed=panel)
+    if d.plan_text is not None:
+        write_atomic(out / PLAN, d.plan_text)
+    names = (REPORT, FINDINGS, PLAN, SEALED, OPENED)
+    return {name: out / name for name in names if (out / name).exists()}
+
+
+def _run(place: Path, by: Answerer, done: Done | None) -> str:
+    """Run the process to its end; why there may be no answer."""
+    task = {"place": str(place), "diagnose": by.diagnose, "import_from": by.import_from}
+    command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
+    own = str(place / "answer")
+    environment = dict.fromkeys(THREADS, "1") | {"HOME": own, "TMPDIR": own, "LANG": "C.UTF-8", "TZ": "UTC"}
+    with (place / "output").open("wb") as errors:
+        with without_interrupt():
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=place / "case",
+                env=environment,
+            )  # fmt: skip
+        late = threading.Timer(by.limit_s, process.kill)
+        late.start()
+        try:
+            with ending(process.kill):
+                assert process.stdin is not None and process.stdout is not None
+                with suppress(BrokenPipeError):  # it has ended already, and its output says why
+                    process.stdin.write(json.dumps(task).encode())
+                    process.stdin.close()
+                for line in process.stdout:
+                    _relay(line, done)
+                process.wait()
+        finally:
+            late.cancel()
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+    said = (place / "output").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    if process.returncode == -9:
+        return f"no end within {by.limit_s:g} s"
+    return said[-1] if said else "it ended without a message; run it again"
+
+
+def _relay(line: bytes, done: Done | None) -> None:
+    """Hand a line of progress on; whatever else is printed is no progress."""
+    try:
+        step, n, of = json.loads(line)
+    except (ValueError, TypeError):
+        return
+    if done is not None:
+        done(str(step), int(n), int(of))
+
+
+def _named(findings: tuple[Finding, ...]) -> str:
+    return ", ".join(f"{x.mechanism} at {x.where.name}, {100 * x.probability:.0f} %" for x in findings)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n"

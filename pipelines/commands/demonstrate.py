@@ -1,0 +1,52 @@
+"""`thermodrift demonstrate`: a sealed demonstration of the diagnosis on simulated runs; the work is in `evidence`."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines import console
+from pipelines.options import Json
+
+if TYPE_CHECKING:
+    from evidence.demonstration.demonstrating import Demonstration
+
+
+def demonstration_dict(d: Demonstration) -> dict[str, Any]:
+    """The demonstration for other programs; everything in it is simulated."""
+    return {
+        "simulated": True, "seed": d.seed, "outcome": d.judgement.outcome, "right": d.judgement.right,
+        "sealed": {"digest": d.seal.digest, "case": d.seal.case_digest, "at": d.seal.at},
+        "concealed": dict(d.answer), "diagnosis": d.diagnosis.findings.model_dump(mode="json", by_alias=True),
+        "isolation": d.isolation, "out": str(d.out), "files": {name: str(path) for name, path in d.files.items()},
+    }  # fmt: skip
+
+
+def today_seed() -> int:
+    """Today's date as YYYYMMDD."""
+    return int(f"{date.today():%Y%m%d}")
+
+
+def demonstrate(
+    seed: Annotated[int | None, typer.Option(help="draws what is concealed; default: today's date, YYYYMMDD")] = None,
+    to: Annotated[Path | None, typer.Option("--out", help="folder of the page; default: var/demonstration")] = None,
+    as_json: Json = False,
+) -> None:
+    """Conceal an effect in simulated runs, seal it, diagnose without the answer, and open the seal."""
+    from evidence.demonstration.demonstrating import REPORT
+    from evidence.demonstration.demonstrating import demonstrate as work
+    from pipelines.settings import home
+
+    def say(text: str) -> None:
+        if not as_json:
+            console.line(text)
+
+    with console.progress(as_json) as (_, done):
+        d = work(today_seed() if seed is None else seed, to or home() / "demonstration", say, done)
+    if as_json:
+        console.print_json(demonstration_dict(d))
+    else:
+        console.line(f"page       {d.files[REPORT]}")
