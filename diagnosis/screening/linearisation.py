@@ -13,19 +13,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data.arrays import Array
+from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Candidate, CandidateKind, Fitted
 from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
 from twin.calibration.least_squares import x_of
+from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
+from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
+from twin.mechanisms.base import View
 from twin.network import Heat, Law, Network
-from twin.quantity import Parameter, Value
+from twin.quantity import Parameter, Value, convert
 from twin.schema import TwinPart
+from twin.simulation import Simulation, simulate
 
 AMPLITUDE_OF = "candidate "  # a parameter's source that says whose amplitude it is
 NEARLY_OFF = 1e-12  # where a share cannot be 0
+EVEN_STEPS = 1e-6  # of the longest, by which steps of an even grid differ
 
 
 @dataclass(frozen=True)
@@ -144,6 +150,16 @@ def _sleeping(network: Network, names: set[str]) -> Network:
     )
 
 
+def columns_of(
+    problem: CalibrationProblem, batches: Sequence[Batch], network: Network, z: Array, nuisance: Sequence[Array],
+    numbers: Sequence[int],
+) -> Array:  # fmt: skip
+    """Derivatives (n, k) of all rows by k numbered parameters of a network with more in it, at a fit's unknowns."""
+    other = on_network(problem, batches, network)
+    at, own = carried_z(problem, other, z), carried_nuisances(problem, other, nuisance)
+    return np.concatenate(list(other.columns(x_of(other.unknowns, at), own, numbers)))
+
+
 def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
     """By candidate the change (n_b,) of every batch's rows, in units of the given noise, at its usual values.
 
@@ -151,13 +167,19 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
     """
     out: dict[str, list[Array]] = {}
     left_out: dict[str, str] = {}
-    before = fitted.problem.residuals(fitted.x, fitted.state.nuisance)
+    problem, nuisance = fitted.problem, fitted.state.nuisance
+    before = problem.residuals(fitted.x, nuisance)
+    run = simulate(problem.network, fitted.values, *problem.own(nuisance))
     for c in proposed:
         if c.amplitudes or c.part is None:
             continue
         try:
-            swap = c.kind is CandidateKind.SENSOR_SWAP
-            change = _exchanged(fitted, c, before) if swap else difference(fitted, c.applied(fitted.part), before)
+            if c.kind is CandidateKind.SENSOR_SWAP:
+                change = _exchanged(fitted, c, before)
+            elif MECHANISMS[c.mechanism].effects() == ("reading",) and c.part.at is None and not c.part.drivers:
+                change = _read_otherwise(fitted, c, run)
+            else:
+                change = difference(fitted, c.applied(fitted.part), before)
         except (InputError, WorkError) as error:
             left_out[c.name] = str(error)
             continue
@@ -176,6 +198,27 @@ def difference(fitted: Fitted, part: TwinPart, before: Sequence[Array]) -> list[
     x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
     after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
     return [b - a for b, a in zip(before, after, strict=True)]
+
+
+def _read_otherwise(fitted: Fitted, c: Candidate, run: Simulation) -> list[Array]:
+    """A sensor or a clock moves no heat: the law reads the same simulation otherwise."""
+    assert c.part is not None
+    problem, mechanism = fitted.problem, MECHANISMS[c.mechanism]
+    given = {k: convert(v.value, mechanism.spec(k).unit) for k, v in c.part.parameters.items()}
+    p = {s.name: np.asarray(given.get(s.name, s.value)) for s in mechanism.parameters}
+    steps = np.diff(run.time_s, axis=1)
+    even = steps.size and np.ptp(steps) < EVEN_STEPS * steps.max()
+    view = View(time_s=run.time_s, step_s=float(steps[0, 0]) if even else np.nan)
+    series = np.concatenate([run.readings[0], run.errors[0]], axis=-1)
+    out = [np.zeros(len(m.row)) for m in problem.measured]
+    for name in several(c.part.acts_on):
+        k = problem.channels.index(name)
+        moved = np.asarray(mechanism().reading(series[..., k], view, p)) - series[..., k]
+        for b, m in enumerate(problem.measured):
+            at = m.channel == k
+            first = moved[b, m.first[k]] if m.is_error[k] else 0.0
+            out[b][at] = (moved[b, m.row[at]] - first) / problem.noise[k]
+    return out
 
 
 def _exchanged(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array] | None:

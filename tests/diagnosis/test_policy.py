@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from diagnosis.policy import POLICY, STAGES, Policy, markdown
+from diagnosis.structure.policy import StructurePolicy
 
 ROOT = Path(__file__).parents[2]
 # Numerics and presentation: grids, guards against division by zero, digits, widths, axes of tables.
@@ -23,11 +24,13 @@ NO_DECISION = {
     "fitting/regression.py": {
         "MATRIX_FILTER_ROWS", "MEMORY_REACHES_ROWS", "MEMORY_SHARES", "MIN_DIRECTION_SQUARE",
     },
+    "structure/covariance.py": {"MAD_TO_SD"},
+    "structure/screen.py": {"NO_TRACE"},
     "localisation/free_series.py": {"STEP_HALVINGS", "UNUSED_CORNER"},
     "localisation/linearised.py": {"MAX_MODAL_VALUES"},
     "localisation/where_when.py": {"CLOCK_EDGES_H", "MAX_DRIVER_LEVELS", "SINCE_START_EDGES_MIN"},
     "screening/evidence.py": {"TINY"},
-    "screening/linearisation.py": {"NEARLY_OFF"},
+    "screening/linearisation.py": {"EVEN_STEPS", "NEARLY_OFF"},
     "screening/screen.py": {"NO_TRACE_SD"},
     "search/null.py": {"CACHED_NULLS", "TINY"},
 }  # fmt: skip
@@ -69,7 +72,7 @@ def test_numbers_are_seen_however_they_are_assigned() -> None:
     assert constants(text) == {"A", "C", "D", "E", "_I"}
 
 
-@pytest.mark.parametrize("field", fields(Policy), ids=lambda f: f.name)
+@pytest.mark.parametrize("field", [*fields(Policy), *fields(StructurePolicy)], ids=lambda f: f.name)
 def test_every_threshold_has_a_unit_a_reason_and_its_evidence(field: object) -> None:
     metadata = field.metadata  # type: ignore[attr-defined]
     assert metadata["unit"] and len(metadata["reason"]) > 10

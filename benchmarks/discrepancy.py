@@ -1,0 +1,143 @@
+"""Does the simulated structural discrepancy tell missing physics from structure on machines of other kinds?
+
+    python -m benchmarks.discrepancy --kinds lathe board --cases 12 --out var/discrepancy
+
+Draws cases of every kind (nothing missing, one effect, an effect of no list; amplitudes log-uniform from 1.5 to 25
+noise sigmas before recalibration), runs one round of `diagnosis.structure` on each, and prints by kind: the area under
+the curve of nothing against one by the score in thresholds, effects named first without a false alarm and at the
+threshold, false alarms, and seconds of CPU. Cases that are done are kept and not done again; `--workers` side by side.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from data.errors import InputError, WorkError
+from data.processes import Processes
+from diagnosis.fitting.batches import usable_batches
+from diagnosis.structure.fit import baseline
+from diagnosis.structure.naming import Refit, detect
+from plants.kinds import KINDS, draw_kind_case, effects_of, unlisted_of
+from twin.compile import compile_network
+from twin.schema import twin_part
+
+SIGMAS = (1.5, 25.0)
+SHARES = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
+SHOWN = 10
+
+
+def drawn(kind: str, seed: int) -> tuple[str, dict[str, float]]:
+    """What a case lacks: "nothing", "one" or "unlisted", and the effect with the sigma asked for."""
+    rng = np.random.default_rng([seed, 77])
+    what = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    sigma = float(np.exp(rng.uniform(*np.log(SIGMAS))))
+    pool = {"nothing": (), "one": effects_of(kind), "unlisted": unlisted_of(kind)}[what]
+    pool = tuple(key for key in pool if not key.startswith("wrong_"))  # what calibration alone repairs
+    return what, {str(rng.choice(pool)): sigma} if pool else {}
+
+
+def examined(kind: str, seed: int, out: str) -> dict[str, Any]:
+    """One case, from its file where it is done already."""
+    path = Path(out) / f"{kind}_{seed}.json"
+    if path.exists():
+        return dict(json.loads(path.read_text()))
+    what, effects = drawn(kind, seed)
+    case = draw_kind_case(seed, kind, effects, decoys=seed % 2 == 1)
+    begun = time.process_time()
+    row: dict[str, Any] = {"kind": kind, "seed": seed, "what": what, "terms": case.truth["terms"]}
+    try:
+        with threadpool_limits(limits=1):
+            part = twin_part(case.machine)
+            batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
+            found = detect(baseline(case.machine, part, batches), 0)
+        row |= {
+            "threshold": found.threshold, "score": found.score, "null": np.sort(found.null.gain).round(2).tolist(),
+            "listed": [_plain(r) for r in found.listed], "free": [_plain(r) for r in found.free],
+            "screen": [_scored(s) for s in found.screen.scored[:SHOWN]], "inflation": dict(found.screen.inflation),
+            "rows": found.before.problem.measured[0].row.size, "candidates": len(found.screen.scored),
+        }  # fmt: skip
+    except (InputError, WorkError) as error:
+        row["trouble"] = str(error)
+    row["cpu_s"] = round(time.process_time() - begun, 1)
+    path.write_text(json.dumps(row, default=float))
+    return row
+
+
+def _plain(r: Refit) -> dict[str, Any]:
+    c = r.candidate
+    return {"name": c.name, "mechanism": c.mechanism, "kind": c.where.kind, "place": c.where.name, "gain": r.gain,
+            "level": r.level, "screen": r.scored.gain}  # fmt: skip
+
+
+def _scored(s: Any) -> dict[str, Any]:
+    c = s.candidate
+    return {"name": c.name, "mechanism": c.mechanism, "kind": c.where.kind, "place": c.where.name, "gain": s.gain}
+
+
+def right(row: Mapping[str, Any], named: Mapping[str, Any] | None) -> bool:
+    """Whether a refit names the one effect: its mechanism (or one that is the same law) at its place or next to it."""
+    if named is None or not row["terms"]:
+        return False
+    t = row["terms"][0]
+    places = {t["where"]["name"], *(a["name"] if isinstance(a, dict) else a for a in t["also"]), *t["neighbours"]}
+    ends = {end for place in places for end in place.split("-")}
+    same = {t["mechanism"], *t.get("same_as", ())}
+    return named["mechanism"] in same and bool({named["place"], *named["place"].split("-")} & (places | ends))
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line a kind, and one for all."""
+    head = "kind        n none/one/unl   AUC   named, no false alarm   named   false alarms   unlisted   CPU s"
+    out = [head]
+    kinds = sorted({r["kind"] for r in rows})
+    for kind in [*kinds, "all"]:
+        own = [r for r in rows if kind in ("all", r["kind"]) and "score" in r]
+        none, one, unlisted = ([r for r in own if r["what"] == what] for what in SHARES)
+        if not none or not one:
+            continue
+        a, b = np.array([r["score"] for r in none]), np.array([r["score"] for r in one])
+        auc = float(np.mean((b[:, None] > a) + 0.5 * (b[:, None] == a)))
+        first = [right(r, next(iter(r["listed"]), None)) for r in one]
+        clean = sum(f and s > a.max() for f, s in zip(first, b, strict=True))
+        named = sum(f and s > 1.0 for f, s in zip(first, b, strict=True))
+        flagged = sum(r["score"] > 1.0 for r in unlisted)
+        cpu = np.median([r["cpu_s"] for r in own])
+        false = int(np.sum(a > 1.0))
+        out.append(
+            f"{kind:<11} {len(none):>3} {len(one):>3} {len(unlisted):>3}  {auc:6.2f}   {clean:>3} of {len(one):<10}"
+            f"  {named:>3} of {len(one):<3} {false:>5} of {len(none):<4} {flagged:>4} of {len(unlisted):<3} {cpu:8.1f}"
+        )
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--kinds", nargs="+", default=["lathe", "board"], choices=list(KINDS))
+    parser.add_argument("--cases", type=int, default=12, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("var/discrepancy"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    tasks = [(kind, given.first + k, str(given.out)) for k in range(given.cases) for kind in given.kinds]
+    rows = []
+    with Processes(given.workers) as pool:
+        for k, row in pool.completed(examined, tasks):
+            rows.append(row)
+            best = next(iter(row.get("listed", ())), {"name": row.get("trouble", "none"), "gain": 0.0})
+            effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or "nothing"
+            print(f"{tasks[k][0]:<10} {effect:<30} score {row.get('score', 0):6.2f}  {best['name'][:50]} "
+                  f"{best['gain']:.0f} nats  {row['cpu_s']:.0f} s", flush=True)  # fmt: skip
+    print("\n".join(table(rows)))
+
+
+if __name__ == "__main__":
+    main()
