@@ -40,7 +40,7 @@ def test_a_flow_writes_and_tracks_what_the_command_does(
     assert read_findings(out / "findings.json").machine == "flow-diagnosed" and (out / "report.html").exists()
     assert diagnoses("flow-diagnosed", store)["verdict"].tolist() == ["explained"]
     assert f"flow-diagnosed: {words}" in capfd.readouterr().out
-    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d: None)
+    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d, **_: None)
     toy.verdict = "consistent"
     assert flows.diagnose(str(machine), [], str(out)) == f"diagnosed: consistent, {out}"
     assert not (out / "machine.yml").exists()

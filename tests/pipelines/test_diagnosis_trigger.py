@@ -76,7 +76,7 @@ def test_the_first_training_has_nothing_to_grow_from(home: Path, store: Settings
 @pytest.fixture
 def grown(home: Path, store: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A machine whose twin's error on a new batch has grown by 40 %; its lake holds three recordings."""
-    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d: None)
+    monkeypatch.setattr("reports.diagnosis.page.write_diagnosis_report", lambda path, d, **_: None)
     name = f"grown-{zlib.crc32(str(tmp_path).encode()):x}"
     file = write_machine(tmp_path / "m.yml", name)
     ingest([write_recordings(tmp_path / "in")], load_machine(file), Lake(home / "lake"))

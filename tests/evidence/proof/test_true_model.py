@@ -167,4 +167,4 @@ def test_it_begins_with_less_where_all_of_it_cannot_be_simulated(monkeypatch: py
 
 def _place(s: Scored) -> str:
     assert s.candidate.part is not None and isinstance(s.candidate.part.at, dict)
-    return str(s.candidate.part.at["seat"])
+    return str(s.candidate.part.at.get("seat"))
