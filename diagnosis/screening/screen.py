@@ -43,10 +43,19 @@ def proposed(fitted: Fitted) -> list[Candidate]:
     """All mechanisms at all places, and the alternatives that doubt the machine file's values.
 
     Lags and skews are screened by their slope alone: at a value of their own they would compete with the slack that
-    every fit has for them.
+    every fit has for them. Only laws without a trace at their usual value are screened at others, and radiation goes to
+    surroundings alone: the time of a screen and of its null grows with the number of candidates.
     """
     every = candidates(fitted.machine, fitted.part) + alternatives(fitted.problem.network)
-    return [c for c in every if c.amplitudes or not c.variant_of]
+    return [c for c in every if not (c.variant_of and c.mechanism not in SCANNED) and not _between_bodies(c, fitted)]
+
+
+SCANNED = ("draught", "floor_sink")  # laws that are screened at several values of their shape
+
+
+def _between_bodies(c: Candidate, fitted: Fitted) -> bool:
+    at = c.part.at if c.mechanism == "radiation" and c.part is not None else None
+    return isinstance(at, Mapping) and at.get("surrounding") in fitted.part.bodies
 
 
 def screen(fitted: Fitted, every: Sequence[Candidate]) -> Screen:

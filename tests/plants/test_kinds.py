@@ -149,7 +149,7 @@ def at_steps(at: KindPosed, step_s: float) -> dict[str, np.ndarray]:
     return {n: np.concatenate([r[n] for r in rows]) for n in true}
 
 
-@pytest.mark.parametrize("kind", KIND_NAMES)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[] if k == "board" else pytest.mark.slow) for k in KIND_NAMES])
 def test_half_the_step_gives_the_same_within_the_noise(kind: str) -> None:
     key = "radiation" if "radiation" in effects_of(kind) else "natural_convection"
     at = posed(21, kind, {key: 10.0}, runs=2)

@@ -113,7 +113,10 @@ def test_the_best_amplitude_is_the_rows_where_they_say_much_and_the_priors_else(
 # Planted effects
 
 
-@pytest.mark.parametrize("case", PLANTED)
+USUAL = ("drift", "shift")  # the others with -m slow
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in USUAL else pytest.mark.slow) for c in PLANTED])
 def test_what_is_planted_comes_first_with_its_size(case: str) -> None:
     *_, name, amplitude, size = PLANTED[case]
     _, seen = of(case)
