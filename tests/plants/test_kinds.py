@@ -17,6 +17,7 @@ from twin.compile import compile_network
 from twin.schema import twin_part
 
 KIND_NAMES = tuple(KINDS)
+SWEPT = [pytest.param(k, marks=[] if k in ("lathe", "board") else pytest.mark.slow) for k in KIND_NAMES]
 
 
 def bar(cells: int, cooled_W_per_K: float = 0.0) -> Solid:
@@ -93,7 +94,7 @@ def names_of(case: Case) -> dict[str, set[str]]:
     }
 
 
-@pytest.mark.parametrize("kind", KIND_NAMES)
+@pytest.mark.parametrize("kind", SWEPT)
 def test_a_clean_case_compiles_and_its_rows_are_whole(kind: str) -> None:
     case = draw_kind_case(5, kind, runs=2)
     compile_network(case.machine)
@@ -103,7 +104,7 @@ def test_a_clean_case_compiles_and_its_rows_are_whole(kind: str) -> None:
         assert batch.names("driver") and len(batch.names("temperature")) >= 2
 
 
-@pytest.mark.parametrize("kind", KIND_NAMES)
+@pytest.mark.parametrize("kind", SWEPT)
 def test_all_effects_have_places_that_the_file_names(kind: str) -> None:
     of = KINDS[kind]
     for seed in (1, 2):

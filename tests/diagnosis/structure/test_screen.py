@@ -113,7 +113,7 @@ def test_the_best_amplitude_is_the_rows_where_they_say_much_and_the_priors_else(
 # Planted effects
 
 
-USUAL = ("drift", "shift")  # the others with -m slow
+USUAL = ("drift",)  # the others with -m slow
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in USUAL else pytest.mark.slow) for c in PLANTED])

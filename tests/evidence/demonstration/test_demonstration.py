@@ -42,6 +42,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Machine]:
     return folder, load_machine(machine)
 
 
+@pytest.mark.slow
 def test_it_is_sealed_answered_opened_and_written(tmp_path: Path) -> None:
     lines: list[str] = []
     steps: list[tuple[str, int, int]] = []
