@@ -10,8 +10,8 @@ run: $(READY)  ## the main job on the built-in sample year, then a sealed demons
 	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year --effort quick
 	$(BIN)/thermodrift demonstrate
 
-test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+test: $(READY)  ## with bytecode, since many tests start processes
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -2,10 +2,10 @@
 
     python -m benchmarks.discrepancy --kinds lathe board --cases 12 --out var/discrepancy
 
-Draws cases of every kind (nothing missing, one effect, an effect of no list; amplitudes log-uniform from 1.5 to 25
-noise sigmas before recalibration), runs one round of `diagnosis.structure` on each, and prints by kind: the area under
-the curve of nothing against one by the score in thresholds, effects named first without a false alarm and at the
-threshold, false alarms, and seconds of CPU. Cases that are done are kept and not done again; `--workers` side by side.
+Draws cases of the proof for every kind (nothing missing, one effect, an effect of no list), runs one round of
+`diagnosis.structure` on each, and prints by kind: the area under the curve of nothing against one by the score in
+thresholds, effects named first without a false alarm and at the threshold, false alarms, and seconds of CPU. Cases that
+are done are kept and not done again; `--workers` side by side.
 """
 
 from __future__ import annotations
@@ -22,44 +22,47 @@ from threadpoolctl import threadpool_limits
 
 from data.errors import InputError, WorkError
 from data.processes import Processes
+from diagnosis.diagnose import diagnose
+from diagnosis.findings.schema import Findings
 from diagnosis.fitting.batches import usable_batches
 from diagnosis.structure.fit import baseline
 from diagnosis.structure.naming import Refit, detect
-from plants.kinds import KINDS, draw_kind_case, effects_of, unlisted_of
+from evidence.proof.scoring.answer_key import AnswerKey, Spot
+from evidence.proof.scoring.matching import names_term
+from evidence.proof.spec import KIND_PLANTS, Kind, PlantKind
+from evidence.proof.suite.build import answer_of
+from evidence.proof.suite.other_kinds import drawn_kind, kind_case
 from twin.compile import compile_network
-from twin.schema import twin_part
+from twin.schema import TwinPart, twin_part
 
-SIGMAS = (1.5, 25.0)
-SHARES = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
+SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
 
 
-def drawn(kind: str, seed: int) -> tuple[str, dict[str, float]]:
-    """What a case lacks: "nothing", "one" or "unlisted", and the effect with the sigma asked for."""
-    rng = np.random.default_rng([seed, 77])
-    what = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    sigma = float(np.exp(rng.uniform(*np.log(SIGMAS))))
-    pool = {"nothing": (), "one": effects_of(kind), "unlisted": unlisted_of(kind)}[what]
-    pool = tuple(key for key in pool if not key.startswith("wrong_"))  # what calibration alone repairs
-    return what, {str(rng.choice(pool)): sigma} if pool else {}
-
-
-def examined(kind: str, seed: int, out: str) -> dict[str, Any]:
-    """One case, from its file where it is done already."""
-    path = Path(out) / f"{kind}_{seed}.json"
+def examined(kind: PlantKind, seed: int, out: str, engine: str = "structure") -> dict[str, Any]:
+    """One case, from its file where it is done already; `engine` is `structure`, or `search`: the diagnosis as it is."""
+    path = Path(out) / f"{engine}_{kind}_{seed}.json"
     if path.exists():
         return dict(json.loads(path.read_text()))
-    what, effects = drawn(kind, seed)
-    case = draw_kind_case(seed, kind, effects, decoys=seed % 2 == 1)
+    what = np.random.default_rng(seed).choice(list(SHARES), p=list(SHARES.values()))
+    spec = kind_case("case_0001", what, kind, seed, "development")
+    case = drawn_kind(spec)
+    key = AnswerKey.from_json(answer_of(spec, case))
     begun = time.process_time()
     row: dict[str, Any] = {"kind": kind, "seed": seed, "what": what, "terms": case.truth["terms"]}
     try:
         with threadpool_limits(limits=1):
             part = twin_part(case.machine)
             batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
+            if engine == "search":
+                row |= _searched(diagnose(case.machine, batches).findings, key, part)
+                row["cpu_s"] = round(time.process_time() - begun, 1)
+                path.write_text(json.dumps(row, default=float))
+                return row
             found = detect(baseline(case.machine, part, batches), 0)
         row |= {
             "threshold": found.threshold, "score": found.score, "null": np.sort(found.null.gain).round(2).tolist(),
+            "right": _names(found.best, key, part),
             "listed": [_plain(r) for r in found.listed], "free": [_plain(r) for r in found.free],
             "screen": [_scored(s) for s in found.screen.scored[:SHOWN]], "inflation": dict(found.screen.inflation),
             "rows": found.before.problem.measured[0].row.size, "candidates": len(found.screen.scored),
@@ -69,6 +72,19 @@ def examined(kind: str, seed: int, out: str) -> dict[str, Any]:
     row["cpu_s"] = round(time.process_time() - begun, 1)
     path.write_text(json.dumps(row, default=float))
     return row
+
+
+def _searched(found: Findings, key: AnswerKey, part: TwinPart) -> dict[str, Any]:
+    """The answer of the diagnosis: above 1 where it claims something."""
+    bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
+    first = found.findings[0] if found.findings else None
+    right = (
+        first is not None
+        and bool(key.terms)
+        and names_term(first.mechanism, Spot(first.where.kind, first.where.name), key.terms[0], bodies)
+    )
+    listed = [{"name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0)} for f in found.findings]
+    return {"score": 2.0 if found.findings else 0.0, "right": right, "listed": listed, "verdict": found.verdict}
 
 
 def _plain(r: Refit) -> dict[str, Any]:
@@ -82,15 +98,13 @@ def _scored(s: Any) -> dict[str, Any]:
     return {"name": c.name, "mechanism": c.mechanism, "kind": c.where.kind, "place": c.where.name, "gain": s.gain}
 
 
-def right(row: Mapping[str, Any], named: Mapping[str, Any] | None) -> bool:
-    """Whether a refit names the one effect: its mechanism (or one that is the same law) at its place or next to it."""
-    if named is None or not row["terms"]:
+def _names(best: Refit | None, key: AnswerKey, part: TwinPart) -> bool:
+    """Whether a refit names the one effect, by the rules of the proof."""
+    if best is None or not key.terms:
         return False
-    t = row["terms"][0]
-    places = {t["where"]["name"], *(a["name"] if isinstance(a, dict) else a for a in t["also"]), *t["neighbours"]}
-    ends = {end for place in places for end in place.split("-")}
-    same = {t["mechanism"], *t.get("same_as", ())}
-    return named["mechanism"] in same and bool({named["place"], *named["place"].split("-")} & (places | ends))
+    c = best.candidate
+    bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
+    return names_term(c.mechanism, Spot(c.where.kind, c.where.name), key.terms[0], bodies)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -105,7 +119,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             continue
         a, b = np.array([r["score"] for r in none]), np.array([r["score"] for r in one])
         auc = float(np.mean((b[:, None] > a) + 0.5 * (b[:, None] == a)))
-        first = [right(r, next(iter(r["listed"]), None)) for r in one]
+        first = [r["right"] for r in one]
         clean = sum(f and s > a.max() for f, s in zip(first, b, strict=True))
         named = sum(f and s > 1.0 for f, s in zip(first, b, strict=True))
         flagged = sum(r["score"] > 1.0 for r in unlisted)
@@ -120,14 +134,15 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--kinds", nargs="+", default=["lathe", "board"], choices=list(KINDS))
+    parser.add_argument("--kinds", nargs="+", default=["lathe", "board"], choices=KIND_PLANTS)
     parser.add_argument("--cases", type=int, default=12, help="of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--engine", default="structure", choices=["structure", "search"])
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("var/discrepancy"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    tasks = [(kind, given.first + k, str(given.out)) for k in range(given.cases) for kind in given.kinds]
+    tasks = [(kind, given.first + k, str(given.out), given.engine) for k in range(given.cases) for kind in given.kinds]
     rows = []
     with Processes(given.workers) as pool:
         for k, row in pool.completed(examined, tasks):

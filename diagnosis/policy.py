@@ -92,6 +92,8 @@ class Policy:
     signed_max_square: float = convention(50.0, "squared sd", "bounds what an unusual signed size costs")
     shape_default_sd: float = physical(0.5, "log, or the parameter's unit", "prior of a shape whose law states none")
     shape_parameter_cost_nats: float = analytic(2.0, "nats", "each parameter that shapes an effect (Schwarz 1978)")
+    unnamed_equipment_odds: float = physical(0.05, "odds", "a machine file seldom leaves out what the machine has")
+    machinery_where_nothing_moves_odds: float = physical(1e-3, "odds", "a board of heaters has no bearings")
     missing_companion_cost_nats: float = physical(3.0, "nats", "a law whose companion is not at its place")
     start_min_amplitude_share: float = convention(1e-3, "of the usual value", "lowest start of a positive amplitude")
     start_share_margin: float = convention(0.005, "share", "a fitted share begins so far from 0 and 1")

@@ -8,13 +8,14 @@ would pass for physics.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from diagnosis.candidates.alternatives import heat_amplitudes
 from diagnosis.contracts import Candidate, CandidateKind, Fitted
 from diagnosis.policy import POLICY
+from twin.schema import TwinPart
 
 SLACK_MECHANISMS = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
 
@@ -22,7 +23,9 @@ SLACK_MECHANISMS = ("sensor_place", "sensor_lag", "time_skew", "column_bending",
 def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
     """Prior sd of the amplitude, by candidate, of those that every fit has as slack."""
     out = {}
-    gains, small, films = _chain_gains(fitted), _small(fitted), _films(fitted)
+    gains, small = _chain_gains(fitted), _small(fitted)
+    conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
+    films = films_W_per_K(fitted.part, conductance)
     for c in proposed:
         if c.mechanism == "sensor_place":
             out[c.name] = POLICY.sensor_place_sd
@@ -89,13 +92,12 @@ def _sides(c: Candidate) -> set[str]:
     return set(c.part.at.values())
 
 
-def _films(fitted: Fitted) -> dict[tuple[str, str], float]:
-    """Conductance in W/K by body and surrounding, as fitted.
+def films_W_per_K(part: TwinPart, conductance: Mapping[str, float]) -> dict[tuple[str, str], float]:
+    """Conductance by body and surrounding; `conductance` is that of the exposures by name.
 
     What a body gives to an enclosure's air counts as given to what that air exchanges with.
     """
-    conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
-    exposures = fitted.part.exposures
+    exposures = part.exposures
     around: dict[str, list[str]] = {}
     for e in exposures.values():
         around.setdefault(e.of.partition("@")[0], []).append(e.to)

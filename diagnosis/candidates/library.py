@@ -6,10 +6,12 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations, product
 
 from data.machine import Machine
 from diagnosis.contracts import Candidate, Kind, Where, pieces_of
+from diagnosis.policy import POLICY
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import Mechanism, PortRole, Target
@@ -51,7 +53,6 @@ MOVING = frozenset({"rotating parts", "bearings", "guides", "ball screw"})
 
 # Machine files name the parts that their writer knew. A twentieth has what its file does not hint at; a board or a cell
 # without a moving part has no chiller, bearings or screws, short of a mistake in the file.
-LOG_ODDS_UNNAMED, LOG_ODDS_NO_MACHINE = math.log(1 / 20), math.log(1 / 1000)
 
 
 @dataclass(frozen=True)
@@ -89,15 +90,16 @@ def candidates(machine: Machine, part: TwinPart, keys: Iterable[str] = MECHANISM
 def log_prior_odds(machine: Machine, part: TwinPart | None, candidate: Candidate) -> float:
     """Natural logarithm of the odds that a machine has the equipment that a candidate needs, 0 where nothing is needed.
 
-    0 too where the machine file names the equipment or a driver implies it; `LOG_ODDS_UNNAMED` where nothing hints at
-    it, `LOG_ODDS_NO_MACHINE` where it belongs to machines that move and nothing moves here.
+    0 too where the machine file names the equipment or a driver implies it. Lower where nothing hints at it, and lowest
+    where it belongs to machines that move and nothing moves here.
     """
     if candidate.mechanism not in MECHANISMS:
         return 0.0
-    needs, named = MECHANISMS[candidate.mechanism].needs, equipment_named(machine, part)
-    if not needs or needs in named:
+    needs = MECHANISMS[candidate.mechanism].needs
+    if not needs or needs in (named := equipment_named(machine, part)):
         return 0.0
-    return LOG_ODDS_UNNAMED if needs not in OF_MACHINES or named & MOVING else LOG_ODDS_NO_MACHINE
+    hinted = needs not in OF_MACHINES or named & MOVING
+    return math.log(POLICY.unnamed_equipment_odds if hinted else POLICY.machinery_where_nothing_moves_odds)
 
 
 def equipment_named(machine: Machine, part: TwinPart | None) -> frozenset[str]:
@@ -109,11 +111,16 @@ def equipment_named(machine: Machine, part: TwinPart | None) -> frozenset[str]:
     found = {MECHANISMS[given.law].needs for given in part.mechanisms.values()} - {""} if part else set()
     found |= BY_SPEED if _driven_in(machine, "rpm") else frozenset()
     found |= BY_FEED if _driven_in(machine, "mm/min", "mm") else frozenset()
-    words = _words_of(machine, part)
-    for equipment, stems in HINTS.items():
-        if any(w.startswith(s) or (len(s) >= 5 and s in w) for s in stems for w in words):
-            found.add(equipment)
-    return frozenset(found)
+    return frozenset(found) | _hinted(frozenset(_words_of(machine, part)))
+
+
+@lru_cache(maxsize=64)
+def _hinted(words: frozenset[str]) -> frozenset[str]:
+    """The equipment that words hint at; of one machine file for hundreds of candidates."""
+    hints = {
+        e for e, stems in HINTS.items() for s in stems for w in words if w.startswith(s) or (len(s) >= 5 and s in w)
+    }
+    return frozenset(hints)
 
 
 def _driven_in(machine: Machine, *units: str) -> bool:
@@ -342,7 +349,7 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
     own, pieces = _ends(c.part), pieces_of(part)
     either_way = {"unlinked", "facing"} & set(MECHANISMS[c.mechanism].port_roles.values())
     for given in part.mechanisms.values():
-        if given.law != c.mechanism or _channels(given) != _channels(c.part):
+        if given.law != c.mechanism or driver_channels(given) != driver_channels(c.part):
             continue
         ends = _ends(given)
         if either_way and set(ends.values()) == set(own.values()):
@@ -383,7 +390,8 @@ def _fits(machine: Machine, mechanism: type[Mechanism], c: Candidate) -> bool:
     return by_travel or same_dimension(own, unit) or same_dimension(own, f"{unit}/K")
 
 
-def _channels(given: MechanismPart) -> set[str]:
+def driver_channels(given: MechanismPart) -> set[str]:
+    """The channels of a mechanism's drivers."""
     if isinstance(given.drivers, str):
         return {given.drivers}
     return set((given.drivers or {}).values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from diagnosis.candidates.library import log_prior_odds, outlets_of
 from diagnosis.contracts import Candidate, Fitted, Scored
 from diagnosis.policy import POLICY
+from twin.calibration.least_squares import x_of, z_bounds
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value, convert, same_dimension
 from twin.schema import TwinPart
@@ -92,6 +93,29 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
             if p.value is not None and p.spread is not None
         }
     return values, at
+
+
+def starts(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
+    """Free values and start values of a refit, in the order of trial.
+
+    A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
+    """
+    values, at = start_values(s, now)
+    yield values, {**_joint_start(s, now), **at}
+    yield values, at
+    for share in POLICY.start_amplitude_shares if s.amplitudes else ():
+        yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
+
+
+def _joint_start(s: Scored, now: Fitted) -> dict[str, float]:
+    """Start values of the fit's own parameters: the linear joint optimum with the candidate.
+
+    From their old values some channels would start with large residuals, and their noise would be inflated.
+    """
+    z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
+    values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
+    network = now.problem.network
+    return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}
 
 
 def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:

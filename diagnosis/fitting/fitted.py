@@ -100,6 +100,30 @@ def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
     return np.asarray(start[:, int(np.argmax(conductance))])
 
 
+def carried_start(
+    old: Fitted, part: TwinPart, at: Mapping[str, float] | None = None
+) -> tuple[CalibrationProblem, Array, list[Array]]:
+    """The problem of a changed twin part, and z (p,) and the batches' own unknowns where its fit begins.
+
+    `at` gives start values by parameter name; other new parameters start at their value in the part.
+
+    Raises:
+        InputError: the part does not compile.
+    """
+    network = compile_network(old.machine, part=part)
+    problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
+    z = carried_z(old.problem, problem, old.state.z)
+    known = {u.name for u in old.problem.unknowns}
+    for k, u in enumerate(problem.unknowns):
+        p = network.parameters[network.index(u.name)]
+        begin = at.get(u.name) if at else None
+        if begin is None and u.name not in known:
+            begin = p.value
+        if begin is not None:
+            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
+    return problem, z, carried_nuisances(old.problem, problem, old.state.nuisance)
+
+
 def refitted(
     old: Fitted,
     part: TwinPart,
@@ -117,19 +141,8 @@ def refitted(
     Raises:
         InputError: the part does not compile; WorkError: it cannot be simulated there.
     """
-    network = compile_network(old.machine, part=part)
-    problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
-    z = carried_z(old.problem, problem, old.state.z)
-    known = {u.name for u in old.problem.unknowns}
-    for k, u in enumerate(problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        begin = at.get(u.name) if at else None
-        if begin is None and u.name not in known:
-            begin = p.value
-        if begin is not None:
-            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
+    problem, z, nuisance = carried_start(old, part, at)
     z = np.clip(z, *z_bounds(problem.unknowns))
-    nuisance = carried_nuisances(old.problem, problem, old.state.nuisance)
     state = State.at(
         Filtered(problem, old.memory), z, nuisance, Noise(old.noise.factor, np.ones(len(problem.channels)))
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from typing import TypeVar
@@ -12,7 +12,7 @@ import numpy as np
 from data.arrays import Array
 from data.errors import InputError, WorkError
 from data.processes import Processes
-from diagnosis.candidates.priors import log_prior, start_values
+from diagnosis.candidates.priors import log_prior, start_values, starts
 from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried
 from diagnosis.fitting.fitted import baseline, refitted, settle
 from diagnosis.fitting.regression import Memory, whiter
@@ -20,10 +20,9 @@ from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import alone
 from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import State, descend, x_of, z_bounds
+from twin.calibration.least_squares import State, descend
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
-from twin.quantity import Value
 from twin.schema import TwinPart
 
 T = TypeVar("T")
@@ -80,7 +79,7 @@ def refit(now: Fitted, s: Scored, policy: Policy = POLICY) -> Tried | None:
             return judged(now, Tried(s, 0.0, 0, s.candidate.name, 0.0, fitted), policy=policy)
         except (InputError, WorkError):
             return None
-    for values, begin in _starts(s, now):
+    for values, begin in starts(s, now):
         try:
             part = s.candidate.applied(now.part, values)
             first = Tried(s, 0.0, 0, s.candidate.name, 0.0, refitted(now, part, begin))
@@ -96,18 +95,6 @@ def refit(now: Fitted, s: Scored, policy: Policy = POLICY) -> Tried | None:
         except (InputError, WorkError):
             continue
     return None
-
-
-def _starts(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
-    """Free values and start values of a refit, in the order of trial.
-
-    A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
-    """
-    values, at = start_values(s, now)
-    yield values, {**_joint_start(s, now), **at}
-    yield values, at
-    for share in POLICY.start_amplitude_shares if s.amplitudes else ():
-        yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
 
 
 def _discounted(now: Fitted, c: Candidate) -> bool:
@@ -138,17 +125,6 @@ def _with_equal_weights(now: Fitted, part: TwinPart, begin: Mapping[str, float])
         POLICY.refit_tolerance,
         POLICY.equal_weight_settle_rounds,
     )
-
-
-def _joint_start(s: Scored, now: Fitted) -> dict[str, float]:
-    """Start values of the fit's own parameters: the linear joint optimum with the candidate.
-
-    From their old values some channels would start with large residuals, and their noise would be inflated.
-    """
-    z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
-    values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
-    network = now.problem.network
-    return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}
 
 
 def optimised(now: Fitted, t: Tried, policy: Policy = POLICY) -> Tried:

@@ -12,7 +12,8 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import carried_nuisances, carried_z, check, on_network, spacing_s
+from diagnosis.fitting.fitted import carried_start, check, spacing_s
+from diagnosis.policy import POLICY
 from diagnosis.structure.covariance import (
     Covariance,
     Normal,
@@ -90,7 +91,7 @@ def baseline(
     tell = progress or (lambda what, n, of: None)
     problem = CalibrationProblem.of(compile_network(machine, part=part), batches, _spacing_s(batches))
     k = len(problem.channels)
-    alike = Noise(np.full(k, STRUCTURE.initial_noise_factor), np.full(k, STRUCTURE.initial_rows_per_value))
+    alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
     tell("baseline", 0, 0)
     nothing = [np.zeros(q) for q in problem.nuisance_sizes]
     first = descend(
@@ -146,7 +147,7 @@ def covariance_of(fitted: StructuralFit, linear: Linear, scales: Array) -> Covar
     structure = fitted.structure
     assert structure is not None, "a fit without simulated structure has no covariance"
     sd = white_noise(linear.rows, linear.residual)
-    varying = varying_columns(fitted.machine, fitted.part, fitted.problem, linear)
+    varying = varying_columns(fitted, linear)
     return covariance_at(linear, fitted.problem.unknowns, structure.draws, structure.films, varying, sd, scales)
 
 
@@ -242,19 +243,8 @@ def refitted(
         InputError: the part does not compile; WorkError: it cannot be simulated there.
     """
     assert old.covariance is not None
-    network = compile_network(old.machine, part=part)
-    problem = on_network(old.problem, old.batches, network, free_starts=True)
-    z = carried_z(old.problem, problem, old.state.z)
-    known = {u.name for u in old.problem.unknowns}
-    for k, u in enumerate(problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        begin = at.get(u.name) if at else None
-        if begin is None and u.name not in known:
-            begin = p.value
-        if begin is not None:
-            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
-    z = np.clip(z, *_reach(problem))
-    linear = Linear.at(problem, z, carried_nuisances(old.problem, problem, old.state.nuisance))
+    problem, z, nuisance = carried_start(old, part, at)
+    linear = Linear.at(problem, np.clip(z, *_reach(problem)), nuisance)
     point = descended(problem, linear, [u.name for u in problem.unknowns], old.covariance, steps)
     if not np.isfinite(point.value):
         raise WorkError(f"machine {old.machine.machine}: the changed network cannot be simulated")

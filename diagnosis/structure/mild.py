@@ -13,9 +13,10 @@ import numpy as np
 from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.candidates.alternatives import heat_amplitudes
-from diagnosis.candidates.library import candidates
-from diagnosis.contracts import Candidate
+from diagnosis.candidates.discretisation import films_W_per_K, from_run_to_run
+from diagnosis.candidates.library import candidates, driver_channels
+from diagnosis.contracts import Candidate, Fitted
+from diagnosis.policy import POLICY
 from diagnosis.screening.linearisation import asleep, columns_of
 from diagnosis.structure.policy import STRUCTURE
 from diagnosis.structure.rows import Linear
@@ -23,18 +24,11 @@ from twin.calibration.problem import CalibrationProblem
 from twin.schema import TwinPart
 
 
-def varying_columns(machine: Machine, part: TwinPart, problem: CalibrationProblem, linear: Linear) -> Array:
+def varying_columns(fitted: Fitted, linear: Linear) -> Array:
     """Columns (n, k): every stated heat and film by its run-to-run sd, each run on its own."""
     rows, out = linear.rows, []
-    network = problem.network
-    stated = (machine.twin or {}).get("mechanisms", part.mechanisms)
-    heats = {name for j in heat_amplitudes(network) if (name := network.parameters[j].name).split(".")[1] in stated}
-    for k, u in enumerate(problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        film = u.name.startswith("exposures.") and u.name.endswith((".conductance", ".coefficient"))
-        if p.scale != "log" or p.per_batch or not (film or u.name in heats):
-            continue
-        column = linear.jacobian[:, k] * (STRUCTURE.run_to_run_log_sd / u.spread)
+    for k, sd in from_run_to_run(fitted).items():
+        column = linear.jacobian[:, k] * (sd / fitted.problem.unknowns[k].spread)
         for b in range(rows.batches):
             own = np.zeros(rows.n)
             own[rows.batch(b)] = column[rows.batch(b)]
@@ -76,41 +70,24 @@ def _own_driver(part: TwinPart, every: Collection[Candidate]) -> dict[str, float
     out = {}
     for c in every:
         if c.mechanism == "supply_sag" and c.part is not None and isinstance(c.part.acts_on, str):
-            own = part.mechanisms[c.part.acts_on].drivers if c.part.acts_on in part.mechanisms else None
-            if set(channels_in(c.part.drivers)) & set(channels_in(own)):
+            heat = part.mechanisms.get(c.part.acts_on)
+            if heat is not None and driver_channels(c.part) & driver_channels(heat):
                 out[c.name] = STRUCTURE.heat_shape_sd
     return out
-
-
-def channels_in(drivers: Mapping[str, str] | str | None) -> tuple[str, ...]:
-    """The channels of a mechanism's drivers."""
-    if drivers is None:
-        return ()
-    return (drivers,) if isinstance(drivers, str) else tuple(drivers.values())
 
 
 def stated_films(
     part: TwinPart, problem: CalibrationProblem, values: Array, every: Collection[Candidate]
 ) -> Mapping[str, float]:
-    """Prior sd, m², of natural convection at the bodies whose film the file states as a constant, by candidate.
-
-    What a body gives to an enclosure's air counts as given to what that air exchanges with.
-    """
+    """Prior sd, m², of natural convection at the bodies whose film the file states as a constant, by candidate."""
     conductance = {e.name: 0.0 for e in problem.network.edges}
     for e in problem.network.edges:
         conductance[e.name] += float(e.conductance(values))
-    around: dict[str, list[str]] = {}
-    for x in part.exposures.values():
-        around.setdefault(x.of.partition("@")[0], []).append(x.to)
-    film: dict[tuple[str, str], float] = {}
-    for name, x in part.exposures.items():
-        for air in around.get(x.to, [x.to]):
-            key = x.of.partition("@")[0], air
-            film[key] = film.get(key, 0.0) + conductance.get(name, 0.0)
+    film = films_W_per_K(part, conductance)
     out = {}
     for c in every:
         if c.mechanism == "natural_convection" and c.part is not None and isinstance(c.part.at, Mapping):
             stated = film.get((c.where.name, str(c.part.at["air"])), 0.0)
             if stated > 0:
-                out[c.name] = STRUCTURE.film_area_sd * stated
+                out[c.name] = POLICY.film_area_sd * stated
     return out

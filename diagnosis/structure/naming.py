@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from data.errors import InputError, WorkError
 from diagnosis.candidates.library import log_prior_odds
-from diagnosis.candidates.priors import start_values
+from diagnosis.candidates.priors import starts
 from diagnosis.contracts import Candidate, Scored
+from diagnosis.policy import POLICY
 from diagnosis.structure.fit import StructuralFit, refitted, settle
 from diagnosis.structure.null import Null
 from diagnosis.structure.policy import STRUCTURE
 from diagnosis.structure.screen import Screen, best_variants, moved, screen
-from twin.calibration.least_squares import x_of, z_bounds
-from twin.quantity import Value
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ def _round(now: StructuralFit, seed: int) -> Detection:
 
 def _refits(now: StructuralFit, seen: Screen, scored: Sequence[Scored], most: int, most_settled: int) -> list[Refit]:
     """Refits of the likeliest candidates, and of others that look different; the finalists at their optimum."""
-    top = [s for s in scored[: STRUCTURE.screened] if s.gain > STRUCTURE.screen_min_gain_nats]
+    top = [s for s in scored[: STRUCTURE.screened] if s.gain > POLICY.screen_min_gain_nats]
     odds = {s.candidate.name: log_prior_odds(now.machine, now.part, s.candidate) for s in top}
     ranked = sorted(top, key=lambda s: -(s.gain + odds[s.candidate.name]))
     tried = []
@@ -134,7 +133,7 @@ def _refit(now: StructuralFit, s: Scored, inflation: float, log_prior: float, st
     """The best of its starts, as many as it takes to come near to what the screen promised; None where no start of it
     can be simulated."""
     best: Refit | None = None
-    for values, begin in _starts(s, now):
+    for values, begin in starts(s, now):
         try:
             fitted = refitted(now, s.candidate.applied(now.part, values), begin, steps)
         except (InputError, WorkError):
@@ -155,23 +154,3 @@ def _settled(now: StructuralFit, r: Refit) -> Refit:
     except (InputError, WorkError):
         return r
     return replace(r, fitted=fitted, gain=(fitted.full_evidence - now.full_evidence) / r.inflation)
-
-
-def _starts(s: Scored, now: StructuralFit) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
-    """Free values and start values of a refit, in the order of trial.
-
-    A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
-    """
-    values, at = start_values(s, now)
-    yield values, {**_joint_start(s, now), **at}
-    yield values, at
-    for share in STRUCTURE.start_amplitude_shares if s.amplitudes else ():
-        yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
-
-
-def _joint_start(s: Scored, now: StructuralFit) -> dict[str, float]:
-    """Start values of the fit's own parameters: the linear joint optimum with the candidate."""
-    z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
-    values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
-    network = now.problem.network
-    return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}

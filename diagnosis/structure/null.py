@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from data.arrays import Array
+from diagnosis.policy import POLICY
 from diagnosis.structure.policy import STRUCTURE, StructurePolicy
 
 
@@ -25,7 +26,7 @@ class Null:
     @cached_property
     def _gumbel(self) -> tuple[float, float]:
         """Location and scale."""
-        if len(self.gain) < STRUCTURE.null_min_machines:
+        if len(self.gain) < POLICY.null_min_machines:
             return float("inf"), 1.0
         middle, high = np.quantile(self.gain, (0.5, STRUCTURE.null_high_quantile))
         shares = -np.log(-np.log(np.array([0.5, STRUCTURE.null_high_quantile])))

@@ -9,7 +9,7 @@ from diagnosis.policy import analytic, convention, cost, physical
 
 @dataclass(frozen=True)
 class StructurePolicy:
-    """Thresholds by stage; gains are in nats of log evidence."""
+    """Thresholds by stage, next to those that it shares with `diagnosis.policy.POLICY`; gains in nats of evidence."""
 
     # Refined twins
     refined_twins: int = cost(120, "machines", "refined twins that make the covariance; with 40 it knows too little")
@@ -23,8 +23,6 @@ class StructurePolicy:
     joint_log_sd: float = physical(0.3, "log", "between the conductances inside a body")
 
     # Mild physics that every machine has
-    film_area_sd: float = physical(0.2, "m2 per W/K", "about all of a film that is stated as a constant is natural")
-    run_to_run_log_sd: float = physical(0.05, "log", "no heat and no exposure is the same in every run")
     heat_shape_sd: float = physical(0.05, "of a heat", "no heat follows its driver exactly as its law says")
     clock_sd_rows: float = analytic(0.1, "rows", "a row is a mean over its interval, which blurs corners")
     common_clock_sd_rows: float = analytic(0.5, "rows", "a driver that is held may have changed between two rows")
@@ -41,8 +39,6 @@ class StructurePolicy:
     scale_rounds: int = cost(2, "rounds", "over the groups of draws")
 
     # Fits
-    initial_noise_factor: float = convention(3.0, "given noises", "all channels begin alike, so that none is neglected")
-    initial_rows_per_value: float = convention(20.0, "rows", "so many rows of a smooth misfit count as one")
     first_steps: int = cost(12, "steps", "of plain least squares before any structure is known")
     settle_rounds: int = cost(3, "rounds", "of the covariance, built anew about the fit")
     settle_steps: int = cost(10, "steps", "of the last round of a fit")
@@ -55,11 +51,6 @@ class StructurePolicy:
     )
     settled_nats: float = analytic(1.0, "nats", "a smaller fall of the objective changes no decision")
     max_rows_per_channel: int = cost(1000, "rows", "of all batches; longer recordings are thinned")
-    start_amplitude_shares: tuple[float, ...] = convention(
-        (0.3, 0.1, 0.03),
-        "of the screen's amplitude",
-        "starts in turn, where a machine with all of it cannot be simulated",
-    )
 
     # Screen, null and naming
     amplitude_grid: int = analytic(61, "points", "over three sd of a logarithm either way")
@@ -69,10 +60,7 @@ class StructurePolicy:
     null_high_quantile: float = analytic(0.95, "probability", "one odd machine in twenty does not decide")
     null_min_scale_nats: float = analytic(1.0, "nats", "of a largest value of many candidates")
     null_min_threshold_nats: float = analytic(5.0, "nats", "odds of 150 to 1")
-    null_min_machines: int = analytic(3, "machines", "fewer give no quantile, and nothing is detected")
     screened: int = cost(80, "candidates", "of the screen that are ranked with their prior odds")
-    screen_min_gain_nats: float = convention(0.5, "nats", "a smaller gain in the screen is not looked at")
-    same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot tell two candidates apart")
     refits: int = cost(10, "refits", "that a round makes")
 
 

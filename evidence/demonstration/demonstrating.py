@@ -7,7 +7,6 @@ The case's folder (machine file, recordings) is all that the answering process s
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import shutil
 import subprocess
@@ -26,22 +25,22 @@ from data.machine import Machine, load_machine
 from data.processes import ending, without_interrupt
 from diagnosis.findings.schema import Finding, as_json
 from diagnosis.result import Diagnosis
-from evidence.demonstration.answering import DIAGNOSIS, STATUS
+from evidence.demonstration.answering import DIAGNOSIS
 from evidence.demonstration.plain import from_plain
 from evidence.proof.scoring.answer_key import SCHEMA, AnswerKey
 from evidence.proof.scoring.matching import matches, means
 from evidence.proof.sealing.folder import folder_digest, now, salted_digest
 from evidence.proof.sealing.isolation import allowed, own_source
+from evidence.proof.sealing.running import environment, last_line, lay_out, status_of
 from evidence.proof.sealing.seal import SALT_BYTES
 from plants.sample.concealed import Case, conceal, write_case
-from reports.diagnosis.first_screen import Outcome, Unsealed
+from reports.diagnosis.first_screen import RIGHT, Outcome, Unsealed
 from reports.diagnosis.page import write_diagnosis_report
 
 REPORT, PLAN, FINDINGS, SEALED, OPENED = "report.html", "next_run.yml", "findings.json", "sealed.json", "opened.json"
 CASE = "case"
 LIMIT_S = 900.0
 BEGIN = "import sys; sys.path.insert(0, sys.argv[1]); from evidence.demonstration.answering import main; main()"
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 Say = Callable[[str], None]
 Done = Callable[[str, int, int], None]
@@ -79,7 +78,7 @@ class Judgement:
     @property
     def right(self) -> bool:
         """Whether the answer is right as a whole: all of what was concealed, and nothing else."""
-        return self.outcome in ("found", "nothing_right")
+        return self.outcome in RIGHT
 
 
 @dataclass(frozen=True)
@@ -150,14 +149,9 @@ def answered(case: Path, machine: Machine, by: Answerer, done: Done | None = Non
             raise InputError(
                 f"TMPDIR {place}: lies in {seen}, which the answering process may see; give another TMPDIR"
             )
-        shutil.copytree(case, place / "case")
-        for path in (place / "case").rglob("*"):
-            os.utime(path, (0, 0))  # when a case was written is no part of it
-        (place / "answer").mkdir()
-        (place / "witness").write_text("not to be read\n", encoding="utf-8")
+        lay_out(case, place)
         ended = _run(place, by, done)
-        file = place / "answer" / STATUS
-        status = json.loads(file.read_bytes()) if file.exists() else {"error": ended}
+        status = status_of(place) or {"error": ended}
         if status["error"]:
             raise WorkError(f"demonstration: the diagnosis failed: {status['error']}")
         text = (place / "answer" / DIAGNOSIS).read_text(encoding="utf-8")
@@ -249,13 +243,11 @@ def _run(place: Path, by: Answerer, done: Done | None) -> str:
     """Run the process to its end; why there may be no answer."""
     task = {"place": str(place), "diagnose": by.diagnose, "import_from": by.import_from}
     command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
-    own = str(place / "answer")
-    environment = dict.fromkeys(THREADS, "1") | {"HOME": own, "TMPDIR": own, "LANG": "C.UTF-8", "TZ": "UTC"}
     with (place / "output").open("wb") as errors:
         with without_interrupt():
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=place / "case",
-                env=environment,
+                env=environment(place),
             )  # fmt: skip
         late = threading.Timer(by.limit_s, process.kill)
         late.start()
@@ -274,10 +266,9 @@ def _run(place: Path, by: Answerer, done: Done | None) -> str:
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
-    said = (place / "output").read_text(encoding="utf-8", errors="replace").strip().splitlines()
     if process.returncode == -9:
         return f"no end within {by.limit_s:g} s"
-    return said[-1] if said else "it ended without a message; run it again"
+    return last_line(place, "it again")
 
 
 def _relay(line: bytes, done: Done | None) -> None:

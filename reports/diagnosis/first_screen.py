@@ -11,6 +11,7 @@ from reports.diagnosis import tables
 from reports.labels import count, listed, three_digits, unit_label
 
 Outcome = Literal["found", "found_and_more", "other_place", "in_set", "missed", "wrong", "false_alarm", "nothing_right"]
+RIGHT: tuple[Outcome, ...] = ("found", "nothing_right")  # outcomes of an answer that is right as a whole
 MOST_PARAMETERS = 3  # in a sentence; the table has all
 _LENGTHS = ("um", "mm", "nm")
 _HEADLINES = {
@@ -52,7 +53,7 @@ class Unsealed:
     @property
     def right(self) -> bool:
         """Whether the answer is right as a whole."""
-        return self.outcome in ("found", "nothing_right")
+        return self.outcome in RIGHT
 
     @property
     def column(self) -> str:

@@ -102,10 +102,10 @@ def test_old_and_new_recordings_are_diagnosed_together_and_the_change_is_said(
     more = write_recordings(given / "third", 6) / "b5.csv"
     done = call("diagnose", "--continue", out, "--recordings", more, "--json", "--no-report")
     assert done.code == 0, done.err
-    told = json.loads(done.out)
-    assert set(told["files"]) == {"findings.json", "inputs.json", "findings.2.json"}
-    assert told["continued"]["new"] == ["b5"] and told["continued"]["before"]["verdict"] == "explained"
-    assert told["continued"]["changed"][1] == "First finding: heat to the floor at bed (97\u202f%) → none."
+    answer = json.loads(done.out)
+    assert set(answer["files"]) == {"findings.json", "inputs.json", "findings.2.json"}
+    assert answer["continued"]["new"] == ["b5"] and answer["continued"]["before"]["verdict"] == "explained"
+    assert answer["continued"]["changed"][1] == "First finding: heat to the floor at bed (97\u202f%) → none."
     assert len(toy.calls[-1]["batches"]) == 6
 
 

@@ -53,10 +53,10 @@ def test_it_says_four_lines(call: Call, tmp_path: Path) -> None:
 def test_json_is_one_document(call: Call, tmp_path: Path) -> None:
     done = call("demonstrate", "--seed", FLOOR_SEED, "--out", tmp_path / "out", "--json")
     assert (done.code, done.err) == (0, "")
-    told = json.loads(done.out)
-    assert told["simulated"] and told["outcome"] == "found" and told["right"]
-    assert told["concealed"]["effect"] == "floor_sink" and len(told["sealed"]["digest"]) == 64
-    assert set(told["files"]) == {"report.html", "findings.json", "sealed.json", "opened.json"}
+    answer = json.loads(done.out)
+    assert answer["simulated"] and answer["outcome"] == "found" and answer["right"]
+    assert answer["concealed"]["effect"] == "floor_sink" and len(answer["sealed"]["digest"]) == 64
+    assert set(answer["files"]) == {"report.html", "findings.json", "sealed.json", "opened.json"}
 
 
 def test_bad_input_is_one_line(call: Call, tmp_path: Path) -> None:

@@ -71,8 +71,8 @@ class Training:
     ("options", "endless", "number", "group"),
     [
         (["--direct"], "worker", signal.SIGINT, True),
-        (["--direct"], "here", signal.SIGTERM, False),
-        ([], "worker", signal.SIGTERM, True),
+        pytest.param(["--direct"], "here", signal.SIGTERM, False, marks=pytest.mark.slow),
+        pytest.param([], "worker", signal.SIGTERM, True, marks=pytest.mark.slow),
         ([], "here", signal.SIGINT, False),
     ],
 )

@@ -62,15 +62,11 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
     started = now()
     with tempfile.TemporaryDirectory(prefix="thermodrift-") as scratch:
         place = Path(scratch).resolve()
-        shutil.copytree(case, place / "case")
-        for path in (place / "case").rglob("*"):
-            os.utime(path, (0, 0))  # the time at which a case was built is no part of it
-        (place / "answer").mkdir()
-        (place / "witness").write_text("not to be read\n", encoding="utf-8")
+        lay_out(case, place)
         error = _watched(place, by, stop or Event())
-        status = _status(place)
+        status = status_of(place)
         if "isolation" not in status:
-            raise WorkError(f"the answering process did not start: {error or _last_line(place)}")
+            raise WorkError(f"the answering process did not start: {error or last_line(place)}")
         written = [place / "answer" / name for name in (FINDINGS, PLAN, SERIES, REPLIES)]
         files = {p.name: p.read_bytes() for p in written if p.exists()}
         error = status.get("error") or error
@@ -85,6 +81,15 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
     return files | {RUN: (json.dumps(run, ensure_ascii=False, indent=1) + "\n").encode()}
 
 
+def lay_out(case: Path, place: Path) -> None:
+    """What an answering process finds in its place: a copy of the case, a folder to fill, what it must not read."""
+    shutil.copytree(case, place / "case")
+    for path in (place / "case").rglob("*"):
+        os.utime(path, (0, 0))  # the time at which a case was built is no part of it
+    (place / "answer").mkdir()
+    (place / "witness").write_text("not to be read\n", encoding="utf-8")
+
+
 def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
     """Wait for the process; the reason why it was ended, if it was."""
     task = {"place": str(place), "diagnose": by.diagnose, "baselines": by.baselines, "import_from": by.import_from}
@@ -93,7 +98,7 @@ def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
         with without_interrupt():
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=output, stderr=output, cwd=place / "case",
-                env=_environment(place),
+                env=environment(place),
             )  # fmt: skip
         try:
             assert process.stdin is not None
@@ -103,7 +108,7 @@ def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
             while process.poll() is None:
                 if stop.wait(POLL_S):
                     raise WorkError("the answering process was stopped")
-                if (reached := str(_status(place).get("stage", ""))) != stage:
+                if (reached := str(status_of(place).get("stage", ""))) != stage:
                     stage, since = reached, time.monotonic()
                 limit_s = by.limit_s if stage else START_S
                 if time.monotonic() - since > limit_s:
@@ -114,20 +119,22 @@ def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
     return f"ended by signal {-process.returncode}" if process.returncode < 0 else None
 
 
-def _environment(place: Path) -> Mapping[str, str]:
+def environment(place: Path) -> Mapping[str, str]:
     """One thread, and no path but its own."""
     own = str(place / "answer")
     return dict.fromkeys(THREADS, "1") | {"HOME": own, "TMPDIR": own, "LANG": "C.UTF-8", "TZ": "UTC"}
 
 
-def _status(place: Path) -> dict[str, Any]:
+def status_of(place: Path) -> dict[str, Any]:
+    """What the process states of itself; empty where it has not begun."""
     file = place / "answer" / STATUS
     return dict(json.loads(file.read_bytes())) if file.exists() else {}
 
 
-def _last_line(place: Path) -> str:
+def last_line(place: Path, again: str = "the case again") -> str:
+    """The last that the process printed."""
     lines = (place / "output").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it ended without a message; run the case again"
+    return lines[-1] if lines else f"it ended without a message; run {again}"
 
 
 Answerer = Callable[[str, Event], dict[str, bytes]]

@@ -15,10 +15,10 @@ from data.batch import Batch
 from data.machine import Machine
 from diagnosis.candidates.library import candidates
 from diagnosis.contracts import Scored
+from diagnosis.policy import POLICY
 from diagnosis.structure.fit import StructuralFit, baseline
 from diagnosis.structure.mild import mild_laws
 from diagnosis.structure.null import Null
-from diagnosis.structure.policy import STRUCTURE
 from diagnosis.structure.rows import Linear
 from diagnosis.structure.screen import Prior, Screen, best_variants, moved, never_reported, proposed, screen
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, four_bodies, runs, two_bodies
@@ -204,14 +204,14 @@ def test_what_is_projected_out_is_hardly_left_in_a_signature() -> None:
     prior = now.covariance.prior_of([u.name for u in now.problem.unknowns])
     known = now.covariance.whitened(np.hstack([linear.jacobian * prior, linear.nuisance]))
     rest = now.covariance.projected(known)
-    told = np.einsum("nk,nk->k", known, rest) > 100.0  # the rows say ten times what the prior does
-    assert told.sum() > 10
+    shown = np.einsum("nk,nk->k", known, rest) > 100.0  # the rows say ten times what the prior does
+    assert shown.sum() > 10
     chosen = [s.column for s in seen.scored[:40]]
-    before = np.abs(rest[:, told].T @ seen.whitened[:, chosen])
-    after = np.abs(known[:, told].T @ seen.projected[:, chosen])
+    before = np.abs(rest[:, shown].T @ seen.whitened[:, chosen])
+    after = np.abs(known[:, shown].T @ seen.projected[:, chosen])
     assert after.max() < 0.05 * before.max()
     unit = np.sqrt(seen.square[chosen])
-    assert (after / unit / np.linalg.norm(known[:, told], axis=0)[:, None]).max() < 0.1
+    assert (after / unit / np.linalg.norm(known[:, shown], axis=0)[:, None]).max() < 0.1
 
 
 def test_likeness_is_the_cosine_beyond_all_that_is_recalibrated() -> None:
@@ -262,4 +262,4 @@ def test_mild_films_are_of_bodies_whose_film_is_stated() -> None:
     exposed = {"natural_convection_spindle_room", "natural_convection_head_room", "natural_convection_bed_room"}
     assert exposed <= set(found) and "natural_convection_column_room" not in found
     film = now.values[now.problem.network.index("exposures.head-room.conductance")]
-    assert found["natural_convection_head_room"] == pytest.approx(STRUCTURE.film_area_sd * film)
+    assert found["natural_convection_head_room"] == pytest.approx(POLICY.film_area_sd * film)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from diagnosis.policy import POLICY
 from diagnosis.structure.null import Null
 from diagnosis.structure.policy import STRUCTURE
 
@@ -59,7 +60,7 @@ def test_where_structure_gains_nothing_the_evidence_itself_is_asked_for() -> Non
     assert calm.p_value(calm.threshold()) < STRUCTURE.false_alarms
 
 
-@pytest.mark.parametrize("count", range(STRUCTURE.null_min_machines))
+@pytest.mark.parametrize("count", range(POLICY.null_min_machines))
 def test_too_few_machines_allow_no_claim(count: int) -> None:
     null = Null(np.full(count, -5.0))
     assert null.threshold() == np.inf and null.p_value(1e6) == 1.0
