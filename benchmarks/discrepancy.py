@@ -40,7 +40,7 @@ SHOWN = 10
 
 
 def examined(kind: PlantKind, seed: int, out: str, engine: str = "structure") -> dict[str, Any]:
-    """One case, from its file where it is done already; `engine` is `structure`, or `search`: the diagnosis as it is."""
+    """One case, from its file where it is done already; `engine` is `structure`, or `search`: the diagnosis."""
     path = Path(out) / f"{engine}_{kind}_{seed}.json"
     if path.exists():
         return dict(json.loads(path.read_text()))
@@ -83,7 +83,9 @@ def _searched(found: Findings, key: AnswerKey, part: TwinPart) -> dict[str, Any]
         and bool(key.terms)
         and names_term(first.mechanism, Spot(first.where.kind, first.where.name), key.terms[0], bodies)
     )
-    listed = [{"name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0)} for f in found.findings]
+    listed = [
+        {"name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0)} for f in found.findings
+    ]
     return {"score": 2.0 if found.findings else 0.0, "right": right, "listed": listed, "verdict": found.verdict}
 
 

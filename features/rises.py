@@ -25,7 +25,7 @@ from data.batch import Batch
 from data.errors import InputError, closest
 from data.sweeps import position_bins, sweep_numbers
 
-_RATE_WINDOW_S = 600.0
+RATE_WINDOW_S = 600.0
 _THERMAL = ("temperature", "ambient")
 _LAG = re.compile(r"^lag(\d+(?:\.\d+)?)(s|min|h)$")
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -48,9 +48,8 @@ def feature(batch: Batch, name: str) -> Array:
     base = values - first_finite(values) if thermal else values
     if kind == "rate":
         return _rate_per_h(base, batch.step_s)
-    if match := _LAG.match(kind):
-        tau_s = float(match[1]) * _SECONDS[match[2]]
-        return first_order_lag(base, tau_s, batch.step_s, start=None if thermal else 0.0)
+    if _LAG.match(kind):
+        return first_order_lag(base, parsed_feature(name)[2], batch.step_s, start=None if thermal else 0.0)
     return base
 
 
@@ -146,9 +145,21 @@ def _rate_per_h(values: Array, step_s: float) -> Array:
     if step_s <= 0 or not ok.any():
         return np.where(ok, 0.0, np.nan)
     row = np.arange(len(values))
-    earlier = np.maximum(row - max(1, round(_RATE_WINDOW_S / step_s)), int(np.argmax(ok)))
+    earlier = np.maximum(row - max(1, round(RATE_WINDOW_S / step_s)), int(np.argmax(ok)))
     elapsed_h = np.maximum(row - earlier, 1) * step_s / 3600.0
     return (values - values[np.minimum(earlier, row)]) / elapsed_h
+
+
+def parsed_feature(name: str) -> tuple[str, str, float]:
+    """Channel, kind (`rise`, `rate`, `ambient`, `start` or `lag`) and time constant in s of a feature name.
+
+    Raises:
+        InputError: an unknown kind.
+    """
+    channel, kind = _parts(name)
+    if match := _LAG.match(kind):
+        return channel, "lag", float(match[1]) * _SECONDS[match[2]]
+    return channel, kind or "rise", 0.0
 
 
 def _parts(name: str) -> tuple[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array, Index, Mask
+from data.batch import Channel
 from data.errors import InputError
 from features.design import Design, Moments
 from models.base import Family
+from models.program import Builder, Program
 from models.solvers.batches import fold_masks
 
 _NEW = 1e-8  # a term is independent if at least this share of its square is not explained by the chosen terms
@@ -364,6 +366,22 @@ class AxisCoupled(Family):
         place = {name: c for c, name in enumerate(design.inputs)}
         offset, slope = ([place[i] for i in self.fitted[part]] for part in ("offset_inputs", "slope_inputs"))
         return rise[:, offset] @ self.fitted["offset_um_per_K"], rise[:, slope] @ self.fitted["slope_um_per_mm_K"]
+
+    def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
+        """Outputs K0 in µm and tan β in µm/mm, each 0 in the first row: the error at P is K0 + tan β (P − P0)."""
+        b, f = Builder(channels, step_s), self.fitted
+        x = b.since_first(b.features(self.inputs))
+        place = {name: c for c, name in enumerate(self.inputs)}
+        outputs = []
+        for names, coef in ((f["offset_inputs"], f["offset_um_per_K"]), (f["slope_inputs"], f["slope_um_per_mm_K"])):
+            weights = np.zeros((1, len(self.inputs)))
+            weights[0, [place[n] for n in names]] = coef
+            outputs.append(b.affine(x, weights))
+        return b.program(outputs, False, f["along"], float(f["fixed_end_mm"]))
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        """See `program`."""
+        return []
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row without a position, or where a chosen input is missing."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Self, final
 
@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
-from data.batch import Batch
+from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import Machine
 from data.registry import Effort
 from features.design import Design
+from models.program import Builder, Program
 
 Plain = dict[str, Any]  # str, int, float, list of those, or numpy array
 
@@ -155,6 +156,32 @@ class Family(ABC):
     def predict(self, batch: Batch) -> Array:
         """Error_um (n,) of a batch from its inputs alone, relative to its start as the training targets were."""
         return self.predict_design(Design.build([batch], self.inputs, None), [0])[0]
+
+    def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
+        """The fitted model as operations with carried state, for rows `step_s` apart.
+
+        Raises:
+            InputError: the family has none, or the error channel depends on a position that it does not know.
+        """
+        spec = channels.get(self.target)
+        if spec is not None and spec.position and not self.needs_position:
+            raise InputError(
+                f"family {self.key}: {self.target} is measured along {spec.position}, of which a step in time knows "
+                "nothing; choose axis_coupled"
+            )
+        builder = Builder(channels, step_s)
+        return builder.program(self.operations(builder), self.zero_start)
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        """The nodes of `program` that give what `respond` gives. Override this where the model is a program.
+
+        Raises:
+            InputError: the family has no such form.
+        """
+        from models import FAMILIES
+
+        those = [key for key, family in FAMILIES.items() if family.operations is not Family.operations]
+        raise InputError(f"family {self.key} cannot be written as a program; those that can: {', '.join(those)}")
 
     def n_parameters(self) -> int:
         """How many numbers were learned."""

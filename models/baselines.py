@@ -13,6 +13,7 @@ from data.errors import InputError
 from data.sweeps import position_bins
 from features.design import Design
 from models.base import Family
+from models.program import Builder
 
 _NEED = 1  # rows
 
@@ -93,6 +94,10 @@ class MeanCurve(Family):
             out.append(_on_line(position_mm[rows], self.fitted["position_mm"], table_um))
         return out
 
+    def operations(self, b: Builder) -> Sequence[int]:
+        clock = b.add("clock", [], 1)
+        return [b.add("curve", [clock], 1, knots=self.fitted["time_s"], values=self.fitted["error_um"])]
+
     def n_parameters(self) -> int:
         """Values of the curves."""
         return len(self.fitted.get("error_um", ()))
@@ -132,3 +137,6 @@ class Zero(Family):
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         return [np.zeros(len(design.time_s[design.rows(k)])) for k in batches]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        return [b.constant(0.0)]

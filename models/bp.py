@@ -15,6 +15,7 @@ from data.registry import Effort
 from features.design import Design, decimated_rows
 from features.nets import Nets
 from models.base import Family
+from models.program import Builder
 from models.solvers.batches import too_few_rows
 
 _STACK_VALUES = 4_000_000  # of the Jacobians trained together: what fits a processor's cache and memory
@@ -81,6 +82,18 @@ class BP(Family):
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         x = self.started(design).x
         return [self._predict(x[design.rows(k)]) for k in batches]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        f, x = self.fitted, b.features(self.inputs)
+        h, p = self.hidden, len(self.inputs)
+        u = b.scaled(b.since_first(x) if self.zero_start else x, f["x_spread"], f["x_mean"])
+        nets = np.atleast_2d(np.asarray(f["nets"], float))
+        w, offset, v, c = np.split(nets, [h * p, h * (p + 1), h * (p + 2)], axis=1)
+        hidden = b.affine(u, w.reshape(-1, p), offset.ravel())
+        if self.transfer == "tanh":
+            hidden = b.add("tanh", [hidden], b.size(hidden))
+        share = f["y_spread"] / len(nets)
+        return [b.affine(hidden, share * v.reshape(1, -1), f["y_mean"] + f["y_spread"] * float(c.mean()))]
 
     def n_parameters(self) -> int:
         return int(np.size(self.fitted["nets"]))

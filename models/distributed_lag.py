@@ -12,6 +12,7 @@ from data.errors import InputError, closest
 from features.design import Design
 from models.base import Family
 from models.linear import Blocks, Task
+from models.program import Builder
 from models.solvers.batches import by_batch, fold_masks, steps_s
 from models.solvers.kernels import unit_scale
 from models.solvers.lags import (
@@ -131,6 +132,14 @@ class DistributedLag(Family):
         x = lag_responses(design, list(place)).reshape(len(design.time_s), -1)
         predicted = x @ weights.reshape(len(fitted), -1).T + np.array([m.fitted["intercept_um"] for m in fitted])
         return by_batch(design, predicted, wanted)
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        x = b.features(self.inputs, required=False)
+        begin = np.array([float(b.thermal(name.partition("@")[0])) for name in self.inputs])
+        f, parts = self.fitted, []
+        for delay_s, tau_s in zip(f["delays_s"].tolist(), f["taus_s"].tolist(), strict=True):
+            parts.append(b.delay(b.lag(x, tau_s, begin), delay_s, begin))
+        return [b.affine(b.join(*parts), f["weights_um_per_K"].reshape(1, -1), f["intercept_um"])]
 
     def n_parameters(self) -> int:
         """Coefficients, the order or decay, and the intercept where the level is free."""

@@ -10,6 +10,7 @@ import numpy as np
 from data.arrays import Array
 from features.design import Design
 from models.base import Family
+from models.program import Builder
 from models.solvers.trees import Trees, training_rows
 
 _ROWS = 720  # that few batches may give together
@@ -66,6 +67,11 @@ class HistGradientBoosting(Family):
             values = self.fitted["base_um"] + trees.values(x).sum(axis=0)
             out.append(np.where(np.isfinite(x).all(axis=1), values, np.nan))
         return out
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        trees = Trees.from_plain(self.fitted)
+        total = trees.operation(b, b.features(self.inputs), 1.0, single=False)
+        return [b.affine(total, np.ones((1, 1)), self.fitted["base_um"])]
 
     def n_parameters(self) -> int:
         """A threshold per split and a value per leaf."""

@@ -17,9 +17,10 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.metrics import SIDE_OF_90
+from models.program import Builder
 from models.solvers.batch_process import BatchProcess, Windows
 from models.solvers.batches import by_batch, too_few_rows
-from models.solvers.lags import DRIVEN, PROMPT, UNDRIVEN, Columns
+from models.solvers.lags import DRIVEN, PROMPT, UNDRIVEN, Columns, columns_program
 
 _LEVELS = (0.1, 10.0, 1000.0)  # prior variance of a gain per K, in units of what no column explains
 _STEADY = (1.0, 100.0)  # offset and noise of that, against its walk in an hour
@@ -146,6 +147,10 @@ class LagDictionary(Family):
             time_h = (design.time_s[design.rows(k)] - design.time_s[design.rows(k)][:1]) / 3600.0
             out.append(np.sqrt(start + growth * time_h))
         return out
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        x = columns_program(b, self.inputs, self.fitted["columns"])
+        return [b.affine(x, self.fitted["coef_um"][None])]
 
     def n_parameters(self) -> int:
         """Coefficients, setting weights and the two numbers of the spread."""

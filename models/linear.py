@@ -20,6 +20,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.metrics import SIDE_OF_90
+from models.program import Builder
 from models.solvers.batches import fold_masks
 from models.solvers.kernels import unit_scale
 from models.solvers.pooled_sums import AT_ONCE, Blocks, Pool, inner_sets, leave_block_out
@@ -200,6 +201,10 @@ class Linear(Family):
         """NaN at a row where any input is missing."""
         coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
         return [design.x[design.rows(k)] @ coef + intercept for k in batches]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        x = b.features(self.inputs)
+        return [b.affine(x, self.fitted["coef_um_per_K"][None], self.fitted["intercept_um"])]
 
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]

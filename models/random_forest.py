@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 from data.arrays import Array
 from features.design import Design
 from models.base import Family, inner_groups
+from models.program import Builder
 from models.solvers.trees import Trees, training_rows
 
 _ROWS = 480  # that few batches may give together
@@ -75,6 +76,10 @@ class RandomForest(Family):
         """Predictive standard deviation (n_k,) of a recorded value."""
         constant, factor = self.fitted["variance_um2"], self.fitted["factor"]
         return [np.sqrt(constant + factor * variance) for _, variance in self._moments(design, batches)]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        trees = Trees.from_plain(self.fitted)
+        return [trees.operation(b, b.features(self.inputs), 1.0 / len(trees.roots), single=True)]
 
     def n_parameters(self) -> int:
         """A threshold per split and a value per leaf."""

@@ -13,6 +13,7 @@ from data.arrays import Array
 from features.design import Design
 from features.rises import hold_last
 from models.base import Family, Plain
+from models.program import Builder
 from models.solvers.batches import padded, steps_s, too_few_rows, unpadded
 
 EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where there is one speed
@@ -94,6 +95,14 @@ class ThermalExponential(Family):
             total += amplitude * lag_response(load, tau_s, steps)
         rows = unpadded(design, total)
         return [rows[design.rows(k)] for k in batches]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        taus_s, amplitudes = np.atleast_1d(self.fitted["tau_s"]), np.atleast_1d(self.fitted["amplitude_um"])
+        name, load = self.fitted["speed_channel"], b.constant(1.0)
+        if name:
+            kilo_rpm = b.scaled(b.channels([name], required=False), np.array(1000.0))
+            load = b.add("power", [kilo_rpm], 1, exponents=self.fitted["exponent"])
+        return [b.affine(b.join(*(b.lag(load, tau_s, 0.0) for tau_s in taus_s)), amplitudes[None])]
 
     def n_parameters(self) -> int:
         return 2 * int(np.size(self.fitted["tau_s"])) + (1 if self.fitted["speed_channel"] else 0)

@@ -12,6 +12,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.linear import left_out_spread, mean_square
+from models.program import Builder
 from models.solvers.batches import fold_masks
 from models.solvers.poles import (
     TAUS_S,
@@ -104,6 +105,16 @@ class TransferFunction(Family):
             error_um = error_um + responses(some, signals, tau_s[:, pole]) @ gain_um[:, pole]
         error_um = np.where(np.isfinite(some.x).all(axis=1), error_um, np.nan)
         return [error_um[some.rows(k)] for k in range(some.n_batches)]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        f = self.fitted
+        parts = zip(f["kinds"], f["names"], f["exponents"], strict=True)
+        b.features(self.inputs)
+        signals = b.join(*(Source(kind, name, float(m)).operation(b) for kind, name, m in parts))
+        tau_s, gain_um = np.asarray(f["tau_s"]), np.asarray(f["gain_um"])
+        lagged = [b.lag(signals, tau_s[:, pole], 0.0) for pole in range(tau_s.shape[1])]
+        weights = np.concatenate([f["direct_um"], *gain_um.T])
+        return [b.affine(b.join(signals, *lagged), weights[None], f["intercept_um"])]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value, see `models.linear`.

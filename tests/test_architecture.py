@@ -19,11 +19,12 @@ ALLOWED: Mapping[str, set[str]] = {
     "models": {"data", "features", "twin"},
     "diagnosis": {"data", "twin"},
     "plants": {"data"},
+    "compensation": {"data", "features", "models", "twin"},
     "reports": {"data", "features", "models", "twin", "diagnosis"},
     "evidence": {"data", "features", "models", "twin", "diagnosis", "plants", "reports"},
-    "pipelines": {"data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence"},
+    "pipelines": {"data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence"},
     "thermodrift": {
-        "data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence", "pipelines",
+        "data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence", "pipelines",
     },
 }  # fmt: skip
 ORCHESTRATION = {"prefect", "mlflow", "typer"}

@@ -13,6 +13,7 @@ from scipy.linalg import blas, lapack
 from data.arrays import Array
 from features.design import Design, even_rows
 from models.base import Family
+from models.program import Builder
 from models.solvers.batches import by_batch
 
 Rows = NDArray[np.int64]
@@ -69,6 +70,16 @@ class KernelExpansion(Family):
                 values = kernel(x[some] / scale, support, sigma, self.linear) @ alpha + bias
                 out[some[:, None], members] = values
         return by_batch(design, out, wanted)
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        f = self.fitted
+        scale, support, alpha = (np.asarray(f[k], float) for k in ("scale", "support", "alpha"))
+        x = b.features(self.inputs)
+        u = b.scaled(b.since_first(x) if self.zero_start else x, scale)
+        p = max(1, len(self.inputs))
+        curve = b.add("kernel", [u], 1, support=support, weights=alpha, sharpness=1.0 / (2.0 * p * f["sigma"] ** 2))
+        line = b.affine(u, (LINEAR_WEIGHT / p * alpha @ support)[None] * self.linear)
+        return [b.affine(b.join(curve, line), np.ones((1, 2)), f["bias"])]
 
     def n_parameters(self) -> int:
         return int(np.size(self.fitted["alpha"])) + 3

@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from data.arrays import Array
+from data.errors import InputError
 from features.design import Design
 from features.rises import first_finite, first_order_lag
 from models.linear import Pool, Task, Tuned
+from models.program import Builder
 from models.solvers.batches import bridged, steps_s
 
 PROMPT, UNDRIVEN, DRIVEN = 0, 1, 2  # how far a column reaches: inputs of now, what is measured, what is commanded
@@ -83,6 +85,43 @@ class Columns:
         )
 
 
+def columns_program(b: Builder, inputs: Sequence[str], names: Sequence[str]) -> int:
+    """The columns `Columns.of` as operations, but for their level at the start; `names` are those that were fitted."""
+    drivers = [name for name, spec in b.known.items() if spec.role == "driver"]
+    x, held = b.features(inputs), b.channels(drivers, required=False) if drivers else -1
+    parts = [b.lags(x, [60.0 * lag_min for lag_min in _LAGS_MIN], 1.0)]
+    powers = [
+        (d, power)
+        for d, name in enumerate(drivers)
+        for power in ((1.0, 2.0) if b.known[name].unit == "rpm" else (1.0,))
+    ]
+    if powers:
+        signals = b.pick(held, [d for d, _ in powers])
+        load = b.add("power", [signals], len(powers), exponents=[power for _, power in powers])
+        at = np.arange(len(_LAGS_MIN) * len(powers)).reshape(len(_LAGS_MIN), len(powers))
+        parts.append(b.pick(b.lags(load, [60.0 * lag_min for lag_min in _LAGS_MIN], 0.0), at.T.ravel().tolist()))
+    gone = b.lags(b.constant(1.0), [60.0 * g for g in _CLOCK_GONE_MIN], 0.0)
+    parts.append(gone)
+    thermal = [c for c in dict.fromkeys(name.partition("@")[0] for name in inputs) if b.thermal(c)]
+    if thermal:
+        first = b.add("first", [b.channels(thermal)], len(thermal))
+        level = b.add("median", [first], 1)
+        away = b.sub(b.join(level, first), b.join(b.constant(_REFERENCE_DEGC), *[level] * len(thermal)))
+        if len(thermal) == 1:
+            away = b.pick(away, [0])
+        wide = b.size(away)
+        places = np.repeat(np.arange(len(_CLOCK_GONE_MIN) - len(_GONE_MIN), len(_CLOCK_GONE_MIN)), wide)
+        shares = b.pick(gone, places.tolist())
+        parts.append(b.add("mul", [b.join(*[away] * len(_GONE_MIN)), shares], wide * len(_GONE_MIN)))
+    whole = b.join(*parts)
+    if b.size(whole) != len(names):
+        raise InputError(
+            f"lag_dictionary: the machine's channels give {b.size(whole)} columns, the model was fitted with "
+            f"{len(names)}; give the machine file that it was trained with"
+        )
+    return whole
+
+
 @dataclass(frozen=True)
 class _Column:
     name: str
@@ -127,13 +166,17 @@ def _drivers(design: Design) -> list[_Column]:
     first = len(_scaled_inputs(design))
     out = []
     for d, (name, unit) in enumerate(zip(design.driver_names, design.driver_units, strict=True)):
-        # Friction and windage grow with speed and its square; a feed acts through the distance travelled.
-        for power in (1, 2) if unit == "rpm" else (1,):
+        for power in _powers(unit):
             for lag_min in _LAGS_MIN:
                 values = _lagged_by_batch(design, np.abs(held[:, d]) ** power, lag_min, at_rest=True)
                 label = f"{name}^{power}" if power > 1 else name
                 out.append(_Column(f"{label} after {lag_min:g} min", values, _FULL_SCALE_K, first + d, power, DRIVEN))
     return out
+
+
+def _powers(unit: str) -> tuple[int, ...]:
+    """Friction and windage grow with speed and its square; a feed acts through the distance travelled."""
+    return (1, 2) if unit == "rpm" else (1,)
 
 
 def _starts(design: Design) -> list[_Column]:

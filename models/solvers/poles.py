@@ -18,6 +18,7 @@ from data.arrays import Array, Mask
 from features.design import Design, Moments
 from features.rises import hold_last
 from models.linear import EPS
+from models.program import Builder
 from models.solvers.batches import padded, steps_s, unpadded
 from models.solvers.pooled_sums import Blocks, Pool, left_out_mean_S_um
 from models.thermal_exponential import lag_response
@@ -63,6 +64,19 @@ class Source:
         if self.kind == "room":
             return _temperature(design, self.name) - _first(design, self.name)
         return _first(design, self.name) - _first(design, ambient_of(design))
+
+    def operation(self, b: Builder) -> int:
+        """The same as a node of a program."""
+        if self.kind == "input":
+            return b.features([self.name])
+        raw = b.channels([self.name], required=False)
+        if self.kind in ("speed", "load"):
+            scaled = b.scaled(raw, np.array(_LIKE_1_K.get(b.known[self.name].unit, 1.0)))
+            return b.add("power", [scaled], 1, exponents=self.exponent)
+        if self.kind == "room":
+            return b.since_first(raw)
+        room = next(c for c, spec in b.known.items() if spec.role == "ambient")
+        return b.add("first", [b.sub(raw, b.channels([room], required=False))], 1)
 
 
 def drivers_of(design: Design) -> list[Source]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from features.design import Design, decimated_rows
+from models.program import Builder
 from models.solvers.batches import too_few_rows
 
 _FEWEST = 4
@@ -67,6 +68,11 @@ class Trees:
                 node = child
             out[:, start : start + step] = self.value[node]
         return out
+
+    def operation(self, b: Builder, x: int, weight: float, single: bool) -> int:
+        """Weighted sum of the trees at x; with `single` inputs are rounded to single precision first."""
+        plain = {name: values for name, values in self.as_plain().items() if name != "value"}
+        return b.add("trees", [x], 1, **plain, value=weight * self.value, single=float(single))
 
     def as_plain(self) -> dict[str, Any]:
         """The arrays by name."""

@@ -1,8 +1,8 @@
 """The whole proof in small, nothing replaced: fixed cases sealed, answered apart by the real diagnosis, opened.
 
 It proves the chain, not the diagnosis: with six runs of four hours a case is too short to judge that. All six cases
-(nothing missing, a decoy, one effect on either plant, two effects, one that no list holds) take minutes; by default
-one of them runs.
+(nothing missing, a decoy, one effect on either plant, two effects, one that no list holds) take minutes: `-m slow`. By
+default `test_prove_command` walks the same chain with an examinee that answers at once.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from evidence.proof.spec import CaseSpec
 from evidence.proof.suite import small_suite
 
 WORKERS = 2
-QUICK = (3,)  # one effect on finite volumes
+pytestmark = pytest.mark.slow
 Proof = tuple[Path, ProofOutcome, list[CaseSpec]]
 
 
-@pytest.fixture(scope="module", params=[QUICK, pytest.param(range(6), marks=pytest.mark.slow)], ids=["one", "six"])
-def proof(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Proof:
-    out, specs = tmp_path_factory.mktemp("small") / "proof", [small_suite()[k] for k in request.param]
+@pytest.fixture(scope="module")
+def proof(tmp_path_factory: pytest.TempPathFactory) -> Proof:
+    out, specs = tmp_path_factory.mktemp("small") / "proof", small_suite()
     seal(ProofFolder(out), Suite("development", specs, "small", secret=False), make_case, WORKERS)
     run_proof(out, WORKERS, by=Examinee(limit_s=3600.0))  # no time is judged here
     return out, open_proof(out, WORKERS, deals=0), specs

@@ -1,0 +1,1 @@
+"""A promoted model in the form that another program or a control takes."""
