@@ -23,8 +23,10 @@ from threadpoolctl import threadpool_limits
 from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.diagnose import diagnose
-from diagnosis.findings.schema import Findings
 from diagnosis.fitting.batches import usable_batches
+from diagnosis.result import Diagnosis
+from diagnosis.search.acceptance import least_gain
+from diagnosis.search.decision import Round, agreed_on
 from diagnosis.structure.fit import baseline
 from diagnosis.structure.naming import Refit, detect
 from evidence.proof.scoring.answer_key import AnswerKey, Spot
@@ -55,7 +57,7 @@ def examined(kind: PlantKind, seed: int, out: str, engine: str = "structure") ->
             part = twin_part(case.machine)
             batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
             if engine == "search":
-                row |= _searched(diagnose(case.machine, batches).findings, key, part)
+                row |= _searched(diagnose(case.machine, batches), key, part)
                 row["cpu_s"] = round(time.process_time() - begun, 1)
                 path.write_text(json.dumps(row, default=float))
                 return row
@@ -74,8 +76,9 @@ def examined(kind: PlantKind, seed: int, out: str, engine: str = "structure") ->
     return row
 
 
-def _searched(found: Findings, key: AnswerKey, part: TwinPart) -> dict[str, Any]:
+def _searched(done: Diagnosis, key: AnswerKey, part: TwinPart) -> dict[str, Any]:
     """The answer of the diagnosis: above 1 where it claims something."""
+    found = done.findings
     bodies = {name: sensor.at.partition("@")[0] for name, sensor in part.sensors.items()}
     first = found.findings[0] if found.findings else None
     right = (
@@ -86,7 +89,24 @@ def _searched(found: Findings, key: AnswerKey, part: TwinPart) -> dict[str, Any]
     listed = [
         {"name": f"{f.mechanism} {f.where.name}", "gain": f.evidence.get("gain_nats", 0.0)} for f in found.findings
     ]
-    return {"score": 2.0 if found.findings else 0.0, "right": right, "listed": listed, "verdict": found.verdict}
+    rounds = [_round(r, key, bodies) for r in done.search.rounds] if done.search is not None else []
+    score = 2.0 if found.findings else 0.0
+    return {"score": score, "right": right, "listed": listed, "verdict": found.verdict, "rounds": rounds}
+
+
+def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any]:
+    """The criteria of a round and its best refits."""
+    n = len(r.before.batches)
+    tried = [
+        {"name": t.candidate.name, "gain": t.gain, "level": t.level, "improved": t.improved, "least": least_gain(t, n),
+         "structure": r.null.threshold(r.density, name=t.candidate.name), "agreed": agreed_on(t, n),
+         "physics": t.candidate.kind.is_physics,
+         "right": bool(key.terms) and any(
+             names_term(t.candidate.mechanism, Spot(t.candidate.where.kind, t.candidate.where.name), term, bodies)
+             for term in key.terms)}
+        for t in r.tried[:SHOWN] if t.fitted is not None
+    ]  # fmt: skip
+    return {"accepted": r.accepted, "threshold": r.threshold, "batches": n, "tried": tried}
 
 
 def _plain(r: Refit) -> dict[str, Any]:

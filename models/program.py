@@ -71,7 +71,7 @@ class Program:
         required: of each channel whether a row without it has no output; another is bridged by its last value.
         step_s: time between rows.
         nodes: the first is the input.
-        outputs: nodes of one value each: the error in µm, and along an axis its slope in µm/mm.
+        outputs: nodes: of a model the error in µm, along an axis also its slope in µm/mm, one value each.
         along, reference_mm: channel and P0 of the position along which the error is offset + slope · (P − P0).
     """
 
@@ -99,7 +99,7 @@ class Program:
         required = np.array(self.required, bool)
         every = bool(required.all())
         outputs = list(self.outputs)
-        nothing = np.full(len(outputs), np.nan)
+        nothing = np.full(self.width, np.nan)
         values: list[Array] = [np.empty(0)] * len(self.nodes)
 
         def run(state: State, row: Array) -> Array:
@@ -117,9 +117,14 @@ class Program:
             state.started = True
             if lacking and (every or bool(missing[required].any())):
                 return nothing
-            return np.array([values[o][0] for o in outputs])
+            return values[outputs[0]].copy() if len(outputs) == 1 else np.concatenate([values[o] for o in outputs])
 
         return run
+
+    @property
+    def width(self) -> int:
+        """Number o of output values."""
+        return sum(self.nodes[k].size for k in self.outputs)
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings, lists and arrays."""
@@ -168,7 +173,7 @@ class State:
 def replay(program: Program, rows: Array) -> Array:
     """Outputs (n, o) of a whole batch, rows (n, m)."""
     run, state = program.runner(), program.begin()
-    return np.array([run(state, row) for row in rows]).reshape(len(rows), len(program.outputs))
+    return np.array([run(state, row) for row in rows]).reshape(len(rows), program.width)
 
 
 class Builder:

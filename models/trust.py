@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from data.arrays import Array
-from data.batch import Batch
+from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from features.rises import feature, feature_unit
@@ -20,6 +20,7 @@ from models import FAMILIES
 from models.base import Family
 from models.crossing import Crossing, with_target
 from models.metrics import residual_std_um
+from models.program import Builder, Program
 from models.protocols import Fold
 
 Watched = Mapping[str, Array]  # quantity -> (n,) of one batch
@@ -99,6 +100,36 @@ class Region:
         every = list(self.beyond(values).values())
         known = np.array([np.isfinite(far) for far in every]).any(axis=0)
         return np.where(known, np.max([np.nan_to_num(far, nan=0.0) for far in every], axis=0), np.nan)
+
+    def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
+        """The watched quantities (q,) row by row, in the order of `ranges`, see `row`."""
+        b = Builder(channels, step_s)
+        return b.program([b.features(list(self.ranges), required=False)], zero_start=False)
+
+    def row(self) -> Callable[[Array], tuple[float, str]]:
+        """`far(values (q,)) -> (distance, quantity)`: `beyond` and the farthest of one row, in the order of `ranges`.
+
+        Missing quantities are skipped; 0 and no quantity where none is outside.
+        """
+        names = list(self.ranges)
+        low, high = (np.array([self.ranges[n][side] for n in names]) for side in (0, 1))
+        least = np.array([_LEAST_WIDTH.get(self.units.get(n, ""), 0.0) for n in names])
+        width = np.maximum(high - low, least)
+        width[width == 0.0] = 1.0
+        points = [names.index(n) for n in self.points] if len(self.points) > 1 else []
+        widths = np.maximum(self.high - self.low, _LEAST_WIDTH_OF_PATTERN_K)
+
+        def far(values: Array) -> tuple[float, str]:
+            beyond = np.nan_to_num(_excess(values, low, high) / width, nan=0.0)
+            at = int(np.argmax(beyond)) if len(beyond) else -1
+            most, name = (float(beyond[at]), names[at]) if at >= 0 else (0.0, "")
+            if points:
+                scores = (values[points] - self.centre) @ self.directions
+                pattern = float(np.nan_to_num(_excess(scores, self.low, self.high) / widths, nan=0.0).max())
+                most, name = (pattern, PATTERN) if pattern > most else (most, name)
+            return (most, name) if most > 0 else (0.0, "")
+
+        return far
 
     def excess(self, name: str, values: Watched) -> str:
         """How a quantity of a batch leaves the region, as "room 31 degC, trained 18 to 27"."""

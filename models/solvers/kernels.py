@@ -124,7 +124,12 @@ def from_origin(support: Array, alpha: Array) -> tuple[Array, Array]:
 def unit_scale(design: Design) -> Array:
     """What inputs are divided by for their unit, (p,): the same in every fold."""
     units = design.input_units or ("",) * len(design.inputs)
-    return np.array([SCALES.get(u, _OTHER_SCALE) for u in units])
+    return np.array([scale_of(u) for u in units])
+
+
+def scale_of(unit: str) -> float:
+    """What an input of that unit is divided by."""
+    return SCALES.get(unit, _OTHER_SCALE)
 
 
 def evenly(design: Design, batches: Sequence[int], most: int) -> Rows:

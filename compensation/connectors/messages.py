@@ -1,0 +1,395 @@
+"""What all connectors share: addresses, channel names and units, samples and corrections as text, reports of skips."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import math
+import os
+import re
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from compensation.contracts import Correction, Sample
+from data.errors import InputError, WorkError, closest
+from data.machine import Machine
+from data.readers.cells import parse_number
+from data.readers.csv import normalise
+from data.units import conversion
+
+BLOCK_S = 0.9  # the longest time that a sink's `write` may wait: the contract allows 1 s
+IDLE_S = 0.5  # a source yields None after this silence: the contract asks for one at least every second
+TIME_KEYS = ("time_s", "time", "timestamp")
+STATES = ("off", "fade-out", "hold", "warm-up", "active")  # from no authority to full authority
+
+_MILLISECONDS_FROM = 1e11  # a Unix time in s reaches this in the year 5138
+_MAX_KEYS = 1000  # of `Reports`: names come from outside, memory must not grow with them
+_INBOX_SIZE = 1000
+_MISSING = ("", "nan", "null", "none")
+
+
+# ----- addresses
+
+
+def shown(address: str) -> str:
+    """An address as error lines may show it: without user, password and query."""
+    return re.sub(r"//.*@", "//", address, flags=re.DOTALL).partition("?")[0]
+
+
+@dataclass(frozen=True)
+class NetworkAddress:
+    """A parsed ``SCHEME://HOST:PORT/PATH?KEY=VALUE``; `text` is the address without its query."""
+
+    text: str
+    scheme: str
+    host: str
+    port: int
+    path: str
+    query: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, address: str, default_port: int, keys: Collection[str], secrets: str) -> NetworkAddress:
+        """Split and check an address; `keys` are the known query keys, `secrets` the start of the variables' names.
+
+        Raises:
+            InputError: a user or password in the address, no host, a wrong port, an unknown or repeated query key.
+        """
+        text = shown(address)
+        parts = urlsplit(address)
+        if "@" in parts.netloc:
+            raise InputError(
+                f"{text}: the address holds a user or a password, expected neither; "
+                f"set {secrets}_USER and {secrets}_PASSWORD in the environment"
+            )
+        try:
+            port = parts.port
+        except ValueError:
+            raise InputError(
+                f"{text}: got the port {parts.netloc.rpartition(':')[2]!r}, expected 1 to 65535; correct it"
+            ) from None
+        if not parts.hostname or "#" in address:
+            got = "'#'" if "#" in address else "no host"
+            raise InputError(f"{text}: got {got}, expected {parts.scheme}://HOST:PORT/PATH; correct the address")
+        try:
+            query = parse_qs(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
+        except ValueError:
+            raise InputError(f"{text}: the part after '?' cannot be read; expected KEY=VALUE&KEY=VALUE") from None
+        for key, values in query.items():
+            if key not in keys:
+                raise InputError(f"{text}: unknown key {key!r} after '?': {closest(key, keys)}")
+            if len(values) > 1:
+                raise InputError(f"{text}: key {key!r} stands {len(values)} times after '?'; give it once")
+        path = unquote(parts.path).strip("/")
+        return cls(text, parts.scheme, parts.hostname, port or default_port, path, {k: v[0] for k, v in query.items()})
+
+    def seconds(self, key: str, default_s: float) -> float:
+        """A duration from the query, s.
+
+        Raises:
+            InputError: not a number above 0.
+        """
+        given = self.query.get(key)
+        value = default_s if given is None else parse_number(given)
+        if value is None or value <= 0:
+            raise InputError(f"{self.text}: {key}: got {given!r}, expected a number of seconds above 0; correct it")
+        return value
+
+
+def credentials(secrets: str) -> tuple[str, str | None] | None:
+    """User and password from the environment variables ``SECRETS_USER`` and ``SECRETS_PASSWORD``; None without a user.
+
+    Raises:
+        InputError: a password without a user.
+    """
+    user, password = os.environ.get(f"{secrets}_USER"), os.environ.get(f"{secrets}_PASSWORD")
+    if not user and password:
+        raise InputError(f"{secrets}_PASSWORD is set and {secrets}_USER is not; set both or neither")
+    return (user, password) if user else None
+
+
+# ----- reports on standard error
+
+
+def warn(text: str) -> None:
+    """One line on standard error."""
+    print(f"thermodrift: {text}", file=sys.stderr, flush=True)
+
+
+class Reports:
+    """Reports what is skipped: the first `first` items of an unbroken row of skips under one key, each in one line."""
+
+    def __init__(self, first: int = 1) -> None:
+        self._first = first
+        self._skips: dict[str, int] = {}
+
+    def skipped(self, key: str, text: str) -> None:
+        """Report a skip, unless `first` reports stand under this key since the last success."""
+        if key not in self._skips and len(self._skips) >= _MAX_KEYS:
+            return
+        n = self._skips[key] = self._skips.get(key, 0) + 1
+        if n <= self._first:
+            silent = n == self._first
+            warn(f"{text}; skipped" + " (further ones are not reported until one is read)" * silent)
+
+    def read(self, key: str) -> None:
+        """Note a success: the next skip under this key is reported again."""
+        self._skips.pop(key, None)
+
+
+def excerpt(given: object) -> str:
+    """What was given, short enough for an error line."""
+    text = given.decode("utf-8", "replace") if isinstance(given, bytes | bytearray) else given
+    quoted = repr(text)
+    return quoted if len(quoted) <= 60 else f"{quoted[:57]}…"
+
+
+# ----- numbers and times
+
+
+def number(given: object, decimal: str = ".") -> float | None:
+    """A finite number from a JSON value or a cell, or None."""
+    if isinstance(given, str):
+        return parse_number(given, decimal)
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        return None
+    try:
+        value = float(given)
+    except OverflowError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def is_missing(given: object) -> bool:
+    """Whether a value says that there is none: null, NaN or an empty cell."""
+    if isinstance(given, str):
+        return given.strip().lower() in _MISSING
+    return given is None or (isinstance(given, float) and math.isnan(given))
+
+
+def unix_time_s(given: object, pattern: str | None = None, unit_s: float = 1.0) -> float:
+    """Unix time in s from a number or a time stamp.
+
+    A number counts in `unit_s`; in s it may also be Unix milliseconds (from 1e11). Text is read by the strptime
+    `pattern`, if one is given, or as ISO 8601. Without an offset from UTC it is in this computer's local time.
+
+    Raises:
+        ValueError: neither; the message says what was got and expected.
+    """
+    value = number(given)
+    if value is not None:
+        return value / 1e3 if unit_s == 1.0 and value >= _MILLISECONDS_FROM else value * unit_s
+    text = given.strip() if isinstance(given, str) else ""
+    for read in (lambda: dt.datetime.strptime(text, pattern or ""), lambda: dt.datetime.fromisoformat(text)):
+        try:
+            return read().timestamp()
+        except (ValueError, OverflowError, OSError):
+            continue
+    form = f" or {pattern!r}" if pattern else ""
+    raise ValueError(f"got time {excerpt(given)}, expected Unix seconds or an ISO time stamp{form}")
+
+
+# ----- channels
+
+
+class Target(NamedTuple):
+    """Where a value goes: value in the channel's unit = factor · value + offset."""
+
+    channel: str
+    is_reading: bool
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+class Names:
+    """Finds the channel that a name from outside means, and its conversion into the machine file's unit.
+
+    A channel goes by its own name or by the `column` of the machine file. A value under the name is in `unit`, one
+    under the column in `unit_in_file`. Where both are the same text, a CSV file means the column, all others the name.
+
+    Raises:
+        InputError: a unit that cannot be converted.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self.channels = tuple(machine.channels)
+        self._by_name: dict[str | int, Target] = {}
+        self._by_column: dict[str | int, Target] = {}
+        for name, part in machine.channels.items():
+            where = f"machine file {machine.machine}: channel {name!r}"
+            scale = conversion(part.unit_in_file or part.unit, part.unit, where)
+            is_error = part.role == "error"
+            self._by_name[name] = Target(name, is_error)
+            self._by_column[name if part.column is None else part.column] = Target(name, is_error, *scale)
+        for known in (self._by_name, self._by_column):  # other spellings, where they are no other channel's
+            for exact, target in list(known.items()):
+                known.setdefault(exact if isinstance(exact, int) else normalise(exact), target)
+
+    def of_column(self, header: str | int) -> Target | None:
+        """The channel of a column of a CSV file, or None."""
+        return self._find(header, self._by_column, self._by_name)
+
+    def of_key(self, key: str) -> Target | None:
+        """The channel of a key of a message, or None."""
+        return self._find(key, self._by_name, self._by_column)
+
+    @staticmethod
+    def _find(key: str | int, *tables: Mapping[str | int, Target]) -> Target | None:
+        spellings = [key] if isinstance(key, int) else [key, key.strip(), normalise(key)]
+        return next((table[s] for table in tables for s in spellings if s in table), None)
+
+
+def sample_from_json(
+    text: str | bytes | bytearray, names: Names, reports: Reports, where: str, arrival_s: float | None
+) -> Sample:
+    """A sample from one JSON object.
+
+    Either ``{"time_s": …, "values": {channel: number}, "readings_um": {error channel: number}}`` or flat, with the
+    channels next to the time; a number under an error channel is a reading in both. The time stands under `time_s`,
+    `time` or `timestamp`, as Unix time in s or as an ISO time stamp; without one the sample has `arrival_s`. A value
+    that is no number, or whose channel is unknown, is left out with one report.
+
+    Raises:
+        ValueError: not a JSON object, or no time and no `arrival_s`; the message says what was got and expected.
+    """
+    try:
+        given = json.loads(text)
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        raise ValueError(f"got {excerpt(text)}, expected one JSON object")
+    stamps = [given.pop(key) for key in TIME_KEYS if key in given]
+    if stamps:
+        time_s = unix_time_s(stamps[0])
+    elif arrival_s is not None:
+        time_s = arrival_s
+    else:
+        raise ValueError(f"got {excerpt(text)}, expected the key 'time_s'")
+    nested = [given[key] for key in ("values", "readings_um") if key in given]
+    for part in nested:
+        if not isinstance(part, dict):
+            raise ValueError(f"got {excerpt(part)} under 'values' or 'readings_um', expected an object")
+    values: dict[str, float] = {}
+    readings_um: dict[str, float] = {}
+    for key, cell in (item for part in nested or [given] for item in part.items()):
+        take(names.of_key(key), key, cell, names, reports, where, values, readings_um)
+    return Sample(time_s, values, readings_um)
+
+
+def take(
+    target: Target | None,
+    key: str,
+    given: object,
+    names: Names,
+    reports: Reports,
+    where: str,
+    values: dict[str, float],
+    readings: dict[str, float],
+    decimal: str = ".",
+) -> None:
+    """Put a number under its channel into `values` or `readings`; report an unknown channel and what is no number."""
+    if target is None:
+        reports.skipped(key, f"{where}: unknown channel {excerpt(key)}: {closest(key[:60], names.channels)}")
+        return
+    if is_missing(given):
+        return
+    value = number(given, decimal)
+    if value is None:
+        reports.skipped(key, f"{where}: {key}: got {excerpt(given)}, expected a number")
+        return
+    reports.read(key)
+    (readings if target.is_reading else values)[target.channel] = value * target.factor + target.offset
+
+
+# ----- samples that arrive in another thread
+
+
+class Inbox:
+    """Samples on their way from a connector's thread to the runtime; when full, the oldest go, with one report."""
+
+    def __init__(self, where: str, size: int = _INBOX_SIZE) -> None:
+        self._where = where
+        self._samples: deque[Sample] = deque()
+        self._size = size
+        self._changed = threading.Condition()
+        self._closed = False
+        self._full = False
+
+    def put(self, sample: Sample) -> None:
+        """Add a sample; never blocks."""
+        with self._changed:
+            if len(self._samples) >= self._size:
+                self._samples.popleft()
+                if not self._full:
+                    warn(f"{self._where}: {self._size} samples wait, the oldest are dropped; the runtime is too slow")
+                self._full = True
+            self._samples.append(sample)
+            self._changed.notify_all()
+
+    def get(self, timeout_s: float) -> Sample | None:
+        """The oldest sample, or None when none has come in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._samples or self._closed, timeout_s)
+            if not self._samples:
+                return None
+            sample = self._samples.popleft()
+            self._full = self._full and bool(self._samples)
+            return sample
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._samples.clear()
+            self._changed.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def samples(self) -> Iterator[Sample | None]:
+        """Samples as they come, None in silence; ends after `close`."""
+        while not self._closed:
+            sample = self.get(IDLE_S)
+            if not self._closed:
+                yield sample
+
+
+# ----- corrections
+
+
+def check_deliverable(correction: Correction, where: str) -> None:
+    """Refuse a correction that no control must get.
+
+    Raises:
+        WorkError: an offset or slope that is not finite.
+    """
+    for what, parts in (("offset_um", correction.offset_um), ("slope_um_per_m", correction.slope_um_per_m)):
+        for axis, value in parts.items():
+            if not math.isfinite(value):
+                raise WorkError(f"{where}: axis {axis!r}: {what} is {value}, expected a finite number; nothing is sent")
+
+
+def correction_record(correction: Correction) -> dict[str, Any]:
+    """The fields of a correction as plain data, for JSON."""
+    return {
+        "time_s": float(correction.time_s),
+        "offset_um": {axis: float(v) for axis, v in correction.offset_um.items()},
+        "slope_um_per_m": {axis: float(v) for axis, v in correction.slope_um_per_m.items()},
+        "state": dict(correction.state),
+        "reasons": dict(correction.reasons),
+    }
+
+
+def overall_state(correction: Correction) -> str:
+    """The state with most authority among the axes: `off` only where every axis is off."""
+    return max(correction.state.values(), key=lambda s: STATES.index(s) if s in STATES else -1, default="off")
+
+
+def deadline_s() -> float:
+    """The moment, on the monotonic clock in s, until which a `write` that begins now may wait."""
+    return time.monotonic() + BLOCK_S

@@ -1,0 +1,333 @@
+"""Compensation as it runs: samples in, corrections out.
+
+One `Compensator` serves one machine. A sample passes the guard of the sensors, then every axis runs its model as a
+program on a grid of `period_s`, corrects it by what a probe has measured, weighs it by how far the machine is outside
+the trained region, and hands it to the state machine of `compensation.safety`. Nothing of a run is kept but the states,
+so memory does not grow, and `as_plain` is all that a restart needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from compensation import safety
+from compensation.contracts import Correction, Sample
+from compensation.safety import Axis, Limits
+from compensation.substitutes import Guard, Substitutes, Watch
+from data.arrays import Array
+from data.errors import InputError
+from models.conformal import RunBound
+from models.program import Program, State
+from models.solvers.kernels import scale_of
+from models.trust import SLACK, Region
+from models.updating import State as Learned
+from models.updating import Updater
+
+SCHEMA = "thermodrift.compensation/1"
+_ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
+_NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
+_UM_PER_M = 1000.0  # per µm/mm
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """One error channel's model, ready to run.
+
+    Attributes:
+        axis: error channel.
+        program: gives the error in µm, along an axis also its slope in µm/mm.
+        inputs, units: features of the family, with the unit of each, that readings scale with.
+        region, watched: where the model was trained, and the program of the quantities it watches.
+        bound: how the error grows outside of it; None where that is not known.
+        updater: the filter of readings; None where it could not be learned.
+        limits: of what is sent.
+    """
+
+    axis: str
+    program: Program
+    inputs: tuple[str, ...]
+    units: tuple[str, ...]
+    region: Region
+    watched: Program
+    bound: RunBound | None = None
+    updater: Updater | None = None
+    limits: Limits = field(default_factory=Limits)
+
+    def authority(self, distance: float) -> float:
+        """Share of the correction that is applied so far outside of the trained region, in widths.
+
+        The error there is expected to be `RunBound.factor` times that of an ordinary run; a correction whose error
+        grows by a factor is worth its inverse. Without a bound it falls with the distance itself.
+        """
+        if distance <= SLACK:
+            return 1.0
+        if self.bound is None or not math.isfinite(factor := self.bound.factor(math.nan, distance)):
+            return 1.0 / (1.0 + distance)
+        return min(1.0, 1.0 / factor)
+
+
+@dataclass
+class _Running:
+    """State of one axis."""
+
+    model: State
+    region: State
+    learned: Learned | None
+    safety: Axis
+    error_um: float = 0.0  # of the last row, with readings
+    free_um: float = math.nan  # of the last row, of the model alone
+    scaled: Array = field(default_factory=lambda: np.zeros(0))  # inputs of the last row, for the filter
+    slope_um_per_mm: float = 0.0
+    odd_um: float = math.nan  # of the last reading, where it was rejected: how far it was off
+    trust: float = 1.0
+    why: str = ""
+    at_s: float = 0.0  # since the start of the run
+
+
+class Compensator:
+    """The corrections of a machine's axes.
+
+    Args:
+        machine: name.
+        axes: their models.
+        substitutes: learned at training; None: sensors are not guarded.
+        period_s: grid on which the models run, s; they are made for it.
+        log: told what is noticed, one line each.
+    """
+
+    def __init__(
+        self,
+        machine: str,
+        axes: Sequence[AxisModel],
+        substitutes: Substitutes | None = None,
+        period_s: float = 10.0,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        if not axes:
+            raise InputError(f"compensation of {machine}: no axis given; name at least one model")
+        for a in axes:
+            if a.program.step_s != period_s or a.watched.step_s != period_s:
+                raise InputError(
+                    f"compensation of {machine}: axis {a.axis} is made for {a.program.step_s:g} s, got a period of "
+                    f"{period_s:g} s; make the program for that period"
+                )
+        self.machine, self.axes, self.period_s, self.log = machine, tuple(axes), period_s, log
+        self.guard = Guard(substitutes) if substitutes is not None else None
+        self._watch = self.guard.begin() if self.guard is not None else None
+        self._steps = {a.axis: (a.program.runner(), a.watched.runner(), a.region.row()) for a in axes}
+        self._run = {a.axis: self._fresh(a) for a in axes}
+        self._grid_s: float | None = None  # time stamp of the grid's last row
+        self._held: dict[str, float] = {}
+        self.rejected = 0
+
+    def _fresh(self, a: AxisModel, was: Axis | None = None) -> _Running:
+        learned = a.updater.begin() if a.updater is not None else None
+        return _Running(a.program.begin(), a.watched.begin(), learned, was or Axis())
+
+    def begin_run(self) -> None:
+        """Starts a new run: the error is 0 from here on, as after a new reference of the tool. What is sent returns
+        there within its limits."""
+        self._run = {a.axis: self._fresh(a, self._run[a.axis].safety) for a in self.axes}
+        self._grid_s = None
+
+    def take(self, sample: Sample, clock_s: float) -> Correction:
+        """The correction after a sample; `clock_s` is the monotonic clock of the runtime, s.
+
+        A sample without values only brings readings.
+        """
+        if not sample.values:
+            for axis, measured_um in sample.readings_um.items():
+                self._read(axis, measured_um)
+            return self.silence(clock_s, sample.time_s)
+        fault, notes = self._advance(sample)
+        for axis, measured_um in sample.readings_um.items():
+            self._read(axis, measured_um)
+        offset: dict[str, float] = {}
+        slope: dict[str, float] = {}
+        state, reasons = {}, {}
+        for a in self.axes:
+            run = self._run[a.axis]
+            wanted_um = -run.error_um if math.isfinite(run.error_um) else math.nan
+            run.safety, sent_um, reason = safety.step(
+                run.safety, a.limits, clock_s, sample.time_s, wanted_um, run.trust, fault
+            )
+            offset[a.axis], state[a.axis] = sent_um, run.safety.state
+            reasons[a.axis] = "; ".join(r for r in (reason, run.why, notes) if r)
+            self._slope(a, sent_um, wanted_um, slope)
+        return Correction(sample.time_s, offset, slope, state, reasons)
+
+    def silence(self, clock_s: float, time_s: float) -> Correction:
+        """The correction while nothing arrives; `time_s` is stamped on it."""
+        offset: dict[str, float] = {}
+        slope: dict[str, float] = {}
+        state, reasons = {}, {}
+        for a in self.axes:
+            run = self._run[a.axis]
+            run.safety, sent_um, reason = safety.silence(run.safety, a.limits, clock_s)
+            offset[a.axis], state[a.axis], reasons[a.axis] = sent_um, run.safety.state, reason
+            self._slope(a, sent_um, -run.error_um, slope)
+        return Correction(time_s, offset, slope, state, reasons)
+
+    def stop(self) -> None:
+        """The operator stops: every axis fades out."""
+        for run in self._run.values():
+            run.safety = safety.stop(run.safety)
+
+    def _slope(self, a: AxisModel, sent_um: float, wanted_um: float, slope: dict[str, float]) -> None:
+        """The slope in the share of what is wanted that the limits let through: both grow and fade together."""
+        if a.program.along:
+            run = self._run[a.axis]
+            share = min(max(sent_um / wanted_um, 0.0), 1.0) if math.isfinite(wanted_um) and wanted_um else 1.0
+            active = run.safety.state != "off" and math.isfinite(run.slope_um_per_mm)
+            slope[a.axis] = -share * run.slope_um_per_mm * _UM_PER_M if active else 0.0
+
+    def _advance(self, sample: Sample) -> tuple[str | None, str]:
+        """Takes the models to the time of the sample: why it cannot be used, and what was replaced in it."""
+        if not math.isfinite(sample.time_s):
+            return None, ""  # the state machine refuses the time stamp
+        values, fault, notes = dict(sample.values), None, ""
+        if self.guard is not None and self._watch is not None:
+            self._watch, checked = self.guard.step(self._watch, sample.time_s, sample.values)
+            values, fault, notes = dict(checked.values), checked.fault, checked.reason
+        clean = {c: float(v) for c, v in values.items() if v is not None and math.isfinite(v)}
+        if fault is not None:
+            return fault, notes
+        if self._grid_s is not None and sample.time_s - self._grid_s > _NEW_RUN_S:
+            self.log(f"silent for {(sample.time_s - self._grid_s) / 3600:.1f} h: a new run begins")
+            self.begin_run()
+        if self._grid_s is None:
+            self._held = clean
+            if missing := self._missing(clean):
+                return f"not yet seen: {', '.join(missing)}", notes
+            self._rows(sample.time_s, [clean])
+            return None, notes
+        rows = int((sample.time_s - self._grid_s) / self.period_s + 1e-9)
+        if rows > 0:
+            whole = {**self._held, **clean}
+            shares = (np.arange(rows) + 1) / rows  # a longer gap is bridged by a straight line
+            between = [{c: self._held[c] + w * (v - self._held[c]) for c, v in whole.items()} for w in shares]
+            self._held = whole
+            self._rows(self._grid_s + rows * self.period_s, between)
+        return None, notes
+
+    def _missing(self, values: Mapping[str, float]) -> list[str]:
+        wanted = dict.fromkeys(c for a in self.axes for c in a.program.channels)
+        return [c for c in wanted if c not in values]
+
+    def _rows(self, time_s: float, rows: Sequence[Mapping[str, float]]) -> None:
+        """Steps every model through rows of the grid, the last one at `time_s`."""
+        self._grid_s = time_s
+        for a in self.axes:
+            run, (step, watch, far) = self._run[a.axis], self._steps[a.axis]
+            for values in rows:
+                run.at_s += self.period_s if run.model.started else 0.0
+                out = step(run.model, _row(a.program, values))
+                seen = watch(run.region, _row(a.watched, values))
+            run.free_um, run.scaled = float(out[0]), self._scaled(a, seen, float(out[0]))
+            run.slope_um_per_mm = float(out[1]) if len(out) > 1 else 0.0
+            distance, quantity = far(seen)
+            run.trust = a.authority(distance)
+            run.why = f"{quantity} outside the trained region by {distance:.2g} widths" if run.trust < 1.0 else ""
+            run.error_um = run.free_um
+            if a.updater is not None and run.learned is not None and math.isfinite(run.free_um):
+                run.error_um, _, run.learned = a.updater.step(run.learned, run.at_s, run.free_um, run.scaled)
+
+    def _scaled(self, a: AxisModel, seen: Array, predicted_um: float) -> Array:
+        if not a.inputs:
+            return np.array([predicted_um])
+        names = list(a.region.ranges)
+        return np.array([seen[names.index(i)] / scale_of(u) for i, u in zip(a.inputs, a.units, strict=True)])
+
+    def _read(self, axis: str, measured_um: float) -> None:
+        """A reading of the error that is left with the correction that is being sent."""
+        a = next((a for a in self.axes if a.axis == axis), None)
+        if a is None:
+            self.log(f"{axis}: reading not used: no such axis; compensated are {', '.join(self._run)}")
+            return
+        run = self._run[axis]
+        if a.updater is None or run.learned is None or not run.learned.started or not math.isfinite(run.free_um):
+            self.log(f"{axis}: reading of {measured_um:g} µm not used: no filter, or no prediction yet")
+            return
+        total_um = measured_um - run.safety.sent_um  # the machine's own error: what is left less what was added
+        known, row = run.learned, (run.at_s, run.free_um, run.scaled)
+        expected_um, sd_um, _ = a.updater.step(known, *row)
+        off_um = total_um - expected_um
+        if not abs(off_um) <= _ODD_READING_SD * sd_um:
+            again = abs(off_um - run.odd_um) <= _ODD_READING_SD * sd_um
+            run.odd_um = off_um if math.isfinite(off_um) else math.nan
+            if not again:
+                self.rejected += 1
+                self.log(
+                    f"{axis}: reading of {measured_um:g} µm rejected: {off_um:+.3g} µm from what is expected, more "
+                    f"than {_ODD_READING_SD:g} standard deviations of {sd_um:.3g} µm; probe again"
+                )
+                return
+            self.log(f"{axis}: two readings in a row are {off_um:+.3g} µm off: the machine has changed, both count")
+            known = replace(known, cov=known.cov * (off_um / sd_um) ** 2)
+        run.odd_um = math.nan
+        _, _, run.learned = a.updater.step(known, *row, total_um)
+        run.error_um, _, _ = a.updater.step(run.learned, *row)
+
+    def as_plain(self) -> dict[str, Any]:
+        """Everything that a restart needs, numbers, strings and lists."""
+        axes = {}
+        for name, run in self._run.items():
+            learned = run.learned and {
+                "mean": run.learned.mean.tolist(), "cov": run.learned.cov.tolist(), "time_s": run.learned.time_s,
+                "started": run.learned.started,
+            }  # fmt: skip
+            axes[name] = {
+                "model": run.model.as_plain(), "region": run.region.as_plain(), "learned": learned,
+                "safety": run.safety.as_plain(), "error_um": _or_none(run.error_um),
+                "free_um": _or_none(run.free_um), "scaled": [_or_none(v) for v in run.scaled.tolist()],
+                "slope_um_per_mm": _or_none(run.slope_um_per_mm), "trust": run.trust, "at_s": run.at_s,
+            }  # fmt: skip
+        watch = self._watch.as_plain() if self._watch is not None else None
+        return {"schema": SCHEMA, "machine": self.machine, "period_s": self.period_s, "grid_s": self._grid_s,
+                "held": self._held, "watch": watch, "axes": axes}  # fmt: skip
+
+    def restore(self, plain: Mapping[str, Any]) -> None:
+        """Goes on from `as_plain` of another process: what was learned is kept, what is sent does not jump.
+
+        Raises:
+            InputError: the state of another machine, period or set of axes.
+        """
+        got = (plain.get("schema"), plain.get("machine"), plain.get("period_s"), sorted(plain.get("axes", ())))
+        expected = (SCHEMA, self.machine, self.period_s, sorted(self._run))
+        if got != expected:
+            raise InputError(
+                f"state of a compensation: got {got}, expected {expected}; delete the file, the compensation then "
+                "starts afresh"
+            )
+        self._grid_s = plain["grid_s"]
+        self._held = {c: float(v) for c, v in plain["held"].items()}
+        if self.guard is not None and plain["watch"] is not None:
+            self._watch = Watch.from_plain(plain["watch"])
+        for name, one in plain["axes"].items():
+            kept = one["learned"]
+            learned = kept and Learned(
+                np.array(kept["mean"], float), np.array(kept["cov"], float), float(kept["time_s"]), kept["started"]
+            )
+            self._run[name] = _Running(
+                State.from_plain(one["model"]), State.from_plain(one["region"]), learned,
+                Axis.from_plain(one["safety"]), _or_nan(one["error_um"]), _or_nan(one["free_um"]),
+                np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
+                at_s=float(one["at_s"]),
+            )  # fmt: skip
+
+
+def _row(program: Program, values: Mapping[str, float]) -> Array:
+    return np.array([values.get(c, math.nan) for c in program.channels])
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else float(value)

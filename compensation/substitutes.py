@@ -1,0 +1,471 @@
+"""Plausibility of temperature channels at the machine, and values in place of those that fail.
+
+The rises r of all temperature channels of a run, values less their first, are taken as jointly Gaussian with mean 0.
+Any channel then follows from any subset g of the others by the conditional mean
+
+    E[r_i | r_g] = C_ig (C_gg)⁻¹ r_g,
+
+where C is the second moment of training rises with the variance of noise on its diagonal. A substitute adds what this
+predicts since the last good value, so that it continues from there. Its stated standard deviation is that of batches
+that were left out of C.
+
+Conditional Gaussian: Rasmussen & Williams (2006), eq. A.6; the noise acts as the penalty of ridge regression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+
+from data.arrays import Array, Mask
+from data.batch import Batch
+from data.errors import InputError, one_of
+
+Status = Literal["ok", "lost", "implausible", "stepping", "frozen"]
+STATUSES: tuple[Status, ...] = get_args(Status)
+
+_ROLES = ("temperature", "ambient")
+_LEAST_BATCHES = 2  # one is left out
+_LEAST_ROWS = 3  # of a batch with all channels: a start, and a rise that changes
+_NOISE_SHARES = (1e-5, 1e-4, 1e-3, 1e-2)  # noise variance tried, as a share of the mean square rise
+_RATE_QUANTILE = 0.999  # of the rate of change in training: a few outliers are no usual change
+_RATE_MARGIN = 3.0  # on that: a door or a coolant valve that training did not see
+_HELD_MARGIN = 1.5  # on the longest constant stretch of training
+_LEAST_SD_K = 1e-3  # below the resolution of any temperature sensor of a machine
+_SAME_K = 1e-9  # equal but for rounding: a frozen value is repeated exactly
+_FARTHEST_K = 1e4  # no machine is hotter; bounds channels without a range
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """When a channel counts as failed, and for how long it may be replaced.
+
+    Attributes:
+        substitute_s: time in total that a channel may be replaced, s; a good channel earns it back at the same pace.
+            An hour suffices to finish the part and to call maintenance. It also bounds the pause between two samples
+            after which the guard starts afresh, since no substitute reaches across a longer one.
+        step_sd: change against the regression between two samples that is a step, in standard deviations. The standard
+            deviation is that of whole runs, so 6 between two samples is far outside of what training shows.
+        frozen_sd: change that the regression predicts while the value stays constant, in standard deviations.
+        back_sd: distance to the substitute within which a channel counts as recovered, in standard deviations.
+        back_samples: consecutive samples for which that must hold.
+        bad_share: share of failed channels above which nothing is replaced any more: the regressions then rest on a
+            minority, and a common cause such as the logger is likely.
+    """
+
+    substitute_s: float = 3600.0
+    step_sd: float = 6.0
+    frozen_sd: float = 5.0
+    back_sd: float = 4.0
+    back_samples: int = 5
+    bad_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a limit is not finite or not above 0."""
+        for name, value in self.__dict__.items():
+            if not isinstance(value, int | float) or not np.isfinite(value) or value <= 0:
+                raise InputError(
+                    f"limits of sensors: got {name}={value!r}, expected a finite number above 0; "
+                    f"leave it out for the default of {type(self).__dataclass_fields__[name].default}"
+                )
+
+
+@dataclass(frozen=True)
+class Substitutes:
+    """What training knows of n temperature channels.
+
+    Attributes:
+        names: the channels.
+        covariance_K2: second moment of their rises with the noise on the diagonal, K², (n, n).
+        sd_K: standard deviation of each channel about its regression on all others, in left-out batches, K, (n,).
+        rate_K_per_s: largest usual rate of change with its margin, K/s, (n,).
+        held_s: longest time that a channel was constant while its regression moved by more than sd_K, s, (n,).
+        low, high: plausible range, in the unit of the channels, (n,).
+        resolution_K: smallest step shown, K, (n,); 0 where not known.
+        step_s: step of the training grid, s; changes within a shorter time are mostly noise.
+    """
+
+    names: tuple[str, ...]
+    covariance_K2: Array
+    sd_K: Array
+    rate_K_per_s: Array
+    held_s: Array
+    low: Array
+    high: Array
+    resolution_K: Array
+    step_s: float
+
+    @classmethod
+    def learn(cls, batches: Sequence[Batch], channels: Sequence[str]) -> Self:
+        """From training batches; masked stretches are left out.
+
+        Args:
+            batches: at least 2 in which all channels are recorded together.
+            channels: inputs of the model. Those that are neither `temperature` nor `ambient` are not guarded.
+
+        Raises:
+            InputError: an unknown channel, no temperature channel, or too few batches.
+        """
+        for name in channels:
+            for batch in batches:
+                batch.values(name)  # raises where a batch lacks it
+        names = tuple(dict.fromkeys(n for n in channels if batches and batches[0].channels[n].role in _ROLES))
+        runs = [run for batch in batches if len((run := _complete(batch, names))[0]) >= _LEAST_ROWS] if names else []
+        if len(runs) < _LEAST_BATCHES:
+            raise InputError(
+                f"substitutes of sensors: got {len(names)} temperature channel(s) among {', '.join(channels) or 'none'}"
+                f" and {len(runs)} batch(es) in which all are recorded together, expected at least 1 channel and "
+                f"{_LEAST_BATCHES} batches; give more batches or leave out channels with long gaps"
+            )
+        specs = [batches[0].channels[n] for n in names]
+        resolution_K = np.array([s.resolution or 0.0 for s in specs])
+        rises = [values - values[0] for _, values in runs]
+        covariance_K2, left_out_K2 = _regularised(rises, resolution_K)
+        sd_K = np.maximum(np.sqrt(left_out_K2), np.maximum(resolution_K / 2, _LEAST_SD_K))
+        step_s = max(float(np.median(np.diff(time_s))) for time_s, _ in runs)
+        rate = np.concatenate([np.abs(np.diff(v, axis=0)) / np.diff(t)[:, None] for t, v in runs])
+        usual = _RATE_MARGIN * np.quantile(rate, _RATE_QUANTILE, axis=0)
+        held = [_held_s(t, r, r - _residual(covariance_K2, r), sd_K) for (t, _), r in zip(runs, rises, strict=True)]
+        return cls(
+            names,
+            covariance_K2,
+            sd_K,
+            np.maximum(usual, resolution_K / step_s),
+            np.max(held, axis=0),
+            np.array([-_FARTHEST_K if s.low is None else s.low for s in specs]),
+            np.array([_FARTHEST_K if s.high is None else s.high for s in specs]),
+            resolution_K,
+            step_s,
+        )
+
+    def weights(self, good: Mask) -> tuple[Array, Array]:
+        """Regression of every channel on the good ones other than itself, for a mask (n,).
+
+        Returns:
+            Weights (n, n), row i for channel i, and standard deviations, K, (n,): `sd_K` enlarged as far as the
+            Gaussian loses precision without the channels that are not good.
+        """
+        c, at, rest = self.covariance_K2, np.flatnonzero(good), np.flatnonzero(~good)
+        weights, variance_K2 = np.zeros_like(c), np.diag(c).copy()
+        if len(at):
+            precision = np.linalg.inv(c[np.ix_(at, at)])
+            own = np.diag(precision)
+            weights[np.ix_(at, at)] = np.eye(len(at)) - precision / own[:, None]
+            variance_K2[at] = 1.0 / own
+            weights[np.ix_(rest, at)] = c[np.ix_(rest, at)] @ precision
+            variance_K2[rest] -= np.einsum("ij,ij->i", weights[np.ix_(rest, at)], c[np.ix_(rest, at)])
+        return weights, self.sd_K * np.sqrt(np.maximum(variance_K2 / self._full_K2, 1.0))
+
+    def as_plain(self) -> dict[str, Any]:
+        """Numbers, strings and arrays."""
+        return {**{name: getattr(self, name) for name in self.__dataclass_fields__}, "names": list(self.names)}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Self:
+        """The inverse of `as_plain`; lists in place of arrays are read too."""
+        arrays = {k: np.asarray(plain[k], float) for k in cls.__dataclass_fields__ if k not in ("names", "step_s")}
+        return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), **arrays)
+
+    @cached_property
+    def _full_K2(self) -> Array:
+        """Conditional variance of each channel given all others, (n,)."""
+        return np.asarray(1.0 / np.diag(np.linalg.inv(self.covariance_K2)))
+
+
+@dataclass(frozen=True)
+class Watch:
+    """State of a guard between two samples; arrays are (n,), NaN where nothing has arrived.
+
+    Attributes:
+        status: of each channel.
+        filled: value returned last, measured or substituted.
+        raw: value that arrived last, NaN where it was lost or implausible.
+        used_s: how long each channel has been replaced, s.
+        agreed: consecutive samples for which a failed channel has been consistent.
+        same: value that the channel has kept, `same_s` how long, s, and `moved_K` what the regression predicts for
+            that time, K.
+        time_s: time stamp of the last sample, s; None before the first.
+    """
+
+    status: tuple[Status, ...]
+    filled: Array
+    raw: Array
+    used_s: Array
+    agreed: Array
+    same: Array
+    same_s: Array
+    moved_K: Array
+    time_s: float | None = None
+
+    @property
+    def bad(self) -> Mask:
+        return np.array([s != "ok" for s in self.status])
+
+    def as_plain(self) -> dict[str, Any]:
+        """Numbers, strings and lists; None where a value is not known."""
+        arrays = {
+            name: [None if np.isnan(v) else v for v in getattr(self, name).tolist()]
+            for name in self.__dataclass_fields__
+            if name not in ("status", "time_s")
+        }
+        return {"status": list(self.status), "time_s": self.time_s, **arrays}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Self:
+        """The inverse of `as_plain`. Raises: InputError, an unknown status or arrays of different lengths."""
+        status = tuple(one_of(str(s), STATUSES, "status of a channel") for s in plain["status"])
+        arrays = {
+            name: np.array([np.nan if v is None else float(v) for v in plain[name]])
+            for name in cls.__dataclass_fields__
+            if name not in ("status", "time_s")
+        }
+        if lengths := {name: len(a) for name, a in arrays.items() if len(a) != len(status)}:
+            raise InputError(
+                f"state of a guard: got {lengths}, expected {len(status)} values, one for every status; delete the "
+                "stored state, the guard then starts afresh"
+            )
+        return cls(status, time_s=None if plain["time_s"] is None else float(plain["time_s"]), **arrays)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """One sample after the guard.
+
+    Attributes:
+        values: what the model may use: every value of the sample, failed channels replaced, in the unit that arrived.
+        status: guarded channel → `ok`, `lost`, `implausible`, `stepping` or `frozen`.
+        sd_K: replaced channel → standard deviation of its substitute, K.
+        fault: why the values cannot be used; None where they can.
+        reason: which channels are replaced, why and how well; empty where none is.
+    """
+
+    values: Mapping[str, float]
+    status: Mapping[str, Status]
+    sd_K: Mapping[str, float]
+    fault: str | None
+    reason: str
+
+
+class Guard:
+    """Checks sample after sample and replaces channels that fail.
+
+    - `lost`: absent or NaN.
+    - `implausible`: outside of the range of the channel, or infinite.
+    - `stepping`: faster than ever usual in training, or suddenly away from its regression on the other good channels.
+      Where several are, the worst is judged first and the others without it.
+    - `frozen`: exactly constant for longer than in training, and than its grid's step, while the regression predicts a
+      clear change.
+
+    A failed channel is taken again after `back_samples` samples that change at a usual rate and agree with its
+    substitute. Where the substitute itself cannot be trusted any more, because its time is spent or more than half of
+    the channels failed together, a lost or implausible channel is taken again on its rate alone. A channel that steps
+    or freezes then needs to agree nevertheless, or a fresh start by `begin`.
+    """
+
+    def __init__(self, substitutes: Substitutes, limits: GuardLimits | None = None) -> None:
+        self.substitutes = substitutes
+        self.limits = limits or GuardLimits()
+        self._weights: tuple[bytes, tuple[Array, Array]] | None = None  # of the mask used last
+
+    def begin(self) -> Watch:
+        """State before the first sample."""
+        n = len(self.substitutes.names)
+        unknown, zero = np.full(n, np.nan), np.zeros(n)
+        status: tuple[Status, ...] = ("ok",)
+        return Watch(status * n, unknown, unknown, zero, zero, unknown, zero, zero)
+
+    def step(self, watch: Watch, time_s: float, values: Mapping[str, float]) -> tuple[Watch, Checked]:
+        """One sample: the state after it and the values to use.
+
+        Args:
+            watch: state before.
+            time_s: time stamp of the sample, s. A step back counts as no time.
+            values: channel → value. Channels that are not guarded pass through.
+
+        Raises:
+            InputError: `watch` belongs to other channels.
+        """
+        s, limits = self.substitutes, self.limits
+        if len(watch.status) != len(s.names):
+            raise InputError(
+                f"state of a guard: got {len(watch.status)} channels, expected {len(s.names)} "
+                f"({', '.join(s.names)}); delete the stored state, the guard then starts afresh"
+            )
+        dt_s = 0.0 if watch.time_s is None or not np.isfinite(time_s) else max(time_s - watch.time_s, 0.0)
+        if dt_s > limits.substitute_s:
+            watch, dt_s = self.begin(), 0.0
+        x = np.array([_number(values.get(name)) for name in s.names])
+        status: list[Status] = list(watch.status)
+        present = np.isfinite(x) & (x >= s.low) & (x <= s.high)
+        before = watch.filled
+        fresh = present & np.isnan(before)
+        for i in np.flatnonzero(~present & ~watch.bad):
+            status[i] = "lost" if np.isnan(x[i]) else "implausible"
+        usual_K = s.rate_K_per_s * max(dt_s, s.step_s) + 2 * s.resolution_K
+        good = present & ~watch.bad & ~fresh
+        good, weights, sd_K = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
+        for i in np.flatnonzero(present & ~watch.bad & ~fresh & ~good):
+            status[i] = "stepping"
+        predicted_K = weights @ np.where(good, x - before, 0.0)
+
+        same = good & (np.abs(x - watch.same) <= _SAME_K)
+        same_s = np.where(same, watch.same_s + dt_s, 0.0)
+        moved_K = np.where(same, watch.moved_K + predicted_K, 0.0)
+        frozen = same & (same_s > _HELD_MARGIN * np.maximum(s.held_s, s.step_s))
+        frozen &= np.abs(moved_K) > limits.frozen_sd * sd_K + s.resolution_K
+        for i in np.flatnonzero(frozen):
+            status[i] = "frozen"
+        good &= ~frozen
+        filled = np.clip(np.where(frozen, watch.same + moved_K, before + predicted_K), s.low, s.high)
+        filled = np.where(good | fresh, x, filled)
+        for i in np.flatnonzero(fresh):
+            status[i] = "ok"
+
+        failed = np.array([a != "ok" for a in status])
+        many = failed.mean() > limits.bad_share
+        back, agreed = self._recovered(watch, status, x, present, filled, usual_K, sd_K, bool(many))
+        for i in np.flatnonzero(back):
+            status[i] = "ok"
+        filled = np.where(back, x, filled)
+        bad = failed & ~back
+        used_s = np.where(bad, watch.used_s + dt_s, np.maximum(watch.used_s - dt_s, 0.0))
+        kept = same | (bad & ~np.isnan(watch.same))  # a failed channel keeps the value at which it failed
+        after = replace(
+            watch,
+            status=tuple(status),
+            filled=filled,
+            raw=np.where(present, x, np.nan),
+            used_s=used_s,
+            agreed=agreed,
+            same=np.where(kept, watch.same, filled),
+            same_s=same_s,
+            moved_K=moved_K,
+            time_s=float(time_s) if np.isfinite(time_s) else watch.time_s,
+        )
+        return after, self._checked(after, values, sd_K)
+
+    def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Array, Array]:
+        """Good channels that do not step, with the weights and standard deviations of the regressions on them."""
+        good = good & (np.abs(change_K) <= usual_K)
+        while True:
+            weights, sd_K = self._regression(good)
+            off_K = np.where(good, change_K - weights @ np.where(good, change_K, 0.0), 0.0)
+            steps = np.abs(off_K) > self.limits.step_sd * sd_K + self.substitutes.resolution_K
+            # One channel left has no regression: its change is judged by the rate alone.
+            if not steps.any() or good.sum() < 2:
+                return good, weights, sd_K
+            good = good.copy()
+            good[np.argmax(np.where(steps, np.abs(off_K) / sd_K, 0.0))] = False
+
+    def _regression(self, good: Mask) -> tuple[Array, Array]:
+        key = good.tobytes()
+        if self._weights is None or self._weights[0] != key:
+            self._weights = (key, self.substitutes.weights(good))
+        return self._weights[1]
+
+    def _recovered(
+        self,
+        watch: Watch,
+        status: list[Status],
+        x: Array,
+        present: Mask,
+        filled: Array,
+        usual_K: Array,
+        sd_K: Array,
+        many: bool,
+    ) -> tuple[Mask, Array]:
+        """Which failed channels are taken again (n,), and the number of consistent samples of each (n,).
+
+        A channel that returns with another value than its trusted substitute is marked as stepping in `status`.
+        """
+        s, limits = self.substitutes, self.limits
+        present = watch.bad & present
+        steady = present & (np.abs(x - watch.raw) <= usual_K)
+        near = np.abs(x - filled) <= limits.back_sd * sd_K + s.resolution_K
+        spent = watch.used_s > limits.substitute_s
+        gone = np.array([a in ("lost", "implausible") for a in status])
+        stuck = np.array([a == "frozen" for a in status]) & (np.abs(x - watch.same) <= _SAME_K)
+        trusted = ~spent & (not many)
+        for i in np.flatnonzero(steady & ~near & trusted & gone):
+            status[i] = "stepping"
+        first = present & np.isnan(watch.raw)  # nothing before it to judge its rate by
+        consistent = (steady | first) & ~stuck & (near | (~trusted & (gone | many)))
+        agreed = np.where(consistent, watch.agreed + 1, 0)
+        return np.asarray(agreed >= limits.back_samples), agreed.astype(float)
+
+    def _checked(self, watch: Watch, values: Mapping[str, float], sd_K: Array) -> Checked:
+        s, limits = self.substitutes, self.limits
+        bad = np.flatnonzero(watch.bad)
+        faults = [
+            f"{s.names[i]} {watch.status[i]}: "
+            + ("never arrived" if np.isnan(watch.filled[i]) else f"replaced for more than {limits.substitute_s:.0f} s")
+            for i in bad
+            if np.isnan(watch.filled[i]) or watch.used_s[i] > limits.substitute_s
+        ]
+        if len(bad) > limits.bad_share * len(s.names):
+            named = ", ".join(f"{s.names[i]} {watch.status[i]}" for i in bad)
+            faults.insert(0, f"{len(bad)} of {len(s.names)} temperature channels failed ({named})")
+        notes = [f"{s.names[i]} {watch.status[i]}, replaced (sd {sd_K[i]:.2g} K)" for i in bad]
+        return Checked(
+            values={**values, **dict(zip(s.names, watch.filled.tolist(), strict=True))},
+            status=dict(zip(s.names, watch.status, strict=True)),
+            sd_K={s.names[i]: float(sd_K[i]) for i in bad},
+            fault="; ".join(faults) or None,
+            reason="; ".join(notes),
+        )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _complete(batch: Batch, names: Sequence[str]) -> tuple[Array, Array]:
+    """Times (m,) and values (m, n) of the rows in which every channel is known."""
+    values = np.column_stack([batch.masked(name) for name in names])
+    known = np.isfinite(values).all(axis=1)
+    return batch.time_s[known], values[known]
+
+
+def _residual(covariance_K2: Array, rises_K: Array) -> Array:
+    """Rises (m, n) less the regression of each channel on all others."""
+    precision = np.linalg.inv(covariance_K2)
+    return np.asarray(rises_K @ precision / np.diag(precision))
+
+
+def _regularised(rises_K: Sequence[Array], resolution_K: Array) -> tuple[Array, Array]:
+    """Second moment with the noise that predicts left-out batches best, (n, n), and their mean squares, K², (n,).
+
+    Every batch counts the same, however long it is.
+    """
+    moments = np.array([r.T @ r / len(r) for r in rises_K])
+    total = moments.mean(axis=0)
+    scale_K2 = max(float(np.diag(total).mean()), _LEAST_SD_K**2)
+    best: tuple[float, Array, Array] | None = None
+    for share in _NOISE_SHARES:
+        noise = np.diag(resolution_K**2 / 12 + share * scale_K2)
+        squares = [
+            np.mean(_residual((len(moments) * total - own) / (len(moments) - 1) + noise, r) ** 2, axis=0)
+            for own, r in zip(moments, rises_K, strict=True)
+        ]
+        left_out_K2 = np.mean(squares, axis=0)
+        score = float(np.log(np.maximum(left_out_K2, _LEAST_SD_K**2)).sum())
+        if best is None or score < best[0]:
+            best = score, total + noise, left_out_K2
+    assert best is not None
+    return best[1], best[2]
+
+
+def _held_s(time_s: Array, rises_K: Array, predicted_K: Array, sd_K: Array) -> Array:
+    """Longest time that each channel was constant while its regression moved by more than its sd, s, (n,)."""
+    found = np.zeros(rises_K.shape[1])
+    changed = np.abs(np.diff(rises_K, axis=0)) > _SAME_K
+    for i in range(rises_K.shape[1]):
+        edges = np.flatnonzero(changed[:, i])
+        first, last = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(time_s) - 1]])
+        moved = np.abs(predicted_K[last, i] - predicted_K[first, i]) > sd_K[i]
+        found[i] = np.max((time_s[last] - time_s[first])[moved], initial=0.0)
+    return found

@@ -1,0 +1,203 @@
+"""Samples in, corrections out: equal to the batch prediction, safe whatever comes, and the same after a restart."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from compensation.contracts import Correction, Sample
+from compensation.runtime import AxisModel, Compensator
+from compensation.safety import Limits
+from compensation.substitutes import Substitutes
+from data.batch import Batch
+from data.errors import InputError
+from features.design import Design
+from models import FAMILIES
+from models.program import replay
+from models.trust import Region, watched
+from models.updating import Updater, out_of_fold
+from tests.conftest import make_toy_batches
+
+QUICK = Limits(rate_um_per_s=10.0, step_um=1e6, warm_up_s=0.0, stale_s=1000.0, max_offset_um=500.0)
+INPUTS = ("t0", "t4", "room")
+
+
+def model_of(train: list[Batch], key: str = "ridge", axis: str = "z", limits: Limits = QUICK) -> AxisModel:
+    family = FAMILIES[key]().fit(train, INPUTS, axis)
+    region, channels, step_s = Region.of(train, INPUTS), train[0].channels, train[0].step_s
+    design = Design.build(train, INPUTS, axis)
+    updater = Updater.learn(out_of_fold(design, key, range(len(train))))
+    return AxisModel(
+        axis, family.program(channels, step_s), INPUTS, design.input_units, region, region.program(channels, step_s),
+        updater=updater, limits=limits,
+    )  # fmt: skip
+
+
+def samples(batch: Batch, at_s: float = 1e9) -> list[Sample]:
+    rows = batch.table[["t0", "t1", "t2", "t3", "t4", "room", "spindle_rpm"]].to_dict("records")
+    return [
+        Sample(at_s + t, {str(c): float(v) for c, v in row.items()}) for t, row in zip(batch.time_s, rows, strict=True)
+    ]
+
+
+def run(machine: Compensator, given: Iterable[Sample]) -> list[Correction]:
+    return [machine.take(s, s.time_s - 1e9) for s in given]
+
+
+@pytest.mark.parametrize("key", ["ridge", "distributed_lag", "lag_dictionary"])
+def test_what_is_sent_is_the_negative_of_the_prediction(key: str) -> None:
+    *train, left = make_toy_batches(8, 60)
+    model = replace(model_of(train, key), updater=None)
+    machine = Compensator("toy", [model], period_s=left.step_s)
+    sent = [c.offset_um["z"] for c in run(machine, samples(left))]
+    wanted = FAMILIES[key]().fit(train, INPUTS, "z").predict(left)
+    far = model.region.row()
+    trust = np.array([model.authority(far(v)[0]) for v in _watched(model, left)])
+    assert np.abs(np.array(sent) + trust * wanted).max() < 1e-6
+
+
+def _watched(model: AxisModel, batch: Batch) -> np.ndarray:
+    rows = np.column_stack([batch.masked(c) for c in model.watched.channels])
+    return replay(model.watched, rows)
+
+
+def test_a_row_is_as_far_outside_as_the_batch_says() -> None:
+    *train, left = make_toy_batches(8, 60)
+    model = model_of(train[:3])
+    whole = model.region.distance(watched(left, INPUTS))
+    rows = [model.region.row()(v)[0] for v in _watched(model, left)]
+    assert np.abs(whole - rows).max() < 1e-9 and whole.max() > 0.1
+
+
+def drifting() -> list[Batch]:
+    """Batches with a drift that no input shows, of another size in each; the last is in the middle of the others."""
+    batches = make_toy_batches(9, 60)
+    sizes_um = [-9.0, 6.0, -3.0, 9.0, 8.0, -6.0, 3.0, -8.0, 5.0]
+    out = []
+    for b, size_um in zip(batches, sizes_um, strict=True):
+        drift_um = size_um * -np.expm1(-b.time_s / 3600.0)
+        out.append(replace(b, table=b.table.assign(z=b.table["z"] + drift_um)))
+    return [*out[:4], *out[5:], out[4]]
+
+
+def test_two_odd_readings_that_agree_are_a_machine_that_has_changed() -> None:
+    batches = make_toy_batches(9, 60)
+    left = batches.pop(4)
+    lines: list[str] = []
+    machine = Compensator("toy", [model_of(batches)], period_s=left.step_s, log=lines.append)
+    truth_um = left.table["z"].to_numpy() - left.table["z"][0] + 30.0
+    sent = []
+    for k, s in enumerate(samples(left)):
+        reading = {"z": float(truth_um[k] + sent[-1])} if k in (20, 25) else {}
+        sent.append(machine.take(replace(s, readings_um=reading), s.time_s - 1e9).offset_um["z"])
+    left_um = truth_um + np.array(sent)
+    assert left_um[21:25].mean() > 25.0 and abs(left_um[26:].mean()) < 3.0
+    assert machine.rejected == 1 and "the machine has changed" in lines[-1]
+
+
+def test_readings_correct_what_the_model_misses_and_odd_ones_are_rejected() -> None:
+    *train, left = drifting()
+    lines: list[str] = []
+    machine = Compensator("toy", [model_of(train)], period_s=left.step_s, log=lines.append)
+    given = samples(left)
+    sent = []
+    for k, s in enumerate(given):
+        if k in (20, 40):
+            truth_um = left.table["z"][k] - left.table["z"][0]
+            s = replace(s, readings_um={"z": float(truth_um + sent[-1])})
+        if k == 50:
+            s = replace(s, readings_um={"z": 4000.0, "w": 1.0})
+        sent.append(machine.take(s, s.time_s - 1e9).offset_um["z"])
+    truth = left.table["z"].to_numpy() - left.table["z"][0]
+    left_um = truth + np.array(sent)
+    assert abs(left_um[10:20].mean()) > 6.0 and abs(left_um[41:50].mean()) < 3.0
+    assert machine.rejected == 1
+    assert any("z: reading of 4000 µm rejected" in line for line in lines)
+    assert any("w: reading not used: no such axis" in line for line in lines)
+
+
+def test_a_restart_keeps_what_was_learned_and_does_not_jump() -> None:
+    *train, left = make_toy_batches(8, 60)
+    given = samples(left)
+    given[20] = replace(given[20], readings_um={"z": 5.0})
+    whole = run(Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s), given)
+    first = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s)
+    before = run(first, given[:30])
+    again = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s)
+    again.restore(json.loads(json.dumps(first.as_plain())))
+    after = run(again, given[30:])
+    jump = abs(after[0].offset_um["z"] - before[-1].offset_um["z"])
+    assert jump < 2.0
+    assert [c.offset_um["z"] for c in after[2:]] == pytest.approx([c.offset_um["z"] for c in whole[32:]], abs=1e-9)
+    with pytest.raises(InputError, match=r"^state of a compensation: got .* expected .*; delete the file"):
+        Compensator("other", [model_of(train)], period_s=left.step_s).restore(first.as_plain())
+
+
+def test_a_lost_sensor_is_replaced_then_held_then_faded() -> None:
+    *train, left = make_toy_batches(8, 120)
+    limits = replace(QUICK, hold_s=600.0, stale_s=400.0, rate_um_per_s=0.01)
+    machine = Compensator("toy", [model_of(train, limits=limits)], Substitutes.learn(train, INPUTS), left.step_s)
+    given = samples(left)
+    given[30:] = [replace(s, values={c: v for c, v in s.values.items() if c != "t0"}) for s in given[30:]]
+    states = [c.state["z"] for c in run(machine, given)]
+    assert states[31] == "active" and {"hold", "fade-out"} <= set(states[31:])
+    assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s][-1] in ("off", "fade-out")
+
+
+def test_channels_that_were_never_seen_are_named() -> None:
+    *train, left = make_toy_batches(8, 20)
+    machine = Compensator("toy", [model_of(train)], period_s=left.step_s)
+    done = machine.take(Sample(1e9, {"t0": 20.0}), 0.0)
+    assert done.offset_um == {"z": 0.0} and "not yet seen: t4, room" in done.reasons["z"]
+
+
+def test_an_axis_of_another_period_is_refused() -> None:
+    with pytest.raises(InputError, match=r"axis z is made for 300 s, got a period of 10 s"):
+        Compensator("toy", [model_of(make_toy_batches(4, 20))], period_s=10.0)
+
+
+TRAIN = make_toy_batches(6, 40)
+MODEL = model_of(TRAIN, limits=Limits(rate_um_per_s=0.05, max_offset_um=20.0, stale_s=900.0))
+SUBSTITUTES = Substitutes.learn(TRAIN, INPUTS)
+ODD = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-50, 90), st.none())
+HOSTILE = st.lists(
+    st.tuples(
+        st.floats(-2000.0, 20000.0), st.floats(0.0, 2000.0), st.dictionaries(st.sampled_from(INPUTS), ODD),
+        st.dictionaries(st.sampled_from(["z", "q"]), ODD.filter(lambda v: v is not None), max_size=1),
+        st.sampled_from(["take", "silence", "restart"]),
+    ),
+    max_size=30,
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(HOSTILE)
+def test_whatever_comes_what_is_sent_is_finite_and_limited(
+    stream: list[tuple[float, float, dict[str, float], dict[str, float], str]],
+) -> None:
+    machine, clock_s, was = Compensator("toy", [MODEL], SUBSTITUTES, 300.0), 0.0, 0.0
+    for jump_s, elapsed_s, values, readings, what in stream:
+        clock_s += elapsed_s
+        if what == "restart":
+            plain = json.loads(json.dumps(machine.as_plain()))
+            machine = Compensator("toy", [MODEL], SUBSTITUTES, 300.0)
+            machine.restore(plain)
+            continue
+        time_s = 1e9 + clock_s + jump_s
+        done = machine.silence(clock_s, time_s)
+        if what == "take":
+            first_um = done.offset_um["z"]
+            assert abs(first_um - was) <= min(0.05 * 900.0, 1.0) + 1e-9
+            was = first_um
+            done = machine.take(Sample(time_s, values, readings), clock_s)
+        sent_um = done.offset_um["z"]
+        assert math.isfinite(sent_um) and abs(sent_um) <= 20.0
+        assert abs(sent_um - was) <= min(0.05 * 900.0, 1.0) + 1e-9
+        was = sent_um
