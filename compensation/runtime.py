@@ -123,6 +123,8 @@ class Compensator:
         self._run = {a.axis: self._fresh(a) for a in axes}
         self._grid_s: float | None = None  # time stamp of the grid's last row
         self._held: dict[str, float] = {}
+        self._arrived_s: dict[str, float] = {}  # time stamp at which each channel last had a value
+        self._patience_s = max(a.limits.stale_s for a in axes)
         self.rejected = 0
 
     def _fresh(self, a: AxisModel, was: Axis | None = None) -> _Running:
@@ -195,6 +197,9 @@ class Compensator:
             self._watch, checked = self.guard.step(self._watch, sample.time_s, sample.values)
             values, fault, notes = dict(checked.values), checked.fault, checked.reason
         clean = {c: float(v) for c, v in values.items() if v is not None and math.isfinite(v)}
+        self._arrived_s |= dict.fromkeys(clean, sample.time_s)
+        if fault is None and self._grid_s is not None and (lost := self._lost(sample.time_s)):
+            fault = f"lost: {', '.join(lost)}"  # channels that no regression replaces
         if fault is not None:
             return fault, notes
         if self._grid_s is not None and sample.time_s - self._grid_s > _NEW_RUN_S:
@@ -218,6 +223,10 @@ class Compensator:
     def _missing(self, values: Mapping[str, float]) -> list[str]:
         wanted = dict.fromkeys(c for a in self.axes for c in a.program.channels)
         return [c for c in wanted if c not in values]
+
+    def _lost(self, time_s: float) -> list[str]:
+        wanted = dict.fromkeys(c for a in self.axes for c in a.program.channels)
+        return [c for c in wanted if time_s - self._arrived_s.get(c, time_s) > self._patience_s]
 
     def _rows(self, time_s: float, rows: Sequence[Mapping[str, float]]) -> None:
         """Steps every model through rows of the grid, the last one at `time_s`."""

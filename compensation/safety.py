@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, Literal, Self, get_args
 
 from data.errors import InputError, one_of
@@ -241,9 +241,10 @@ def _judged(samples: SampleClock, limits: Limits, clock_s: float, time_s: float)
     if samples.lead_s is None:
         return replace(seen, newest_s=time_s, lead_s=lead_s), None
     jump_s = lead_s - samples.lead_s
-    if abs(jump_s) <= limits.stale_s:
-        if samples.newest_s is not None and time_s <= samples.newest_s:
-            return seen, f"clock: the sample is {samples.newest_s - time_s:.3g} s older than the newest one"
+    behind_s = -inf if samples.newest_s is None else samples.newest_s - time_s
+    if abs(jump_s) <= limits.stale_s and behind_s <= limits.stale_s:
+        if behind_s >= 0:
+            return seen, f"clock: the sample is {behind_s:.3g} s older than the newest one"
         # The lead follows fresher samples at once and older ones no faster than clocks drift, so that a source that
         # falls behind little by little is noticed.
         leads_s = max(lead_s, samples.lead_s - _CLOCK_DRIFT * min(since_s, limits.stale_s))
@@ -255,8 +256,8 @@ def _judged(samples: SampleClock, limits: Limits, clock_s: float, time_s: float)
         seen = replace(seen, other_for_s=samples.other_for_s + since_s)
         if seen.other_for_s >= limits.warm_up_s:
             return replace(seen, newest_s=time_s, lead_s=lead_s, other_s=None, other_for_s=0.0), None
-    kind = "ahead of the clock so far" if jump_s > 0 else "behind the clock so far"
-    return seen, f"clock: the sample is {abs(jump_s):.3g} s {kind}"
+    off_s = jump_s if abs(jump_s) > limits.stale_s else -behind_s
+    return seen, f"clock: the sample is {abs(off_s):.3g} s {'ahead of' if off_s > 0 else 'behind'} the clock so far"
 
 
 def _silent(axis: Axis, limits: Limits, elapsed_s: float) -> Axis:

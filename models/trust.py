@@ -106,18 +106,30 @@ class Region:
         b = Builder(channels, step_s)
         return b.program([b.features(list(self.ranges), required=False)], zero_start=False)
 
+    def widths(self) -> tuple[Array, Array, Array]:
+        """Least and greatest value and width (q,) of every watched quantity."""
+        low, high = (np.array([ends[side] for ends in self.ranges.values()]) for side in (0, 1))
+        least = np.array([_LEAST_WIDTH.get(self.units.get(n, ""), 0.0) for n in self.ranges])
+        width = np.maximum(high - low, least)
+        return low, high, np.where(width == 0.0, 1.0, width)
+
+    def pattern(self) -> dict[str, Any]:
+        """The pattern of the points: places among the watched quantities, none for fewer than two points."""
+        names = list(self.ranges)
+        points = [names.index(n) for n in self.points] if len(self.points) > 1 else []
+        spread = np.maximum(self.high - self.low, _LEAST_WIDTH_OF_PATTERN_K)
+        return {"points": points, "centre": self.centre, "directions": self.directions, "least": self.low,
+                "most": self.high, "spread": spread}  # fmt: skip
+
     def row(self) -> Callable[[Array], tuple[float, str]]:
         """`far(values (q,)) -> (distance, quantity)`: `beyond` and the farthest of one row, in the order of `ranges`.
 
         Missing quantities are skipped; 0 and no quantity where none is outside.
         """
         names = list(self.ranges)
-        low, high = (np.array([self.ranges[n][side] for n in names]) for side in (0, 1))
-        least = np.array([_LEAST_WIDTH.get(self.units.get(n, ""), 0.0) for n in names])
-        width = np.maximum(high - low, least)
-        width[width == 0.0] = 1.0
-        points = [names.index(n) for n in self.points] if len(self.points) > 1 else []
-        widths = np.maximum(self.high - self.low, _LEAST_WIDTH_OF_PATTERN_K)
+        low, high, width = self.widths()
+        pattern = self.pattern()
+        points, widths = pattern["points"], pattern["spread"]
 
         def far(values: Array) -> tuple[float, str]:
             beyond = np.nan_to_num(_excess(values, low, high) / width, nan=0.0)

@@ -12,14 +12,17 @@ import typer
 from data.errors import InputError, WorkError
 from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
+from pipelines.commands.compensate import compensate
 from pipelines.commands.demonstrate import demonstrate
 from pipelines.commands.describe import describe
 from pipelines.commands.diagnose import diagnose
+from pipelines.commands.export import export
 from pipelines.commands.ingest import ingest
 from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
 from pipelines.commands.promote import promote, rollback
 from pipelines.commands.prove import app as prove
+from pipelines.commands.rehearse import rehearse
 from pipelines.commands.report import report
 from pipelines.commands.reproduce import reproduce
 from pipelines.commands.schedule import schedule
@@ -35,8 +38,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
-    describe, ingest, train, report, promote, rollback, status, predict, schedule, simulate, calibrate, diagnose,
-    demonstrate, reproduce,
+    describe, ingest, train, report, promote, rollback, status, predict, rehearse, compensate, export, schedule,
+    simulate, calibrate, diagnose, demonstrate, reproduce,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

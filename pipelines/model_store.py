@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from compensation.substitutes import Substitutes
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError
@@ -24,6 +25,7 @@ from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
 from models.conformal import RunBound
 from models.trust import SLACK, Region, disagreement_um, farthest, watched
+from models.updating import Updater
 
 SCHEMA = "thermodrift.model/3"
 _READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run
@@ -49,6 +51,8 @@ class StoredModel:
     info: dict[str, Any] = field(default_factory=dict)  # training_id, cell, n_batches, simulated, …
     bound: RunBound | None = None  # of the error of a run
     siblings: tuple[Family, ...] = ()  # whose disagreement with `family` the bound follows
+    updater: Updater | None = None  # of readings of a probe
+    substitutes: Substitutes | None = None  # of failed sensors
 
     @property
     def simulated(self) -> bool:
@@ -126,6 +130,8 @@ def save(
     info: Mapping[str, Any] | None = None,
     bound: RunBound | None = None,
     siblings: Sequence[Family] = (),
+    updater: Updater | None = None,
+    substitutes: Substitutes | None = None,
 ) -> None:
     """Write the three files; `machine_yaml` is the text of the machine file."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -137,6 +143,8 @@ def save(
         "region": _to_json(region.as_plain(), arrays),
         "bound": None if bound is None else _to_json(bound.as_plain(), arrays),
         "siblings": [_to_json(s.as_plain(), arrays) for s in siblings],
+        "updater": None if updater is None else _to_json(updater.as_plain(), arrays),
+        "substitutes": None if substitutes is None else _to_json(substitutes.as_plain(), arrays),
         "info": dict(info or {}),
     }
     (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -168,7 +176,10 @@ def load(folder: Path) -> StoredModel:
     bound = RunBound.from_plain(plain["bound"]) if plain.get("bound") else None
     siblings = tuple(family_from_plain(s) for s in plain.get("siblings", ()))
     region = Region.from_plain(plain["region"])
-    return StoredModel(family_from_plain(plain), machine, region, plain["info"], bound, siblings)
+    updater = Updater.from_plain(plain["updater"]) if plain.get("updater") else None
+    substitutes = Substitutes.from_plain(plain["substitutes"]) if plain.get("substitutes") else None
+    family = family_from_plain(plain)
+    return StoredModel(family, machine, region, plain["info"], bound, siblings, updater, substitutes)
 
 
 def frame_to_batch(model: StoredModel, table: pd.DataFrame, batch_id: str = "frame") -> Batch:

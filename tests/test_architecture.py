@@ -20,7 +20,7 @@ ALLOWED: Mapping[str, set[str]] = {
     "diagnosis": {"data", "twin"},
     "plants": {"data"},
     "compensation": {"data", "features", "models", "twin"},
-    "reports": {"data", "features", "models", "twin", "diagnosis"},
+    "reports": {"data", "features", "models", "twin", "diagnosis", "compensation"},
     "evidence": {"data", "features", "models", "twin", "diagnosis", "plants", "reports"},
     "pipelines": {"data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence"},
     "thermodrift": {

@@ -46,7 +46,7 @@ _REPORTED = 3  # of an unbroken row of unreadable payloads of one topic
 
 
 class _Link:
-    """A client with its thread that connects, and reconnects with a delay that grows from 1 s to 30 s."""
+    """A client with its thread that connects, and reconnects with a delay that grows from 1 s to 5 s."""
 
     def __init__(self, address: str, query: tuple[str, ...], on_connected: Callable[[], object] | None = None) -> None:
         """`query`: known query keys; `on_connected`: what to do at every new connection, in the client's thread."""
@@ -63,7 +63,7 @@ class _Link:
         self._on_connected = on_connected
         self.problem = "not connected yet"
         self.client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=True)
-        self.client.reconnect_delay_set(1, 30)
+        self.client.reconnect_delay_set(1, 5)
         # no limit of its own: paho counts messages that `drop_out_messages` dropped as in flight for ever
         self.client.max_inflight_messages_set(0)
         self.client.max_queued_messages_set(1000)
@@ -112,7 +112,7 @@ class _Link:
     def _on_disconnect(
         self, client: Client, userdata: Any, flags: DisconnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
-        if reason.is_failure:
+        if reason.is_failure and self.connected.is_set():  # else the broker refused it, and the reason is known
             self._lost(f"connection lost ({reason})")
         self.connected.clear()
 

@@ -37,7 +37,7 @@ _PORT = 4840
 _REQUEST_S = 4.0  # that a server may take to answer
 _CONNECT_S = 10.0
 _FIRST_CONNECTION_S = 5.0  # that a new sink waits for its server, before the first write
-_LONGEST_DELAY_S = 30.0  # between two tries to connect
+_LONGEST_DELAY_S = 5.0  # between two tries to connect
 _INTEGER_BITS = {"SByte": 7, "Byte": 8, "Int16": 15, "UInt16": 16, "Int32": 31, "UInt32": 32, "Int64": 63, "UInt64": 64}
 
 # asyncua logs tracebacks at every lost connection, which is reported here in one line

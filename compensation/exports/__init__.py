@@ -1,1 +1,19 @@
-"""A promoted model in the form that another program or a control takes."""
+"""A fitted model as a file for controls and other programs: generic JSON, C, structured text, ONNX, control data.
+
+An export is one class below `compensation.exports.base.Exporter` in one file and one line in `EXPORTS`.
+"""
+
+from data.registry import Registry
+
+EXPORTS = Registry(
+    "export",
+    {
+        "json": "compensation.exports.json_file:JsonExport",
+        "c": "compensation.exports.c99:CExport",
+        "st": "compensation.exports.structured_text:StructuredTextExport",
+        "onnx": "compensation.exports.onnx_graph:OnnxExport",
+        "sinumerik": "compensation.exports.sinumerik:SinumerikExport",
+        "heidenhain": "compensation.exports.heidenhain:HeidenhainExport",
+        "fanuc": "compensation.exports.fanuc:FanucExport",
+    },
+)

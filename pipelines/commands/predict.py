@@ -35,13 +35,18 @@ def load_model(model_uri: str, settings: Settings) -> StoredModel:
     """
     from pipelines import model_store
 
+    return model_store.load(model_folder(model_uri, settings))
+
+
+def model_folder(model_uri: str, settings: Settings) -> Path:
+    """The local folder of its files; downloaded where the store is remote. Raises as `load_model`."""
     if not model_uri.startswith(("models:/", "runs:/")):
         if not Path(model_uri).is_dir():
             raise InputError(
                 f"model {model_uri!r}: no such folder; expected models:/NAME@champion, models:/NAME/VERSION, "
                 "runs:/RUN/model or the folder of a stored model"
             )
-        return model_store.load(Path(model_uri))
+        return Path(model_uri)
     from mlflow.exceptions import MlflowException
 
     from pipelines.registry import CHAMPION, find_version, local_folder
@@ -53,14 +58,14 @@ def load_model(model_uri: str, settings: Settings) -> StoredModel:
             open_store(settings).get_run(run_id)
         except MlflowException:
             raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_uri}") from None
-        return model_store.load(Path(local_folder(model_uri, settings)))
+        return Path(local_folder(model_uri, settings))
     match = _REGISTERED.match(model_uri)
     if match is None:
         raise InputError(f"model {model_uri!r}: expected models:/NAME@alias or models:/NAME/VERSION")
     with store_errors(settings):
         client = open_store(settings)
         version = find_version(client, match["name"], match["alias"] or match["version"] or CHAMPION)
-    return model_store.load(Path(local_folder(version.source, settings)))
+    return Path(local_folder(version.source, settings))
 
 
 def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame:

@@ -1,0 +1,431 @@
+"""Programs as statements of a language with arrays, loops and branches: shared by C and structured text.
+
+Node k becomes one block that sets the array ``v<k>``; ``s<k>`` is what it carries from row to row, ``c<k>_<name>`` its
+constants. `first_row` is true in the first row, in which every block sets its own state: a reset needs no more.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import ClassVar
+
+import numpy as np
+
+from compensation.exports.base import AxisModel
+from data.arrays import Array
+from models.program import Node, Program
+
+_UNROLLED = 8  # places of a `pick` that are written one by one
+_NUMBERS_A_LINE = 5
+Shape = tuple[str, int]  # "real", "whole" or "logical", and the length; 0 for a single value
+
+
+class Language(ABC):
+    """Spelling of statements; operators + - * / and indices x[i] are the same in both languages."""
+
+    functions: ClassVar[Mapping[str, str]]  # abs, exp, min, max, single
+
+    @abstractmethod
+    def comment(self, text: str) -> str: ...
+
+    @abstractmethod
+    def put(self, target: str, value: str) -> str: ...
+
+    @abstractmethod
+    def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
+        """First and last line of a loop over first … count − 1."""
+
+    @abstractmethod
+    def when(self, condition: str) -> tuple[str, str, str]:
+        """First line, line before what else is done, and last line of a branch."""
+
+    @abstractmethod
+    def repeat(self, left: str, right: str) -> tuple[str, str]:
+        """First and last line of a loop while two whole numbers differ."""
+
+    @abstractmethod
+    def number(self, value: float) -> str:
+        """A number inside an expression."""
+
+    @abstractmethod
+    def power(self, base: str, exponent: float) -> str:
+        """base ** exponent for a base above 0."""
+
+    def call(self, function: str, *args: str) -> str:
+        return f"{self.functions[function]}({', '.join(args)})"
+
+    def tanh(self, w: Writer, target: str, x: str) -> None:
+        """Statements that set the target to tanh x."""
+        w.put(target, self.call("tanh", x))
+
+
+class Writer:
+    """Collects statements, and the variables and constants that they need, by name."""
+
+    def __init__(self, language: Language, prefix: str = "", indent: int = 1) -> None:
+        self.language, self.prefix, self.indent = language, prefix, indent
+        self.lines: list[str] = []
+        self.tables: dict[str, Array] = {}  # constants; whole numbers where the array's type is
+        self.memory: dict[str, Shape] = {}
+        self.scalars: dict[str, str] = {}
+
+    def line(self, text: str) -> None:
+        self.lines.append(("    " * self.indent + text).rstrip())
+
+    def comment(self, text: str) -> None:
+        self.line(self.language.comment(text))
+
+    def put(self, target: str, value: str) -> None:
+        self.line(self.language.put(target, value))
+
+    def table(self, name: str, values: Array) -> str:
+        self.tables[self.prefix + name] = values
+        return self.prefix + name
+
+    def array(self, name: str, size: int, kind: str = "real") -> str:
+        self.memory[self.prefix + name] = (kind, size)
+        return self.prefix + name
+
+    def scalar(self, name: str, kind: str = "real") -> str:
+        self.scalars[name] = kind
+        return name
+
+    @contextmanager
+    def loop(self, count: int, index: str = "i", first: int | str = 0) -> Iterator[str]:
+        """The index as an expression; a loop of one round is written without one."""
+        if count == 1 and first == 0:
+            yield "0"
+            return
+        head, tail = self.language.loop(self.scalar(index, "whole"), count, first)
+        with self._block(head, tail):
+            yield index
+
+    @contextmanager
+    def repeat(self, left: str, right: str) -> Iterator[None]:
+        with self._block(*self.language.repeat(left, right)):
+            yield
+
+    @contextmanager
+    def when(self, condition: str) -> Iterator[None]:
+        head, _, tail = self.language.when(condition)
+        with self._block(head, tail):
+            yield
+
+    @contextmanager
+    def otherwise(self) -> Iterator[None]:
+        """Directly behind `when`."""
+        _, head, tail = self.language.when("")
+        self.lines.pop()
+        with self._block(head, tail):
+            yield
+
+    @contextmanager
+    def _block(self, head: str, tail: str) -> Iterator[None]:
+        self.line(head)
+        self.indent += 1
+        yield
+        self.indent -= 1
+        self.line(tail)
+
+
+class _Lowered:
+    """The blocks of one program."""
+
+    def __init__(self, w: Writer, program: Program) -> None:
+        self.w, self.language, self.program = w, w.language, program
+
+    def name(self, k: int) -> str:
+        """Array of node k."""
+        n = self.program.nodes[k]
+        if n.op == "constant":
+            return self.w.table(f"c{k}_value", n.data["value"])
+        return self.w.array(f"v{k}", n.size)
+
+    def item(self, k: int, index: str) -> str:
+        """Element of node k; that of a single value whatever the index is."""
+        return f"{self.name(k)}[{'0' if self.program.nodes[k].size == 1 else index}]"
+
+    def part(self, k: int, name: str, index: str, size: int) -> str:
+        """Element of a constant of node k that has one number for each of `size` or one for all."""
+        values = np.broadcast_to(self.program.nodes[k].data[name], size)
+        return f"{self.w.table(f'c{k}_{name}', values)}[{index}]"
+
+    def block(self, k: int) -> None:
+        n = self.program.nodes[k]
+        if n.size == 0 or n.op in ("input", "constant"):
+            return
+        of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
+        self.w.comment(f"v{k}: {_TITLES[n.op]}{of}")
+        _BLOCKS[n.op](self, k, n)
+
+    def join(self, k: int, n: Node) -> None:
+        at = 0
+        for a in n.args:
+            size = self.program.nodes[a].size
+            if size:
+                with self.w.loop(size) as i:
+                    place = str(at) if i == "0" else f"{at} + {i}" if at else i
+                    self.w.put(f"{self.name(k)}[{place}]", self.item(a, i))
+            at += size
+
+    def pick(self, k: int, n: Node) -> None:
+        places = n.data["places"].astype(int)
+        if n.size <= _UNROLLED:
+            for to, place in enumerate(places):
+                self.w.put(f"{self.name(k)}[{to}]", f"{self.name(n.args[0])}[{place}]")
+            return
+        table = self.w.table(f"c{k}_places", places)
+        with self.w.loop(n.size) as i:
+            self.w.put(f"{self.name(k)}[{i}]", f"{self.name(n.args[0])}[{table}[{i}]]")
+
+    def affine(self, k: int, n: Node) -> None:
+        width = self.program.nodes[n.args[0]].size
+        with self.w.loop(n.size) as i:
+            offset = self.part(k, "offset", i, n.size)
+            if not width:
+                self.w.put(f"{self.name(k)}[{i}]", offset)
+                return
+            total = self.w.scalar("total")
+            self.w.put(total, offset)
+            matrix = self.w.table(f"c{k}_matrix", n.data["matrix"].ravel())
+            with self.w.loop(width, "j") as j:
+                place = j if i == "0" else f"{i} * {width} + {j}" if width > 1 else i
+                self.w.put(total, f"{total} + {matrix}[{place}] * {self.item(n.args[0], j)}")
+            self.w.put(f"{self.name(k)}[{i}]", total)
+
+    def two(self, k: int, n: Node) -> None:
+        a, b = n.args
+        with self.w.loop(n.size) as i:
+            sign = "-" if n.op == "sub" else "*"
+            self.w.put(f"{self.name(k)}[{i}]", f"{self.item(a, i)} {sign} {self.item(b, i)}")
+
+    def power(self, k: int, n: Node) -> None:
+        exponents = np.broadcast_to(n.data["exponents"], n.size)
+        for i, exponent in enumerate(exponents.tolist()):
+            target, x = f"{self.name(k)}[{i}]", self.language.call("abs", self.item(n.args[0], str(i)))
+            if exponent == 1.0:
+                self.w.put(target, x)
+                continue
+            with self.w.when(f"{x} > {self.language.number(0.0)}"):
+                self.w.put(target, self.language.power(x, exponent))
+            with self.w.otherwise():  # not every language defines a power of 0
+                self.w.put(target, self.language.number(0.0**exponent))
+
+    def median(self, k: int, n: Node) -> None:
+        (a,), size = n.args, self.program.nodes[n.args[0]].size
+        if size == 1:
+            self.w.put(f"{self.name(k)}[0]", self.item(a, "0"))
+            return
+        order = self.w.array(f"o{k}", size)
+        with self.w.loop(size) as i:
+            self.w.put(f"{order}[{i}]", self.item(a, i))
+        held = self.w.scalar("held")
+        with (
+            self.w.loop(size - 1, "i") as i,
+            self.w.loop(size, "j", f"{i} + 1") as j,
+            self.w.when(f"{order}[{j}] < {order}[{i}]"),
+        ):
+            self.w.put(held, f"{order}[{i}]")
+            self.w.put(f"{order}[{i}]", f"{order}[{j}]")
+            self.w.put(f"{order}[{j}]", held)
+        half = self.language.number(0.5)
+        self.w.put(f"{self.name(k)}[0]", f"{half} * ({order}[{(size - 1) // 2}] + {order}[{size // 2}])")
+
+    def first(self, k: int, n: Node) -> None:
+        with self.w.when("first_row"), self.w.loop(n.size) as i:
+            self.w.put(f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+
+    def lag(self, k: int, n: Node) -> None:
+        with self.w.loop(n.size) as i:
+            v, x, keep = f"{self.name(k)}[{i}]", self.item(n.args[0], i), self.part(k, "keep", i, n.size)
+            with self.w.when("first_row"):
+                self.w.put(v, f"{self.part(k, 'begin', i, n.size)} * {x}")
+            with self.w.otherwise():
+                self.w.put(v, f"{keep} * {v} + ({self.language.number(1.0)} - {keep}) * {x}")
+
+    def _ring(self, k: int, n: Node, rows: int) -> tuple[str, str]:
+        """Advances a ring of rows to the place of the newest, 0 in the first row: its array and that place."""
+        ring, head = self.w.array(f"s{k}", rows * n.size), self.w.array(f"n{k}", 0, "whole")
+        self.w.put(head, f"{head} + 1")
+        with self.w.when(f"first_row {self._or} {head} >= {rows}"):
+            self.w.put(head, "0")
+        return ring, head
+
+    @property
+    def _or(self) -> str:
+        return self.language.functions["or"]
+
+    def _earlier(self, head: str, rows: int, ahead: int, name: str) -> str:
+        """The place `ahead` of the newest, which is the oldest for 1."""
+        place = self.w.scalar(name, "whole")
+        self.w.put(place, f"{head} + {ahead}")
+        with self.w.when(f"{place} >= {rows}"):
+            self.w.put(place, f"{place} - {rows}")
+        return place
+
+    def delay(self, k: int, n: Node) -> None:
+        rows, part = int(n.data["rows"][0]) + 2, float(n.data["part"][0])
+        ring, head = self._ring(k, n, rows)
+        with self.w.when("first_row"), self.w.loop(rows, "j") as j, self.w.loop(n.size) as i:
+            start = f"{self.part(k, 'begin', i, n.size)} * {self.item(n.args[0], i)}"
+            self.w.put(f"{ring}[{self._at(j, n, i)}]", start)
+        with self.w.loop(n.size) as i:
+            self.w.put(f"{ring}[{self._at(head, n, i)}]", self.item(n.args[0], i))
+        near = self._earlier(head, rows, 2, "row_near")
+        far = self._earlier(head, rows, 1, "row_far") if part else ""
+        with self.w.loop(n.size) as i:
+            value = f"{ring}[{self._at(near, n, i)}]"
+            if part:
+                shares = self.language.number(1.0 - part), self.language.number(part)
+                value = f"{shares[0]} * {value} + {shares[1]} * {ring}[{self._at(far, n, i)}]"
+            self.w.put(f"{self.name(k)}[{i}]", value)
+
+    def _at(self, row: str, n: Node, i: str) -> str:
+        return row if n.size == 1 else f"{row} * {n.size} + {i}"
+
+    def rate(self, k: int, n: Node) -> None:
+        rows = int(n.data["rows"][0])
+        ring, head = self._ring(k, n, rows + 1)
+        seen, far = self.w.array(f"r{k}", 0, "whole"), self.w.scalar("row_far", "whole")
+        with self.w.when("first_row"):
+            self.w.put(seen, "0")
+        with self.w.otherwise(), self.w.when(f"{seen} < {rows}"):
+            self.w.put(seen, f"{seen} + 1")
+        with self.w.loop(n.size) as i:
+            self.w.put(f"{ring}[{self._at(head, n, i)}]", self.item(n.args[0], i))
+        self.w.put(far, f"{head} - {seen}")
+        with self.w.when(f"{far} < 0"):
+            self.w.put(far, f"{far} + {rows + 1}")
+        with self.w.when("first_row"), self.w.loop(n.size) as i:
+            self.w.put(f"{self.name(k)}[{i}]", self.language.number(0.0))
+        with self.w.otherwise(), self.w.loop(n.size) as i:
+            rise = f"{self.item(n.args[0], i)} - {ring}[{self._at(far, n, i)}]"
+            hours = self.language.number(self.program.step_s / 3600.0)
+            self.w.put(f"{self.name(k)}[{i}]", f"({rise}) / ({seen} * {hours})")
+
+    def clock(self, k: int, n: Node) -> None:
+        with self.w.when("first_row"):
+            self.w.put(f"{self.name(k)}[0]", self.language.number(0.0))
+        with self.w.otherwise():
+            self.w.put(f"{self.name(k)}[0]", f"{self.name(k)}[0] + {self.language.number(self.program.step_s)}")
+
+    def curve(self, k: int, n: Node) -> None:
+        knots, values = n.data["knots"], n.data["values"]
+        zero = self.language.number(0.0)
+        with self.w.loop(n.size) as i:
+            total = self.w.scalar("total")
+            self.w.put(total, self.language.number(float(values[0])))
+            if len(knots) > 1:
+                knot, wide, slope = curve_pieces(n)
+                names = [self.w.table(f"c{k}_{t}", v) for t, v in (("knots", knot), ("wide", wide), ("slopes", slope))]
+                with self.w.loop(len(knot), "j") as j:
+                    beyond = f"{self.item(n.args[0], i)} - {names[0]}[{j}]"
+                    inside = self.language.call("min", self.language.call("max", beyond, zero), f"{names[1]}[{j}]")
+                    self.w.put(total, f"{total} + {names[2]}[{j}] * {inside}")
+            self.w.put(f"{self.name(k)}[{i}]", total)
+
+    def tanh(self, k: int, n: Node) -> None:
+        with self.w.loop(n.size) as i:
+            self.language.tanh(self.w, f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+
+    def kernel(self, k: int, n: Node) -> None:
+        support, weights = np.atleast_2d(n.data["support"]), n.data["weights"]
+        rows, width = support.shape
+        total, away, d = self.w.scalar("total"), self.w.scalar("away"), self.w.scalar("apart")
+        self.w.put(total, self.language.number(0.0))
+        with self.w.loop(rows) as i:
+            self.w.put(away, self.language.number(0.0))
+            if width:
+                name = self.w.table(f"c{k}_support", support.ravel())
+                with self.w.loop(width, "j") as j:
+                    place = i if width == 1 else f"{i} * {width} + {j}"
+                    self.w.put(d, f"{name}[{place}] - {self.item(n.args[0], j)}")
+                    self.w.put(away, f"{away} + {d} * {d}")
+            exponent = f"{self.language.number(-float(n.data['sharpness'][0]))} * {away}"
+            weight = f"{self.w.table(f'c{k}_weights', weights)}[{i}]"
+            self.w.put(total, f"{total} + {weight} * {self.language.call('exp', exponent)}")
+        self.w.put(f"{self.name(k)}[0]", total)
+
+    def trees(self, k: int, n: Node) -> None:
+        d, w = n.data, self.w
+        whole = {name: w.table(f"c{k}_{name}", d[name].astype(int)) for name in ("roots", "feature", "left", "right")}
+        real = {name: w.table(f"c{k}_{name}", d[name]) for name in ("threshold", "value")}
+        (a,), seen = n.args, self.name(n.args[0])
+        if d["single"][0] and self.program.nodes[a].size:
+            seen = w.array(f"o{k}", self.program.nodes[a].size)
+            with w.loop(self.program.nodes[a].size) as i:
+                w.put(f"{seen}[{i}]", self.language.call("single", self.item(a, i)))
+        total, node = w.scalar("total"), w.scalar("node", "whole")
+        w.put(total, self.language.number(0.0))
+        with w.loop(len(d["roots"])) as i:
+            w.put(node, f"{whole['roots']}[{i}]")
+            with w.repeat(f"{whole['left']}[{node}]", node):  # a leaf is its own child
+                with w.when(f"{seen}[{whole['feature']}[{node}]] <= {real['threshold']}[{node}]"):
+                    w.put(node, f"{whole['left']}[{node}]")
+                with w.otherwise():
+                    w.put(node, f"{whole['right']}[{node}]")
+            w.put(total, f"{total} + {real['value']}[{node}]")
+        w.put(f"{self.name(k)}[0]", total)
+
+
+_BLOCKS: Mapping[str, Callable[[_Lowered, int, Node], None]] = {
+    "join": _Lowered.join,
+    "pick": _Lowered.pick,
+    "affine": _Lowered.affine,
+    "sub": _Lowered.two,
+    "mul": _Lowered.two,
+    "power": _Lowered.power,
+    "median": _Lowered.median,
+    "first": _Lowered.first,
+    "lag": _Lowered.lag,
+    "delay": _Lowered.delay,
+    "rate": _Lowered.rate,
+    "clock": _Lowered.clock,
+    "curve": _Lowered.curve,
+    "tanh": _Lowered.tanh,
+    "kernel": _Lowered.kernel,
+    "trees": _Lowered.trees,
+}
+_TITLES: Mapping[str, str] = {
+    "join": "values joined",
+    "pick": "values picked",
+    "affine": "offset plus matrix times values",
+    "sub": "difference",
+    "mul": "product",
+    "power": "power of the absolute value",
+    "median": "median",
+    "first": "value in the first row",
+    "lag": "first-order lag",
+    "delay": "delay",
+    "rate": "slope per hour",
+    "clock": "s since the first row",
+    "curve": "piecewise linear curve",
+    "tanh": "tanh",
+    "kernel": "weighted sum of Gaussian kernels",
+    "trees": "weighted sum of regression trees",
+}
+
+
+def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
+    """Knots, widths and slopes of a curve's pieces: it is values[0] + Σ slope · min(max(x − knot, 0), width)."""
+    knots, values = n.data["knots"], n.data["values"]
+    wide = np.diff(knots)
+    return knots[:-1], wide, np.divide(np.diff(values), wide, out=np.zeros_like(wide), where=wide > 0)
+
+
+def lower(w: Writer, axis: AxisModel) -> list[str]:
+    """Writes the blocks of all nodes; the outputs as expressions, one for each."""
+    lowered = _Lowered(w, axis.program)
+    for k in range(len(axis.program.nodes)):
+        lowered.block(k)
+    return [lowered.item(o, "0") for o in axis.program.outputs]
+
+
+def number_lines(values: Array, number: Callable[[float], str]) -> list[str]:
+    """The numbers of a constant array, separated by commas, a few a line; whole ones where the array's type is."""
+    whole = np.issubdtype(values.dtype, np.integer)
+    texts = [str(int(v)) if whole else number(float(v)) for v in values.tolist()]
+    wide = _NUMBERS_A_LINE * (3 if whole else 1)
+    return [", ".join(texts[i : i + wide]) + ("," if i + wide < len(texts) else "") for i in range(0, len(texts), wide)]

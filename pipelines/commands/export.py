@@ -1,0 +1,43 @@
+"""`thermodrift export`: a promoted model in the form that a control or another program takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines import console
+from pipelines.commands.compensate import MaxOffset, Period, Rate
+from pipelines.options import Json
+
+
+def export(
+    models: Annotated[list[str], typer.Argument(help="models:/NAME@champion or a folder, one for each axis")],
+    to: Annotated[str, typer.Option("--to", help="c, st, onnx, json, sinumerik, heidenhain or fanuc")],
+    out: Annotated[Path | None, typer.Option("--out", help="folder; default: var/export/MACHINE")] = None,
+    max_um: MaxOffset = None,
+    rate_um_per_s: Rate = 0.1,
+    period_s: Period = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Write a model for a control, as C, as structured text, as ONNX or as JSON, with its limits and its fallback."""
+    from compensation.exports import EXPORTS
+    from pipelines.commands.predict import load_model, model_folder
+    from pipelines.compensating import Given, export_of
+    from pipelines.settings import configure_environment, home, load
+
+    exporter = EXPORTS[to]()
+    configure_environment()
+    settings = load()
+    stored = {m: load_model(m, settings) for m in models}
+    folders = {m: model_folder(m, settings) for m in models}
+    given = export_of(stored, folders, Given(max_um, rate_um_per_s), period_s)
+    folder = out or home() / "export" / given.machine
+    paths = exporter.write(given, folder)
+    if as_json:
+        console.print_json({"machine": given.machine, "simulated": given.simulated, "sha256": given.digest,
+                            "files": [str(p) for p in paths]})  # fmt: skip
+        return
+    for path in paths:
+        console.line(path)

@@ -1,0 +1,88 @@
+"""`thermodrift rehearse`: a compensation in a closed loop with recordings, before it goes to the machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines import console
+from pipelines.commands.compensate import MaxOffset, Period, Rate
+from pipelines.options import Json
+
+if TYPE_CHECKING:
+    from compensation.rehearsal import Rehearsal
+
+
+def rehearsal_dict(r: Rehearsal) -> dict[str, Any]:
+    """The rehearsal's figures for other programs."""
+    axes = {}
+    for a in r.before_um:
+        (band_before, band_after), (rms_before, rms_after) = r.band_um(a), r.rms_um(a)
+        axes[a] = {"band95_before_um": band_before, "band95_after_um": band_after, "rms_before_um": rms_before,
+                   "rms_after_um": rms_after}  # fmt: skip
+    return {"machine": r.machine, "simulated": r.simulated, "samples": len(r.time_s), "readings": len(r.readings_s),
+            "failures": len(r.failures), "axes": axes}  # fmt: skip
+
+
+def rehearse(
+    models: Annotated[list[str], typer.Argument(help="models:/NAME@champion or a folder, one for each axis")],
+    recordings: Annotated[list[Path], typer.Option(help="file or folder; batches that the model has not seen")],
+    fail: Annotated[
+        list[str] | None, typer.Option(help="SENSOR:HOW@START+DURATION, HOW lost, frozen or stepping")
+    ] = None,
+    readings_h: Annotated[
+        float | None, typer.Option(help="hours between two readings of a probe; default: none")
+    ] = None,
+    sample_s: Annotated[float, typer.Option(help="time between two samples, s")] = 10.0,
+    max_um: MaxOffset = None,
+    rate_um_per_s: Rate = 0.1,
+    period_s: Period = 10.0,
+    through: Annotated[
+        str | None, typer.Option(help="mqtt://…: talk to a running `thermodrift compensate --replay`")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="page; default: var/rehearsal/MACHINE.html")] = None,
+    as_json: Json = False,
+) -> None:
+    """Play recordings to a compensation as if they happened now, let sensors fail, and show the error before and after.
+
+    Each recording follows the other after a night. With --through it speaks to a compensation that runs elsewhere.
+    """
+    import math
+
+    from compensation.rehearsal import failure
+    from compensation.rehearsal import rehearse as work
+    from pipelines.commands.predict import load_model
+    from pipelines.compensating import Given, compensator
+    from pipelines.recordings import check_recordings, read_files
+    from pipelines.settings import configure_environment, home, load
+    from reports.rehearsal import write_rehearsal
+
+    failures = [failure(text) for text in fail or ()]
+    configure_environment()
+    settings = load()
+    stored = [load_model(m, settings) for m in models]
+    machine = stored[0].machine
+    check_recordings(recordings)
+    batches = [b for path in recordings for b in read_files(machine, path)]
+    axes = [m.family.target for m in stored]
+    if through is None:
+        running = compensator(stored, Given(max_um, rate_um_per_s, sample_s), period_s, lambda line: None)
+        exchange: Any = lambda s: running.take(s, s.time_s)  # noqa: E731
+    else:
+        from compensation.exchange import MqttExchange
+
+        exchange = MqttExchange(through)
+    every_s = math.inf if readings_h is None else 3600.0 * readings_h
+    with console.progress(as_json) as (_, done):
+        r = work(batches, axes, exchange, sample_s, failures, every_s, lambda n, of: done("rehearse", n, of))
+    page = out or home() / "rehearsal" / f"{machine.machine}.html"
+    write_rehearsal(page, r, ", ".join(models))
+    if as_json:
+        console.print_json(rehearsal_dict(r) | {"page": str(page)})
+        return
+    for a in axes:
+        before, after = r.band_um(a)
+        console.line(f"{a:<10} band of 95 % of the rows: {before:.2f} µm without, {after:.2f} µm with compensation")
+    console.line(f"page       {page}")

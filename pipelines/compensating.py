@@ -1,0 +1,203 @@
+"""A promoted model at the machine: from the registry to a running compensation, its state on disk, its exports."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from compensation.contracts import Correction, Sink, Source
+from compensation.exports.base import AxisModel as ExportedAxis
+from compensation.exports.base import Export
+from compensation.runtime import AxisModel, Compensator
+from compensation.safety import Limits
+from compensation.substitutes import Substitutes
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from features.rises import feature_unit
+from pipelines.model_store import FILES, StoredModel
+
+PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
+_SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
+_LOST_SAMPLES = 3  # in a row before the input is stale
+_ROOM = 1.25  # of the largest error of the training: a correction beyond is a failure of the model
+
+
+def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisModel:
+    """A stored model made ready to run every `period_s`.
+
+    Raises:
+        InputError: the family cannot run step by step, with those that can.
+    """
+    channels = stored.machine.batch_channels()
+    family = stored.family
+    empty = Batch(stored.machine.machine, "no rows", pd.DataFrame({"time_s": []}), channels)
+    return AxisModel(
+        family.target, family.program(channels, period_s), family.inputs,
+        tuple(feature_unit(empty, i) for i in family.inputs), stored.region, stored.region.program(channels, period_s),
+        stored.bound, stored.updater, limits,
+    )  # fmt: skip
+
+
+def compensator(
+    models: Sequence[StoredModel], limits: Given, period_s: float = PERIOD_S, log: Callable[[str], None] = print
+) -> Compensator:
+    """The models of one machine, an axis each.
+
+    Raises:
+        InputError: models of different machines, or twice the same axis.
+    """
+    machines = sorted({m.machine.machine for m in models})
+    axes = [m.family.target for m in models]
+    if len(machines) != 1 or len(set(axes)) < len(axes):
+        raise InputError(
+            f"compensation: got models of machine {', '.join(machines) or '(none)'} for the axes {', '.join(axes)}; "
+            "expected one machine and one model for each axis"
+        )
+    known = [m.substitutes for m in models if m.substitutes is not None]
+    made = [axis_model(m, limits.of(m), period_s) for m in models]
+    return Compensator(machines[0], made, _widest(known), period_s, log)
+
+
+@dataclass(frozen=True)
+class Given:
+    """The limits that a user gives for every axis of a machine.
+
+    Attributes:
+        max_um: largest offset, µm; None: a quarter more than the largest error of the model's training.
+        rate_um_per_s: largest rate, µm/s.
+        sample_s: how often samples arrive, s; None: the step of the machine file.
+    """
+
+    max_um: float | None = None
+    rate_um_per_s: float = 0.1
+    sample_s: float | None = None
+
+    def of(self, stored: StoredModel) -> Limits:
+        """The limits of one axis. Raises: InputError, one that makes no sense."""
+        default, largest_um = Limits(), float(stored.info.get("largest_um", 0.0))
+        usual_um = _ROOM * largest_um if largest_um > 0 else default.max_offset_um
+        every_s = stored.machine.recording.step_s if self.sample_s is None else self.sample_s
+        return Limits(
+            max_offset_um=usual_um if self.max_um is None else self.max_um,
+            rate_um_per_s=self.rate_um_per_s,
+            stale_s=max(default.stale_s, _LOST_SAMPLES * (every_s or 0.0)),
+        )
+
+
+def _widest(known: Sequence[Substitutes]) -> Substitutes | None:
+    """Of several models' substitutes those of the most sensors: they know the most neighbours of each."""
+    return max(known, key=lambda s: len(s.names), default=None)
+
+
+class StateFile:
+    """The state of a compensation on disk, replaced atomically."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def load(self) -> Mapping[str, Any] | None:
+        """What was saved; None where nothing was.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        try:
+            plain = json.loads(self.path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise InputError(f"state file {self.path}: cannot be read ({error}); delete it to start afresh") from None
+        return dict(plain)
+
+    def save(self, plain: Mapping[str, Any]) -> None:
+        """Replaces the file. Raises: WorkError, it cannot be written."""
+        scratch = self.path.with_suffix(".new")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            scratch.write_text(json.dumps(plain), encoding="utf-8")
+            scratch.replace(self.path)
+        except OSError as error:
+            raise WorkError(f"state file {self.path}: cannot be written ({error}); give another --state") from None
+
+
+def serve(
+    machine: Compensator,
+    source: Source,
+    sinks: Sequence[Sink],
+    state: StateFile | None = None,
+    log: Callable[[str], None] = print,
+    replay: bool = False,
+    seen: Callable[[Correction], None] = lambda c: None,
+) -> None:
+    """Answers samples until the source ends; then every axis keeps what it sent last in the state file.
+
+    A sink that fails is reported once and tried again with the next correction: the machine holds what it has.
+
+    Args:
+        replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests.
+        seen: called with every correction.
+    """
+    saved_s, failing, clock_s, begun = -_SAVED_EVERY_S, set[int](), 0.0, False
+    try:
+        if state is not None and (known := state.load()) is not None:
+            machine.restore(known)
+            log(f"goes on from {state.path}")
+        begun = True
+        for sample in source.samples():
+            if not replay:
+                clock_s = time.monotonic()
+            elif sample is not None:
+                clock_s = sample.time_s
+            correction = machine.take(sample, clock_s) if sample else machine.silence(clock_s, time.time())
+            for k, sink in enumerate(sinks):
+                try:
+                    sink.write(correction)
+                    failing.discard(k)
+                except WorkError as error:
+                    if k not in failing:
+                        log(str(error))
+                    failing.add(k)
+            seen(correction)
+            if state is not None and clock_s - saved_s > _SAVED_EVERY_S:
+                state.save(machine.as_plain())
+                saved_s = clock_s
+    finally:
+        if state is not None and begun:
+            state.save(machine.as_plain())
+        source.close()
+        for sink in sinks:
+            sink.close()
+
+
+def export_of(
+    models: Mapping[str, StoredModel], folders: Mapping[str, Path], limits: Given, period_s: float
+) -> Export:
+    """Models of one machine by their names, ready for an export.
+
+    Raises:
+        InputError: see `compensator` and `Family.program`.
+    """
+    compensator(list(models.values()), limits, period_s)
+    digest = hashlib.sha256()
+    for folder in folders.values():
+        inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
+        for name in FILES:
+            digest.update((inner / name).read_bytes())
+    axes = []
+    for stored in models.values():
+        made = axis_model(stored, limits.of(stored), period_s)
+        trained = {c: (low, high) for c, (low, high) in stored.info.get("trained", {}).items()}
+        axes.append(ExportedAxis(made.axis, made.program, trained, made.limits))
+    first = next(iter(models.values()))
+    return Export(
+        machine=first.machine.machine, model=", ".join(models), version=str(first.info.get("training_id", "")),
+        digest=digest.hexdigest(), created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        simulated=any(m.simulated for m in models.values()), axes=tuple(axes),
+    )  # fmt: skip

@@ -1,0 +1,255 @@
+"""Every export: equal to the program, complete in what it states, and clear in what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensation.exports import EXPORTS
+from compensation.exports.base import AxisModel, Export, identifiers
+from compensation.exports.straight_line import formulas
+from data.batch import Batch, Channel
+from data.errors import InputError
+from models import FAMILIES
+from models.base import Family
+from models.program import Builder, Program, replay
+
+DIGEST = "0123456789abcdef" * 4
+PROGRAMS = tuple(k for k, f in FAMILIES.items() if f.operations is not Family.operations)
+Batches = Callable[..., list[Batch]]
+STRAIGHT = ("sinumerik", "heidenhain", "fanuc")
+LINEAR = ("mlr", "ridge", "pcr", "pls", "huber", "elastic_net", "axis_coupled")
+
+
+@dataclass(frozen=True)
+class SomeLimits:
+    max_offset_um: float = 40.0
+    rate_um_per_s: float = 0.02
+    hold_s: float = 900.0
+    stale_s: float = 30.0
+
+
+def along_y(batch: Batch) -> Batch:
+    """The batch with z measured at five positions in turn, and growing along them."""
+    at_mm = 100.0 * (np.arange(batch.n_rows) % 5)
+    rise = batch.values("t0") - batch.values("t0")[0]
+    table = batch.table.assign(y=at_mm, z=batch.values("z") + 0.01 * rise * at_mm)
+    channels = dict(batch.channels) | {"y": Channel("y", "position", "mm")}
+    return replace(batch, table=table, channels=channels | {"z": replace(channels["z"], position="y")})
+
+
+@cache
+def fitted(
+    key: str, make: Batches, inputs: tuple[str, ...] = ("t0", "t2", "t4@lag30min", "room")
+) -> tuple[Program, np.ndarray]:
+    """A family's program, and the rows of a batch that it was not fitted on."""
+    batches = make(5, 40)
+    if FAMILIES[key].needs_position:
+        batches = [along_y(batch) for batch in batches]
+    *train, left = batches
+    options = {"random_forest": {"n_trees": 20}, "bp": {"starts": 1}}.get(key, {})
+    try:
+        family = FAMILIES[key](**options)
+    except TypeError:
+        family = FAMILIES[key]()
+    program = family.fit(train, inputs, "z").program(left.channels, left.step_s)
+    return program, np.column_stack([left.masked(c) for c in program.channels] or [np.empty((left.n_rows, 0))])
+
+
+def every_operation(step_s: float = 300.0) -> Program:
+    """A program with all operations, sizes of one and more, and fractional delays; two outputs along y."""
+    rng = np.random.default_rng(1)
+    known = {n: Channel(n, "temperature", "degC") for n in "abcd"}
+    known |= {"rpm": Channel("rpm", "driver", "rpm"), "y": Channel("y", "driver", "mm")}
+    b = Builder(known, step_s)
+    x, rpm = b.features(["a", "b", "c"]), b.channels(["rpm"], required=False)
+    many = b.lags(b.join(x, b.features(["d@rate", "a@rate"])), [600.0, 0.0, 7200.0], 1.0)
+    many = b.pick(many, list(range(b.size(many)))[::-1])
+    load = b.add("power", [b.join(*[b.scaled(rpm, np.array(1000.0))] * 4)], 4, exponents=[0.0, 1.0, 2.0, 0.7])
+    late = b.join(b.delay(x, 450.0, 0.0), b.delay(x, 900.0, 1.0), b.delay(rpm, 100.0, 1.0), b.delay(rpm, 300.0, 0.0))
+    middle = b.join(b.add("median", [x], 1), b.add("median", [load], 1), b.add("median", [rpm], 1))
+    curve = b.add("curve", [x], 3, knots=[-2.0, 0.0, 1.0, 5.0], values=[3.0, -1.0, 4.0, 2.0])
+    level = b.add("curve", [b.add("clock", [], 1)], 1, knots=[600.0], values=[2.5])
+    ramp = b.add("curve", [b.add("clock", [], 1)], 1, knots=[600.0, 3000.0], values=[0.0, 9.0])
+    net = b.affine(b.add("tanh", [b.affine(x, rng.normal(size=(4, 3)), 0.1)], 4), rng.normal(size=(2, 4)))
+    kernel = b.add("kernel", [x], 1, support=rng.normal(size=(7, 3)), weights=rng.normal(size=7), sharpness=0.03)
+    trees = [
+        b.add("trees", [x], 1, roots=[0, 3, 4], feature=[0, 0, 0, 0, 2, 0, 1, 0, 0], single=single,
+              left=[1, 1, 2, 3, 5, 5, 7, 7, 8], right=[2, 1, 2, 3, 6, 5, 8, 7, 8],
+              threshold=[0.3, 0, 0, 0, 0.7, 0, -0.2, 0, 0], value=[0, 1, 2, 0.5, 0, 3, 0, -4, 8])
+        for single in (0.0, 1.0)
+    ]  # fmt: skip
+    wide = b.add("mul", [many, many], b.size(many))
+    whole = b.join(many, load, late, middle, curve, level, ramp, net, kernel, *trees, wide)
+    weights = rng.normal(size=(2, b.size(whole)))
+    both = b.affine(whole, weights * [[0.1], [0.001]], 0.3)
+    return b.program([b.pick(both, [0]), b.pick(both, [1])], False, along="y", reference_mm=120.0)
+
+
+def rows_with_holes(program: Program, n: int = 60) -> np.ndarray:
+    """Random walks; rows begin late, and later every channel misses some."""
+    rng = np.random.default_rng(2)
+    rows = 20.0 + rng.normal(size=(n, len(program.channels))).cumsum(axis=0)
+    rows[:, [c == "rpm" for c in program.channels]] *= 100.0
+    rows[:2, 0] = np.nan
+    rows[10:40][rng.random((30, rows.shape[1])) < 0.1] = np.nan
+    return rows
+
+
+def straight(region: Mapping[str, tuple[float, float]] | None = None) -> AxisModel:
+    """3 (t0 − t0 first) − 2 t1 + 1.5, and with a slope of 0.01 (t0 − t0 first) along y."""
+    known = {n: Channel(n, "temperature", "degC") for n in ("t0", "t1")}
+    b = Builder(known, 300.0)
+    x = b.channels(["t0", "t1"])
+    rise = b.since_first(b.pick(x, [0]))
+    error = b.affine(b.join(rise, b.pick(x, [1])), np.array([[3.0, -2.0]]), 1.5)
+    program = b.program([error, b.affine(rise, np.array([[0.01]]))], False, "y", 100.0)
+    trained = {"t0": (10.0, 30.0), "t1": (15.0, 25.0), "y": (0.0, 500.0)} if region is None else region
+    return AxisModel("y", program, trained, SomeLimits())
+
+
+def offset_only() -> AxisModel:
+    a = straight()
+    program = replace(a.program, outputs=a.program.outputs[:1], along="", reference_mm=0.0)
+    return replace(a, program=program)
+
+
+def export_of(*axes: AxisModel, machine: str = "mill 1", simulated: bool = True) -> Export:
+    return Export(machine, "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", simulated, axes)
+
+
+def dynamic(axis: str = "z") -> AxisModel:
+    return AxisModel(axis, every_operation(), {"a": (5.0, 35.0), "y": (0.0, 500.0)}, SomeLimits())
+
+
+@pytest.mark.parametrize("key", list(EXPORTS))
+def test_every_file_states_what_it_is(key: str, tmp_path: Path) -> None:
+    paths = EXPORTS[key]().write(export_of(offset_only()), tmp_path)
+    assert paths and all(p.is_file() and p.name.startswith("mill_1") for p in paths)
+    for path in paths:
+        text = path.read_bytes().decode(errors="replace")
+        for told in ("mill 1", "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", "SIMULATED", "degC", "um",
+                     "-error_um", "hold"):  # fmt: skip
+            assert told in text or (path.suffix == ".c" and told in (tmp_path / "mill_1.h").read_text()), told
+    for path in EXPORTS[key]().write(export_of(offset_only(), simulated=False), tmp_path):
+        assert not re.search(rb"(?<!_)SIMULATED", path.read_bytes())
+
+
+@pytest.mark.parametrize("key", list(EXPORTS))
+def test_it_has_a_summary_and_file_names(key: str) -> None:
+    exporter = EXPORTS[key]
+    assert exporter.key == key and exporter.summary and exporter.suffix
+
+
+@pytest.mark.parametrize("key", STRAIGHT)
+def test_a_dynamic_model_is_refused_with_the_exports_that_can(key: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"lag.*thermodrift compensate.*these exports can: json, c, st, onnx$"
+    ) as error:
+        EXPORTS[key]().write(export_of(dynamic()), tmp_path)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_slope_is_refused_where_the_control_has_none(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"slope along y.*can: json, c, st, onnx, sinumerik, heidenhain$"):
+        EXPORTS["fanuc"]().write(export_of(straight()), tmp_path)
+
+
+def test_axes_of_different_steps_cannot_share_a_function(tmp_path: Path) -> None:
+    slow = replace(dynamic("x"), program=every_operation(600.0))
+    with pytest.raises(InputError, match=r"^export c: .*z 300 s, x 600 s.*can: json, st, onnx$"):
+        EXPORTS["c"]().write(export_of(dynamic(), slow), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"axes": ()}, "expected at least one"),
+        ({"axes": (dynamic(), dynamic())}, "each once"),
+        ({"axes": (replace(dynamic(), limits=SomeLimits(max_offset_um=0.0)),)}, "limits"),
+        ({"axes": (replace(dynamic(), region={"a": (3.0, 1.0)}),)}, "trained region of a is 3 to 1"),
+        ({"axes": (replace(dynamic(), program=replace(every_operation(), along="")),)}, "2 outputs"),
+    ],
+)
+def test_an_unusable_statement_is_one_line(change: dict[str, object], told: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=told) as error:
+        EXPORTS["json"]().write(replace(export_of(dynamic()), **change), tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    a = offset_only()
+    nodes = tuple(replace(n, data={k: v * np.nan for k, v in n.data.items()}) if n.op == "affine" else n
+                  for n in a.program.nodes)  # fmt: skip
+    with pytest.raises(InputError, match=r"\(affine\) is not finite"):
+        EXPORTS["c"]().write(export_of(replace(a, program=replace(a.program, nodes=nodes))), tmp_path)
+
+
+def test_json_gives_the_program_back(tmp_path: Path) -> None:
+    program = every_operation()
+    (path,) = EXPORTS["json"]().write(export_of(dynamic()), tmp_path)
+    stored = json.loads(path.read_text())
+    assert stored["schema"] == "thermodrift.export/1"
+    (axis,) = stored["axes"]
+    rows = rows_with_holes(program)
+    assert np.array_equal(replay(Program.from_plain(axis["program"]), rows), replay(program, rows), equal_nan=True)
+    assert stored["operations"].keys() == {n.op for n in program.nodes}
+    assert axis["inputs"][0] == {
+        "channel": "a", "unit": "degC", "required": True, "trained": [5.0, 35.0], "usable": [-25.0, 65.0],
+    }  # fmt: skip
+    assert axis["limits"]["max_slope_um_per_m"] == pytest.approx(40.0 / 0.38)
+
+
+def test_formulas_are_the_program() -> None:
+    offset, slope = formulas(straight())
+    assert offset.constant == 1.5 and slope.constant == 0.0
+    assert np.allclose(offset.now, [3.0, -2.0]) and np.allclose(offset.first, [-3.0, 0.0])
+    assert np.allclose(slope.now, [0.01, 0.0])
+    assert offset.text(["t0", "t1"]) == "1.5 + 3 * (t0 - t0_first) - 2 * t1"
+    assert offset.bounds(straight()) == (1.5 - 60.0 - 50.0, 1.5 + 60.0 - 30.0)
+
+
+@pytest.mark.parametrize("key", LINEAR)
+def test_a_linear_family_is_a_straight_line(key: str, toy_batches: Batches) -> None:
+    program, rows = fitted(key, toy_batches, ("t0", "t2", "room"))
+    lines = formulas(AxisModel("z", program, {}, SomeLimits()))
+    got = [[line.value(row, rows[0]) for line in lines] for row in rows]
+    assert np.abs(got - replay(program, rows)).max() < 1e-9
+
+
+def test_sinumerik_states_its_data(tmp_path: Path) -> None:
+    (path,) = EXPORTS["sinumerik"]().write(export_of(straight()), tmp_path)
+    text = path.read_text()
+    for told in ("MD32750", "MD32760", "SD43900", "SD43910", "SD43920", "$MA_TEMP_COMP_TYPE[Y] = 3",
+                 "$SA_TEMP_COMP_REF_POSITION[Y] = 100", "-1.5 - 3 * (t0 - t0_first) + 2 * t1", "in the style of",
+                 "WARNING: axis y: the offset can reach 108.5 um", "the slope can reach 200 um/m"):  # fmt: skip
+        assert told in text, told
+    assert float(text.split("VELO_FACTOR[Y] = ")[1].split()[0]) >= 0.01 * 20.0 * 1e-3 * 0.4
+    assert (
+        "an input has no trained region"
+        in EXPORTS["sinumerik"]().files(export_of(straight({})))["mill_1_sinumerik.txt"]
+    )
+
+
+def test_heidenhain_and_fanuc_keep_within_their_ranges(tmp_path: Path) -> None:
+    hot = {"t0": (-10_000.0, 10_000.0), "t1": (15.0, 25.0)}
+    wide = SomeLimits(max_offset_um=1e5, rate_um_per_s=5.0)
+    (words,) = EXPORTS["heidenhain"]().write(export_of(replace(straight(hot), limits=wide)), tmp_path)
+    text = words.read_text()
+    assert "beyond the range of a word of 32767 um" in text and "MIN -32767 MAX 32767 RATE 1 " in text
+    assert "EXPANSION Y SENSOR t0 REFERENCE 100 VALUE -1e-05" in text
+    (offsets,) = EXPORTS["fanuc"]().write(export_of(replace(offset_only(), region=hot, limits=wide)), tmp_path)
+    text = offsets.read_text()
+    assert "beyond the alarm limit of 9998 um" in text and "LIMIT 9998 ALARM 9999" in text
+
+
+def test_identifiers_are_distinct_and_plain() -> None:
+    assert identifiers(["Fräse 1", "fr_se-1", "1", "__a__b", "µ"]) == ["Fr_se_1", "fr_se_1_2", "m_1", "a_b", "m"]

@@ -1,0 +1,215 @@
+"""A stored model at the machine: what is stored for it, the commands, and a model that needs nothing of thermodrift."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from compensation.substitutes import Substitutes
+from data.errors import InputError
+from data.machine import load_machine
+from data.recording import read_batches
+from features.design import Design
+from models import FAMILIES
+from models.trust import Region
+from models.updating import Updater, out_of_fold
+from pipelines import model_store
+from pipelines.cli import app
+from pipelines.compensating import Given, compensator
+from pipelines.pyfunc_model import SERVED, Served
+from pipelines.serving import write_served
+from tests.toys.small_year import write_machine, write_year
+
+INPUTS = ("front", "bed")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def year(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("machine-year")
+    write_year(folder / "in", 7)
+    write_machine(folder / "m.yml", "mill")
+    return folder
+
+
+def store_model(year: Path, folder: Path, key: str = "distributed_lag", axis: str = "z") -> model_store.StoredModel:
+    text = (year / "m.yml").read_text()
+    machine = load_machine(year / "m.yml")
+    *train, _ = [b for f in sorted((year / "in").glob("*.csv")) for b in read_batches(f, machine)]
+    family = FAMILIES[key]().fit(train, INPUTS, axis)
+    design = Design.build(train, INPUTS, axis)
+    updater = Updater.learn(out_of_fold(design, key, range(len(train))))
+    info = {
+        "simulated": True,
+        "step_s": 300.0,
+        "largest_um": 40.0,
+        "trained": {"front": [0.0, 60.0], "bed": [0.0, 60.0]},
+    }
+    region = Region.of(train, INPUTS)
+    substitutes = Substitutes.learn(train, INPUTS)
+    model_store.save(folder, family, text, region, info, None, (), updater, substitutes)
+    return model_store.load(folder)
+
+
+@pytest.fixture(scope="module")
+def model(year: Path) -> Path:
+    store_model(year, year / "model")
+    return year / "model"
+
+
+def last_recording(year: Path) -> Path:
+    return sorted((year / "in").glob("*.csv"))[-1]
+
+
+def test_what_the_machine_needs_is_stored(year: Path, model: Path) -> None:
+    stored = model_store.load(model)
+    again = store_model(year, year / "again")
+    assert stored.updater is not None and stored.updater == again.updater
+    assert stored.substitutes is not None
+    assert (stored.substitutes.covariance_K2 == again.substitutes.covariance_K2).all()
+
+
+def test_a_recording_on_standard_input_is_answered_row_by_row(
+    year: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = model_store.load(model)
+    machine = stored.machine
+    (batch,) = read_batches(last_recording(year), machine)
+    rows = "".join(
+        json.dumps({"time_s": 1e9 + t, "front": f, "bed": b}) + "\n"
+        for t, f, b in zip(batch.time_s, batch.values("front"), batch.values("bed"), strict=True)
+    )
+    options = ["compensate", str(model), "--replay", "--period-s", "300", "--rate-um-per-s", "50", "--from", "-"]
+    done = CliRunner().invoke(app, options, input=rows)
+    assert done.exit_code == 0, done.output
+    answers = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert len(answers) == batch.n_rows
+    assert {"time_s", "offset_um", "state"} <= answers[0].keys()
+    assert answers[-1]["state"] == {"z": "active"}
+    wanted = -stored.predict(batch)
+    assert abs(answers[-1]["offset_um"]["z"]) <= abs(wanted[-1]) + 1.0 + 1e-6
+
+
+def test_the_state_file_goes_on(year: Path, model: Path, tmp_path: Path) -> None:
+    (batch,) = read_batches(last_recording(year), model_store.load(model).machine)
+    table = batch.table.rename(columns={"time_s": "time"}).drop(columns=["z", "x"])
+    table["time"] += 1e9
+    for name, part in (("one", table[:40]), ("two", table[40:])):
+        part.to_csv(tmp_path / f"{name}.csv", index=False)
+    state = tmp_path / "state.json"
+    for name in ("one", "two"):
+        options = ["compensate", str(model), "--replay", "--from", str(tmp_path / f"{name}.csv"), "--state", str(state),
+                   "--to", str(tmp_path / "sent.csv"), "--period-s", "300"]  # fmt: skip
+        done = CliRunner().invoke(app, options)
+        assert done.exit_code == 0, done.output
+    assert "goes on from" in done.stderr
+    sent = pd.read_csv(tmp_path / "sent.csv")
+    column = next(c for c in sent if "offset" in c and "z" in c)
+    assert len(sent) == len(table) and np.abs(np.diff(sent[column])).max() <= 1.0 + 1e-9
+    state.write_text("{")
+    done = CliRunner().invoke(app, options)
+    assert done.exit_code == 1 and isinstance(done.exception, InputError)
+    assert "cannot be read" in str(done.exception) and "delete it" in str(done.exception)
+
+
+def test_axes_of_other_machines_and_families_that_cannot_run_are_refused(
+    year: Path, model: Path, tmp_path: Path
+) -> None:
+    stored = model_store.load(model)
+    with pytest.raises(InputError, match="expected one machine and one model for each axis"):
+        compensator([stored, stored], Given())
+    other = store_model(year, tmp_path / "gm", "gm1n")
+    with pytest.raises(InputError, match=r"family gm1n cannot be written as a program; those that can: "):
+        compensator([other], Given())
+
+
+def test_limits_follow_the_training_and_how_often_samples_arrive(model: Path) -> None:
+    stored = model_store.load(model)
+    assert Given().of(stored).stale_s == 900.0 and Given(sample_s=1.0).of(stored).stale_s == 30.0
+    assert Given().of(stored).max_offset_um == 50.0 and Given(7.0).of(stored).max_offset_um == 7.0
+
+
+def test_a_rehearsal_shows_before_and_after(year: Path, model: Path, tmp_path: Path) -> None:
+    options = ["rehearse", str(model), "--recordings", str(last_recording(year)), "--sample-s", "60"]
+    options += ["--period-s", "60", "--rate-um-per-s", "1", "--readings-h", "1", "--out", str(tmp_path / "page.html")]
+    options += ["--json", "--fail"]
+    done = CliRunner().invoke(app, [*options, "front:lost@2h+20min"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert told["simulated"] and told["samples"] == 361 and told["readings"] == 6
+    assert told["axes"]["z"]["band95_after_um"] < 0.6 * told["axes"]["z"]["band95_before_um"]
+    page = (tmp_path / "page.html").read_text()
+    assert "SIMULATED" in page and "front" in page and "<script" not in page
+    done = CliRunner().invoke(app, [*options, "nose:lost@2h+1h"])
+    assert isinstance(done.exception, InputError) and "no channel 'nose'" in str(done.exception)
+    done = CliRunner().invoke(app, [*options, "front:gone"])
+    assert isinstance(done.exception, InputError) and "SENSOR:HOW@START+DURATION" in str(done.exception)
+
+
+@pytest.mark.parametrize("kind", ["json", "c", "st", "onnx"])
+def test_an_export_states_model_and_limits(model: Path, tmp_path: Path, kind: str) -> None:
+    done = CliRunner().invoke(app, ["export", str(model), "--to", kind, "--out", str(tmp_path), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert told["simulated"] and len(told["sha256"]) == 64
+    content = b"".join(Path(p).read_bytes() for p in told["files"])
+    assert b"SIMULATED" in content and told["sha256"].encode() in content
+
+
+def test_an_unknown_export_names_the_known_ones(model: Path) -> None:
+    done = CliRunner().invoke(app, ["export", str(model), "--to", "plc"])
+    assert isinstance(done.exception, InputError) and "unknown export 'plc'" in str(done.exception)
+
+
+def frame_of(year: Path, stored: model_store.StoredModel) -> pd.DataFrame:
+    (batch,) = read_batches(last_recording(year), stored.machine)
+    two = pd.concat([batch.table.assign(batch_id="a"), batch.table.assign(batch_id="b")], ignore_index=True)
+    return two.drop(columns=["x", "z"])
+
+
+@pytest.mark.parametrize("key", ["ridge", "distributed_lag", "lag_dictionary", "lssvm"])
+def test_served_without_thermodrift_it_predicts_the_same(year: Path, tmp_path: Path, key: str) -> None:
+    stored = store_model(year, tmp_path, key)
+    assert write_served(stored, tmp_path, 300.0) == SERVED
+    table = frame_of(year, stored)
+    got, wanted = Served(tmp_path).predict(table), model_store.predict_frame(stored, table)
+    assert np.abs(got["predicted_um"] - wanted["predicted_um"]).max() < 1e-4
+    assert (got["outside_region"] == wanted["outside_region"]).all() and got["outside_region"].any()
+    with pytest.raises(ValueError, match="no column 'front'"):
+        Served(tmp_path).predict(table.drop(columns="front"))
+    with pytest.raises(ValueError, match="the model steps by 300 s"):
+        Served(tmp_path).predict(table.assign(time_s=2 * table["time_s"]))
+
+
+def test_it_imports_nothing_of_thermodrift(year: Path, tmp_path: Path) -> None:
+    stored = store_model(year, tmp_path)
+    write_served(stored, tmp_path, 300.0)
+    table = frame_of(year, stored)
+    table.to_csv(tmp_path / "rows.csv", index=False)
+    (tmp_path / "served.py").write_text((ROOT / "pipelines" / "pyfunc_model.py").read_text())
+    code = (
+        f"import sys; sys.path = [p for p in sys.path if p not in ('', {str(ROOT)!r})]; sys.path.insert(0, '.')\n"
+        "import pandas, served, pathlib\n"
+        "print(served.Served(pathlib.Path('.')).predict(pandas.read_csv('rows.csv')).to_csv(index=False))\n"
+        "own = {'data', 'features', 'models', 'pipelines', 'compensation', 'scipy'} & set(sys.modules)\n"
+        "assert 'pipelines' not in own, own\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    got = pd.read_csv(io.StringIO(done.stdout))
+    assert np.abs(got["predicted_um"] - model_store.predict_frame(stored, table)["predicted_um"]).max() < 1e-4
+
+
+def test_a_family_that_is_no_program_says_what_it_needs(year: Path, tmp_path: Path) -> None:
+    stored = store_model(year, tmp_path, "gm1n")
+    assert write_served(stored, tmp_path, 300.0) == ()
+    with pytest.raises(RuntimeError, match="family gm1n is no ONNX file; install thermodrift"):
+        Served(tmp_path)
