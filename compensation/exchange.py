@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import time
 from queue import Empty, SimpleQueue
 from typing import Any
 from urllib.parse import urlparse
 
 import paho.mqtt.client as mqtt
 
+from compensation.connectors.mqtt import prompt_socket
 from compensation.contracts import Correction, Sample
 from data.errors import WorkError
 
-_WAIT_S = 10.0
+_WAIT_S, _AGAIN_S = 30.0, 1.0
 
 
 class MqttExchange:
@@ -27,7 +29,9 @@ class MqttExchange:
         self.address, self.prefix = address, parts.path.strip("/")
         self._answers: SimpleQueue[dict[str, Any]] = SimpleQueue()
         self._ready: SimpleQueue[bool] = SimpleQueue()
+        self._heard = False
         self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        self._client.on_socket_open = prompt_socket
         self._client.on_connect = lambda client, *_: client.subscribe(f"{self.prefix}/correction", 1)
         self._client.on_subscribe = lambda *_: self._ready.put(True)
         self._client.on_message = lambda _, __, message: self._answers.put(json.loads(message.payload))
@@ -40,17 +44,22 @@ class MqttExchange:
 
     def __call__(self, sample: Sample) -> Correction:
         message = {"time_s": sample.time_s, "values": dict(sample.values), "readings_um": dict(sample.readings_um)}
-        self._client.publish(f"{self.prefix}/sample", json.dumps(message), 1)
-        while True:
+        until_s, text, sent_s = time.monotonic() + _WAIT_S, json.dumps(message), -_AGAIN_S
+        while (now_s := time.monotonic()) < until_s:
+            if now_s - sent_s >= _AGAIN_S and (sent_s < 0 or not self._heard):  # it may not have subscribed yet
+                self._client.publish(f"{self.prefix}/sample", text, 1)
+                sent_s = now_s
             try:
-                got = self._answers.get(timeout=_WAIT_S)
+                got = self._answers.get(timeout=_AGAIN_S)
             except Empty:
-                raise WorkError(
-                    f"{self.address}: no correction within {_WAIT_S:g} s; start `thermodrift compensate` with the same "
-                    "address"
-                ) from None
+                continue
             if abs(got["time_s"] - sample.time_s) < 1e-3:
+                self._heard = True
                 return Correction(got["time_s"], got["offset_um"], got["slope_um_per_m"], got["state"], got["reasons"])
+        raise WorkError(
+            f"{self.address}: no correction within {_WAIT_S:g} s; start `thermodrift compensate --replay` with the "
+            "same address"
+        )
 
     def close(self) -> None:
         """Disconnects."""

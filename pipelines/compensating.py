@@ -176,9 +176,7 @@ def serve(
             sink.close()
 
 
-def export_of(
-    models: Mapping[str, StoredModel], folders: Mapping[str, Path], limits: Given, period_s: float
-) -> Export:
+def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], limits: Given, period_s: float) -> Export:
     """Models of one machine by their names, ready for an export.
 
     Raises:

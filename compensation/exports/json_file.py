@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -31,6 +32,7 @@ OPERATIONS: Mapping[str, str] = {
     "trees": "sum over roots: from node = root, node = left[node] if x[feature[node]] <= threshold[node] else "
     "right[node], until node is its own child; value[node]. With single, x is rounded to single precision first",
 }
+_NUMBERS = re.compile(r"\[\n([-+\d.eE,\s]+)\]")  # a list of numbers over several lines, which no string has
 ROWS = (
     "The first row is that at which every channel has been seen. The state passes over a missing channel at its last "
     "value; a row without a required channel has no output."
@@ -50,4 +52,5 @@ class JsonExport(Exporter):
         meaning = {op: text for op, text in OPERATIONS.items() if op in used}
         whole = {"schema": SCHEMA, **export.described(), "rows": ROWS, "operations": meaning, "axes": axes}
         text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())
+        text = _NUMBERS.sub(lambda m: f"[{' '.join(m[1].split())}]", text)
         return {f"{export.stem}{self.suffix}": text + "\n"}

@@ -130,8 +130,8 @@ def formulas(axis: AxisModel) -> list[Formula]:
 
 def warnings(axis: AxisModel, lines: Sequence[Formula], most_um: float = inf, told: str = "") -> list[str]:
     """Lines that state where K0 or tan β can leave its range in the trained region; `told` names the control's."""
-    offset_um = (most_um, told), (axis.limits.max_offset_um, "max_offset_um, where it is cut,")
-    slope = ((axis.max_slope_um_per_m, "its limit, where it is cut,"),)
+    offset_um = (most_um, told, ""), (axis.limits.max_offset_um, "max_offset_um", "; it is cut there")
+    slope = ((axis.max_slope_um_per_m, "its limit", "; it is cut there"),)
     quantities = (("offset", "um", 1.0, offset_um), ("slope", "um/m", 1000.0, slope))
     out = []
     for formula, (name, unit, factor, limits) in zip(lines, quantities, strict=False):
@@ -140,10 +140,10 @@ def warnings(axis: AxisModel, lines: Sequence[Formula], most_um: float = inf, to
             out.append(f"WARNING: axis {axis.axis}: the range of the {name} is unknown; an input has no trained region")
             continue
         largest = factor * max(abs(b) for b in bounds)
-        for most, which in limits:
+        for most, which, then in limits:
             if largest > most:
                 reach = f"the {name} can reach {largest:.6g} {unit} in the trained region"
-                out.append(f"WARNING: axis {axis.axis}: {reach}, beyond {which} of {most:g} {unit}")
+                out.append(f"WARNING: axis {axis.axis}: {reach}, beyond {which} of {most:g} {unit}{then}")
     return out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from test_exports_programs import (
 
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
+from compensation.safety import Limits
 from models.program import replay
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the C export")
@@ -104,11 +105,6 @@ def test_the_file_can_state_any_text(tmp_path: Path) -> None:
     Compiled(replace(export, model='x "y" \\'), tmp_path)
 
 
-@dataclass(frozen=True)
-class Stepped(SomeLimits):
-    step_um: float = 1.0
-
-
 def test_the_correction_is_limited_in_size_and_rate_and_reaches_the_negative_error(tmp_path: Path) -> None:
     machine = Compiled(export_of(straight()), tmp_path)  # at 0.02 µm/s a step of 300 s is 6 µm
     sent, slopes = [0.0], [0.0]
@@ -120,7 +116,9 @@ def test_the_correction_is_limited_in_size_and_rate_and_reaches_the_negative_err
     assert np.abs(np.diff(sent)).max() <= 6.0 + 1e-9 and np.abs(np.diff(slopes)).max() <= 6.0 / 0.4 + 1e-9
     assert sent[1] == 6.0 and sent[9] == pytest.approx(-(1.5 + 12.0 - 40.0)) and slopes[13] == pytest.approx(-40.0)
     assert sent[-1] == pytest.approx(-36.5) and slopes[-1] == pytest.approx(-100.0)  # 40 µm at 0.4 m
-    stepped = Compiled(export_of(replace(straight(), limits=Stepped())), tmp_path / "stepped")
+    stepped = Compiled(
+        export_of(replace(straight(), limits=Limits(rate_um_per_s=0.02, step_um=1.0))), tmp_path / "stepped"
+    )
     assert [stepped.correction(np.array([20.0, 20.0]))[1][0] for _ in range(3)] == [1.0, 2.0, 3.0]
 
 
