@@ -41,17 +41,6 @@ def at_size(spec: Spec, size: float) -> Spec:
     return replace(spec, value=float(np.clip(spec.value * size, spec.low, spec.high)))
 
 
-def usual_amplitude(c: Candidate, amplitude: str, size: float) -> tuple[float, float, float]:
-    """Prior of an amplitude counted from the value without an effect: centre, sd, and sd of its logarithm or 0."""
-    mechanism, off = MECHANISMS[c.mechanism], c.amplitudes[amplitude]
-    spec = at_size(mechanism.spec(amplitude), size)
-    if spec.scale == "linear" or mechanism.any_unit or spec.low < off:
-        spread = POLICY.signed_prior_sd_factor * (1.0 if spec.spread is None else spec.spread)
-        return 0.0, spread, 0.0
-    usual = abs((spec.value or 1.0) - off) or 1.0
-    return usual, 0.0, max(POLICY.amplitude_min_log_sd, spec.spread or 0.0)
-
-
 def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
     """A candidate's free values with priors, and parameter values by network name where its fit begins.
 

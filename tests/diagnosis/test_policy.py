@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from diagnosis.policy import POLICY, STAGES, Policy, markdown
-from diagnosis.structure.policy import StructurePolicy
 
 ROOT = Path(__file__).parents[2]
 # Numerics and presentation: grids, guards against division by zero, digits, widths, axes of tables.
@@ -72,7 +71,7 @@ def test_numbers_are_seen_however_they_are_assigned() -> None:
     assert constants(text) == {"A", "C", "D", "E", "_I"}
 
 
-@pytest.mark.parametrize("field", [*fields(Policy), *fields(StructurePolicy)], ids=lambda f: f.name)
+@pytest.mark.parametrize("field", fields(Policy), ids=lambda f: f.name)
 def test_every_threshold_has_a_unit_a_reason_and_its_evidence(field: object) -> None:
     metadata = field.metadata  # type: ignore[attr-defined]
     assert metadata["unit"] and len(metadata["reason"]) > 10

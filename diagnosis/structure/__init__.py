@@ -1,1 +1,0 @@
-"""Structural discrepancy: what a lumped network leaves of a real machine, simulated and used as a covariance."""
