@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,19 @@ from typing import Any
 import pandas as pd
 
 from compensation.contracts import Correction, Sink, Source
+from compensation.exchange import MqttExchange
+from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel as ExportedAxis
 from compensation.exports.base import Export
+from compensation.rehearsal import Rehearsal, failure, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
 from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from features.rises import feature_unit
-from pipelines.model_store import FILES, StoredModel
+from pipelines.model_store import FILES, StoredModel, load
+from pipelines.settings import home
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
 _SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
@@ -174,6 +180,54 @@ def serve(
         source.close()
         for sink in sinks:
             sink.close()
+
+
+def rehearse_models(
+    models: Sequence[StoredModel],
+    batches: Sequence[Batch],
+    given: Given,
+    *,
+    period_s: float = PERIOD_S,
+    failures: Sequence[str] = (),
+    readings_h: float | None = None,
+    through: str | None = None,
+    done: Callable[[int, int], None] = lambda n, of: None,
+) -> Rehearsal:
+    """Plays batches to the models of one machine, see `compensation.rehearsal.rehearse`.
+
+    Args:
+        failures: of sensors, as "front:lost@3h+45min".
+        readings_h: hours between two readings of a probe; None: none.
+        through: address of a broker at which a compensation runs; None: it runs here.
+
+    Raises:
+        InputError: models, failures or batches that cannot be used; WorkError: nobody answers at the broker.
+    """
+    sample_s = given.sample_s or PERIOD_S
+    failing = [failure(text) for text in failures]
+    every_s = math.inf if readings_h is None else 3600.0 * readings_h
+    axes = [m.family.target for m in models]
+    if through is None:
+        running = compensator(models, given, period_s, lambda line: None)
+        return rehearse(batches, axes, lambda s: running.take(s, s.time_s), sample_s, failing, every_s, done)
+    with closing(MqttExchange(through)) as exchange:
+        return rehearse(batches, axes, exchange, sample_s, failing, every_s, done)
+
+
+def write_export(
+    models: Mapping[str, Path], to: str, out: Path | None = None, given: Given | None = None, period_s: float = PERIOD_S
+) -> tuple[Export, list[Path]]:
+    """Writes the models of one machine, folders by the names they are given, in one of the forms of `EXPORTS`.
+
+    Returns:
+        What the files state, and the files.
+
+    Raises:
+        InputError: an unknown form, models of different machines, or a family that the form cannot express.
+    """
+    exporter = EXPORTS[to]()
+    export = export_of({name: load(folder) for name, folder in models.items()}, models, given or Given(), period_s)
+    return export, exporter.write(export, out or home() / "export" / export.machine)
 
 
 def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], limits: Given, period_s: float) -> Export:

@@ -19,7 +19,18 @@ if TYPE_CHECKING:
     from features.selectors import SELECTORS
     from models import FAMILIES
     from models.crossing import Plan
-    from thermodrift.api import calibrate, diagnose, ingest, load_model, predict, read, simulate, train
+    from thermodrift.api import (
+        calibrate,
+        diagnose,
+        export,
+        ingest,
+        load_model,
+        predict,
+        read,
+        rehearse,
+        simulate,
+        train,
+    )
     from twin.calibration import CalibrationOptions
     from twin.mechanisms import MECHANISMS
 
@@ -27,14 +38,25 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "diagnose",
-    "ingest", "load_machine", "load_model", "predict", "read", "simulate", "train",
+    "export", "ingest", "load_machine", "load_model", "predict", "read", "rehearse", "simulate", "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",
     "MECHANISMS": "twin.mechanisms", "Plan": "models.crossing", "SELECTORS": "features.selectors",
     "load_machine": "data.machine",
 }  # fmt: skip
-_ROOMS = ("data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence", "pipelines")
+_ROOMS = (
+    "data",
+    "features",
+    "models",
+    "twin",
+    "compensation",
+    "diagnosis",
+    "plants",
+    "reports",
+    "evidence",
+    "pipelines",
+)
 
 
 def __getattr__(name: str) -> Any:

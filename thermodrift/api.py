@@ -22,6 +22,7 @@ from data.machine import Machine, load_machine
 if TYPE_CHECKING:
     import pandas as pd
 
+    from compensation.rehearsal import Rehearsal
     from data.ingest import IngestReport
     from data.lake import Lake
     from diagnosis.result import Diagnosis
@@ -144,6 +145,65 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
     return table
 
 
+def rehearse(
+    models: Paths,
+    recordings: Paths,
+    *,
+    sample_s: float = 10.0,
+    failures: Sequence[str] = (),
+    readings_h: float | None = None,
+    max_um: float | None = None,
+    rate_um_per_s: float = 0.1,
+    out: Path | str | None = None,
+) -> Rehearsal:
+    """Play recordings to a compensation as if they happened now: the error without and with it.
+
+    Args:
+        models: what `load_model` takes, one for each axis of one machine.
+        recordings: files or folders that the models have not seen.
+        sample_s: time between two samples.
+        failures: of sensors, as "front:lost@3h+45min": how is lost, frozen or stepping, from when on and how long.
+        readings_h: hours between two readings of a probe; None: none.
+        max_um, rate_um_per_s: limits of what is sent; None: a quarter more than the training's largest error.
+        out: page of the rehearsal; None: none.
+
+    Raises:
+        InputError: models, recordings or failures that cannot be used.
+    """
+    from pipelines.compensating import Given, rehearse_models
+    from pipelines.recordings import read_files
+
+    names = _uris(models)
+    known = [load_model(name) for name in names]
+    batches = [b for path in _paths(recordings) for b in read_files(known[0].machine, path)]
+    given = Given(max_um, rate_um_per_s, sample_s)
+    done = rehearse_models(known, batches, given, failures=failures, readings_h=readings_h)
+    if out is not None:
+        from reports.rehearsal import write_rehearsal
+
+        write_rehearsal(Path(out), done, ", ".join(map(str, names)))
+    return done
+
+
+def export(models: Paths, to: str, out: Path | str | None = None) -> list[Path]:
+    """Write models for a control or another program: c, st, onnx, json, sinumerik, heidenhain or fanuc.
+
+    Args:
+        models: what `load_model` takes, one for each axis of one machine.
+        out: folder of the files; None: below the home.
+
+    Raises:
+        InputError: an unknown form, or a family that it cannot express, with those that can.
+    """
+    from pipelines.commands.predict import model_folder
+    from pipelines.compensating import write_export
+    from pipelines.settings import configure_environment, load
+
+    configure_environment()
+    folders = {str(m): model_folder(str(m), load()) for m in _uris(models)}
+    return write_export(folders, to, None if out is None else Path(out))[1]
+
+
 def simulate(
     machine: AnyMachine,
     plan: Path | str,
@@ -259,6 +319,10 @@ def _machine_file(machine: AnyMachine) -> Path:
 
 def _paths(recordings: Paths) -> list[Path]:
     return [Path(p) for p in ([recordings] if isinstance(recordings, Path | str) else recordings)]
+
+
+def _uris(models: Paths) -> list[Path | str]:
+    return [models] if isinstance(models, Path | str) else list(models)
 
 
 def _progress(step: str, n: int, of: int) -> None:

@@ -22,19 +22,14 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write a model for a control, as C, as structured text, as ONNX or as JSON, with its limits and its fallback."""
-    from compensation.exports import EXPORTS
-    from pipelines.commands.predict import load_model, model_folder
-    from pipelines.compensating import Given, export_of
-    from pipelines.settings import configure_environment, home, load
+    from pipelines.commands.predict import model_folder
+    from pipelines.compensating import Given, write_export
+    from pipelines.settings import configure_environment, load
 
-    exporter = EXPORTS[to]()
     configure_environment()
     settings = load()
-    stored = {m: load_model(m, settings) for m in models}
     folders = {m: model_folder(m, settings) for m in models}
-    given = export_of(stored, folders, Given(max_um, rate_um_per_s), period_s)
-    folder = out or home() / "export" / given.machine
-    paths = exporter.write(given, folder)
+    given, paths = write_export(folders, to, out, Given(max_um, rate_um_per_s), period_s)
     if as_json:
         console.print_json({"machine": given.machine, "simulated": given.simulated, "sha256": given.digest,
                             "files": [str(p) for p in paths]})  # fmt: skip

@@ -49,40 +49,30 @@ def rehearse(
 
     Each recording follows the other after a night. With --through it speaks to a compensation that runs elsewhere.
     """
-    import math
-
-    from compensation.rehearsal import failure
-    from compensation.rehearsal import rehearse as work
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, compensator
+    from pipelines.compensating import Given, rehearse_models
     from pipelines.recordings import check_recordings, read_files
     from pipelines.settings import configure_environment, home, load
     from reports.rehearsal import write_rehearsal
 
-    failures = [failure(text) for text in fail or ()]
     configure_environment()
     settings = load()
     stored = [load_model(m, settings) for m in models]
     machine = stored[0].machine
     check_recordings(recordings)
     batches = [b for path in recordings for b in read_files(machine, path)]
-    axes = [m.family.target for m in stored]
-    if through is None:
-        running = compensator(stored, Given(max_um, rate_um_per_s, sample_s), period_s, lambda line: None)
-        exchange: Any = lambda s: running.take(s, s.time_s)  # noqa: E731
-    else:
-        from compensation.exchange import MqttExchange
-
-        exchange = MqttExchange(through)
-    every_s = math.inf if readings_h is None else 3600.0 * readings_h
+    given = Given(max_um, rate_um_per_s, sample_s)
     with console.progress(as_json) as (_, done):
-        r = work(batches, axes, exchange, sample_s, failures, every_s, lambda n, of: done("rehearse", n, of))
+        r = rehearse_models(
+            stored, batches, given, period_s=period_s, failures=fail or (), readings_h=readings_h, through=through,
+            done=lambda n, of: done("rehearse", n, of),
+        )  # fmt: skip
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
     write_rehearsal(page, r, ", ".join(models))
     if as_json:
         console.print_json(rehearsal_dict(r) | {"page": str(page)})
         return
-    for a in axes:
+    for a in r.before_um:
         before, after = r.band_um(a)
         console.line(f"{a:<10} band of 95 % of the rows: {before:.2f} µm without, {after:.2f} µm with compensation")
     console.line(f"page       {page}")
