@@ -15,9 +15,10 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family, inner_groups
 from models.metrics import SIDE_OF_90
+from models.program import Builder
 from models.solvers.batch_process import LeftOut
 from models.solvers.batches import too_few_rows
-from models.solvers.kernels import Kernel, evenly, products, unit_scale
+from models.solvers.kernels import Kernel, evenly, from_origin, products, unit_scale
 
 Rows = NDArray[np.int64]
 LINES = (1e2, 1e3, 1e4, 1e5, 1e6)
@@ -132,6 +133,20 @@ class GaussianProcess(Family):
         setting, support, alpha = self._setting(), np.asarray(self.fitted["support"]), self.fitted["alpha"]
         u = self._scaled(design)
         return [setting.shared(u[design.rows(k)], support, not self.zero_start) @ alpha for k in batches]
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        setting, alpha = self._setting(), np.asarray(self.fitted["alpha"], float)
+        support = np.atleast_2d(np.asarray(self.fitted["support"], float))
+        x = b.features(self.inputs)
+        u = b.scaled(b.since_first(x) if self.zero_start else x, np.asarray(self.fitted["scale"], float))
+        p = max(1, len(self.inputs))
+        line = b.affine(u, (setting.line / p * alpha @ support)[None], 0.0 if self.zero_start else float(alpha.sum()))
+        if not setting.curve > 0:
+            return [line]
+        rows, weights = from_origin(support, alpha) if self.zero_start else (support, alpha)
+        sharpness = 1.0 / (2.0 * p * setting.length**2)
+        curve = b.add("kernel", [u], 1, support=rows, weights=setting.curve * weights, sharpness=sharpness)
+        return [b.affine(b.join(line, curve), np.ones((1, 2)))]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """Predictive standard deviation (n_k,) of a recorded value of a new batch, its own part and noise included.

@@ -40,7 +40,7 @@ def test_row_by_row_gives_what_the_whole_batch_gives(key: str, toy_batches: Batc
     assert np.abs(got - wanted).max() < 1e-6
 
 
-@pytest.mark.parametrize("key", ["ridge", "distributed_lag", "lssvm"])
+@pytest.mark.parametrize("key", ["ridge", "distributed_lag", "lssvm", "gaussian_process"])
 def test_every_kind_of_feature_and_the_level_as_published(key: str, toy_batches: Batches) -> None:
     *train, left = toy_batches(6, 40)
     for family in (FAMILIES[key](), FAMILIES[key]().as_published()):
