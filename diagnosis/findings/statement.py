@@ -136,17 +136,27 @@ def effect_phrase(found: Found) -> str:
 
 
 def falls(rms: Sequence[Rms], most: int = 2) -> str:
-    """How far the errors of the runs left out fall, the greatest fall first; nothing where none does."""
+    """How far the errors of the runs left out fall, the greatest fall first, and which ones rise; nothing where none
+    falls."""
     fallen = [r for r in rms if r.after < POLICY.fallen_max_share * r.before]
     fallen = sorted(fallen, key=lambda r: (r.after / r.before, r.channel))[:most]
+    risen = [r for r in rms if r.before < POLICY.fallen_max_share * r.after and not r.after <= r.noise]
+    risen = sorted(risen, key=lambda r: (-r.after / r.before, r.channel))[:most]
     said = []
     for k, r in enumerate(fallen):
-        what = f"the misfit of the sensor {r.channel}" if r.sensor else f"the {r.channel} error"
         of = " of runs left out of the fit" if k == 0 else ""
-        unit = "K" if r.unit == "degC" else r.unit
         noise = f" (noise {few(r.noise)})" if r.noise > 0 else ""
-        said.append(f"{what}{of} falls from {few(r.before)} to {with_unit(few(r.after), unit)}{noise}")
-    return listed(said)
+        said.append(f"{_error_of(r)}{of} falls from {few(r.before)} to {_left(r)}{noise}")
+    worse = listed([f"{_error_of(r)} rises from {few(r.before)} to {_left(r)}" for r in risen])
+    return f"{listed(said)}{f', while {worse}' if worse and said else ''}"
+
+
+def _error_of(r: Rms) -> str:
+    return f"the misfit of the sensor {r.channel}" if r.sensor else f"the {r.channel} error"
+
+
+def _left(r: Rms) -> str:
+    return with_unit(few(r.after), "K" if r.unit == "degC" else r.unit)
 
 
 def verdict_statement(

@@ -85,7 +85,8 @@ def headline(verdict: str, probabilities: Sequence[float]) -> str:
     effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
     return {
         "consistent": "Consistent: nothing is missing that these runs could show.",
-        "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} only the noise remains.",
+        "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} nothing else is "
+        "missing that these runs could show.",
         "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",
         "unlisted": "Something is missing that no listed mechanism explains.",
         "undecidable": "Something is missing, but these recordings cannot tell what.",

@@ -20,7 +20,7 @@ from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
-from models.program import replay
+from models.program import Builder, replay
 from models.trust import Region, watched
 from models.updating import Updater, out_of_fold
 from tests.conftest import make_toy_batches
@@ -201,3 +201,32 @@ def test_whatever_comes_what_is_sent_is_finite_and_limited(
         assert math.isfinite(sent_um) and abs(sent_um) <= 20.0
         assert abs(sent_um - was) <= min(0.05 * 900.0, 1.0) + 1e-9
         was = sent_um
+
+
+def test_a_lost_driver_holds() -> None:
+    *train, left = make_toy_batches(8, 60)
+    machine = Compensator("toy", [model_of(train, "lag_dictionary")], Substitutes.learn(train, INPUTS), left.step_s)
+    given = samples(left)
+    given[20:] = [replace(s, values={c: v for c, v in s.values.items() if c != "spindle_rpm"}) for s in given[20:]]
+    done = run(machine, given)
+    assert done[22].state["z"] == "active"
+    assert any(c.state["z"] == "hold" and "lost: spindle_rpm" in c.reasons["z"] for c in done[23:])
+
+
+def test_an_axis_with_a_slope_sends_both_in_the_same_share() -> None:
+    b = Builder(make_toy_batches(1)[0].channels, 300.0)
+    x = b.since_first(b.features(["t0"]))
+    program = b.program([b.affine(x, np.array([[2.0]])), b.affine(x, np.array([[0.05]]))], False, "position", 100.0)
+    train = make_toy_batches(4, 40)
+    region = Region.of(train, ("t0",))
+    limits = replace(QUICK, max_offset_um=4.0)
+    model = AxisModel("z", program, ("t0",), ("K",), region, region.program(train[0].channels, 300.0), limits=limits)
+    machine = Compensator("toy", [model], period_s=300.0)
+    low_degC = region.ranges["t0@start"][0]
+    for k, rise_K in enumerate((0.0, 1.0, 1.0, 4.0, 4.0)):
+        values = {"t0": low_degC + rise_K, "spindle_rpm": 2000.0}
+        done = machine.take(Sample(1e9 + 300.0 * k, values), 300.0 * k)
+        if rise_K == 1.0 and k == 2:
+            assert done.offset_um["z"] == pytest.approx(-2.0) and done.slope_um_per_m["z"] == pytest.approx(-50.0)
+    assert done.offset_um["z"] == -4.0  # of -8 wanted
+    assert done.slope_um_per_m["z"] == pytest.approx(-100.0)  # of -200
