@@ -13,6 +13,7 @@ from data.errors import InputError, closest
 from features.design import Design
 from features.grey import equations, least_squares
 from models.base import Family, Plain
+from models.program import Builder
 from models.solvers.batches import bridged, by_batch, padded, steps_s, too_few_rows, unpadded
 
 RESPONSES = ("difference", "whitening")
@@ -107,6 +108,26 @@ class GM1N(Family):
     ) -> list[list[Array]]:
         every = sorted({k for batches in wanted for k in batches})
         return by_batch(design, self._respond(design, fitted, every), wanted)
+
+    def operations(self, b: Builder) -> Sequence[int]:
+        """A first-order lag of the drive, at the step that was learned from.
+
+        Raises:
+            InputError: another step, the other response, or an input that is not 0 at a batch's start: there the sums
+                count its first value in the second row.
+        """
+        learned_s, a = float(self.fitted["step_s"]), float(self.fitted["a"])
+        drives = [n for n in self.inputs if not b.thermal(n.partition("@")[0]) or n.endswith("@start")]
+        if self.response != "difference" or drives or abs(b.step_s - learned_s) > 1e-3 * learned_s:
+            raise InputError(
+                f"family {self.key}: a program needs the response difference, inputs that are 0 at the start and the "
+                f"step it learned from, {learned_s:g} s; got {self.response}, {', '.join(self.inputs)} and "
+                f"{b.step_s:g} s"
+            )
+        c = 1.0 / (1.0 + a / 2.0)
+        keep = (1.0 - a / 2.0) * c
+        drive = b.affine(b.features(self.inputs, required=False), c / (1.0 - keep) * self.fitted["b"][None])
+        return [b.add("lag", [drive], 1, keep=keep, begin=1.0)]
 
     def n_parameters(self) -> int:
         return 1 + len(self.inputs)

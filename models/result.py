@@ -83,7 +83,11 @@ class GridResult:
 
 @dataclass(frozen=True)
 class Training:
-    """One tracked training of one error channel. `promotion` is what `registry.promote` recorded, empty if nothing."""
+    """One tracked training of one error channel.
+
+    `promotion` is what `registry.promote` recorded, with the champion_version of now; empty if nothing. `code_version`
+    is the program's, see `tracking.code_version`; empty where none is recorded.
+    """
 
     training_id: str
     started: pd.Timestamp
@@ -91,3 +95,4 @@ class Training:
     result: GridResult
     params: dict[str, str] = field(default_factory=dict)
     promotion: dict[str, Any] = field(default_factory=dict)
+    code_version: str = ""

@@ -94,8 +94,14 @@ def test_it_begins_where_every_channel_has_been_seen(toy_batches: Batches) -> No
 
 
 def test_a_family_without_one_names_those_that_have_one(toy_batches: Batches) -> None:
-    with pytest.raises(InputError, match=r"^family gm1n cannot be written as a program; those that can: zero, mean_"):
-        FAMILIES["gm1n"]().program(toy_batches(1)[0].channels, 300.0)
+    with pytest.raises(InputError, match=r"^family gru cannot be written as a program; those that can: zero, mean_"):
+        FAMILIES["gru"]().program(toy_batches(1)[0].channels, 300.0)
+
+
+def test_sums_that_count_rows_need_the_step_they_learned(toy_batches: Batches) -> None:
+    fitted = FAMILIES["gm1n"]().fit(toy_batches(4, 40), ("t0", "t2"), "z")
+    with pytest.raises(InputError, match=r"the step it learned from, 300 s; got difference, t0, t2 and 10 s"):
+        fitted.program(toy_batches(1)[0].channels, 10.0)
 
 
 def test_most_families_have_one() -> None:
