@@ -18,7 +18,7 @@ from data.arrays import Array
 from data.checks.invalid import sentinels
 from data.errors import InputError
 from data.guess import Guess, PositionGroup
-from data.machine import ChannelPart, Machine
+from data.machine import MAX_NAME, TAKEN, ChannelPart, Machine
 from data.peek import Table, look, sheets_of
 from data.readers.csv import normalise
 from data.readers.header import Layout
@@ -71,8 +71,8 @@ class Group:
         """Channel name -> place of its column, for every column that holds a number in any table."""
         names: dict[str, int] = {}
         for i in sorted({i for _, table in self.tables for i in table.numeric}):
-            name = self._slug(i)
-            names[name if name not in names and name != "time_s" else f"{name}_{i}"] = i
+            name = self._slug(i)[: MAX_NAME // 2]
+            names[name if name not in names and name not in TAKEN else f"{name}_{i}"] = i
         return names
 
     def _slug(self, i: int) -> str:

@@ -47,11 +47,12 @@ class Clock:
 class Ingested:
     """One batch of one file, or one file without a usable batch (`batch_id` "").
 
-    `status`: new, unchanged, refreshed, new_version, duplicate, withdrawn (see `data.manifest.Stored`); conflict: left
-    out because another file of the same ingest gave other content under this id; quarantined: the file, or what was
-    left of it, cannot be used; waiting: the file is still being written, the next ingest takes it. `stored_as` is the
-    batch's id in the lake, "" if it is not there. Rows are rows of the recording: `rows_in` = `rows_stored` +
-    `rows_dropped`; None if unknown. `found`: what the checks of one batch found, with the machine file's overrules.
+    `status`: new, unchanged, refreshed, healed, new_version, duplicate, withdrawn (see `data.manifest.Stored`);
+    conflict: left out because another file of the same ingest gave other content under this id; quarantined: the file,
+    or what was left of it, cannot be used; waiting: the file is still being written, the next ingest takes it.
+    `stored_as` is the batch's id in the lake, "" if it is not there. Rows are rows of the recording: `rows_in` =
+    `rows_stored` + `rows_dropped`; None if unknown. `found`: what the checks of one batch found, with the machine
+    file's overrules.
     """
 
     file: str
@@ -243,6 +244,8 @@ def _note(row: Ingested, result: Stored) -> None:
         row.version, row.rows_stored, row.rows_dropped, row.found, row.findings = None, 0, row.rows_in, (), 0
     if result.status == "duplicate":
         row.reason = f"the same measured values as batch {result.batch_id}, which is stored"
+    elif result.status == "healed":
+        row.reason = "the same content as before; its file in the lake was damaged or gone and is written anew"
     elif result.status == "withdrawn":
         row.stored_as = ""
         row.reason = (

@@ -14,6 +14,9 @@ file is kept. Replacing `_manifest.json` commits a write: `load` gives the old s
 The current file is replaced next. If the process is killed in between, plain readers see the old version until the
 next write, which finds the batch under `pending`.
 
+The manifest has the hash of every file, and `load` verifies it: a file that was changed or cut after its ingest is
+refused, and the next ingest of its source *heals* it, which writes it anew.
+
 A withdrawn batch keeps its versions but has no current file, and nothing loads it; `restore` brings it back, `purge`
 deletes its content. Withdrawn content is not stored again.
 """
@@ -37,7 +40,7 @@ from filelock import FileLock, Timeout
 from data import manifest as listing
 from data.batch import Batch
 from data.errors import InputError, WorkError, closest
-from data.lakefile import content_digest, decode, encode, measured_digest, remarks_digest, safe_name
+from data.lakefile import content_digest, decode, encode, measured_digest, read_body, remarks_digest, safe_name
 from data.manifest import Entry, Staged, Stored, Version
 
 LOG = "reasons.jsonl"
@@ -103,6 +106,7 @@ class Lake:
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
         self._lock = FileLock(self.root / ".lock", timeout=LOCK_WAIT_S)
+        self._known: tuple[tuple[int, int, int] | None, dict[str, str]] = (None, {})
 
     def put(self, batch: Batch) -> Stored:
         """Store one batch: nothing is ever overwritten; the same content twice is stored once.
@@ -118,18 +122,25 @@ class Lake:
         return self.commit([self.stage(b) for b in batches])
 
     def stage(self, batch: Batch, digest: str | None = None) -> Staged:
-        """Write a batch's file without making it visible; `digest` saves hashing it again."""
+        """Write a batch's file without making it visible, unless it stands there undamaged already.
+
+        `digest` saves hashing the batch again.
+        """
         digest = digest or content_digest(batch)
         folder = f"_versions/machine={safe_name(batch.machine)}/{safe_name(batch.batch_id)}"
         file = f"{folder}/{digest[:12]}-{remarks_digest(batch)[:8]}.parquet"
-        if not (self.root / file).exists():
+        noted = self._noted(file)
+        sha256 = self._intact(file, digest, noted)
+        healed = sha256 is None and (noted is not None or (self.root / file).exists())
+        if sha256 is None:
             body = encode(batch, digest)
+            sha256 = hashlib.sha256(body).hexdigest()
             with self._writing():
                 self._replace(self.root / file, body)
         year = batch.start.year if batch.start is not None else 0
         return Staged(
             batch.machine, batch.batch_id, digest, measured_digest(batch), file, batch.source, batch.n_rows, year,
-            batch.simulated,
+            batch.simulated, sha256, healed,
         )  # fmt: skip
 
     def commit(self, staged: Sequence[Staged], distinct: bool = False) -> list[Stored]:
@@ -235,7 +246,7 @@ class Lake:
 
         Raises:
             InputError: no such machine, batch or version; the closest and the allowed ones.
-            WorkError: its file is missing or damaged.
+            WorkError: its file is missing, damaged, or was changed after the ingest.
         """
         entries = self._entries(machine, batch_id)
         by_number = {e["version"]: e for e in entries}
@@ -251,13 +262,14 @@ class Lake:
                 f"lake {self.root}: batch {batch_id} of {machine} is withdrawn ({gone.reason}); "
                 f"`thermodrift lake restore {machine} {batch_id}` brings it back"
             )
-        return self._read(by_number[number])
+        return self._read(by_number[number], f"batch {batch_id} of {machine}")
 
     def load_all(self, machine: str) -> list[Batch]:
         """Current version of every batch in use, by start (unknown last), then id.
 
         Raises:
             InputError: the lake holds nothing of this machine, or all of it is withdrawn.
+            WorkError: see `load`.
         """
         held = listing.active(self._batches(machine))
         if not held:
@@ -265,7 +277,7 @@ class Lake:
                 f"lake {self.root}: every batch of machine {machine!r} is withdrawn; "
                 f"`thermodrift lake restore {machine} '*'` brings them back"
             )
-        batches = [self._read(entries[-1]) for entries in held.values()]
+        batches = [self._read(entries[-1], f"batch {i} of {machine}") for i, entries in held.items()]
         return sorted(
             batches, key=lambda b: (b.start is None, "" if b.start is None else b.start.isoformat(), b.batch_id)
         )
@@ -346,8 +358,58 @@ class Lake:
             raise InputError(f"lake {self.root}: {machine} has no batch {batch_id!r}; {closest(batch_id, batches)}")
         return batches[batch_id]
 
-    def _read(self, entry: Entry) -> Batch:
-        return replace(decode(self.root / entry["file"], entry["version"]), source=entry["source"])
+    def _read(self, entry: Entry, name: str) -> Batch:
+        """A version as it was ingested; `name` is that of its batch.
+
+        Raises:
+            WorkError: its file is missing, damaged, or holds something else than was ingested.
+        """
+        path = self.root / entry["file"]
+        remedy = (
+            f"restore it from a backup or ingest its source {entry['source'] or '(unknown)'} again, "
+            "which writes it anew where the content is the same"
+        )
+        noted = entry.get("sha256", {}).get(entry["file"])
+        body = read_body(path, f"{name}: ", remedy)
+        if noted is not None and (got := hashlib.sha256(body).hexdigest()) != noted:
+            raise WorkError(
+                f"lake file {path}: {name} cannot be read (the file was changed or cut after its ingest: sha256 "
+                f"{got[:12]}…, expected {noted[:12]}…); {remedy}"
+            )
+        batch = replace(decode(body, path, entry["version"]), source=entry["source"])
+        if noted is None and content_digest(batch) != entry["digest"]:  # a lake of an earlier program
+            raise WorkError(f"lake file {path}: {name} cannot be read (other content than was ingested); {remedy}")
+        return batch
+
+    def _noted(self, file: str) -> str | None:
+        """The hash of a file under the root as the manifest has it; the manifest is read where it has changed."""
+        try:
+            seen = self._manifest_path.stat()
+        except OSError:
+            return None
+        look = (seen.st_ino, seen.st_size, seen.st_mtime_ns)
+        if self._known[0] != look:
+            machines = self._manifest()["machines"].values()
+            found = listing.hashes(e for batches in machines for entries in batches.values() for e in entries)
+            self._known = look, found
+        return self._known[1].get(file)
+
+    def _intact(self, file: str, digest: str, noted: str | None) -> str | None:
+        """The hash of a stored file, None where it must be written: it is not there, or damaged.
+
+        Where the manifest has no hash of it, the content itself is compared.
+        """
+        path = self.root / file
+        try:
+            body = read_body(path)
+            sha256 = hashlib.sha256(body).hexdigest()
+            if noted is None:
+                batch = decode(body, path)
+                same = content_digest(batch) == digest and path.stem.endswith(remarks_digest(batch)[:8])
+                return sha256 if same else None
+        except (InputError, WorkError):
+            return None
+        return sha256 if sha256 == noted else None
 
     def _withdrawn(
         self, manifest: dict[str, Any], machine: str, batch_ids: Sequence[str]
@@ -362,7 +424,7 @@ class Lake:
         batches = manifest["machines"].get(machine, {})
         for entry in (e for entries in batches.values() for e in entries if "measured" not in e):
             try:
-                entry["measured"] = measured_digest(self._read(entry))
+                entry["measured"] = measured_digest(self._read(entry, machine))
             except WorkError:
                 continue  # a damaged file has no values to compare; `load` reports it
         return listing.copies_of(batches)

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
-from data.machine import Machine, Recording, TimeColumn
+from data.machine import RESERVED, Machine, Recording, TimeColumn
 
 SCHEMA = "thermodrift.batch/1"
 META_KEY = b"thermodrift"
-RESERVED = ("batch", "simulated", "machine", "year")  # columns that the lake adds, and its partition keys
 MEASURED = ("temperature", "ambient", "error")  # roles whose noise tells recordings apart
 PARALLEL_VALUES = 500_000
 
@@ -96,23 +95,39 @@ def encode(batch: Batch, digest: str) -> pa.Buffer:
     return sink.getvalue()
 
 
-def decode(path: Path, version: int = 1) -> Batch:
-    """Read one stored file back; `version` is the number that the lake gives it.
+def read_body(path: Path, name: str = "", remedy: str = "ingest its source again") -> bytes:
+    """The bytes of a stored file; `name` and `remedy` go into the error line.
 
     Raises:
-        WorkError: the file is missing, damaged, or not one that the lake wrote.
+        WorkError: the file cannot be read.
     """
     try:
-        table = pq.ParquetFile(path).read()
+        return path.read_bytes()
+    except OSError as error:
+        raise WorkError(f"lake file {path}: {name}cannot be read ({error.strerror}); {remedy}") from None
+
+
+def decode(body: bytes, path: Path, version: int = 1) -> Batch:
+    """The batch of a stored file's bytes; `path` names the file in error lines, `version` is the lake's number of it.
+
+    Raises:
+        WorkError: damaged, or not a file that the lake wrote.
+    """
+    try:
+        table = pq.ParquetFile(pa.BufferReader(body)).read()
         meta = json.loads((table.schema.metadata or {})[META_KEY])
         if meta["schema"] != SCHEMA:
             raise ValueError(f"schema {meta['schema']!r}")
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        return _batch(table, meta, version)
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise WorkError(
             f"lake file {path}: cannot be read ({reason}); expected a batch stored by ingest; "
             "restore it from a backup or ingest its source again"
         ) from None
+
+
+def _batch(table: Any, meta: Mapping[str, Any], version: int) -> Batch:
     frame = table.drop_columns(["batch", "simulated"]).to_pandas(ignore_metadata=True)
     return Batch(
         machine=meta["machine"],

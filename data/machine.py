@@ -2,15 +2,53 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from data.batch import Channel, Role
 from data.errors import InputError, closest
 from data.units import seconds
 from data.yaml_file import load_yaml, parse_yaml
+
+RESERVED = ("batch", "simulated", "machine", "year")  # columns that the lake adds, and its partition keys
+TAKEN = (*RESERVED, "time_s", "batch_id")  # names of columns that stand next to the channels somewhere
+MAX_NAME = 80  # characters: the name becomes part of longer file names
+_MAX_NAME_BYTES = 160
+_MARKS = " _-.+%°()"
+
+
+def _channel_name(name: str) -> str:
+    """The name of a channel, which also becomes that of a column, a file, an experiment and a registered model.
+
+    The separators of this project (``|`` between the inputs of a cell, ``@`` before the form of an input), those of
+    paths and addresses (``/ \\ : ? #``), quotes, wildcards and control characters would break one of these.
+
+    Raises:
+        ValueError: another name.
+    """
+    allowed = "letters and digits of any script, blanks and _ - . + % ° ( )"
+    bad = next((c for c in name if c not in _MARKS and unicodedata.category(c)[0] not in "LMN"), None)
+    if bad is not None:
+        raise ValueError(f"a channel's name has the character {bad!r}, allowed are {allowed}; rename the channel")
+    if not name.strip() or name[0] in " .-+" or name[-1] in " .":
+        raise ValueError(
+            "a channel's name must begin with a letter, a digit, _ % ° or ( and not end with a blank or a dot, "
+            f"allowed inside are {allowed}; rename the channel"
+        )
+    if len(name) > MAX_NAME or len(name.encode()) > _MAX_NAME_BYTES:
+        raise ValueError(
+            f"a channel's name has {len(name)} characters, allowed are {MAX_NAME} (and {_MAX_NAME_BYTES} bytes); "
+            "shorten it"
+        )
+    if name in TAKEN:
+        raise ValueError(f"thermodrift adds a column of this name ({', '.join(TAKEN)}); rename the channel")
+    return name
+
+
+ChannelName = Annotated[str, AfterValidator(_channel_name)]
 
 
 class Section(BaseModel):
@@ -155,11 +193,11 @@ class Overrule(Section):
 class Machine(Section):
     """A whole machine file."""
 
-    machine: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]
+    machine: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_\-]*$", max_length=MAX_NAME)]
     description: str = ""
     simulated: bool = False
     recording: Recording = Recording()
-    channels: dict[str, ChannelPart]
+    channels: dict[ChannelName, ChannelPart]
     ignore: list[str] = []  # columns known and not wanted
     overrule: list[Overrule] = []
     twin: dict[str, Any] | None = None  # read by the twin

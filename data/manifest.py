@@ -1,6 +1,7 @@
 """The lake's manifest as plain data: which versions of which batches exist, which are withdrawn, and changes to them.
 
 ``{"schema", "pending": [[machine, batch], …], "machines": {machine: {batch: [version, …]}}}``, versions oldest first.
+A version's ``"sha256"`` has the hash of the bytes of each of its files; versions of an earlier program have none.
 A withdrawn version has ``"withdrawn": {"reason", "at", "purged_at"}``; `purged_at` is empty while its file is kept. A
 batch is withdrawn where its last version is. Functions change the manifest that they are given; nothing is written.
 """
@@ -15,7 +16,7 @@ from typing import Any, Literal
 from data.errors import InputError, closest
 
 SCHEMA = "thermodrift.lake/1"
-Status = Literal["new", "unchanged", "refreshed", "new_version", "duplicate", "withdrawn"]
+Status = Literal["new", "unchanged", "refreshed", "healed", "new_version", "duplicate", "withdrawn"]
 Entry = dict[str, Any]  # one version of a batch as it is stored
 Copies = dict[str, dict[str, Entry]]  # digest of measured values -> batch id -> version
 
@@ -24,10 +25,10 @@ Copies = dict[str, dict[str, Entry]]  # digest of measured values -> batch id ->
 class Stored:
     """The outcome of storing a batch.
 
-    `status`: new, new_version; unchanged, refreshed (the same content, with other findings); duplicate: left out,
-    another batch has the same measured values; withdrawn: left out, these were withdrawn for `reason`. `version` and
-    `batch_id` are what the lake holds, so those of the other batch for a duplicate. `replaces` is the source of the
-    version before a new one.
+    `status`: new, new_version; unchanged, refreshed (the same content, with other findings), healed (the same content,
+    whose stored file was damaged or gone and is written anew); duplicate: left out, another batch has the same measured
+    values; withdrawn: left out, these were withdrawn for `reason`. `version` and `batch_id` are what the lake holds, so
+    those of the other batch for a duplicate. `replaces` is the source of the version before a new one.
     """
 
     status: Status
@@ -70,7 +71,11 @@ class Version:
 
 @dataclass(frozen=True)
 class Staged:
-    """A batch whose file is written and waits for a commit; `measured` as `lakefile.measured_digest`."""
+    """A batch whose file is written and waits for a commit.
+
+    `measured` is as `lakefile.measured_digest`, `sha256` the hash of the file's bytes; `healed`: the file replaces a
+    damaged one.
+    """
 
     machine: str
     batch_id: str
@@ -81,6 +86,8 @@ class Staged:
     rows: int
     year: int
     simulated: bool
+    sha256: str
+    healed: bool = False
 
 
 def empty() -> dict[str, Any]:
@@ -98,6 +105,11 @@ def version_of(entry: Entry) -> Version:
 def withdrawal(entry: Entry) -> Withdrawal | None:
     """The withdrawal of a version, None where it is in use."""
     return Withdrawal(**entry["withdrawn"]) if "withdrawn" in entry else None
+
+
+def hashes(entries: Iterable[Entry]) -> dict[str, str]:
+    """File -> SHA-256 (hex) of its bytes, as far as noted."""
+    return {file: sha256 for e in entries for file, sha256 in e.get("sha256", {}).items()}
 
 
 def active(batches: Mapping[str, list[Entry]]) -> dict[str, list[Entry]]:
@@ -129,6 +141,9 @@ def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None =
     batches = manifest["machines"].get(s.machine, {})
     entries = batches.get(s.batch_id, [])
     last = entries[-1] if s.batch_id in active(batches) else None
+    for entry in entries:  # content that came back has two versions with one file
+        if s.file in (entry["file"], *entry["earlier"]):
+            entry.setdefault("sha256", {})[s.file] = s.sha256
     if last is not None and last["digest"] == s.digest:
         return _same_again(last, s)
     same = dict((copies or {}).get(s.measured, {}))
@@ -148,7 +163,7 @@ def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None =
     made: Entry = {
         "version": entries[-1]["version"] + 1 if entries else 1, "digest": s.digest, "measured": s.measured,
         "source": s.source, "stored_at": now, "rows": s.rows, "year": s.year, "simulated": s.simulated,
-        "current": True, "file": s.file, "earlier": [],
+        "current": True, "file": s.file, "earlier": [], "sha256": {s.file: s.sha256},
     }  # fmt: skip
     replaced = bool(entries)
     manifest["machines"].setdefault(s.machine, {}).setdefault(s.batch_id, []).append(made)
@@ -160,10 +175,11 @@ def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None =
 
 
 def _same_again(last: Entry, s: Staged) -> Stored:
-    status: Status = "unchanged" if last["file"] == s.file else "refreshed"
-    if status == "refreshed":
+    status: Status = "healed" if s.healed else "unchanged" if last["file"] == s.file else "refreshed"
+    if last["file"] != s.file:
         last["earlier"] = [f for f in (*last["earlier"], last["file"]) if f != s.file]
         last["file"] = s.file
+        last.setdefault("sha256", {})[s.file] = s.sha256
     return Stored(status, last["version"], s.digest, s.machine, s.batch_id)
 
 

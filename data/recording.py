@@ -514,4 +514,7 @@ def _start(place: Place, machine: Machine, batch_start: float, file_start: float
             return named + pd.Timedelta(seconds=batch_start - file_start) if machine.recording.split else named
         except ValueError:
             pass  # counted as start_unreadable; a time column may still give the start
-    return pd.Timestamp(0) + pd.Timedelta(seconds=round(batch_start, 6)) if stamped else None
+    try:
+        return pd.Timestamp(0) + pd.Timedelta(seconds=round(batch_start, 6)) if stamped else None
+    except (ValueError, OverflowError):  # beyond the year 2262, so a damaged stamp
+        return None

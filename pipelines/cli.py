@@ -22,6 +22,7 @@ from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
 from pipelines.commands.promote import promote, rollback
 from pipelines.commands.prove import app as prove
+from pipelines.commands.registry import registry
 from pipelines.commands.rehearse import rehearse
 from pipelines.commands.report import report
 from pipelines.commands.reproduce import reproduce
@@ -38,8 +39,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
-    describe, ingest, train, report, promote, rollback, status, predict, rehearse, compensate, export, schedule,
-    simulate, calibrate, diagnose, demonstrate, reproduce,
+    describe, ingest, train, report, promote, rollback, status, registry, predict, rehearse, compensate, export,
+    schedule, simulate, calibrate, diagnose, demonstrate, reproduce,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

@@ -5,6 +5,7 @@ A stored model needs neither MLflow nor the recordings: `load(folder).predict(ba
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -30,6 +31,8 @@ from models.updating import Updater
 SCHEMA = "thermodrift.model/3"
 _READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run
 FILES = ("model.json", "arrays.npz", "machine.yml")
+SERVED = ("serving.json", "model.onnx", "region.onnx")  # only of families that are programs
+_AGAIN = "load the model from the registry again, or promote it again"
 
 
 class RunError(NamedTuple):
@@ -133,7 +136,10 @@ def save(
     updater: Updater | None = None,
     substitutes: Substitutes | None = None,
 ) -> None:
-    """Write the three files; `machine_yaml` is the text of the machine file."""
+    """Write the three files; `machine_yaml` is the text of the machine file.
+
+    `model.json` holds the SHA-256 of the two others, which `load` verifies.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, NDArray[Any]] = {}
     plain = _to_json(family.as_plain(), arrays)
@@ -147,32 +153,72 @@ def save(
         "substitutes": None if substitutes is None else _to_json(substitutes.as_plain(), arrays),
         "info": dict(info or {}),
     }
-    (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
     np.savez(folder / "arrays.npz", allow_pickle=False, **arrays)
     (folder / "machine.yml").write_text(machine_yaml, encoding="utf-8")
+    _write(folder, document, FILES[1:])
+
+
+def add_hashes(folder: Path, names: Sequence[str]) -> None:
+    """Note the SHA-256 of further files of a stored model, those by which it is served, in its `model.json`."""
+    _write(folder, json.loads((folder / "model.json").read_text(encoding="utf-8")), names)
+
+
+def _write(folder: Path, document: dict[str, Any], names: Sequence[str]) -> None:
+    hashes = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    document["sha256"] = document.get("sha256", {}) | hashes
+    (folder / "model.json").write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
 def load(folder: Path) -> StoredModel:
     """Read a stored model from its folder, or from the folder of the MLflow model around it.
 
     Raises:
-        InputError: no model there, a file damaged, or a model of another version.
+        InputError: no model there, a file damaged or other than it was stored, or a model of another version.
     """
     inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
     try:
         document = json.loads((inner / "model.json").read_text(encoding="utf-8"))
+        _check_document(document, folder)
+        _check_hashes(document.get("sha256", {}), inner, folder)
         machine_yaml = (inner / "machine.yml").read_text(encoding="utf-8")
         with np.load(inner / "arrays.npz", allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, BadZipFile, ValueError) as error:
+    except (OSError, ValueError, BadZipFile, EOFError, RecursionError) as error:  # also text that is none
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"model folder {folder}: not a stored model ({error}); expected the files {', '.join(FILES)}"
+            f"model folder {folder}: not a stored model ({reason}); expected the files {', '.join(FILES)}"
         ) from None
+    machine = parse_machine(machine_yaml, str(inner / "machine.yml"))
+    try:
+        return _from_document(_from_json(document, arrays), machine)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"model folder {folder}: model.json is damaged ({type(error).__name__}: {error}); {_AGAIN}"
+        ) from None
+
+
+def _check_document(document: Any, folder: Path) -> None:
     if not isinstance(document, dict) or document.get("schema") not in _READABLE:
         got = document.get("schema") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"model folder {folder}: got schema {got!r}, expected {SCHEMA!r}; train the model again")
-    plain = _from_json(document, arrays)
-    machine = parse_machine(machine_yaml, str(inner / "machine.yml"))
+
+
+def _check_hashes(noted: Any, inner: Path, folder: Path) -> None:
+    """Refuse files other than those that were stored; a model of an earlier program has no hashes."""
+    if not isinstance(noted, dict):
+        raise InputError(f"model folder {folder}: not a stored model (sha256 is no mapping); {_AGAIN}")
+    for name in (*FILES[1:], *SERVED):
+        if name not in noted or (name in SERVED and not (inner / name).exists()):  # here nothing is served
+            continue
+        got = hashlib.sha256((inner / name).read_bytes()).hexdigest()
+        if got != noted[name]:
+            raise InputError(
+                f"model folder {folder}: not a stored model as it was promoted ({name} has sha256 {got[:12]}…, "
+                f"expected {str(noted[name])[:12]}…); {_AGAIN}"
+            )
+
+
+def _from_document(plain: dict[str, Any], machine: Machine) -> StoredModel:
     bound = RunBound.from_plain(plain["bound"]) if plain.get("bound") else None
     siblings = tuple(family_from_plain(s) for s in plain.get("siblings", ()))
     region = Region.from_plain(plain["region"])

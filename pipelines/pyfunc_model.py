@@ -7,6 +7,7 @@ onnxruntime alone.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -42,16 +43,24 @@ class Served:
     """A model that needs nothing of thermodrift.
 
     Raises:
-        RuntimeError: the family is no program and needs thermodrift.
+        RuntimeError: the family is no program and needs thermodrift, or a file is other than it was stored.
     """
 
     def __init__(self, folder: Path) -> None:
+        stored = json.loads((folder / "model.json").read_text(encoding="utf-8"))
         if not (folder / "serving.json").exists():
-            family = json.loads((folder / "model.json").read_text(encoding="utf-8")).get("family")
+            family = stored.get("family")
             raise RuntimeError(
                 f"a model of the family {family} is no ONNX file; install thermodrift where it is to be loaded, or "
                 "promote a model of another family"
             )
+        for name in SERVED:
+            noted = stored.get("sha256", {}).get(name)  # none in a model of an earlier program
+            if noted and hashlib.sha256((folder / name).read_bytes()).hexdigest() != noted:
+                raise RuntimeError(
+                    f"model folder {folder}: {name} is not the file that was promoted; load the model from the "
+                    "registry again, or promote it again"
+                )
         import onnxruntime
 
         self.told = json.loads((folder / "serving.json").read_text(encoding="utf-8"))

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import yaml
 from filelock import FileLock
-from mlflow.entities.model_registry import ModelVersion
+from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.exceptions import MlflowException
 from mlflow.models import ModelSignature
 from mlflow.protos.databricks_pb2 import RESOURCE_DOES_NOT_EXIST, ErrorCode
@@ -39,10 +39,11 @@ from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
 from models.trust import Region, fit_siblings
 from models.updating import Updater, out_of_fold
-from pipelines import model_store, pyfunc_model
+from pipelines import audit, model_store, pyfunc_model
+from pipelines.audit import CHAMPION
 from pipelines.serving import write_served
 from pipelines.settings import Settings
-from pipelines.tracking import load_training, open_store, record_promotion, store_errors
+from pipelines.tracking import code_version, load_training, open_store, record_promotion, store_errors
 
 _MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 _SERVED_PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")  # of a family that is an ONNX file
@@ -138,7 +139,9 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
     with _locked(name, settings):
         champion = _by_alias(client, name, CHAMPION)
         fingerprint = new.fingerprint
-        same = [v for v in _versions(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags]
+        same = [
+            v for v in versions_of(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags
+        ]
         if same and (champion is not None or force or not new.choice.trusted):
             done = _keep(client, same[0], champion, new, force)
         else:
@@ -156,7 +159,8 @@ def _keep(
     if force and (champion is None or champion.version != version):
         if champion is not None:
             client.set_model_version_tag(name, version, "replaces", champion.version)
-        _crown(client, name, version, champion)
+        why = f"by force; same batches, cell and machine file as version {version}"
+        _crown(client, name, version, why, new.training_id, force)
         summary += f"; version {version} is champion by force"
     stays = same if force else champion
     return Promotion(
@@ -189,7 +193,7 @@ def _register(
     client.update_model_version(name, version, ("SIMULATED. " if simulated else "") + choice.summary)
     client.set_registered_model_tag(name, "simulated", _text(simulated))
     if replaces:
-        _crown(client, name, version, champion)
+        _crown(client, name, version, reason, new.training_id, force)
     else:
         client.set_registered_model_alias(name, CHALLENGER, version)
     client.set_model_version_tag(name, version, "outcome", outcome)  # last: what lacks it was interrupted
@@ -221,11 +225,15 @@ def _tags(new: Newcomer) -> dict[str, str]:
         "fingerprint": new.fingerprint, "machine": result.machine, "target": result.target,
         "selector": choice.selector, "family": choice.family, "n_tsp": str(choice.n_tsp),
         "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
+        "code_version": code_version(),
     }  # fmt: skip
 
 
-def rollback(name: str, settings: Settings) -> Promotion:
+def rollback(name: str, settings: Settings, reason: str = "") -> Promotion:
     """Make the version that the present champion replaced the champion again.
+
+    Args:
+        reason: why; the log of champions keeps it.
 
     Raises:
         InputError: unknown model, no champion, or nothing that it replaced.
@@ -237,10 +245,11 @@ def rollback(name: str, settings: Settings) -> Promotion:
         if not previous:
             raise InputError(f"model {name!r}: champion version {present.version} replaced none; nothing to go back to")
         back = find_version(client, name, previous)
-        client.set_registered_model_alias(name, CHAMPION, back.version)
-        client.set_model_version_tag(name, present.version, "was_champion_until", _now())
+        audit.move_champion(
+            client, name, back.version, action="rollback", why=reason or f"version {present.version} was rolled back",
+            training_id=back.tags.get("training_id", ""), code_version=code_version(),
+        )  # fmt: skip
         client.set_model_version_tag(name, present.version, "rolled_back", "true")
-        client.delete_model_version_tag(name, back.version, "was_champion_until")
     summary = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
     return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
                      back.tags.get("caution", ""), summary)  # fmt: skip
@@ -249,7 +258,8 @@ def rollback(name: str, settings: Settings) -> Promotion:
 def status(settings: Settings) -> pd.DataFrame:
     """Every version of every model: name, version, aliases, expected_S_um, expected_S_bound90_um and expected_by (the
     protocol) of a run in the next season, leave_batch_out_S_mean_um, cell, score_um, n_batches, trained_at, simulated,
-    trusted, reason, was_champion_until, training_id; newest version first within a name."""
+    trusted, reason, was_champion_until (UTC, by the log of champions; empty for the champion), training_id; newest
+    version first within a name."""
     client = open_store(settings)
     numbers = ["expected_S_um", "expected_S_bound90_um", "leave_batch_out_S_mean_um", "score_um"]
     columns = ["name", "version", "aliases", "machine", "target", *numbers[:2], "expected_by", *numbers[2:3], "cell",
@@ -258,17 +268,36 @@ def status(settings: Settings) -> pd.DataFrame:
     rows = []
     with store_errors(settings):
         for model in client.search_registered_models(max_results=1000):
-            for v in _versions(client, model.name):
-                tags = v.tags
+            log = audit.read(model)
+            ends = audit.latest_ends(log.reigns, log.champion)
+            for v in versions_of(client, model.name):
+                tags, until = v.tags, ends.get(int(v.version))
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))
                 rows.append({
                     **{c: tags.get(c, "") for c in columns}, "name": model.name, "version": int(v.version),
                     "aliases": ", ".join(aliases), **{n: float(tags.get(n, "nan")) for n in numbers},
                     "n_batches": int(tags.get("n_batches", 0)), "simulated": tags.get("simulated") == "true",
                     "trusted": tags.get("trusted") != "false",
+                    "was_champion_until": "" if until is None else until.isoformat(timespec="seconds"),
                 })  # fmt: skip
     table = pd.DataFrame(rows, columns=columns)
     return table.sort_values(["name", "version"], ascending=[True, False]).reset_index(drop=True)
+
+
+def find_model(client: MlflowClient, name: str) -> RegisteredModel:
+    """A registered model by name.
+
+    Raises:
+        InputError: unknown name, with the closest.
+    """
+    try:
+        return client.get_registered_model(name)
+    except MlflowException as error:
+        if error.error_code != ErrorCode.Name(RESOURCE_DOES_NOT_EXIST):
+            raise
+        names = [m.name for m in client.search_registered_models(max_results=1000)]
+        hint = closest(name, names) if names else "the registry is empty; train first"
+        raise InputError(f"unknown model {name!r}; {hint}") from None
 
 
 def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
@@ -277,17 +306,10 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     Raises:
         InputError: unknown name, version or alias, with the closest and the allowed ones.
     """
-    try:
-        model = client.get_registered_model(name)
-    except MlflowException as error:
-        if error.error_code != ErrorCode.Name(RESOURCE_DOES_NOT_EXIST):
-            raise
-        names = [m.name for m in client.search_registered_models(max_results=1000)]
-        hint = closest(name, names) if names else "the registry is empty; train first"
-        raise InputError(f"unknown model {name!r}; {hint}") from None
+    model = find_model(client, name)
     if which in model.aliases:
         return client.get_model_version_by_alias(name, which)
-    versions = {str(v.version): v for v in _versions(client, name)}
+    versions = {str(v.version): v for v in versions_of(client, name)}
     if which == CHAMPION and versions:
         newest = next(iter(versions.values()))
         raise InputError(
@@ -355,15 +377,16 @@ def _locked(name: str, settings: Settings) -> Iterator[None]:
         yield
 
 
-def _crown(client: MlflowClient, name: str, new: str, previous: ModelVersion | None) -> None:
-    client.set_registered_model_alias(name, CHAMPION, new)
-    if previous is not None:
-        client.set_model_version_tag(name, previous.version, "was_champion_until", _now())
+def _crown(client: MlflowClient, name: str, version: str, why: str, training_id: str, forced: bool) -> None:
+    audit.move_champion(
+        client, name, version, action="promote", why=why, training_id=training_id, code_version=code_version(),
+        forced=forced,
+    )  # fmt: skip
     if CHALLENGER in client.get_registered_model(name).aliases:  # it lost to an older champion
         client.delete_registered_model_alias(name, CHALLENGER)
 
 
-def _versions(client: MlflowClient, name: str) -> list[ModelVersion]:
+def versions_of(client: MlflowClient, name: str) -> list[ModelVersion]:
     quoted = name.replace("'", "''")
     found = client.search_model_versions(f"name = '{quoted}'", max_results=10_000)
     return sorted(found, key=lambda v: -int(v.version))
@@ -458,7 +481,7 @@ def _at_the_machine(new: Newcomer) -> tuple[Updater | None, Substitutes | None]:
     minutes to be fitted again.
     """
     updater, substitutes, family = None, None, new.family
-    if type(family).operations is Family.operations:
+    if not new.batches or type(family).operations is Family.operations:
         return None, None
     batches = sorted(new.batches, key=lambda b: (b.start is None, b.start, b.batch_id))
     with suppress(InputError):
@@ -488,4 +511,4 @@ def _requirements(family: Family) -> list[str]:
     return [f"{p}=={installed(p).partition('+')[0]}" for p in (*_MODEL_PACKAGES, *torch)]
 
 
-CHAMPION, CHALLENGER = "champion", "challenger"
+CHALLENGER = "challenger"

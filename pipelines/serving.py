@@ -14,13 +14,12 @@ from compensation.exports.onnx_graph import OnnxExport
 from compensation.safety import Limits
 from data.errors import InputError
 from models.program import Program
-from pipelines.model_store import StoredModel
-from pipelines.pyfunc_model import SERVED
+from pipelines.model_store import SERVED, StoredModel, add_hashes
 
 
 def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str, ...]:
-    """Writes the ONNX files of a model and of its trained region next to it; the names of the files, none where the
-    family is no program or the step is not known."""
+    """Writes the ONNX files of a model and of its trained region next to it, and their hashes into its `model.json`;
+    the names of the files, none where the family is no program or the step is not known."""
     channels = stored.machine.batch_channels()
     try:
         model = stored.family.program(channels, step_s)
@@ -43,6 +42,7 @@ def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str,
         },
     }  # fmt: skip
     (folder / "serving.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    add_hashes(folder, SERVED)
     return SERVED
 
 

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import platform
 import re
+import subprocess
 import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import mlflow
 import numpy as np
@@ -36,6 +40,7 @@ from models.outlook import outlook
 from models.promotion import choose, judged
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
+from pipelines.audit import CHAMPION
 from pipelines.caller import Say
 from pipelines.settings import Settings, load
 
@@ -53,7 +58,8 @@ def experiment_id(client: MlflowClient, settings: Settings, machine: str, target
         if found.tags.get("simulated") != yes_or_no(simulated):
             client.set_experiment_tag(found.experiment_id, "simulated", yes_or_no(simulated))
         return str(found.experiment_id)
-    where = f"{settings.artifacts_uri}/{machine}/{target}" if settings.artifacts_uri else None
+    # quoted, since a store decodes an address: the name 50%2f is no folder
+    where = f"{settings.artifacts_uri}/{machine}/{quote(target)}" if settings.artifacts_uri else None
     tags = {"simulated": yes_or_no(simulated), "machine": machine, "target": target, "kind": "thermodrift"}
     return str(client.create_experiment(name, artifact_location=where, tags=tags))
 
@@ -107,6 +113,23 @@ def finished_runs(client: MlflowClient, kind: str) -> list[Run]:
 def started(run: Run) -> pd.Timestamp:
     """The start time, UTC."""
     return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
+
+
+@cache
+def code_version() -> str:
+    """The version of this program: ``git COMMIT`` of a checkout, -dirty with changes; else ``thermodrift VERSION``."""
+    root = Path(__file__).resolve().parents[1]
+    if (root / ".git").exists():  # an installation inside another project's checkout has none of its own
+        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=True, timeout=20,
+                env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+            )  # fmt: skip
+            return f"git {done.stdout.strip()}"
+        except (OSError, subprocess.SubprocessError):
+            pass  # without git, or a checkout of another user: the package's version is what is known
+    return f"thermodrift {version('thermodrift')}"
 
 
 def yes_or_no(value: bool) -> str:
@@ -187,7 +210,8 @@ def log_training(
         experiment = experiment_id(client, settings, result.machine, result.target, result.simulated)
         common = {"simulated": yes_or_no(result.simulated), "machine": result.machine, "target": result.target}
         name = f"{result.machine} {result.target} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
-        run = client.create_run(experiment, tags={**common, "kind": "training"}, run_name=name)
+        tags = {**common, "kind": "training", "code_version": code_version()}
+        run = client.create_run(experiment, tags=tags, run_name=name)
         parent = str(run.info.run_id)
         status = "FAILED"
         try:
@@ -244,10 +268,25 @@ def load_training(training_id: str, settings: Settings) -> Training:
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"training {training_id}: its tables in {folder} cannot be read ({error})") from None
     tags = run.data.tags
+    promotion = json.loads(tags.get("promotion", "{}"))
+    if promotion:
+        with store_errors(settings):
+            promotion["champion_version"] = _champion_now(client, promotion["name"])
     return Training(
-        training_id, started(run), tags.get("simulated") == "true", result, dict(run.data.params),
-        json.loads(tags.get("promotion", "{}")),
+        training_id, started(run), tags.get("simulated") == "true", result, dict(run.data.params), promotion,
+        tags.get("code_version", ""),
     )  # fmt: skip
+
+
+def _champion_now(client: MlflowClient, model: str) -> int | None:
+    """The present champion: a later promotion or a roll-back may have replaced the one that a training recorded."""
+    try:
+        version = client.get_registered_model(model).aliases.get(CHAMPION)
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        return None
+    return None if version is None else int(version)
 
 
 def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str, Any]) -> None:

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, closest
 from data.machine import Machine
 from data.units import conversion
+from data.yaml_file import parse_plain
 from plants.options import stream
 from plants.plant import Posed, posed, with_amounts
 from plants.runs import Block, Run, earlier
@@ -86,10 +86,7 @@ def read_plan(text: str, drivers: Sequence[str], where: str = "run plan") -> Pla
     Raises:
         InputError: no YAML mapping, no stages, an unknown key, a value that is none, no room; one line.
     """
-    try:
-        given = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{where}: is no YAML ({str(error).splitlines()[0]}); give a run plan") from None
+    given = parse_plain(text, where)
     if not isinstance(given, Mapping) or not isinstance(given.get("stages"), list):
         raise InputError(f"{where}: has no list of stages; write stages: [{{minutes: 5, spindle_rpm: 0}}]")
     before = list(_before(text, drivers, where))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         load_model,
         predict,
         read,
+        registry,
         rehearse,
         simulate,
         train,
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "diagnose",
-    "export", "ingest", "load_machine", "load_model", "predict", "read", "rehearse", "simulate", "train",
+    "export", "ingest", "load_machine", "load_model", "predict", "read", "registry", "rehearse", "simulate",
+    "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",

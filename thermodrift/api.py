@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -202,6 +203,47 @@ def export(models: Paths, to: str, out: Path | str | None = None) -> list[Path]:
     configure_environment()
     folders = {str(m): model_folder(str(m), load()) for m in _uris(models)}
     return write_export(folders, to, None if out is None else Path(out))[1]
+
+
+def registry(
+    model: str | None = None,
+    *,
+    at: str | date | datetime | None = None,
+    machine: str | None = None,
+    lineage: bool = False,
+) -> pd.DataFrame:
+    """Champions of the registered models, now or at an earlier time; a model's history; or a version's lineage.
+
+    Args:
+        model: NAME: its history; with `lineage` NAME/VERSION, or NAME for the champion (at that time). Default: all.
+        at: which version was champion then. A date, also as a string, is that whole day; a time without a zone is
+            local.
+        machine: name of a machine: its models only.
+        lineage: the batches that a version was trained on.
+
+    Returns:
+        Times in UTC. Without arguments a row per model: model, machine, target, champion, since, action, who, why,
+        versions, note. With `at` a row per champion: model, machine, target, version, since, until, action, who, why,
+        training_id, code_version, note; version is missing where there was none. With a model a row per entry of its
+        log: when, who, host, action, model, from_version, to_version, why, forced, training_id, code_version, until,
+        carried_out, note. With `lineage` a row per batch: batch_id, start, digest, version, source, n_rows, masked;
+        ``attrs`` holds the version's model, training and code versions.
+
+    Raises:
+        InputError: an unknown model, version or machine, or a time without any champion, before the first promotion or
+            in the future.
+        WorkError: the tracking store does not answer.
+    """
+    from pipelines import settings
+    from pipelines.commands.registry import Lineage, look_up
+
+    settings.configure_environment()
+    found = look_up(model, at, machine, lineage, settings.load())
+    if isinstance(found, Lineage):
+        table = found.batches
+        table.attrs.update(found.version)
+        return table
+    return found
 
 
 def simulate(

@@ -212,6 +212,9 @@ def with_date(date: Any, time: Any) -> Any:
     return pc.binary_join_element_wise(*texts, " ")
 
 
+_EPOCH = pd.Timestamp(0).as_unit("us")  # in ns a damaged year, such as 2826, overflows
+
+
 def _text_to_seconds(column: Any, pattern: str | None, decimal: str) -> Array:
     text = pc.utf8_trim_whitespace(column)
     if pattern is None or pattern == _ISO:
@@ -224,7 +227,7 @@ def _text_to_seconds(column: Any, pattern: str | None, decimal: str) -> Array:
     if pattern and "%S" in pattern and parsed.isna().any():
         other = pattern.replace("%S.%f", "%S") if "%f" in pattern else pattern.replace("%S", "%S.%f")
         parsed = parsed.fillna(_parse(cells, other))
-    seconds: Array = np.asarray((parsed - pd.Timestamp(0)).dt.total_seconds(), np.float64)
+    seconds: Array = np.asarray((parsed - _EPOCH).dt.total_seconds(), np.float64)
     if np.isnan(seconds).all():
         seconds = _serial_to_seconds(to_float(column, decimal)[0])
     return seconds

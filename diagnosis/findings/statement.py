@@ -96,7 +96,7 @@ def statement(found: Found) -> str:
     if fall:
         claim += f"; with it {fall}"
         better, of = found.evidence.get("batches_improved"), found.evidence.get("batches")
-        claim += f", better in {better} of {of} runs" if better is not None and of else ""
+        claim += f", more probable in {better} of {of} runs" if better is not None and of else ""
     return " ".join(
         [
             f"{claim}.",

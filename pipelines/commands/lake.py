@@ -51,14 +51,15 @@ def show(
     as_json: Json = False,
 ) -> None:
     """One batch: versions, sources, findings, withdrawal, and the trainings and models that used it."""
-    from data.lakefile import decode
+    from data.lakefile import decode, read_body
     from pipelines.recordings import home_lake
 
     lake = home_lake()
     versions = lake.versions(machine, batch)
     last = versions[-1]
     kept = last.withdrawn is None or not last.withdrawn.purged_at
-    content = decode(lake.root / last.files[-1], last.version) if kept else None
+    file = lake.root / last.files[-1]
+    content = decode(read_body(file), file, last.version) if kept else None
     findings = [f.as_dict() for f in content.findings] if content else []
     used = _trainings_with(machine, [batch])
     if as_json:

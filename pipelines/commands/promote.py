@@ -25,11 +25,14 @@ def promote(
     console.line(promote_tracked(training, machine, cell, force, settings.load()).summary)
 
 
-def rollback(model: Annotated[str, typer.Argument(help="registered model, MACHINE-CHANNEL")]) -> None:
+def rollback(
+    model: Annotated[str, typer.Argument(help="registered model, MACHINE-CHANNEL")],
+    reason: Annotated[str, typer.Option("--reason", help="why; `thermodrift registry MODEL` shows it")] = "",
+) -> None:
     """Make the previous champion the champion again."""
     from pipelines import settings
 
     settings.configure_environment()
     from pipelines import registry
 
-    console.line(registry.rollback(model, settings.load()).summary)
+    console.line(registry.rollback(model, settings.load(), reason).summary)

@@ -12,6 +12,7 @@ import yaml
 from data.arrays import Array
 from data.errors import InputError
 from data.machine import Machine
+from data.yaml_file import parse_plain
 from plants.kinds.case import KindPosed, ahead_s, all_effects, posed, variants
 from plants.kinds.plant import Dice
 from plants.kinds.runs import KindRun
@@ -64,8 +65,8 @@ def execute(
 def _in_a_hall(text: str) -> str:
     """The plan without surroundings that are none of a hall, such as a coolant's inlet: these stay as they are."""
     try:
-        given = yaml.safe_load(text)
-    except yaml.YAMLError:
+        given = parse_plain(text, "run plan")
+    except InputError:
         return text  # the reader says what is wrong
     if not isinstance(given, dict) or not isinstance(given.get("surroundings"), dict):
         return text

@@ -175,7 +175,13 @@ def interval_label(comparison: dict[str, float], digits: int = 2) -> str:
     return f"{text} (90 %: {number(ends[0], digits)} to {number(ends[1], digits)} µm)"
 
 
-_CHIPS = {"champion": "champion", "challenger": "challenger", "unchanged": "unchanged", "": "not promoted"}
+_CHIPS = {
+    "champion": "champion",
+    "former": "former champion",
+    "challenger": "challenger",
+    "unchanged": "unchanged",
+    "": "not promoted",
+}
 
 
 @dataclass(frozen=True)
@@ -224,8 +230,12 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
         f"({choice.protocol}, {count(choice.n_batches, 'batch')}{_nested(choice, digits)})"
     )
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
-    if outcome == "champion":
+    if outcome == "champion" and p["version"] == p.get("champion_version"):
         summary = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
+    elif outcome == "champion":  # replaced or rolled back since
+        outcome = "former"
+        why = _why_champion(p).replace("it is", "it was", 1).replace("replaces", "it replaced", 1)
+        summary = f"Version {p['version']}, {model}, was champion: {score}; {why}. {_champion_now(p)} now."
     elif outcome == "challenger":
         summary = f"{_champion_now(p)}; version {p['version']}, {model}, is challenger: {score}; {_why_challenger(p)}."
     elif outcome == "unchanged":
@@ -250,11 +260,13 @@ def _champion_now(p: dict[str, Any]) -> str:
 
 
 def mark_of(training: Training) -> str:
-    """What the chosen cell's model is now: champion, challenger, or only chosen."""
+    """What the chosen cell's model is now: champion, former champion, challenger, or only chosen."""
     p = training.promotion
     if not p:
         return "chosen"
-    return "champion" if p["version"] == p["champion_version"] else "challenger"
+    if p["version"] == p["champion_version"]:
+        return "champion"
+    return "former champion" if p["outcome"] == "champion" else "challenger"
 
 
 def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:

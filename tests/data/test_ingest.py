@@ -281,6 +281,23 @@ def test_subfolders_are_read_and_every_file_is_listed(tmp_path: Path, lake: Lake
     assert lake.load("vmc", "b").values("T1")[0] == 1.0
 
 
+def test_a_damaged_file_of_the_lake_is_healed_by_its_source(tmp_path: Path, lake: Lake) -> None:
+    files = [write(tmp_path / "a.csv", "a,1,30,2"), write(tmp_path / "b.csv", "b,2,30,2")]
+    ingest(files, MACHINE, lake)
+    stored = lake.root / lake.versions("vmc", "a")[0].files[0]
+    stored.chmod(0o644)
+    stored.write_bytes(stored.read_bytes()[:-100])
+    with pytest.raises(WorkError, match=r"batch a of vmc cannot be read .*or ingest its source .*a\.csv again"):
+        lake.load_all("vmc")
+    report = ingest(files, MACHINE, lake)
+    assert statuses(report) == [("a", "healed"), ("b", "unchanged")]
+    assert report.rows[0].reason == (
+        "the same content as before; its file in the lake was damaged or gone and is written anew"
+    )
+    assert lake.load("vmc", "a").values("T1")[0] == 1.0 and len(lake.versions("vmc", "a")) == 1
+    assert statuses(ingest(files, MACHINE, lake)) == [("a", "unchanged"), ("b", "unchanged")]
+
+
 def test_a_growing_file_waits(tmp_path: Path, lake: Lake) -> None:
     still, growing = write(tmp_path / "a.csv", "a,1,3,0"), write(tmp_path / "b.csv", "b,2,3,0")
     waits: list[float] = []

@@ -1,5 +1,7 @@
 """The lake against plain readers, plain copies of what was put, and random histories."""
 
+import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -19,7 +21,7 @@ from hypothesis import strategies as st
 from data.batch import Batch, Channel, Finding
 from data.errors import InputError, WorkError
 from data.lake import Lake
-from data.lakefile import content_digest, safe_name
+from data.lakefile import content_digest, encode, safe_name
 
 FINDING = Finding("frozen", "T1", "T1 stands at 20.0 degC for 3 h", 0.0, 60.0)
 
@@ -276,6 +278,79 @@ def test_damage_is_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "_manifest.json").write_text("{")
     with pytest.raises(WorkError, match=r"_manifest\.json: cannot be read"):
         lake.machines()
+
+
+def stored_file(lake: Lake, batch_id: str = "run1") -> Path:
+    return lake.root / lake.versions("vmc", batch_id)[-1].files[-1]
+
+
+def overwrite(file: Path, body: bytes) -> None:
+    file.chmod(0o644)
+    file.write_bytes(body)
+
+
+def other_values(digest: str) -> bytes:
+    """A stored file as the lake writes it, with the note of another one: valid, with other values."""
+    return encode(make(seed=7), digest).to_pybytes()
+
+
+@pytest.mark.parametrize("damage", ["values", "cut", "a byte", "gone"])
+@pytest.mark.parametrize("hashes", [True, False], ids=["", "of an earlier program"])
+def test_a_file_changed_after_its_ingest_is_refused_and_healed(tmp_path: Path, damage: str, hashes: bool) -> None:
+    lake = Lake(tmp_path)
+    batch = make(findings=(FINDING,))
+    digest = lake.put_many([batch, make("run2", seed=2)])[0].digest
+    file, listed = stored_file(lake), tmp_path / "_manifest.json"
+    if not hashes:
+        manifest = json.loads(listed.read_text())
+        for entries in manifest["machines"]["vmc"].values():
+            del entries[0]["sha256"]
+        listed.write_text(json.dumps(manifest))
+    body = file.read_bytes()
+    changed = {"values": other_values(digest), "cut": body[:-40], "a byte": body[:9] + b"?" + body[10:]}
+    if damage == "gone":
+        file.unlink()
+    else:
+        overwrite(file, changed[damage])
+    for reading in (lambda: lake.load("vmc", "run1"), lambda: lake.load_all("vmc")):
+        with pytest.raises(WorkError, match=r"lake file .*: .*cannot be read .*ingest its source .*again") as told:
+            reading()
+        assert len(str(told.value).splitlines()) == 1 and str(file) in str(told.value)
+        if hashes or damage == "values":
+            assert "batch run1 of vmc" in str(told.value) and "in/run1.csv" in str(told.value)
+    stored = lake.put(batch)
+    assert stored.status == ("healed" if hashes or damage != "gone" else "unchanged")
+    assert (stored.version, stored.digest) == (1, digest)
+    same(lake.load("vmc", "run1"), batch)
+    (current,) = tmp_path.glob("machine=vmc/year=*/run1.parquet")
+    np.testing.assert_array_equal(pd.read_parquet(current)["T1"], batch.values("T1"))
+    assert lake.put(batch).status == "unchanged"
+    assert len(lake.load_all("vmc")) == 2
+
+
+def test_a_lake_of_an_earlier_program_gets_hashes_with_the_next_ingest(tmp_path: Path) -> None:
+    lake, listed = Lake(tmp_path), tmp_path / "_manifest.json"
+    lake.put(make())
+    manifest = json.loads(listed.read_text())
+    (entry,) = manifest["machines"]["vmc"]["run1"]
+    noted = entry.pop("sha256")
+    assert noted == {entry["file"]: hashlib.sha256(stored_file(lake).read_bytes()).hexdigest()}
+    listed.write_text(json.dumps(manifest))
+    same(lake.load("vmc", "run1"), make())
+    before = stored_file(lake).stat().st_mtime_ns
+    assert lake.put(make()).status == "unchanged"
+    assert json.loads(listed.read_text())["machines"]["vmc"]["run1"][0]["sha256"] == noted
+    assert stored_file(lake).stat().st_mtime_ns == before
+
+
+def test_one_file_of_two_versions_is_healed_for_both(tmp_path: Path) -> None:
+    lake = Lake(tmp_path)
+    for seed in (1, 2, 1):
+        lake.put(make(seed=seed))
+    overwrite(stored_file(lake), b"PAR1")
+    assert lake.put(make(seed=1)).status == "healed"
+    for version in (1, 3):
+        same(lake.load("vmc", "run1", version), make(seed=1))
 
 
 STEPS = st.lists(

@@ -159,6 +159,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> N
     assert seen == {(False, 0), (True, 0), (True, 1)}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_kills_at_random_moments_on_one_lake(tmp_path: Path) -> None:
     assert run(f"kill_at_random(t.Path({str(tmp_path)!r}))").wait(300) == 0

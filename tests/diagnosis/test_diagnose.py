@@ -122,6 +122,7 @@ def test_no_listed_mechanism_is_said_with_its_size() -> None:
         assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
 
 
+@pytest.mark.slow
 def test_what_listed_mechanisms_only_share_in_is_told_whole() -> None:
     """By vacuum and speed together: a switched heat of the library takes over some of it."""
     by_both = {

@@ -350,6 +350,7 @@ def test_a_seed_draws_only_the_null() -> None:
     assert not np.array_equal(one.flipped, other.flipped)
 
 
+@pytest.mark.slow
 def test_processes_do_not_matter() -> None:
     one, two = first_round(0), first_round(0, processes=2)
     assert list(gains(one)) == list(gains(two))

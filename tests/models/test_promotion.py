@@ -242,6 +242,7 @@ def _many_lucky_cells(seed: int, cells: int, gain_um: float) -> GridResult:
     return GridResult("toy", "z", False, batches, pd.DataFrame(rows), pd.DataFrame(summary), *(4 * [empty]))
 
 
+@pytest.mark.slow
 def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
     rule = PromotionRule(tie_percent=0, score="S_mean")
     choices = [promotion.decide(_many_lucky_cells(seed, 15, 0.0), rule) for seed in range(30)]

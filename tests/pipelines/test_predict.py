@@ -297,7 +297,12 @@ def test_a_damaged_or_foreign_folder_is_told(stored, store, tmp_path):
         load_model(str(stored), store)
     (stored / "model.json").write_text(text)
     np.savez(stored / "arrays.npz", a0=np.array([object()], dtype=object))
-    with pytest.raises(InputError, match="not a stored model"):  # a pickled array is refused, never loaded
+    with pytest.raises(InputError, match=r"not a stored model as it was promoted \(arrays.npz has sha256"):
+        load_model(str(stored), store)
+    document = json.loads(text)
+    del document["sha256"]
+    (stored / "model.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"not a stored model \(Object arrays"):  # a pickled array is never loaded
         load_model(str(stored), store)
 
 

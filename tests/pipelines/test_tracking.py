@@ -143,3 +143,14 @@ class FakeClient:
         if self.trouble:
             raise mlflow.exceptions.MlflowException(self.trouble)
         return []
+
+
+@pytest.mark.parametrize("target", ["Spindel vorn 50 %", "%2e%2e%2f%2e%2e%2foutside"])
+def test_artifacts_stay_in_the_folder_of_their_channel(store, tmp_path, target):
+    """A store decodes the address of an experiment, so that an unquoted name may lead out of its folder."""
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    (tmp_path / "note.txt").write_text("x")
+    run = client.create_run(tracking.experiment_id(client, store, "toy-quoted", target, True))
+    client.log_artifact(run.info.run_id, str(tmp_path / "note.txt"))
+    (note,) = store.home.rglob(f"{run.info.run_id}/**/note.txt")
+    assert note.relative_to(store.home / "artifacts" / "toy-quoted").parts[0] == target

@@ -24,6 +24,7 @@ def test_temperatures_at_the_sensors_converge_with_the_step_squared() -> None:
     assert _rms(at[1] - at[2]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_grid_of_eight_cells_for_each_moves_the_sensors_by_little() -> None:
     plain, finer = draw_castings(SEED, False), draw_castings(SEED, False, 2)
     assert finer.structure.size > 4 * plain.structure.size

@@ -136,7 +136,7 @@ def test_it_is_another_day_with_its_own_noise_and_the_same_every_time() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("stages: [", "run plan: is no YAML"),
+        ("stages: [", "not valid YAML"),
         ("name: x", "run plan: has no list of stages; write stages:"),
         ("stages: [4]", "stage 1: got 4, expected a mapping"),
         ("stages: [{minutes: 5, spindel_rpm: 2}]", "unknown key 'spindel_rpm'; did you mean 'spindle_rpm'"),

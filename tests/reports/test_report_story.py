@@ -20,6 +20,7 @@ FEW = COMPARISON | {"n_batches": 3, "words": "3 batches in common, need at least
 OUTCOMES: dict[str, dict[str, object]] = {
     "first": {"version": 1, "champion_version": 1, "against": None},
     "better": {"comparison": COMPARISON},
+    "rolled back": {"comparison": COMPARISON, "champion_version": 2},
     "forced": {"comparison": FORCED, "forced": True},
     "not better": {"outcome": "challenger", "champion_version": 2, "comparison": WORSE},
     "too few batches": {"outcome": "challenger", "champion_version": 2, "comparison": FEW},

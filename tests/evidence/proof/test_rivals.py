@@ -45,6 +45,7 @@ def named(reply: dict[str, Any]) -> list[tuple[str, str]]:
     return [(f["mechanism"], f["where"]["name"]) for f in reply["findings"]]
 
 
+@pytest.mark.slow
 def test_a_reply_has_the_agreed_form() -> None:
     out = replied()
     assert set(out) == {"baselines", "ablations", "reference"}

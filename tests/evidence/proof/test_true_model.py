@@ -108,6 +108,7 @@ def test_what_no_list_has_is_fitted_by_its_own_law(hidden: dict[str, str]) -> No
     assert true_model(given.machine, batches, answer("unlisted", unrecorded)).visible == (None,)
 
 
+@pytest.mark.slow
 def test_a_plant_of_other_numerics_has_a_true_model_too() -> None:
     drawn = draw(2, "sun", 2.0, **SHORT)
     key = answer("one", *({**t, "size": 2.0, "decoy": False, "active": "always"} for t in drawn.truth["terms"]))
@@ -116,6 +117,7 @@ def test_a_plant_of_other_numerics_has_a_true_model_too() -> None:
     assert got.error_true < 0.7 * got.error_before
 
 
+@pytest.mark.slow
 def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
     """A bar sits at the spindle and all that the key says is which error it moves; the screen sees usual bars only."""
     bar = {"law": "mandrel_fixture", "acts_on": "z", "at": {"seat": "spindle"},
@@ -132,6 +134,7 @@ def test_of_a_shape_that_no_key_states_the_refits_choose_the_place() -> None:
     assert full is not None and picked.candidate.name in full.part.mechanisms
 
 
+@pytest.mark.slow
 def test_two_heats_of_one_mechanism_at_one_body_are_two_terms() -> None:
     """A cabinet that is always on, and one that a driver switches: each is fitted by a candidate of its own."""
     heat = {"law": "cabinet_heat", "into": "bed"}

@@ -128,6 +128,7 @@ def test_unknown_studies_and_too_few_seeds_are_told_in_one_line() -> None:
         run_studies(["year_round_pcr"], 1)
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STUDIES._members, "toy", f"{__name__}:Toy")
     steps: list[tuple[str, int, int]] = []
