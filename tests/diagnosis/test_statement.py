@@ -63,8 +63,8 @@ def found(mechanism: str, kind: Kind, value: float = 0.12, unit: str = "K/h", pr
 def test_claim_evidence_advice_and_caveat() -> None:
     assert statement(SINK) == (
         "Missing: heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of the fit "
-        "falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. Radiation to walls or from a hot neighbour "
-        "at the bed (8 %) would look the same in these runs; a night switched off would tell them apart."
+        "falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. Radiation to walls or from a hot "
+        "neighbour at the bed (8 %) would look the same in these runs; a night switched off would tell them apart."
     )
     capped = replace(SINK, others=(), separates="", caps=("3 runs only", "a resolution of 0.5 K"))
     assert statement(capped).endswith("runs. No surer than that: 3 runs only and a resolution of 0.5 K.")
@@ -86,8 +86,8 @@ def test_a_tie_is_said_as_one() -> None:
     assert statement(tied) == (
         "These runs cannot tell two explanations apart: heat to the floor at the bed, 10 W/K (90 %: 9–12) (52 %) or "
         "radiation to walls or from a hot neighbour at the bed (surrounding: the room) (31 %); with it the z error of "
-        "runs left out of the fit falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. A night switched "
-        "off would tell them apart."
+        "runs left out of the fit falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. A night "
+        "switched off would tell them apart."
     )
     likelier = replace(tied, probability=0.004, others=(replace(tied.others[0], probability=0.92),))
     assert claim_phrase(likelier) == (
