@@ -241,6 +241,7 @@ def test_physics_never_takes_the_place_of_a_finer_network() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imitates", [True, False])
 def test_another_effect_is_asked_only_where_the_first_leaves_its_gain(
     imitates: bool, monkeypatch: pytest.MonkeyPatch

@@ -250,6 +250,7 @@ def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
     assert np.mean([c.nested_S_mean_um for c in choices]) == pytest.approx(10.0, abs=0.4)  # nothing was gained
 
 
+@pytest.mark.slow
 def test_a_lucky_winner_is_not_trusted_and_a_true_one_is() -> None:
     rule = PromotionRule(tie_percent=0, score="S_mean")
     lucky = [promotion.decide(_many_lucky_cells(s, 15, 0.0), rule) for s in range(10)]

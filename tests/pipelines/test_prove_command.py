@@ -80,6 +80,7 @@ def test_step_by_step(call: Call, asked: list[str], tmp_path: Path) -> None:
     assert steps == ["sealed", "run", *["started", "answered"] * 2, "opened", "scored"]
 
 
+@pytest.mark.slow
 def test_all_at_once_goes_on_where_it_stood(call: Call, asked: list[str], tmp_path: Path) -> None:
     proof = tmp_path / "proof"
     assert call("prove", "seal", *ASKED, "--out", proof).code == 0

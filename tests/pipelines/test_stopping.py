@@ -73,7 +73,7 @@ class Training:
         (["--direct"], "worker", signal.SIGINT, True),
         pytest.param(["--direct"], "here", signal.SIGTERM, False, marks=pytest.mark.slow),
         pytest.param([], "worker", signal.SIGTERM, True, marks=pytest.mark.slow),
-        ([], "here", signal.SIGINT, False),
+        pytest.param([], "here", signal.SIGINT, False, marks=pytest.mark.slow),
     ],
 )
 def test_a_signal_ends_all_processes_and_the_next_run_resumes(

@@ -58,6 +58,7 @@ def test_the_truth_is_recovered(small: Machine, truth: np.ndarray, found: Calibr
     assert found.undetermined == []
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say(small: Machine) -> None:
     network = compile_network(small)
     empty = empty_batches(small, 2, hours=3.0)

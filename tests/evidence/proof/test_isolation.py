@@ -97,6 +97,7 @@ def test_a_proof_does_not_lie_where_it_is_seen() -> None:
     assert not inside.exists()
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_is_one_line(tmp_path: Path) -> None:
     case = case_of(tmp_path / "case", [])
     for diagnose, limit_s, error in (

@@ -91,6 +91,7 @@ def test_a_mechanism_of_no_candidate_is_judged_by_the_case_without_it() -> None:
     assert true_model(known, runs(known, hidden), key).visible == (None,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [{"square_cross": "6e-6 W"}, {"square": "6e-6 W"}])
 def test_what_no_list_has_is_fitted_by_its_own_law(hidden: dict[str, str]) -> None:
     """Heat by the speed squared while coolant flows; where it always flows, by the speed squared alone."""
