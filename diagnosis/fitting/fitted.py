@@ -234,7 +234,11 @@ class LeftOutRows:
 
 
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
-    """Every batch predicted by the fit to all others."""
+    """Every batch predicted by the fit to all others.
+
+    Its own starts and zeros are those of plain least squares: an error is stated in the unit of its channel, and what
+    counts a drift as memory leaves a zero almost free.
+    """
     problem, state = fitted.problem, fitted.state
     weight = 1.0 / fitted.noise.factor**2
     blocks = list(problem.linearise(fitted.x, state.nuisance))
@@ -252,7 +256,7 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
     for k, (block, w) in enumerate(zip(blocks, rows, strict=True)):
         z = np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high)
         moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
-        known, aim = (w.innovations((rows.T * w.scale).T) for rows in (block.nuisance, moved))
+        known, aim = ((part.T * w.scale).T for part in (block.nuisance, moved))
         normal = known.T @ known + np.eye(known.shape[1])
         nuisance: Array = np.asarray(np.linalg.solve(normal, known.T @ aim), float)
         one = problem.only([k])
