@@ -31,7 +31,7 @@ from models.updating import Updater
 SCHEMA = "thermodrift.compensation/1"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
 _NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
-_UM_PER_M = 1000.0  # per µm/mm
+_MM_PER_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ class AxisModel:
         region, watched: where the model was trained, and the program of the quantities it watches.
         bound: how the error grows outside of it; None where that is not known.
         updater: the filter of readings; None where it could not be learned.
-        limits: of what is sent.
+        limits: of what is sent; along an axis they hold at the reference position and at its farther end.
+        lever_mm: of an error along an axis the greatest distance from the reference position, at which a change of the
+            slope moves the tool the most.
     """
 
     axis: str
@@ -57,6 +59,7 @@ class AxisModel:
     bound: RunBound | None = None
     updater: Updater | None = None
     limits: Limits = field(default_factory=Limits)
+    lever_mm: float = 1000.0
 
     def authority(self, distance: float) -> float:
         """Share of the correction that is applied so far outside of the trained region, in widths.
@@ -79,6 +82,7 @@ class _Running:
     region: State
     learned: Learned | None
     safety: Axis
+    slope_safety: Axis  # of the slope's part at the lever
     error_um: float = 0.0  # of the last row, with readings
     free_um: float = math.nan  # of the last row, of the model alone
     scaled: Array = field(default_factory=lambda: np.zeros(0))  # inputs of the last row, for the filter
@@ -127,14 +131,15 @@ class Compensator:
         self._patience_s = max(a.limits.stale_s for a in axes)
         self.rejected = 0
 
-    def _fresh(self, a: AxisModel, was: Axis | None = None) -> _Running:
+    def _fresh(self, a: AxisModel, was: _Running | None = None) -> _Running:
         learned = a.updater.begin() if a.updater is not None else None
-        return _Running(a.program.begin(), a.watched.begin(), learned, was or Axis())
+        sent = (was.safety, was.slope_safety) if was is not None else (Axis(), Axis())
+        return _Running(a.program.begin(), a.watched.begin(), learned, *sent)
 
     def begin_run(self) -> None:
         """Starts a new run: the error is 0 from here on, as after a new reference of the tool. What is sent returns
         there within its limits."""
-        self._run = {a.axis: self._fresh(a, self._run[a.axis].safety) for a in self.axes}
+        self._run = {a.axis: self._fresh(a, self._run[a.axis]) for a in self.axes}
         self._grid_s = None
 
     def take(self, sample: Sample, clock_s: float) -> Correction:
@@ -149,44 +154,44 @@ class Compensator:
         fault, notes = self._advance(sample)
         for axis, measured_um in sample.readings_um.items():
             self._read(axis, measured_um)
-        offset: dict[str, float] = {}
-        slope: dict[str, float] = {}
-        state, reasons = {}, {}
+        wanted = {}
         for a in self.axes:
             run = self._run[a.axis]
-            wanted_um = -run.error_um if math.isfinite(run.error_um) else math.nan
-            run.safety, sent_um, reason = safety.step(
-                run.safety, a.limits, clock_s, sample.time_s, wanted_um, run.trust, fault
-            )
-            offset[a.axis], state[a.axis] = sent_um, run.safety.state
-            reasons[a.axis] = "; ".join(r for r in (reason, run.why, notes) if r)
-            self._slope(a, sent_um, wanted_um, slope)
-        return Correction(sample.time_s, offset, slope, state, reasons)
+            wanted[a.axis] = (-run.error_um, -run.slope_um_per_mm * a.lever_mm)
+        return self._sent(
+            sample.time_s,
+            lambda a, was, k: safety.step(
+                was, a.limits, clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
+            ),
+            notes,
+        )
 
     def silence(self, clock_s: float, time_s: float) -> Correction:
         """The correction while nothing arrives; `time_s` is stamped on it."""
-        offset: dict[str, float] = {}
-        slope: dict[str, float] = {}
-        state, reasons = {}, {}
-        for a in self.axes:
-            run = self._run[a.axis]
-            run.safety, sent_um, reason = safety.silence(run.safety, a.limits, clock_s)
-            offset[a.axis], state[a.axis], reasons[a.axis] = sent_um, run.safety.state, reason
-            self._slope(a, sent_um, -run.error_um, slope)
-        return Correction(time_s, offset, slope, state, reasons)
+        return self._sent(time_s, lambda a, was, k: safety.silence(was, a.limits, clock_s))
 
     def stop(self) -> None:
         """The operator stops: every axis fades out."""
         for run in self._run.values():
-            run.safety = safety.stop(run.safety)
+            run.safety, run.slope_safety = safety.stop(run.safety), safety.stop(run.slope_safety)
 
-    def _slope(self, a: AxisModel, sent_um: float, wanted_um: float, slope: dict[str, float]) -> None:
-        """The slope in the share of what is wanted that the limits let through: both grow and fade together."""
-        if a.program.along:
+    def _sent(
+        self, time_s: float, step: Callable[[AxisModel, Axis, int], tuple[Axis, float, str]], notes: str | None = None
+    ) -> Correction:
+        """The correction from a step of every state machine: number 0 of an axis is its offset, 1 its slope."""
+        offset: dict[str, float] = {}
+        slope: dict[str, float] = {}
+        state, reasons = {}, {}
+        for a in self.axes:
             run = self._run[a.axis]
-            share = min(max(sent_um / wanted_um, 0.0), 1.0) if math.isfinite(wanted_um) and wanted_um else 1.0
-            active = run.safety.state != "off" and math.isfinite(run.slope_um_per_mm)
-            slope[a.axis] = -share * run.slope_um_per_mm * _UM_PER_M if active else 0.0
+            run.safety, offset[a.axis], reason = step(a, run.safety, 0)
+            if a.program.along:
+                run.slope_safety, part_um, _ = step(a, run.slope_safety, 1)
+                slope[a.axis] = part_um / a.lever_mm * _MM_PER_M
+            state[a.axis] = run.safety.state
+            why = run.why if notes is not None else ""
+            reasons[a.axis] = "; ".join(r for r in (reason, why, notes) if r)
+        return Correction(time_s, offset, slope, state, reasons)
 
     def _advance(self, sample: Sample) -> tuple[str | None, str]:
         """Takes the models to the time of the sample: why it cannot be used, and what was replaced in it."""
@@ -292,7 +297,7 @@ class Compensator:
             }  # fmt: skip
             axes[name] = {
                 "model": run.model.as_plain(), "region": run.region.as_plain(), "learned": learned,
-                "safety": run.safety.as_plain(), "error_um": _or_none(run.error_um),
+                "safety": run.safety.as_plain(), "slope_safety": run.slope_safety.as_plain(), "error_um": _or_none(run.error_um),
                 "free_um": _or_none(run.free_um), "scaled": [_or_none(v) for v in run.scaled.tolist()],
                 "slope_um_per_mm": _or_none(run.slope_um_per_mm), "trust": run.trust, "at_s": run.at_s,
             }  # fmt: skip
@@ -324,7 +329,7 @@ class Compensator:
             )
             self._run[name] = _Running(
                 State.from_plain(one["model"]), State.from_plain(one["region"]), learned,
-                Axis.from_plain(one["safety"]), _or_nan(one["error_um"]), _or_nan(one["free_um"]),
+                Axis.from_plain(one["safety"]), Axis.from_plain(one["slope_safety"]), _or_nan(one["error_um"]), _or_nan(one["free_um"]),
                 np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
                 at_s=float(one["at_s"]),
             )  # fmt: skip

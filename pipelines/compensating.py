@@ -32,6 +32,7 @@ from pipelines.settings import home
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
 _SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
 _LOST_SAMPLES = 3  # in a row before the input is stale
+_LEVER_MM = 1000.0  # of an axis whose position channel has no range
 _ROOM = 1.25  # of the largest error of the training: a correction beyond is a failure of the model
 
 
@@ -44,10 +45,12 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     channels = stored.machine.batch_channels()
     family = stored.family
     empty = Batch(stored.machine.machine, "no rows", pd.DataFrame({"time_s": []}), channels)
+    program = family.program(channels, period_s)
+    ends_mm = stored.machine.channels[program.along].range if program.along else None
+    lever_mm = max(abs(end - program.reference_mm) for end in ends_mm) if ends_mm else _LEVER_MM
     return AxisModel(
-        family.target, family.program(channels, period_s), family.inputs,
-        tuple(feature_unit(empty, i) for i in family.inputs), stored.region, stored.region.program(channels, period_s),
-        stored.bound, stored.updater, limits,
+        family.target, program, family.inputs, tuple(feature_unit(empty, i) for i in family.inputs), stored.region,
+        stored.region.program(channels, period_s), stored.bound, stored.updater, limits, lever_mm,
     )  # fmt: skip
 
 

@@ -213,20 +213,41 @@ def test_a_lost_driver_holds() -> None:
     assert any(c.state["z"] == "hold" and "lost: spindle_rpm" in c.reasons["z"] for c in done[23:])
 
 
-def test_an_axis_with_a_slope_sends_both_in_the_same_share() -> None:
-    b = Builder(make_toy_batches(1)[0].channels, 300.0)
+def along_an_axis(limits: Limits) -> Compensator:
+    """Error 2 µm and slope 0.05 µm/mm per K of t0, over 200 mm."""
+    train = make_toy_batches(4, 40)
+    b = Builder(train[0].channels, 300.0)
     x = b.since_first(b.features(["t0"]))
     program = b.program([b.affine(x, np.array([[2.0]])), b.affine(x, np.array([[0.05]]))], False, "position", 100.0)
-    train = make_toy_batches(4, 40)
-    region = Region.of(train, ("t0",))
-    limits = replace(QUICK, max_offset_um=4.0)
-    model = AxisModel("z", program, ("t0",), ("K",), region, region.program(train[0].channels, 300.0), limits=limits)
-    machine = Compensator("toy", [model], period_s=300.0)
-    low_degC = region.ranges["t0@start"][0]
-    for k, rise_K in enumerate((0.0, 1.0, 1.0, 4.0, 4.0)):
-        values = {"t0": low_degC + rise_K, "spindle_rpm": 2000.0}
-        done = machine.take(Sample(1e9 + 300.0 * k, values), 300.0 * k)
-        if rise_K == 1.0 and k == 2:
-            assert done.offset_um["z"] == pytest.approx(-2.0) and done.slope_um_per_m["z"] == pytest.approx(-50.0)
-    assert done.offset_um["z"] == -4.0  # of -8 wanted
-    assert done.slope_um_per_m["z"] == pytest.approx(-100.0)  # of -200
+    region = Region(  # everywhere
+        {"t0": (-1e3, 1e3)}, {"t0": "K"}, (), np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0)
+    )  # fmt: skip
+    model = AxisModel(
+        "z", program, ("t0",), ("K",), region, region.program(train[0].channels, 300.0), limits=limits, lever_mm=200.0
+    )  # fmt: skip
+    return Compensator("toy", [model], period_s=300.0)
+
+
+def test_offset_and_slope_are_each_limited_in_size_and_rate() -> None:
+    machine = along_an_axis(replace(QUICK, max_offset_um=11.0, step_um=5.0))
+    rises_K = (0, 1, 1, 6, 6, 6)
+    done = [machine.take(Sample(1e9 + 300.0 * k, {"t0": 20.0 + r}), 300.0 * k) for k, r in enumerate(rises_K)]
+    assert done[2].offset_um["z"] == pytest.approx(-2.0)
+    assert [c.slope_um_per_m["z"] for c in done[1:3]] == pytest.approx([-25.0, -50.0])  # 5 µm at 200 mm
+    assert done[-1].offset_um["z"] == -11.0  # of -12 wanted
+    assert done[-1].slope_um_per_m["z"] == pytest.approx(-55.0)  # 11 µm at 200 mm, of 60 wanted
+    steps = np.diff([c.slope_um_per_m["z"] * 0.2 for c in done])
+    assert np.abs(steps).max() <= 5.0 + 1e-9
+
+
+def test_a_slope_fades_with_its_offset_and_survives_a_restart() -> None:
+    machine = along_an_axis(replace(QUICK, hold_s=10.0, stale_s=400.0))
+    for k in range(3):
+        done = machine.take(Sample(1e9 + 300.0 * k, {"t0": 20.0 + min(k, 1)}), 300.0 * k)
+    again = along_an_axis(replace(QUICK, hold_s=10.0, stale_s=400.0))
+    again.restore(json.loads(json.dumps(machine.as_plain())))
+    kept = again.silence(0.0, 1e9)
+    assert kept.slope_um_per_m["z"] == done.slope_um_per_m["z"] == pytest.approx(-50.0)
+    for k in range(1, 5):
+        faded = again.silence(500.0 * k, 1e9)
+    assert faded.offset_um["z"] == faded.slope_um_per_m["z"] == 0.0
