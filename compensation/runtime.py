@@ -297,7 +297,8 @@ class Compensator:
             }  # fmt: skip
             axes[name] = {
                 "model": run.model.as_plain(), "region": run.region.as_plain(), "learned": learned,
-                "safety": run.safety.as_plain(), "slope_safety": run.slope_safety.as_plain(), "error_um": _or_none(run.error_um),
+                "safety": run.safety.as_plain(), "slope_safety": run.slope_safety.as_plain(),
+                "error_um": _or_none(run.error_um),
                 "free_um": _or_none(run.free_um), "scaled": [_or_none(v) for v in run.scaled.tolist()],
                 "slope_um_per_mm": _or_none(run.slope_um_per_mm), "trust": run.trust, "at_s": run.at_s,
             }  # fmt: skip
@@ -329,7 +330,8 @@ class Compensator:
             )
             self._run[name] = _Running(
                 State.from_plain(one["model"]), State.from_plain(one["region"]), learned,
-                Axis.from_plain(one["safety"]), Axis.from_plain(one["slope_safety"]), _or_nan(one["error_um"]), _or_nan(one["free_um"]),
+                Axis.from_plain(one["safety"]), Axis.from_plain(one["slope_safety"]),
+                _or_nan(one["error_um"]), _or_nan(one["free_um"]),
                 np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
                 at_s=float(one["at_s"]),
             )  # fmt: skip
