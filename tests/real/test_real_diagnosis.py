@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
 
 from data.machine import Machine
 from diagnosis.contracts import Fitted
@@ -117,6 +118,7 @@ def diagnosed_cell(*rates: str) -> Diagnosis:
     return diagnose(bare_cell(machine), [b for b in batches if b.batch_id[-2:] in rates])
 
 
+@pytest.mark.slow
 def test_the_cell_lacks_its_lost_voltage_and_its_charge_and_both_hold_at_rates_left_out() -> None:
     """As far as they do: at 4C the can is 0.6 K off, sixty times its noise, and the strain 32 um/m."""
     found = diagnosed_cell("1C", "2C", "3C", "4C")
@@ -129,6 +131,7 @@ def test_the_cell_lacks_its_lost_voltage_and_its_charge_and_both_hold_at_rates_l
     assert can["after"].idxmax() == strain["after"].idxmax() == "Q30_S001_4C"
 
 
+@pytest.mark.slow
 def test_two_rates_are_too_few_to_be_sure_and_it_says_so() -> None:
     found = diagnosed_cell("2C", "4C")
     assert found.remarks and "2 runs only" in found.remarks[0]
