@@ -1,1 +1,1 @@
-"""Compensation at the machine: a promoted model beside the control, safely, and its exports to controls."""
+"""Compensation at the machine: a promoted model next to the control, safely, and its exports to controls."""

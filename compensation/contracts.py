@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from math import isfinite
+from typing import Any, Protocol
+
+from data.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -64,3 +67,15 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Gives back what is open; may be called twice."""
+
+
+def check_limits(what: str, limits: Any, may_be_zero: Collection[str] = ()) -> None:
+    """Raises InputError where a field of a dataclass of limits is no finite number above 0, or at 0 where it may be."""
+    for name, spec in limits.__dataclass_fields__.items():
+        value, zero = getattr(limits, name), name in may_be_zero
+        if not isinstance(value, int | float) or not isfinite(value) or value < 0 or (value == 0 and not zero):
+            bound = "at or above 0" if zero else "above 0"
+            raise InputError(
+                f"{what}: got {name}={value!r}, expected a finite number {bound}; leave it out for the default of "
+                f"{spec.default}"
+            )

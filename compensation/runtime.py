@@ -101,7 +101,7 @@ class Compensator:
         axes: their models.
         substitutes: learned at training; None: sensors are not guarded.
         period_s: grid on which the models run, s; they are made for it.
-        log: told what is noticed, one line each.
+        log: called with one line for everything that is noticed.
     """
 
     def __init__(
@@ -124,6 +124,8 @@ class Compensator:
         self.guard = Guard(substitutes) if substitutes is not None else None
         self._watch = self.guard.begin() if self.guard is not None else None
         self._steps = {a.axis: (a.program.runner(), a.watched.runner(), a.region.row()) for a in axes}
+        self._inputs = {a.axis: _inputs_of(a) for a in axes}
+        self._wanted = tuple(dict.fromkeys(c for a in axes for c in a.program.channels))
         self._run = {a.axis: self._fresh(a) for a in axes}
         self._grid_s: float | None = None  # time stamp of the grid's last row
         self._held: dict[str, float] = {}
@@ -226,12 +228,10 @@ class Compensator:
         return None, notes
 
     def _missing(self, values: Mapping[str, float]) -> list[str]:
-        wanted = dict.fromkeys(c for a in self.axes for c in a.program.channels)
-        return [c for c in wanted if c not in values]
+        return [c for c in self._wanted if c not in values]
 
     def _lost(self, time_s: float) -> list[str]:
-        wanted = dict.fromkeys(c for a in self.axes for c in a.program.channels)
-        return [c for c in wanted if time_s - self._arrived_s.get(c, time_s) > self._patience_s]
+        return [c for c in self._wanted if time_s - self._arrived_s.get(c, time_s) > self._patience_s]
 
     def _rows(self, time_s: float, rows: Sequence[Mapping[str, float]]) -> None:
         """Steps every model through rows of the grid, the last one at `time_s`."""
@@ -252,10 +252,8 @@ class Compensator:
                 run.error_um, _, run.learned = a.updater.step(run.learned, run.at_s, run.free_um, run.scaled)
 
     def _scaled(self, a: AxisModel, seen: Array, predicted_um: float) -> Array:
-        if not a.inputs:
-            return np.array([predicted_um])
-        names = list(a.region.ranges)
-        return np.array([seen[names.index(i)] / scale_of(u) for i, u in zip(a.inputs, a.units, strict=True)])
+        places, scale = self._inputs[a.axis]
+        return seen[places] / scale if a.inputs else np.array([predicted_um])
 
     def _read(self, axis: str, measured_um: float) -> None:
         """A reading of the error that is left with the correction that is being sent."""
@@ -335,6 +333,12 @@ class Compensator:
                 np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
                 at_s=float(one["at_s"]),
             )  # fmt: skip
+
+
+def _inputs_of(a: AxisModel) -> tuple[list[int], Array]:
+    """Places of the inputs among the watched quantities, and what each is divided by."""
+    names = list(a.region.ranges)
+    return [names.index(i) for i in a.inputs], np.array([scale_of(u) for u in a.units])
 
 
 def _row(program: Program, values: Mapping[str, float]) -> Array:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any, Literal, Self, get_args
 
+from compensation.contracts import check_limits
 from data.errors import InputError, one_of
 
 State = Literal["off", "warm-up", "active", "hold", "fade-out"]
@@ -59,14 +60,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         """Raises InputError where a limit is not finite, negative, or 0 where that makes no sense."""
-        for name, value in self.__dict__.items():
-            zero = name in ("hold_s", "warm_up_s")
-            if not isinstance(value, int | float) or not isfinite(value) or value < 0 or (value == 0 and not zero):
-                bound = "at or above 0" if zero else "above 0"
-                raise InputError(
-                    f"safety limits: got {name}={value!r}, expected a finite number {bound}; "
-                    f"leave it out for the default of {type(self).__dataclass_fields__[name].default}"
-                )
+        check_limits("safety limits", self, ("hold_s", "warm_up_s"))
 
 
 @dataclass(frozen=True)

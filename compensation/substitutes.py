@@ -21,14 +21,15 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
+from compensation.contracts import check_limits
 from data.arrays import Array, Mask
 from data.batch import Batch
+from data.checks.base import THERMAL
 from data.errors import InputError, one_of
 
 Status = Literal["ok", "lost", "implausible", "stepping", "frozen"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 
-_ROLES = ("temperature", "ambient")
 _LEAST_BATCHES = 2  # one is left out
 _LEAST_ROWS = 3  # of a batch with all channels: a start, and a rise that changes
 _NOISE_SHARES = (1e-5, 1e-4, 1e-3, 1e-2)  # noise variance tried, as a share of the mean square rise
@@ -66,12 +67,7 @@ class GuardLimits:
 
     def __post_init__(self) -> None:
         """Raises InputError where a limit is not finite or not above 0."""
-        for name, value in self.__dict__.items():
-            if not isinstance(value, int | float) or not np.isfinite(value) or value <= 0:
-                raise InputError(
-                    f"limits of sensors: got {name}={value!r}, expected a finite number above 0; "
-                    f"leave it out for the default of {type(self).__dataclass_fields__[name].default}"
-                )
+        check_limits("limits of sensors", self)
 
 
 @dataclass(frozen=True)
@@ -113,7 +109,7 @@ class Substitutes:
         for name in channels:
             for batch in batches:
                 batch.values(name)  # raises where a batch lacks it
-        names = tuple(dict.fromkeys(n for n in channels if batches and batches[0].channels[n].role in _ROLES))
+        names = tuple(dict.fromkeys(n for n in channels if batches and batches[0].channels[n].role in THERMAL))
         runs = [run for batch in batches if len((run := _complete(batch, names))[0]) >= _LEAST_ROWS] if names else []
         if len(runs) < _LEAST_BATCHES:
             raise InputError(

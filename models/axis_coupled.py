@@ -379,10 +379,6 @@ class AxisCoupled(Family):
             outputs.append(b.affine(x, weights))
         return b.program(outputs, False, f["along"], float(f["fixed_end_mm"]))
 
-    def operations(self, b: Builder) -> Sequence[int]:
-        """See `program`."""
-        return []
-
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """NaN at a row without a position, or where a chosen input is missing."""
         out = []

@@ -172,6 +172,16 @@ class Family(ABC):
         builder = Builder(channels, step_s)
         return builder.program(self.operations(builder), self.zero_start)
 
+    @classmethod
+    def has_program(cls) -> bool:
+        """Whether the family can be written as a program."""
+        return cls.operations is not Family.operations or cls.program is not Family.program
+
+    def started_inputs(self, b: Builder) -> int:
+        """The inputs as a node, relative to the batch's start as in `started`; as they are for a free level."""
+        x = b.features(self.inputs)
+        return b.since_first(x) if self.zero_start else x
+
     def operations(self, b: Builder) -> Sequence[int]:
         """The nodes of `program` that give what `respond` gives. Override this where the model is a program.
 
@@ -180,7 +190,7 @@ class Family(ABC):
         """
         from models import FAMILIES
 
-        those = [key for key, family in FAMILIES.items() if family.operations is not Family.operations]
+        those = [key for key, family in FAMILIES.items() if family.has_program()]
         raise InputError(f"family {self.key} cannot be written as a program; those that can: {', '.join(those)}")
 
     def n_parameters(self) -> int:

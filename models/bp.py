@@ -84,9 +84,8 @@ class BP(Family):
         return [self._predict(x[design.rows(k)]) for k in batches]
 
     def operations(self, b: Builder) -> Sequence[int]:
-        f, x = self.fitted, b.features(self.inputs)
-        h, p = self.hidden, len(self.inputs)
-        u = b.scaled(b.since_first(x) if self.zero_start else x, f["x_spread"], f["x_mean"])
+        f, h, p = self.fitted, self.hidden, len(self.inputs)
+        u = b.scaled(self.started_inputs(b), f["x_spread"], f["x_mean"])
         nets = np.atleast_2d(np.asarray(f["nets"], float))
         w, offset, v, c = np.split(nets, [h * p, h * (p + 1), h * (p + 2)], axis=1)
         hidden = b.affine(u, w.reshape(-1, p), offset.ravel())

@@ -137,8 +137,7 @@ class GaussianProcess(Family):
     def operations(self, b: Builder) -> Sequence[int]:
         setting, alpha = self._setting(), np.asarray(self.fitted["alpha"], float)
         support = np.atleast_2d(np.asarray(self.fitted["support"], float))
-        x = b.features(self.inputs)
-        u = b.scaled(b.since_first(x) if self.zero_start else x, np.asarray(self.fitted["scale"], float))
+        u = b.scaled(self.started_inputs(b), np.asarray(self.fitted["scale"], float))
         p = max(1, len(self.inputs))
         line = b.affine(u, (setting.line / p * alpha @ support)[None], 0.0 if self.zero_start else float(alpha.sum()))
         if not setting.curve > 0:

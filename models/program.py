@@ -34,10 +34,9 @@ import numpy as np
 
 from data.arrays import Array
 from data.batch import Channel
+from data.checks.base import THERMAL
 from data.errors import InputError
 from features.rises import RATE_WINDOW_S, parsed_feature
-
-THERMAL = ("temperature", "ambient")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ Watched = Mapping[str, Array]  # quantity -> (n,) of one batch
 
 SLACK = 0.05  # widths beyond the trained range that still count as inside
 PATTERN = "pattern of the points"
-_LEAST_WIDTH = {"K": 5.0, "degC": 5.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}  # a narrow range is not a wall
+LEAST_WIDTH = {"K": 5.0, "degC": 5.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}  # a narrow range is not a wall
 _LEAST_WIDTH_OF_PATTERN_K = 2.0  # sensors scatter about their common course by so much in any machine
 
 
@@ -80,9 +80,8 @@ class Region:
         Quantities that the batch lacks (a driver not recorded) are skipped.
         """
         out = {}
-        for name, (low, high) in self.ranges.items():
+        for name, low, high, width in zip(self.ranges, *self.widths(), strict=True):
             if name in values:
-                width = max(high - low, _LEAST_WIDTH.get(self.units.get(name, ""), 0.0)) or 1.0
                 out[name] = _excess(values[name], low, high) / width
         if len(self.points) > 1 and all(i in values for i in self.points):
             scores = (np.column_stack([values[i] for i in self.points]) - self.centre) @ self.directions
@@ -109,7 +108,7 @@ class Region:
     def widths(self) -> tuple[Array, Array, Array]:
         """Least and greatest value and width (q,) of every watched quantity."""
         low, high = (np.array([ends[side] for ends in self.ranges.values()]) for side in (0, 1))
-        least = np.array([_LEAST_WIDTH.get(self.units.get(n, ""), 0.0) for n in self.ranges])
+        least = np.array([LEAST_WIDTH.get(self.units.get(n, ""), 0.0) for n in self.ranges])
         width = np.maximum(high - low, least)
         return low, high, np.where(width == 0.0, 1.0, width)
 

@@ -239,15 +239,14 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
     Raises:
         InputError: see `compensator` and `Family.program`.
     """
-    compensator(list(models.values()), limits, period_s)
+    running = compensator(list(models.values()), limits, period_s)
     digest = hashlib.sha256()
     for folder in folders.values():
         inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
         for name in FILES:
             digest.update((inner / name).read_bytes())
     axes = []
-    for stored in models.values():
-        made = axis_model(stored, limits.of(stored), period_s)
+    for stored, made in zip(models.values(), running.axes, strict=True):
         trained = {c: (low, high) for c, (low, high) in stored.info.get("trained", {}).items()}
         axes.append(ExportedAxis(made.axis, made.program, trained, made.limits))
     first = next(iter(models.values()))

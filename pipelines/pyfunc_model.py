@@ -63,14 +63,14 @@ class Served:
                 )
         import onnxruntime
 
-        self.told = json.loads((folder / "serving.json").read_text(encoding="utf-8"))
+        self.stated = json.loads((folder / "serving.json").read_text(encoding="utf-8"))
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3  # errors alone
         options.intra_op_num_threads = 1  # a row is small
         self.model, self.region = (
             onnxruntime.InferenceSession(str(folder / name), options, ["CPUExecutionProvider"]) for name in SERVED[1:]
         )
-        region = self.told["region"]
+        region = self.stated["region"]
         self.low, self.high, self.width = (np.array(region[k], float) for k in ("low", "high", "width"))
         self.pattern = {k: np.array(region[k], float) for k in ("centre", "directions", "least", "most", "spread")}
 
@@ -80,7 +80,7 @@ class Served:
         Raises:
             ValueError: a column is missing, or the rows of a batch have another step than the model's.
         """
-        absent = [c for c in ("time_s", *self.told["required"]) if c not in table]
+        absent = [c for c in ("time_s", *self.stated["required"]) if c not in table]
         if absent:
             raise ValueError(f"table: no column {', '.join(map(repr, absent))}; the model needs it")
         parts = [np.arange(len(table))]
@@ -90,12 +90,12 @@ class Served:
         for rows in parts:
             part = table.iloc[rows]
             self._check_step(part["time_s"].to_numpy(float))
-            predicted[rows] = self._run(self.model, self.told["channels"], part)[:, 0]
-            outside[rows] = self._beyond(self._run(self.region, self.told["watched"], part)) > _SLACK
+            predicted[rows] = self._run(self.model, self.stated["channels"], part)[:, 0]
+            outside[rows] = self._beyond(self._run(self.region, self.stated["watched"], part)) > _SLACK
         return pd.DataFrame({"predicted_um": predicted, "outside_region": outside}, index=table.index)
 
     def _check_step(self, time_s: Any) -> None:
-        step_s, rises_s = self.told["step_s"], np.diff(time_s)
+        step_s, rises_s = self.stated["step_s"], np.diff(time_s)
         if len(rises_s) and not np.allclose(rises_s, step_s, rtol=0.01):
             raise ValueError(
                 f"table: 'time_s' rises by {rises_s.min():g} to {rises_s.max():g} s; the model steps by {step_s:g} s: "
@@ -112,7 +112,7 @@ class Served:
         """Distance (n,) from the trained region in its widths, 0 inside."""
         beyond = np.maximum(np.maximum(self.low - watched, watched - self.high), 0.0) / self.width
         far = np.nan_to_num(beyond, nan=0.0).max(axis=1, initial=0.0)
-        points, p = self.told["region"]["points"], self.pattern
+        points, p = self.stated["region"]["points"], self.pattern
         if len(points) > 1:
             scores = (watched[:, points] - p["centre"]) @ p["directions"]
             off = np.maximum(np.maximum(p["least"] - scores, scores - p["most"]), 0.0) / p["spread"]

@@ -481,7 +481,7 @@ def _at_the_machine(new: Newcomer) -> tuple[Updater | None, Substitutes | None]:
     minutes to be fitted again.
     """
     updater, substitutes, family = None, None, new.family
-    if not new.batches or type(family).operations is Family.operations:
+    if not new.batches or not family.has_program():
         return None, None
     batches = sorted(new.batches, key=lambda b: (b.start is None, b.start, b.batch_id))
     with suppress(InputError):
@@ -506,7 +506,7 @@ def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.Dat
 
 def _requirements(family: Family) -> list[str]:
     torch = ("torch",) if hasattr(sys.modules[type(family).__module__], "torch") else ()
-    if type(family).operations is not Family.operations:
+    if family.has_program():
         return [f"{p}=={installed(p).partition('+')[0]}" for p in _SERVED_PACKAGES]
     return [f"{p}=={installed(p).partition('+')[0]}" for p in (*_MODEL_PACKAGES, *torch)]
 

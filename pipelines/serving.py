@@ -33,7 +33,7 @@ def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str,
         (folder / name).write_bytes(whole if isinstance(whole, bytes) else whole.encode())
     low, high, width = stored.region.widths()
     pattern = stored.region.pattern()
-    told = {
+    stated = {
         "schema": "thermodrift.serving/1", "step_s": step_s, "channels": list(model.channels),
         "required": list(stored.channels()), "watched": list(region.channels), "simulated": stored.simulated,
         "region": {
@@ -41,7 +41,7 @@ def write_served(stored: StoredModel, folder: Path, step_s: float) -> tuple[str,
             **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in pattern.items()},
         },
     }  # fmt: skip
-    (folder / "serving.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    (folder / "serving.json").write_text(json.dumps(stated, indent=1), encoding="utf-8")
     add_hashes(folder, SERVED)
     return SERVED
 

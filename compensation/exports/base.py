@@ -16,12 +16,12 @@ import numpy as np
 from data.errors import InputError
 from data.files import check_folder, staged
 from models.program import Program
+from models.trust import LEAST_WIDTH
 
 SIGN = (
     "The model gives the error in um. The control adds the negative of the error: offset_um = -error_um, limited in "
     "size and rate."
 )
-_LEAST_WIDTH = {"K": 5.0, "degC": 5.0, "K/h": 10.0, "rpm": 1000.0, "mm/min": 1000.0}  # as in models.trust
 _LEAST_LEVER_M = 1e-3  # a slope acts over at least 1 mm, so that its limit stays finite
 _LINE = 110
 
@@ -94,7 +94,7 @@ class AxisModel:
         out = []
         for name, unit in zip(self.program.channels, self.program.units, strict=True):
             low, high = self.region.get(name, (-inf, inf))
-            width = max(high - low, _LEAST_WIDTH.get(unit, 0.0))
+            width = max(high - low, LEAST_WIDTH.get(unit, 0.0))
             out.append((low - width, high + width) if isfinite(width) else (-inf, inf))
         return out
 

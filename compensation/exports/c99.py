@@ -70,8 +70,8 @@ def one_step(export: Export) -> str | None:
     steps = {a.axis: a.program.step_s for a in export.axes}
     if len(set(steps.values())) == 1:
         return None
-    told = ", ".join(f"{axis} {step_s:g} s" for axis, step_s in steps.items())
-    return f"one function runs all axes at one step, got {told}; export them one by one or resample"
+    stated = ", ".join(f"{axis} {step_s:g} s" for axis, step_s in steps.items())
+    return f"one function runs all axes at one step, got {stated}; export them one by one or resample"
 
 
 def channels_of(export: Export) -> dict[str, str]:

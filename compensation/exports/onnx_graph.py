@@ -42,16 +42,16 @@ class OnnxExport(Exporter):
 
 def metadata(export: Export, axis: AxisModel) -> dict[str, str]:
     """What `metadata_props` states: texts as they are, everything else as JSON."""
-    told = axis.described()
-    channels = {part: json.dumps([i[name] for i in told["inputs"]]) for part, name in _COLUMNS.items()}
-    rest = {key: json.dumps(told[key]) for key in ("outputs", "position", "step_s", "trained_region", "limits")}
+    stated = axis.described()
+    channels = {part: json.dumps([i[name] for i in stated["inputs"]]) for part, name in _COLUMNS.items()}
+    rest = {key: json.dumps(stated[key]) for key in ("outputs", "position", "step_s", "trained_region", "limits")}
     sizes = [n.state_size() for n in axis.program.nodes[1:]]
     return {
         **{key: value if isinstance(value, str) else json.dumps(value) for key, value in export.described().items()},
         "axis": axis.axis,
         **channels,
         **rest,
-        "fallback": told["fallback"],
+        "fallback": stated["fallback"],
         "state": json.dumps({"nan": len(axis.program.channels), "zeros": sum(sizes)}),
     }
 

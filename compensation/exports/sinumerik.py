@@ -53,9 +53,9 @@ class SinumerikExport(StraightLineExport):
 
 def _axis(a: AxisModel) -> str:
     p, name = a.program, a.axis.upper()
-    factor, told = _factor(a)
+    factor, remarks = _factor(a)
     most_um = factor * MOST_VELOCITY_MM_PER_MIN * 1000.0 / 60.0 * CYCLE_S
-    head = [f"Axis {name}", *formula_lines(a), *warnings(a, formulas(a)), *told]
+    head = [f"Axis {name}", *formula_lines(a), *warnings(a, formulas(a)), *remarks]
     data = [
         (f"$MA_TEMP_COMP_TYPE[{name}] = {'3' if p.along else '1'}", "MD32750: bit 0 offset, bit 1 slope"),
         (f"$MA_COMP_ADD_VELO_FACTOR[{name}] = {factor:.9f}", f"MD32760: at most {most_um:.4g} um per cycle"),
@@ -76,14 +76,18 @@ def _axis(a: AxisModel) -> str:
 def _factor(a: AxisModel) -> tuple[float, list[str]]:
     """MD32760, and what is to be said of it: the rate limit, raised where it would cut tan β."""
     factor = a.limits.rate_um_per_s * 60.0 / 1000.0 / MOST_VELOCITY_MM_PER_MIN
-    told = [
+    remarks = [
         f"The rate limit of {a.limits.rate_um_per_s:g} um/s is {a.limits.rate_um_per_s * CYCLE_S:.4g} um per cycle, a "
         f"factor of {factor:.3g}."
     ]
     needed = _MARGIN * a.max_slope_um_per_m * 1e-6 if a.program.along else 0.0
     if max(needed, _LEAST_FACTOR) > factor:
-        told.append("MD32760 is larger, since it also caps tan beta and has few digits; the PLC keeps the rate limit.")
+        remarks.append(
+            "MD32760 is larger, since it also caps tan beta and has few digits; the PLC keeps the rate limit."
+        )
     chosen = max(factor, needed, _LEAST_FACTOR)
     if chosen > _MOST_FACTOR:
-        told.append(f"WARNING: axis {a.axis}: MD32760 would be {chosen:.3g}, above {_MOST_FACTOR:g}; it is cut there")
-    return min(chosen, _MOST_FACTOR), told
+        remarks.append(
+            f"WARNING: axis {a.axis}: MD32760 would be {chosen:.3g}, above {_MOST_FACTOR:g}; it is cut there"
+        )
+    return min(chosen, _MOST_FACTOR), remarks

@@ -128,9 +128,9 @@ def formulas(axis: AxisModel) -> list[Formula]:
     return out
 
 
-def warnings(axis: AxisModel, lines: Sequence[Formula], most_um: float = inf, told: str = "") -> list[str]:
-    """Lines that state where K0 or tan β can leave its range in the trained region; `told` names the control's."""
-    offset_um = (most_um, told, ""), (axis.limits.max_offset_um, "max_offset_um", "; it is cut there")
+def warnings(axis: AxisModel, lines: Sequence[Formula], most_um: float = inf, limit_name: str = "") -> list[str]:
+    """Lines that state where K0 or tan β can leave its range in the trained region; `limit_name`: the control's."""
+    offset_um = (most_um, limit_name, ""), (axis.limits.max_offset_um, "max_offset_um", "; it is cut there")
     slope = ((axis.max_slope_um_per_m, "its limit", "; it is cut there"),)
     quantities = (("offset", "um", 1.0, offset_um), ("slope", "um/m", 1000.0, slope))
     out = []

@@ -74,8 +74,7 @@ class KernelExpansion(Family):
     def operations(self, b: Builder) -> Sequence[int]:
         f = self.fitted
         scale, support, alpha = (np.asarray(f[k], float) for k in ("scale", "support", "alpha"))
-        x = b.features(self.inputs)
-        u = b.scaled(b.since_first(x) if self.zero_start else x, scale)
+        u = b.scaled(self.started_inputs(b), scale)
         p = max(1, len(self.inputs))
         curve = b.add("kernel", [u], 1, support=support, weights=alpha, sharpness=1.0 / (2.0 * p * f["sigma"] ** 2))
         line = b.affine(u, (LINEAR_WEIGHT / p * alpha @ support)[None] * self.linear)

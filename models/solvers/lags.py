@@ -90,11 +90,7 @@ def columns_program(b: Builder, inputs: Sequence[str], names: Sequence[str]) -> 
     drivers = [name for name, spec in b.known.items() if spec.role == "driver"]
     x, held = b.features(inputs), b.channels(drivers, required=False) if drivers else -1
     parts = [b.lags(x, [60.0 * lag_min for lag_min in _LAGS_MIN], 1.0)]
-    powers = [
-        (d, power)
-        for d, name in enumerate(drivers)
-        for power in ((1.0, 2.0) if b.known[name].unit == "rpm" else (1.0,))
-    ]
+    powers = [(d, power) for d, name in enumerate(drivers) for power in _powers(b.known[name].unit)]
     if powers:
         signals = b.pick(held, [d for d, _ in powers])
         load = b.add("power", [signals], len(powers), exponents=[power for _, power in powers])

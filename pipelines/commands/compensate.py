@@ -1,4 +1,4 @@
-"""`thermodrift compensate`: a promoted model beside the control."""
+"""`thermodrift compensate`: a promoted model next to the control."""
 
 from __future__ import annotations
 
@@ -50,6 +50,6 @@ def compensate(
     sinks = [open_sink(address, machine) for address in to or ["-"]]
     kept = StateFile(state or home() / "compensation" / f"{machine.machine}.json") if state or not replay else None
     labels = ", ".join(f"{a.axis} ±{a.limits.max_offset_um:.3g} µm" for a in running.axes)
-    told = "SIMULATED model; " if any(m.simulated for m in stored) else ""
-    console.note(f"{told}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
+    stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
+    console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
     serve(running, source, sinks, kept, console.note, replay)

@@ -18,11 +18,10 @@ from compensation.exports.straight_line import formulas
 from data.batch import Batch, Channel
 from data.errors import InputError
 from models import FAMILIES
-from models.base import Family
 from models.program import Builder, Program, replay
 
 DIGEST = "0123456789abcdef" * 4
-PROGRAMS = tuple(k for k, f in FAMILIES.items() if f.operations is not Family.operations)
+PROGRAMS = tuple(k for k, f in FAMILIES.items() if f.has_program())
 Batches = Callable[..., list[Batch]]
 STRAIGHT = ("sinumerik", "heidenhain", "fanuc")
 LINEAR = ("mlr", "ridge", "pcr", "pls", "huber", "elastic_net", "axis_coupled")

@@ -15,7 +15,7 @@ from models import FAMILIES
 from models.base import Family
 from models.program import Program, State, replay
 
-PROGRAMS = [key for key, family in FAMILIES.items() if family.operations is not Family.operations]
+PROGRAMS = [key for key, family in FAMILIES.items() if family.has_program()]
 BY_TIME = [key for key in PROGRAMS if key != "axis_coupled"]
 KINDS = ("t0", "t1@rate", "t2@ambient", "t3@lag30min", "t1@start", "spindle_rpm", "spindle_rpm@lag20min", "room")
 Batches = Callable[..., list[Batch]]
