@@ -40,8 +40,8 @@ _FIRST_CONNECTION_S = 5.0  # that a new sink waits for its server, before the fi
 _LONGEST_DELAY_S = 5.0  # between two tries to connect
 _INTEGER_BITS = {"SByte": 7, "Byte": 8, "Int16": 15, "UInt16": 16, "Int32": 31, "UInt32": 32, "Int64": 63, "UInt64": 64}
 
-# asyncua logs tracebacks at every lost connection, which is reported here in one line
-logging.getLogger("asyncua").addHandler(logging.NullHandler())
+# asyncua logs every lost connection with a traceback, which is reported here in one line
+logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
 class Nodes(BaseModel):
