@@ -49,10 +49,15 @@ def counted(step: str, work: Callable[[T], R], of: int, done: Done | None) -> Ca
     def counting(item: T) -> R:
         nonlocal finished
         result = work(item)
-        label = " ".join(item) if isinstance(item, tuple) and all(isinstance(part, str) for part in item) else ""
         with lock:
             finished += 1
-            done(f"{step} {label}".rstrip(), finished, of)
+            done(f"{step} {label(item)}".rstrip(), finished, of)
         return result
 
     return counting
+
+
+def label(item: object) -> str:
+    """An item as progress and task names show it: a name, or names and numbers; else empty."""
+    parts = item if isinstance(item, tuple) else (item,)
+    return " ".join(map(str, parts)) if all(isinstance(part, str | int) for part in parts) else ""

@@ -21,8 +21,8 @@ def schedule(
 
     settings.configure_environment()
     from data.machine import load_machine
-    from pipelines.flows import serve_schedule
     from pipelines.recordings import check_recordings
+    from pipelines.scheduling import serve_schedule
 
     load_machine(machine)
     check_recordings(recordings)

@@ -67,9 +67,11 @@ def test_what_stops_it_is_one_line_and_is_not_tried_again(
 def test_retraining_tells_of_the_diagnosis(
     flows: ModuleType, toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flows, "TrainRequest", functools.partial(TrainRequest, targets=("z",), plan=SMALL))
+    from pipelines import scheduling
+
+    monkeypatch.setattr(scheduling, "TrainRequest", functools.partial(TrainRequest, targets=("z",), plan=SMALL))
     monkeypatch.setattr(training, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
     machine = write_machine(tmp_path / "m.yml", "flow-season")
-    words = flows.retrain(str(machine), [str(write_recordings(tmp_path / "in"))])
+    words = scheduling.retrain(str(machine), [str(write_recordings(tmp_path / "in"))])
     assert words.startswith("flow-season-z version 1 is challenger: no trustworthy model")
     assert words.endswith("; z: left-out S has grown; diagnosed")
