@@ -38,9 +38,10 @@ lock: $(READY)  ## renew the lock file within the ranges of pyproject.toml
 	(echo "# Every direct and indirect version, within pyproject.toml's ranges; \`make lock\` renews it."; \
 	 $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f) > requirements.lock
 
+# What is imported is compiled at its first use: compiling every module of every package takes a third of the set-up.
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v == (3, 11) else f"thermodrift needs Python 3.11, got {v[0]}.{v[1]}; call make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
