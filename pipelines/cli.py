@@ -24,6 +24,7 @@ from pipelines.commands.promote import promote, rollback
 from pipelines.commands.prove import app as prove
 from pipelines.commands.registry import registry
 from pipelines.commands.rehearse import rehearse
+from pipelines.commands.replay import replay
 from pipelines.commands.report import report
 from pipelines.commands.reproduce import reproduce
 from pipelines.commands.schedule import schedule
@@ -40,7 +41,7 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
     describe, ingest, train, report, promote, rollback, status, registry, predict, rehearse, compensate, export,
-    schedule, simulate, calibrate, diagnose, demonstrate, reproduce,
+    replay, schedule, simulate, calibrate, diagnose, demonstrate, reproduce,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         read,
         registry,
         rehearse,
+        replay,
         simulate,
         train,
     )
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "diagnose",
-    "export", "ingest", "load_machine", "load_model", "predict", "read", "registry", "rehearse", "simulate",
+    "export", "ingest", "load_machine", "load_model", "predict", "read", "registry", "rehearse", "replay", "simulate",
     "train",
 ]  # fmt: skip
 _MODULES = {

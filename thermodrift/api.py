@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from data.lake import Lake
     from diagnosis.result import Diagnosis
     from models.crossing import Plan
+    from models.replay import Replay
     from pipelines.commands.simulate import Simulated
     from pipelines.model_store import StoredModel
     from pipelines.training import TrainOutcome
@@ -184,6 +185,46 @@ def rehearse(
 
         write_rehearsal(Path(out), done, ", ".join(map(str, names)))
     return done
+
+
+def replay(
+    machine_file: Path | str,
+    recordings: Paths,
+    out: Path | str,
+    *,
+    channels: Sequence[str] = (),
+    plan: Plan | None = None,
+    start: int = 8,
+    every: int = 4,
+    disturb: int | None = None,
+    processes: int = 1,
+) -> Replay:
+    """Let a year of recordings arrive run by run in a home of its own: retrain, promote, and predict each run first.
+
+    Args:
+        out: folder of the replay; replay.html and replay.json are written there. A replay that was stopped goes on.
+        channels: error channels to learn; default: all.
+        plan: selectors, families, protocols and effort; default: those of quick effort.
+        start: runs of the first training.
+        every: new runs from one training to the next.
+        disturb: seed of a plan in which runs come late, twice, out of order, or faulty at first; None: as recorded.
+
+    Returns:
+        Trainings and runs with the error of the champion, of the first champion and of no model (µm); `score` sums
+        them up.
+
+    Raises:
+        InputError: a file, channel or plan that cannot be used, too few runs, or `out` holds something else.
+        WorkError: `out` cannot be written.
+    """
+    from models.crossing import Plan
+    from pipelines.commands.replay import replay_year
+
+    quick = Plan(effort="quick")
+    return replay_year(
+        Path(machine_file), tuple(_paths(recordings)), Path(out), tuple(channels), plan or quick, start, every, disturb,
+        _log, lambda step, n, of: None, processes,
+    )  # fmt: skip
 
 
 def export(models: Paths, to: str, out: Path | str | None = None) -> list[Path]:
