@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal
 
 from data.errors import InputError, closest
@@ -46,3 +47,18 @@ class Registry(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._members)
+
+
+def packages_reason(kind: str, member: Any) -> str:
+    """Why a member cannot be used where one of its `packages` is not installed; "" where all are."""
+    missing = [name for name in getattr(member, "packages", ()) if find_spec(name) is None]
+    if not missing:
+        return ""
+    named = " and ".join(missing)
+    return f"{kind} {member.key} needs {named}, not installed; install it (pip install {' '.join(missing)})"
+
+
+def check_packages(kind: str, member: Any) -> None:
+    """Raises InputError where one of a member's `packages` is not installed."""
+    if reason := packages_reason(kind, member):
+        raise InputError(f"{reason}, or leave the {kind} out")

@@ -47,6 +47,7 @@ class Family(ABC):
     needs_position: ClassVar[bool] = False  # True: only for error channels that are measured along an axis
     shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work
     effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
+    packages: ClassVar[tuple[str, ...]] = ()  # what it imports to learn that an installation may lack
     has_sd: ClassVar[bool] = False  # True: `sd_um` gives the predictive standard deviation
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError, closest
-from data.registry import Effort
+from data.registry import Effort, check_packages
 from features.design import Design, decimated_rows
 from features.nets import Nets
 from models.base import Family
@@ -45,6 +45,7 @@ class BP(Family):
     source = "Hagan and Menhaj 1994"
     effort: ClassVar[Effort] = "usual"
     closed_form = False
+    packages = ("torch",)
     rank = 70
 
     def __init__(
@@ -117,6 +118,7 @@ class BP(Family):
         return stacks
 
     def _fit_stack(self, design: Design, rows: Sequence[NDArray[np.int64]]) -> list[Self]:
+        check_packages("family", self)
         from features.levenberg_marquardt import train
 
         n, p, starts = max(len(r) for r in rows) + self.zero_start, len(design.inputs), self.starts

@@ -17,7 +17,7 @@ from data.batch import Batch, Channel
 from data.checks import usable_channels, why_missing
 from data.errors import InputError
 from data.machine import Machine
-from data.registry import EFFORTS, Effort
+from data.registry import EFFORTS, Effort, Registry, check_packages, packages_reason
 from features.design import Design
 from features.rises import temperature_inputs
 from features.selectors import SELECTORS
@@ -44,14 +44,18 @@ class Plan:
     n_tsps: tuple[int, ...] | None = None
     iterative_n_tsps: tuple[int, ...] = (2, 4)
     effort: Effort = "usual"
+    left_out: tuple[tuple[str, str], ...] = ()  # what the effort includes and cannot run here, and why
 
     def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
         """The plan with its selectors and families by name; `channels` are the error channels that it is for.
 
         Raises:
             InputError: a family that the plan names needs a twin part, and the machine file has none, or a position,
-                and a channel is not measured along an axis.
+                and a channel is not measured along an axis; or one that it names needs a package that is not installed.
         """
+        for kind, keys, registry in (("selector", self.selectors, SELECTORS), ("family", self.families, FAMILIES)):
+            for key in keys:
+                check_packages(kind, registry[key])
         has_twin = machine is not None and machine.twin is not None
         has_axis = any(c.position for c in channels) or bool(machine is not None and machine.axes())
         for key in self.families:
@@ -66,11 +70,11 @@ class Plan:
         taken = EFFORTS[: EFFORTS.index(self.effort) + 1]
         suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
         suitable = [f for f in suitable if has_axis or not FAMILIES[f].needs_position]
-        return replace(
-            self,
-            selectors=self.selectors or tuple(s for s in SELECTORS if SELECTORS[s].effort in taken),
-            families=self.families or tuple(f for f in suitable if FAMILIES[f].effort in taken),
-        )
+        included = (s for s in SELECTORS if SELECTORS[s].effort in taken)
+        selectors, without = _runnable("selector", SELECTORS, self.selectors or tuple(included))
+        included = (f for f in suitable if FAMILIES[f].effort in taken)
+        families, more = _runnable("family", FAMILIES, self.families or tuple(included))
+        return replace(self, selectors=selectors, families=families, left_out=(*self.left_out, *without, *more))
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""
@@ -78,6 +82,14 @@ class Plan:
         if not family.closed_form:
             wanted = (*(n for n in self.iterative_n_tsps if n in wanted), wanted[-1])
         return tuple(dict.fromkeys(n for n in wanted if n <= n_inputs))
+
+
+def _runnable(
+    kind: str, registry: Registry, keys: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """The keys whose packages are installed, and the others with the reason."""
+    lacking = {key: why for key in keys if (why := packages_reason(kind, registry[key]))}
+    return tuple(k for k in keys if k not in lacking), tuple((f"{kind} {k}", why) for k, why in lacking.items())
 
 
 def suits(family: str, channel: Channel) -> bool:
@@ -206,7 +218,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
                 # A single batch can have too few complete rows to learn from; the other folds still stand.
                 group.remove(fold)
                 lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
-    return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost))
+    return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost, *plan.left_out))
 
 
 def _first_lost(lost: Sequence[tuple[str, str]]) -> str:

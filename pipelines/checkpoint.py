@@ -6,21 +6,24 @@ import hashlib
 import json
 import shutil
 import tempfile
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from data.files import write_atomic
 from models.crossing import Crossing, FamilyResult
 from pipelines.caller import Say
 
 Job = tuple[str, str]  # error channel, family
 _SOURCES = ("data", "features", "models", "twin")
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
+_TOKEN = "token"
 _SUMS = "sums.json"  # the digest of every other file of a kept job
 
 
@@ -32,7 +35,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: Path, crossings: Mapping[str, Crossing], jobs: Sequence[Job]) -> None:
-        self._folder, self._jobs = folder / _digest(crossings), jobs
+        self.folder, self._jobs = folder / _digest(crossings), jobs
 
     def kept(self, say: Say = lambda text: None) -> dict[Job, FamilyResult]:
         """The jobs that an interrupted training finished; `say` receives how many, and what cannot be read."""
@@ -64,13 +67,21 @@ class Checkpoint:
 
         return work
 
+    def token(self) -> str:
+        """A unique id of this training, the same after an interruption, and another one once it was removed."""
+        file = self.folder / _TOKEN
+        if not file.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomic(file, uuid.uuid4().hex)
+        return file.read_text(encoding="utf-8")
+
     def summary(self) -> str:
         """How many jobs are kept where."""
         n = sum(self._held(job).is_dir() for job in self._jobs)
-        return f"{self._count(n)} are kept in {self._folder}; run the same command to go on"
+        return f"{self._count(n)} are kept in {self.folder}; run the same command to go on"
 
     def _held(self, job: Job) -> Path:
-        return self._folder / "__".join(job)
+        return self.folder / "__".join(job)
 
     def _count(self, n: int) -> str:
         channels = len({target for target, _ in self._jobs})
@@ -78,22 +89,29 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Remove the kept jobs, once they are tracked."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _write(result: FamilyResult, held: Path) -> None:
     """All or nothing: a scratch folder is renamed once it is complete."""
     held.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(dir=held.parent, prefix=".writing-"))
+    try:
+        _fill(scratch, result)
+        scratch.rename(held)
+    except OSError:
+        if not held.is_dir():  # else another process was quicker
+            raise
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _fill(scratch: Path, result: FamilyResult) -> None:
     result.scores.to_parquet(scratch / "scores.parquet", index=False)
     result.cells.to_parquet(scratch / "cells.parquet", index=False)
     np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
     (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
     (scratch / _SUMS).write_text(json.dumps(_sums(scratch)), encoding="utf-8")
-    try:
-        scratch.rename(held)
-    except OSError:  # another process was quicker
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _read(held: Path) -> FamilyResult:
@@ -112,7 +130,7 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _digest(crossings: Mapping[str, Crossing]) -> str:
-    digest = hashlib.sha256(f"{_source()} {[version(name) for name in _LIBRARIES]}".encode())
+    digest = hashlib.sha256(f"{_source()} {[_version(name) for name in _LIBRARIES]}".encode())
     for target, crossing in sorted(crossings.items()):
         d = crossing.design
         twin = d.machine.model_dump_json() if d.machine is not None else ""
@@ -121,6 +139,18 @@ def _digest(crossings: Mapping[str, Crossing]) -> str:
         for array in (d.x, d.y_um, d.time_s, d.offsets, d.drivers):
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:24]
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:  # torch may be missing
+        return ""
+
+
+def source_digest() -> str:
+    """SHA-256 (hex) of the program's source that decides the numbers."""
+    return _source()
 
 
 @cache

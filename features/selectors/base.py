@@ -38,6 +38,7 @@ class Selector(ABC):
     source: ClassVar[str]
     takes_n_tsp: ClassVar[bool] = True  # False: the selector decides itself (or keeps all)
     effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
+    packages: ClassVar[tuple[str, ...]] = ()  # what it imports to learn that an installation may lack
 
     @abstractmethod
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array, Mask
+from data.registry import check_packages
 from features.design import Design, decimated_rows
 from features.nets import Nets
 from features.rises import zeroed_error_um
@@ -57,6 +58,7 @@ class MainFactorBP(Selector):
     """
 
     key = "main_factor_bp"
+    packages = ("torch",)
     summary = "largest product of weights in small neural networks, behind a correlation gate"
     source = "main factor strategy: correlation gate and BP weight product, lathe study"
 
@@ -143,6 +145,7 @@ class MainFactorBP(Selector):
 
     def _trained(self, hidden: int, starts: int, x_t: Array, y: Array, known: Mask) -> Nets:
         """Nets (C · starts) of all error channels, y and known (C, n), channel after channel."""
+        check_packages("selector", self)
         from features.levenberg_marquardt import train
 
         drawn = Nets.drawn(starts, len(x_t), hidden, self.seed)

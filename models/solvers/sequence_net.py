@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError
+from data.registry import check_packages
 from features.design import Design
 from models.base import Family, Plain
 from models.solvers.batches import steps_s, too_few_rows
@@ -61,6 +62,7 @@ class SequenceNet(Family):
     """
 
     closed_form = False
+    packages = ("torch",)
     rowwise = False
     rank = 80
     weights: ClassVar[tuple[str, ...]]  # names of the net's arrays
@@ -244,6 +246,7 @@ class SequenceNet(Family):
 
     def _trained(self, stack: Stack) -> list[Plain]:
         """What each net of a stack learned, for inputs in their own units."""
+        check_packages("family", self)
         from models.solvers.torch_training import train  # torch takes a second to load; a prediction needs none
 
         drawn = np.random.default_rng(self.seed).normal(size=(self.hidden, stack.x.shape[2]))
