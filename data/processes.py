@@ -1,7 +1,7 @@
 """One kind of process pool for all rooms: spawned workers, one thread of linear algebra each, shared state sent once.
 
 Nothing outlives a command: a worker ends with the process that started it, Ctrl-C reaches the starting process alone,
-and `end_all` ends what is under way.
+and `data.endings.end_all` ends what is under way.
 
 `joblib.Parallel` does not cover this use: it has no single tasks that run next to the caller and come from several of
 its threads, no start-up step that loads modules before the first task, and it sends a task's state with every task.
@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -25,44 +24,10 @@ from typing import Any, Generic, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from data.endings import ending, without_interrupt
+
 T = TypeVar("T")
 R = TypeVar("R")
-_endings: dict[object, Callable[[], object]] = {}
-
-
-def at_end(end: Callable[[], object]) -> None:
-    """`end_all` calls `end`, from any thread."""
-    _endings[object()] = end
-
-
-@contextmanager
-def ending(end: Callable[[], object]) -> Iterator[None]:
-    """`at_end` while the context is open."""
-    key = object()
-    _endings[key] = end
-    try:
-        yield
-    finally:
-        _endings.pop(key, None)
-
-
-def end_all() -> None:
-    """End at once what runs outside of this process, the last begun first."""
-    while _endings:
-        _endings.popitem()[1]()
-
-
-@contextmanager
-def without_interrupt() -> Iterator[None]:
-    """Processes that this thread starts in the context do not receive Ctrl-C: this process decides when they end."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def in_threads(

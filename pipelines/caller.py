@@ -7,10 +7,6 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
-from threadpoolctl import threadpool_limits
-
-from data.processes import in_threads
-
 T = TypeVar("T")
 R = TypeVar("R")
 Say = Callable[[str], None]  # one line of progress
@@ -33,6 +29,10 @@ class DirectCaller:
         self.done = done
 
     def map(self, step: str, work: Callable[[T], R], items: Sequence[T], retries: int = 0) -> list[R]:
+        from threadpoolctl import threadpool_limits
+
+        from data.processes import in_threads
+
         work = counted(step, work, len(items), self.done)
         with threadpool_limits(limits=1):
             if len(items) == 1:  # in this thread, so that Ctrl-C ends it at once

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from data.processes import ending
+from data.endings import ending
 from pipelines.caller import Done, Say
 
 if TYPE_CHECKING:

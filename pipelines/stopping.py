@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from data.processes import end_all
+from data.endings import end_all
 from pipelines import console
 
 LIMIT_S = 4.0  # for ending processes and removing scratch files; an operator waits 5 s and then kills

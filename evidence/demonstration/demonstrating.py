@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from data.endings import ending, without_interrupt
 from data.errors import InputError, WorkError
 from data.files import check_folder, write_atomic
 from data.machine import Machine, load_machine
-from data.processes import ending, without_interrupt
 from diagnosis.findings.schema import Finding, as_json
 from diagnosis.result import Diagnosis
 from evidence.demonstration.answering import DIAGNOSIS

@@ -18,8 +18,8 @@ from threading import Event
 from typing import Any
 from uuid import uuid4
 
+from data.endings import ending, without_interrupt
 from data.errors import InputError, WorkError
-from data.processes import ending, without_interrupt
 from evidence.proof.sealing.examinee import FINDINGS, PLAN, REPLIES, SERIES, STATUS
 from evidence.proof.sealing.folder import Ledger, ProofFolder, State, folder_digest, now, source_digest, state_of
 from evidence.proof.sealing.isolation import own_source
