@@ -21,7 +21,13 @@ QUIET = {
     "PREFECT_SERVER_LOGGING_LEVEL": "ERROR",
     "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
 }
+# How long a request to a tracking server is tried: about 10 s where it refuses. MLflow itself goes on for minutes.
+PATIENCE = {
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3",
+    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
+}
 
 os.environ.update(TELEMETRY_OFF)
-for _name, _value in QUIET.items():
+for _name, _value in {**QUIET, **PATIENCE}.items():
     os.environ.setdefault(_name, _value)

@@ -163,7 +163,7 @@ def move_champion(
     model = client.get_registered_model(name)
     number = 1 + max((int(m[1]) for key in model.tags if (m := _KEY.fullmatch(key))), default=0)
     entry = Entry(
-        when=now(), who=_who(), host=platform.node(), action=action, model=name, from_version=_champion(model),
+        when=now(), who=who(), host=platform.node(), action=action, model=name, from_version=_champion(model),
         to_version=int(version), why=why[:_MAX_WHY], forced=forced, training_id=training_id, code_version=code_version,
     )  # fmt: skip
     key = f"thermodrift.log.{number:06d}.{uuid.uuid4().hex[:12]}"
@@ -265,7 +265,8 @@ def _champion(model: RegisteredModel) -> int | None:
     return None if version is None else int(version)
 
 
-def _who() -> str:
+def who() -> str:
+    """MLFLOW_TRACKING_USERNAME, else the user of the operating system."""
     try:
         return os.environ.get("MLFLOW_TRACKING_USERNAME", "").strip() or getpass.getuser()
     except (ImportError, KeyError, OSError):  # a container may run under a number that has no name

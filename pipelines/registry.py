@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import yaml
 from filelock import FileLock
+from mlflow.entities import LoggedModelOutput, LoggedModelStatus, Metric
 from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.exceptions import MlflowException
 from mlflow.models import ModelSignature
@@ -39,15 +40,18 @@ from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
 from models.trust import Region, fit_siblings
 from models.updating import Updater, out_of_fold
-from pipelines import audit, model_store, pyfunc_model
+from pipelines import audit, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
+from pipelines.runs import close_interrupted, code_version
 from pipelines.serving import write_served
 from pipelines.settings import Settings
-from pipelines.tracking import code_version, load_training, open_store, record_promotion, store_errors
+from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
 _MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 _SERVED_PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")  # of a family that is an ONNX file
 Outcome = Literal["champion", "challenger", "unchanged"]
+OUTCOME = "outcome"  # the last tag of a version; what lacks it was interrupted
+_INTERRUPTED = "its promotion was interrupted; `thermodrift promote` or the next training finishes it"
 
 
 @dataclass(frozen=True)
@@ -137,17 +141,25 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
     name = settings.model(new.result.machine, new.result.target)
     client = open_store(settings)
     with _locked(name, settings):
-        champion = _by_alias(client, name, CHAMPION)
-        fingerprint = new.fingerprint
-        same = [
-            v for v in versions_of(client, name) if v.tags.get("fingerprint") == fingerprint and "outcome" in v.tags
-        ]
-        if same and (champion is not None or force or not new.choice.trusted):
-            done = _keep(client, same[0], champion, new, force)
+        close_interrupted(client)
+        champion, fingerprint = _by_alias(client, name, CHAMPION), new.fingerprint
+        same = [v for v in versions_of(client, name) if v.tags.get("fingerprint") == fingerprint]
+        begun = next((v for v in same if _is_unfinished(client, v, new.training_id)), None)
+        done = [v for v in same if OUTCOME in v.tags]
+        if begun is None and done and (champion is not None or force or not new.choice.trusted):
+            kept = _keep(client, done[0], champion, new, force)
         else:
-            done = _register(client, name, champion, new, settings, force)
-        record_promotion(client, new.training_id, done.as_dict())
-        return done
+            kept = _register(client, name, champion, new, settings, force, begun)
+        record_promotion(client, new.training_id, kept.as_dict())
+        return kept
+
+
+def _is_unfinished(client: MlflowClient, version: ModelVersion, training_id: str) -> bool:
+    """Whether the promotion that made a version was interrupted: before its outcome, or before its training has it."""
+    if OUTCOME not in version.tags:
+        return True
+    own = version.tags.get("training_id") == training_id
+    return own and "promotion" not in client.get_run(training_id).data.tags
 
 
 def _keep(
@@ -170,10 +182,29 @@ def _keep(
 
 
 def _register(
-    client: MlflowClient, name: str, champion: ModelVersion | None, new: Newcomer, settings: Settings, force: bool
+    client: MlflowClient,
+    name: str,
+    champion: ModelVersion | None,
+    new: Newcomer,
+    settings: Settings,
+    force: bool,
+    begun: ModelVersion | None,
 ) -> Promotion:
-    """A new version, compared with the champion, as champion or challenger."""
+    """A version, compared with the champion, as champion or challenger.
+
+    In this order: the model's files, the version with all its tags, the alias, the outcome on the version, the outcome
+    on the training (in `promote`). After an interruption between any two the next call goes on with the version that
+    is there (`begun`): what lacks an outcome is neither champion nor challenger unless an alias names it.
+
+    Args:
+        champion: what the alias names now, which may be `begun` itself.
+    """
     choice = new.choice
+    settled = begun is not None and (begun.tags.get(OUTCOME) or _alias_of(champion, begun))
+    if force and settled != CHAMPION:
+        settled = ""
+    if begun is not None and settled:  # compare with what it was compared with
+        champion = _version(client, name, begun.tags.get("against", begun.tags.get("replaces", "")))
     comparison, obstacle, why = None, "", "first model of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
@@ -181,28 +212,39 @@ def _register(
         why = "no trustworthy model"
     why = f"by force; {why}" if force and (champion is not None or not choice.trusted) else why
     better = champion is None or (comparison is not None and comparison.better)
-    replaces = force or (choice.trusted and better)
+    replaces = settled == CHAMPION if settled else force or (choice.trusted and better)
     outcome: Outcome = "champion" if replaces else "challenger"
-    info = _info(new)
     reason = why if choice.trusted else f"{why}, {choice.caution}"
-    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | {"reason": reason}
-    if champion is not None and replaces:
-        tags["replaces"] = champion.version
-    version = _log_version(client, name, new, info, tags)
-    simulated = new.result.simulated
-    client.update_model_version(name, version, ("SIMULATED. " if simulated else "") + choice.summary)
-    client.set_registered_model_tag(name, "simulated", _text(simulated))
-    if replaces:
-        _crown(client, name, version, reason, new.training_id, force)
+    against = "" if champion is None else str(champion.version)
+    tags = {"reason": reason, "against": against, "replaces": against if replaces else ""}
+    if begun is None:
+        version = _log_version(client, name, new, tags)
     else:
-        client.set_registered_model_alias(name, CHALLENGER, version)
-    client.set_model_version_tag(name, version, "outcome", outcome)  # last: what lacks it was interrupted
+        version = str(begun.version)
+        for key, text in tags.items():
+            client.set_model_version_tag(name, version, key, text)
+    client.set_registered_model_tag(name, "simulated", _text(new.result.simulated))
+    if not settled:
+        if replaces:
+            _crown(client, name, version, reason, new.training_id, force)
+        else:
+            client.set_registered_model_alias(name, CHALLENGER, version)
+    client.set_model_version_tag(name, version, OUTCOME, outcome)
     return Promotion(
         outcome, name, int(version), int(version) if replaces else None if champion is None else int(champion.version),
         choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
         choice.nested_S_std_um, new.outlook,
     )  # fmt: skip
+
+
+def _alias_of(champion: ModelVersion | None, begun: ModelVersion) -> str:
+    """``champion`` where a version that lacks its outcome is it already, else empty."""
+    return CHAMPION if champion is not None and champion.version == begun.version else ""
+
+
+def _version(client: MlflowClient, name: str, number: str) -> ModelVersion | None:
+    return client.get_model_version(name, number) if number else None
 
 
 def _info(new: Newcomer) -> dict[str, Any]:
@@ -275,6 +317,7 @@ def status(settings: Settings) -> pd.DataFrame:
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))
                 rows.append({
                     **{c: tags.get(c, "") for c in columns}, "name": model.name, "version": int(v.version),
+                    "reason": tags.get("reason", "") if OUTCOME in tags or aliases else _INTERRUPTED,
                     "aliases": ", ".join(aliases), **{n: float(tags.get(n, "nan")) for n in numbers},
                     "n_batches": int(tags.get("n_batches", 0)), "simulated": tags.get("simulated") == "true",
                     "trusted": tags.get("trusted") != "false",
@@ -373,7 +416,7 @@ def _locked(name: str, settings: Settings) -> Iterator[None]:
     """One process at a time changes a model's versions and aliases."""
     folder = settings.home / "locks"
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / f"{name}.lock"), store_errors(settings):
+    with FileLock(folder / f"{name}.lock"), store.exclusive(settings, name), store_errors(settings):
         yield
 
 
@@ -409,12 +452,13 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _log_version(client: MlflowClient, name: str, new: Newcomer, info: dict[str, Any], tags: dict[str, str]) -> str:
-    """Log the model below its training's run and make a registered version of it; returns its number.
+def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str, str]) -> str:
+    """Log the model of a training's run and make a registered version of it; returns its number.
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
-    choice, result = new.choice, new.result
+    choice, result, info = new.choice, new.result, _info(new)
+    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | tags
     bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)
     siblings = fit_siblings(new.family, new.batches)
     with tempfile.TemporaryDirectory() as scratch:
@@ -433,24 +477,47 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, info: dict[str,
             ]),
             outputs=Schema([ColSpec("double", "predicted_um"), ColSpec("boolean", "outside_region")]),
         )  # fmt: skip
-        with mlflow.start_run(run_id=new.training_id):
-            logged = mlflow.pyfunc.log_model(
-                name="model",
-                python_model=str(Path(pyfunc_model.__file__).resolve()),
-                artifacts={f: str(folder / f) for f in (*model_store.FILES, *served)},
-                signature=signature,
-                input_example=_example(stored, [*channels, *drivers]),
-                pip_requirements=_requirements(new.family),
-            )
+        model_id = _begin_model(client, new.training_id, choice)
+        logged = mlflow.pyfunc.log_model(
+            model_id=model_id,
+            python_model=str(Path(pyfunc_model.__file__).resolve()),
+            artifacts={f: str(folder / f) for f in (*model_store.FILES, *served)},
+            signature=signature,
+            input_example=_example(stored, [*channels, *drivers]),
+            pip_requirements=_requirements(new.family),
+        )
+    simulated = result.simulated
+    about = {"machine": result.machine, "target": result.target, "simulated": _text(simulated)}
     try:
-        client.create_registered_model(name, tags={"machine": tags["machine"], "target": tags["target"]})
+        client.create_registered_model(name, tags=about)
     except MlflowException as error:
         if error.error_code != "RESOURCE_ALREADY_EXISTS":
             raise
     made = client.create_model_version(
-        name, logged.model_uri, run_id=new.training_id, tags=tags, model_id=logged.model_id
-    )
+        name, logged.model_uri, run_id=new.training_id, tags=tags, model_id=model_id,
+        description=("SIMULATED. " if simulated else "") + choice.summary,
+    )  # fmt: skip
     return str(made.version)
+
+
+def _begin_model(client: MlflowClient, training_id: str, choice: Choice) -> str:
+    """A model below a training's run, whose status stays: `mlflow.start_run` would set a finished run to running.
+
+    A model that an interrupted promotion has left without files is removed.
+    """
+    run = client.get_run(training_id)
+    experiment = run.info.experiment_id
+    for left in client.search_logged_models([experiment], f"source_run_id = '{training_id}'"):
+        if left.status == LoggedModelStatus.PENDING:
+            client.delete_logged_model(left.model_id)
+    model = client.create_logged_model(
+        experiment, name="model", source_run_id=training_id, params=run.data.params, model_type=choice.family
+    )
+    client.log_outputs(training_id, [LoggedModelOutput(model.model_id, step=0)])
+    at_ms = int(run.info.end_time or run.info.start_time)
+    metrics = [Metric(k, v, at_ms, 0, model_id=model.model_id) for k, v in run.data.metrics.items()]
+    client.log_batch(training_id, metrics=metrics)
+    return str(model.model_id)
 
 
 def _step_s(batches: Sequence[Batch]) -> float:

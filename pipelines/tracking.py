@@ -9,133 +9,53 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import re
-import subprocess
+import shutil
 import tempfile
 import threading
-import time
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import cache
+from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import mlflow
 import numpy as np
 import pandas as pd
 from filelock import FileLock
-from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run, RunTag
+from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
+from requests import RequestException
+from sqlalchemy.exc import SQLAlchemyError
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from diagnosis.result import Diagnosis
 from models import FAMILIES
 from models.outlook import outlook
-from models.promotion import choose, judged
+from models.promotion import Choice, choose, judged
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
+from pipelines import store
 from pipelines.audit import CHAMPION
 from pipelines.caller import Say
-from pipelines.settings import Settings, load
-
-_DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
-_METRICS_AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
-
-
-def experiment_id(client: MlflowClient, settings: Settings, machine: str, target: str, simulated: bool) -> str:
-    """The experiment of a machine's error channel (or "diagnosis"), made where there is none."""
-    name = settings.experiment(machine, target)
-    found = client.get_experiment_by_name(name)
-    if found is not None:
-        if found.lifecycle_stage == "deleted":
-            client.restore_experiment(found.experiment_id)
-        if found.tags.get("simulated") != yes_or_no(simulated):
-            client.set_experiment_tag(found.experiment_id, "simulated", yes_or_no(simulated))
-        return str(found.experiment_id)
-    # quoted, since a store decodes an address: the name 50%2f is no folder
-    where = f"{settings.artifacts_uri}/{machine}/{quote(target)}" if settings.artifacts_uri else None
-    tags = {"simulated": yes_or_no(simulated), "machine": machine, "target": target, "kind": "thermodrift"}
-    return str(client.create_experiment(name, artifact_location=where, tags=tags))
-
-
-def dataset_inputs(batches: pd.DataFrame, context: str = "training") -> list[DatasetInput]:
-    """The lake's batches as dataset inputs; `batches` has batch_id, digest, version, source, n_rows."""
-    out = []
-    for row in batches.to_dict("records"):
-        digest, version = str(row["digest"]), row.get("version", 1)
-        source = json.dumps({"source": str(row.get("source", "")), "batch": row["batch_id"], "version": int(version)})
-        dataset = Dataset(
-            name=str(row["batch_id"]), digest=digest[:_DIGEST_LENGTH] or f"v{version}", source_type="thermodrift_lake",
-            source=source, profile=json.dumps({"num_rows": int(row["n_rows"])}),
-        )  # fmt: skip
-        tags = [InputTag("mlflow.data.context", context), InputTag("digest", digest or f"v{version}")]
-        out.append(DatasetInput(dataset, tags))
-    return out
-
-
-def log_values(
-    client: MlflowClient,
-    run_id: str,
-    metrics: Sequence[Metric],
-    params: Mapping[str, str],
-    tags: Mapping[str, str] | None = None,
-) -> None:
-    """Log in one call, or in a few where there are many metrics."""
-    for first in range(0, len(metrics) or 1, _METRICS_AT_ONCE):
-        chunk = list(metrics[first : first + _METRICS_AT_ONCE])
-        own = [Param(k, v) for k, v in params.items()] if not first else []
-        marks = [RunTag(k, v) for k, v in (tags or {}).items()] if not first else []
-        client.log_batch(run_id, metrics=chunk, params=own, tags=marks)
-
-
-def finished_runs(client: MlflowClient, kind: str) -> list[Run]:
-    """Finished runs of a kind over all experiments of thermodrift, newest first."""
-    experiments = client.search_experiments(filter_string="tags.kind = 'thermodrift'")
-    ids, token, runs = [e.experiment_id for e in experiments], None, []
-    while ids:
-        page = client.search_runs(
-            ids, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'", page_token=token,
-            order_by=["attributes.start_time DESC"],
-        )  # fmt: skip
-        runs += page
-        token = page.token
-        if not token:
-            break
-    return runs
-
-
-def started(run: Run) -> pd.Timestamp:
-    """The start time, UTC."""
-    return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
-
-
-@cache
-def code_version() -> str:
-    """The version of this program: ``git COMMIT`` of a checkout, -dirty with changes; else ``thermodrift VERSION``."""
-    root = Path(__file__).resolve().parents[1]
-    if (root / ".git").exists():  # an installation inside another project's checkout has none of its own
-        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, check=True, timeout=20,
-                env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
-            )  # fmt: skip
-            return f"git {done.stdout.strip()}"
-        except (OSError, subprocess.SubprocessError):
-            pass  # without git, or a checkout of another user: the package's version is what is known
-    return f"thermodrift {version('thermodrift')}"
-
-
-def yes_or_no(value: bool) -> str:
-    """A flag as tags hold it."""
-    return "true" if value else "false"
-
+from pipelines.runs import (
+    Entity,
+    Record,
+    close_interrupted,
+    dataset_records,
+    finished_runs,
+    now_ms,
+    started,
+    tag_run,
+    write_record,
+    yes_or_no,
+)
+from pipelines.settings import Settings, load, masked
+from pipelines.store import StoreOutage
 
 CELL_METRICS = (
     "S_mean_um", "S_std_um", "max_abs_um", "eta", "compensation_effect", "grey_degree", "rmse_um", "tsp_stability",
@@ -143,6 +63,7 @@ CELL_METRICS = (
 _GRID = "grid"
 
 _OPENING = threading.Lock()  # MLflow's own lock on a first migration holds between processes only
+_opened = set[str]()  # by this process
 
 
 def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient:
@@ -151,6 +72,7 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
     Threads may call it at once.
 
     Raises:
+        InputError: the store is a database whose driver is not installed.
         WorkError: the store does not answer, or is of an older MLflow.
     """
     file = settings.store_file
@@ -161,8 +83,10 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
         # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)
         mlflow.set_registry_uri(settings.store_uri)
-        client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
-        client.search_experiments(max_results=1)
+        with store.first_use(settings, say) if settings.store_uri not in _opened else nullcontext():
+            client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
+            client.search_experiments(max_results=1)
+        _opened.add(settings.store_uri)
     return client
 
 
@@ -178,14 +102,42 @@ def _make_store(file: Path) -> None:
 
 @contextmanager
 def store_errors(settings: Settings) -> Iterator[None]:
-    """Turn MLflow's errors into one line."""
+    """Turn the errors of MLflow and of what it writes to into one line.
+
+    Raises:
+        StoreOutage: a server does not answer or fails.
+        WorkError: any other error of the store.
+    """
+    remote = settings.store_file is None
     try:
         yield
     except MlflowException as error:
-        text = str(error).splitlines()[0]
+        text = masked(" ".join(str(error).splitlines()[:1]))
         if "out-of-date database schema" in text:
-            text = f"it is of an older MLflow; make a copy, then run: mlflow db upgrade {settings.store_uri}"
-        raise WorkError(f"tracking store {settings.store_uri}: {text}") from error
+            text = f"it is of an older MLflow; make a copy, then run: mlflow db upgrade {settings.store_name}"
+        outage = remote and error.error_code in _OUTAGE
+        raise (StoreOutage if outage else WorkError)(f"tracking store {settings.store_name}: {_brief(text)}") from error
+    except (RequestException, SQLAlchemyError) as error:
+        text = _brief(masked(str(error).splitlines()[0]))
+        raise (StoreOutage if remote else WorkError)(f"tracking store {settings.store_name}: {text}") from error
+    except OSError as error:
+        if error.errno is None:
+            raise
+        where = error.filename or settings.artifacts_uri or settings.store_name
+        raise WorkError(f"{where}: cannot be written or read ({error.strerror or error})") from error
+
+
+_OUTAGE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED")  # not the input
+
+
+def _brief(text: str) -> str:
+    """What MLflow's client says of a connection, without the path of the request and the names of its classes."""
+    if "failed with timeout" in text or "timed out" in text:
+        return "does not answer in time"
+    if "API request to" in text and "failed with exception" in text:
+        refused = "Connection refused" in text
+        return "does not answer" + (" (connection refused)" if refused else f" ({text.rpartition(': ')[2].strip(')')})")
+    return text
 
 
 def log_training(
@@ -196,34 +148,87 @@ def log_training(
     params: dict[str, Any] | None = None,
     say: Say = lambda text: None,
 ) -> str:
-    """Track one training; returns its id (the parent run's).
-
-    Parent run: the tables as Parquet under grid/, figures (file name -> bytes) under figures/, the lake's batches as
-    dataset inputs. One child run per selector × family: metrics ``leave_batch_out/S_mean_um`` and so on with n_tsp
-    as step, and ``leave_batch_out/fold_S_um`` at the best n_tsp with the fold's index as step.
+    """Track one training; returns its id (the parent run's), see `training_record` and `training_files`.
 
     Raises:
         WorkError: the store does not answer.
     """
+    record = training_record(result, settings.promotion, params)
+    with tempfile.TemporaryDirectory() as scratch:
+        training_files(Path(scratch), result, figures or {})
+        return log_record(record, Path(scratch), settings, say)
+
+
+def log_record(record: Record, files: Path, settings: Settings, say: Say = lambda text: None) -> str:
+    """Track a record with its files; returns the id of its run, of which there is one however often this is called.
+
+    Raises:
+        StoreOutage: a server does not answer.
+        WorkError: the store cannot be written.
+    """
     client = open_store(settings, say)
     with store_errors(settings):
-        experiment = experiment_id(client, settings, result.machine, result.target, result.simulated)
-        common = {"simulated": yes_or_no(result.simulated), "machine": result.machine, "target": result.target}
-        name = f"{result.machine} {result.target} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
-        tags = {**common, "kind": "training", "code_version": code_version()}
-        run = client.create_run(experiment, tags=tags, run_name=name)
-        parent = str(run.info.run_id)
-        status = "FAILED"
-        try:
-            _log_parent(client, parent, result, settings.promotion, params or {})
-            _log_files(client, parent, result, figures or {})
-            client.log_inputs(parent, datasets=dataset_inputs(result.batches))
-            for _, cells in result.cells.groupby(["selector", "family"], sort=False):
-                _log_cells(client, run, {**common, "kind": "cell"}, cells, result, settings.promotion)
-            status = "FINISHED"
-        finally:
-            client.set_terminated(parent, status)
-    return parent
+        close_interrupted(client)
+        return write_record(client, settings, record, files)
+
+
+def training_record(
+    result: GridResult,
+    rule: PromotionRule,
+    params: Mapping[str, Any] | None = None,
+    *,
+    choice: Choice | None = None,
+    record_id: str = "",
+    started_ms: int | None = None,
+) -> Record:
+    """A training as a run: what its chosen cell reached as plain metrics and parameters, and a child per model.
+
+    A child is a selector × family. Its plain metrics are those of its best cell under the protocol that decides; by
+    n_tsp as step, ``leave_batch_out_by_n_tsp/S_mean_um`` and so on, and ``leave_batch_out_by_fold/S_um`` of the best
+    cell with the fold's index as step. Plain names have the same meaning in parent and child.
+
+    Args:
+        choice: the chosen cell; without it the one that the rule picks, and no nested score.
+        record_id: made up where there is none.
+        started_ms: when the training began, ms since 1970; by default now.
+    """
+    ended_ms = now_ms()
+    name = f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {result.machine} {result.target}"
+    counts = {"n_batches": len(result.batches), "n_cells": len(result.cells), "n_findings": len(result.findings)}
+    metrics: dict[str, float] = {}
+    plain, tags = {k: str(v) for k, v in (params or {}).items()}, {}
+    if rule.offered(set(result.cells["protocol"])):
+        best = choice or choose(result.cells, rule)
+        expected = outlook(result, best)
+        metrics |= _cell_metrics(_judged_row(result.cells, rule, best)) | {
+            "nested_S_mean_um": best.nested_S_mean_um, "nested_S_std_um": best.nested_S_std_um,
+            "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,
+        }  # fmt: skip
+        plain |= {
+            "selector": best.selector,
+            "family": best.family,
+            "n_tsp": str(best.n_tsp),
+            "inputs": ", ".join(best.inputs),
+        }
+        tags = {"best": best.name, "best_cell": best.cell, "trusted": yes_or_no(best.trusted)}
+        tags["mlflow.note.content"] = best.summary + (f"; {best.caution}" if best.caution else "")
+    values = tuple((k, float(v), 0) for k, v in {**metrics, **counts}.items() if np.isfinite(v))
+    groups = result.cells.groupby(["selector", "family"], sort=False)
+    return Record(
+        id=record_id or uuid.uuid4().hex, kind="training", machine=result.machine, target=result.target,
+        simulated=result.simulated, name=name, tags=_short(tags), params=_short(plain), metrics=values,
+        started_ms=started_ms or ended_ms, ended_ms=ended_ms, datasets=dataset_records(result.batches),
+        children=tuple(_child(cells, result, rule) for _, cells in groups),
+    )  # fmt: skip
+
+
+def training_files(folder: Path, result: GridResult, figures: Mapping[str, bytes]) -> None:
+    """What a training's run keeps as artifacts: its tables under grid/, and figures (file name -> bytes)."""
+    result.save(folder / _GRID)
+    if figures:
+        (folder / "figures").mkdir()
+    for name, content in figures.items():
+        (folder / "figures" / name).write_bytes(content)
 
 
 def trainings(machine: str | None = None, target: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
@@ -258,7 +263,7 @@ def load_training(training_id: str, settings: Settings) -> Training:
     except MlflowException:
         run = None
     if run is None or run.data.tags.get("kind") != "training":
-        raise InputError(f"training {training_id!r} is not in {settings.store_uri}; `thermodrift status` lists them")
+        raise InputError(f"training {training_id!r} is not in {settings.store_name}; `thermodrift status` lists them")
     with store_errors(settings):
         folder = mlflow.artifacts.download_artifacts(
             run_id=training_id, artifact_path=_GRID, tracking_uri=settings.store_uri
@@ -290,64 +295,49 @@ def _champion_now(client: MlflowClient, model: str) -> int | None:
 
 
 def record_promotion(client: MlflowClient, training_id: str, promotion: dict[str, Any]) -> None:
-    """Keep the outcome of the promotion on the training."""
-    client.set_tag(training_id, "promotion", json.dumps(promotion, ensure_ascii=False))
+    """Keep the outcome of the promotion on the training, also as plain tags for the list of runs."""
+    tags = {
+        "promotion": json.dumps(promotion, ensure_ascii=False), "outcome": str(promotion["outcome"]),
+        "model": f"{promotion['name']} version {promotion['version']}",
+    }  # fmt: skip
+    tag_run(client, training_id, tags)
 
 
-def _log_parent(
-    client: MlflowClient, run_id: str, result: GridResult, rule: PromotionRule, params: dict[str, Any]
-) -> None:
-    now = int(time.time() * 1000)
-    metrics: dict[str, float] = {
-        "n_batches": len(result.batches),
-        "n_cells": len(result.cells),
-        "n_findings": len(result.findings),
-    }
-    tags: list[RunTag] = []
-    if rule.offered(set(result.cells["protocol"])):
-        best = choose(result.cells, rule)
-        expected = outlook(result, best)
-        metrics |= {
-            "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,
-            "leave_batch_out_S_mean_um": expected.leave_batch_out_um, "best_score_um": best.score_um,
-            "best_S_mean_um": best.S_mean_um, "best_S_std_um": best.S_std_um,
-        }  # fmt: skip
-        tags = [RunTag("best", best.name), RunTag("best_cell", best.cell)]
-    client.log_batch(
-        run_id,
-        metrics=[Metric(k, float(v), now, 0) for k, v in metrics.items() if np.isfinite(v)],
-        params=[Param(k, str(v)) for k, v in list(params.items())[:100]],
-        tags=tags,
-    )
+def attach(training_id: str, path: Path, settings: Settings) -> None:
+    """Add a file, such as the report, to the artifacts of a training.
+
+    Raises:
+        StoreOutage: a server does not answer.
+        WorkError: the store cannot be written.
+    """
+    client = open_store(settings)
+    with store_errors(settings):
+        client.log_artifact(training_id, str(path), "report")
 
 
-def _log_files(client: MlflowClient, run_id: str, result: GridResult, figures: dict[str, bytes]) -> None:
-    with tempfile.TemporaryDirectory() as scratch:
-        result.save(Path(scratch) / _GRID)
-        if figures:
-            (Path(scratch) / "figures").mkdir()
-        for name, content in figures.items():
-            (Path(scratch) / "figures" / name).write_bytes(content)
-        client.log_artifacts(run_id, scratch)
+def _judged_row(cells: pd.DataFrame, rule: PromotionRule, choice: Choice) -> pd.Series:
+    """The chosen cell under the protocol that decides."""
+    own = {"selector": choice.selector, "family": choice.family, "n_tsp": choice.n_tsp}
+    return judged(cells[(cells[list(own)] == pd.Series(own)).all(axis=1)], rule).iloc[0]
 
 
-def _log_cells(
-    client: MlflowClient,
-    parent: Run,
-    tags: dict[str, str],
-    cells: pd.DataFrame,
-    result: GridResult,
-    rule: PromotionRule,
-) -> None:
-    """A child run for all cells of one selector and family."""
+def _cell_metrics(row: pd.Series) -> dict[str, float]:
+    """The plain metrics of a cell, a row of `judged`: the same in parent and child, so that a list compares them."""
+    names = {"S_mean_um": "S_mean_um", "S_std_um": "S_std_um", "max_abs_um": "max_um", "score_um": "score_um"}
+    return {shown: float(row[name]) for name, shown in names.items()} | {"n_tsp": float(row["n_tsp"])}
+
+
+def _short(texts: Mapping[str, str]) -> dict[str, str]:
+    return {k: v[:_MAX_CHARACTERS] for k, v in texts.items()}
+
+
+def _child(cells: pd.DataFrame, result: GridResult, rule: PromotionRule) -> Entity:
+    """All cells of one selector and family."""
     selector, family = (str(cells[c].iloc[0]) for c in ("selector", "family"))
-    now = int(time.time() * 1000)
-    metrics: list[Metric] = []
+    metrics: list[tuple[str, float, int]] = []
     for row in cells.to_dict("records"):
         prefix = str(row["protocol"]).replace("-", "_")
-        for name in CELL_METRICS:
-            if np.isfinite(row[name]):
-                metrics.append(Metric(f"{prefix}/{name}", float(row[name]), now, int(row["n_tsp"])))
+        metrics += [(f"{prefix}_by_n_tsp/{name}", float(row[name]), int(row["n_tsp"])) for name in CELL_METRICS]
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
     try:
@@ -355,20 +345,18 @@ def _log_cells(
     except InputError:  # no score under the rule
         best = None
     if best is not None:
-        params |= {"best_n_tsp": str(best["n_tsp"]), "best_inputs": str(best["inputs"])[:6000]}
-        metrics.append(Metric("best_score_um", float(best["score_um"]), now, int(best["n_tsp"])))
+        params |= {"n_tsp": str(best["n_tsp"]), "inputs": str(best["inputs"]).replace("|", ", ")}
+        metrics += [(name, value, 0) for name, value in _cell_metrics(best).items()]
         s = result.scores
         picked = s[
             (s["protocol"].to_numpy() == best["protocol"]) & (s["selector"].to_numpy() == selector)
             & (s["family"].to_numpy() == family) & (s["n_tsp"].to_numpy() == best["n_tsp"])
         ]  # fmt: skip
-        key = f"{str(best['protocol']).replace('-', '_')}/fold_S_um"
-        per_fold = picked.groupby("fold", sort=False)["S_um"].mean()
-        metrics += [Metric(key, float(v), now, i) for i, v in enumerate(per_fold) if np.isfinite(v)]
-    tags = {**tags, "mlflow.parentRunId": parent.info.run_id, "selector": selector, "family": family}
-    run_id = client.create_run(parent.info.experiment_id, tags=tags, run_name=f"{selector} × {family}").info.run_id
-    log_values(client, run_id, metrics, params)
-    client.set_terminated(run_id)
+        key = f"{str(best['protocol']).replace('-', '_')}_by_fold/S_um"
+        metrics += [(key, float(v), i) for i, v in enumerate(picked.groupby("fold", sort=False)["S_um"].mean())]
+    finite = tuple(m for m in metrics if np.isfinite(m[1]))
+    tags = {"selector": selector, "family": family}
+    return Entity(name=f"{selector} × {family}", tags=tags, params=_short(params), metrics=finite)
 
 
 def _training_row(run: Run) -> dict[str, Any]:
@@ -382,7 +370,7 @@ def _training_row(run: Run) -> dict[str, Any]:
         "started": started(run),
         "n_batches": int(run.data.metrics.get("n_batches", 0)),
         "best": tags.get("best", ""),
-        "score_um": run.data.metrics.get("best_score_um", float("nan")),
+        "score_um": run.data.metrics.get("score_um", run.data.metrics.get("best_score_um", math.nan)),
         "simulated": tags.get("simulated") == "true",
         "promotion": promotion.get("outcome", ""),
         "model": version,
@@ -423,26 +411,18 @@ def log_diagnosis(
     Raises:
         WorkError: the store does not answer.
     """
-    f = d.findings
-    client = open_store(settings, say)
-    with store_errors(settings):
-        experiment = experiment_id(client, settings, f.machine, DIAGNOSIS, d.simulated)
-        tags = {"machine": f.machine, "target": DIAGNOSIS, "kind": "diagnosis", "simulated": yes_or_no(d.simulated)}
-        name = f"{f.machine} {DIAGNOSIS} {pd.Timestamp.now():%Y-%m-%d %H:%M}"
-        run_id = str(client.create_run(experiment, tags=tags, run_name=name).info.run_id)
-        status = "FAILED"
-        try:
-            now = int(time.time() * 1000)
-            metrics = [Metric(k, v, now, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v)]
-            shown = {k: str(v)[:_MAX_CHARACTERS] for k, v in {**_diagnosis_params(d), **(params or {})}.items()}
-            log_values(client, run_id, metrics, shown, {k: v[:_MAX_CHARACTERS] for k, v in _diagnosis_tags(d).items()})
-            client.log_inputs(run_id, datasets=dataset_inputs(_batch_table(batches), DIAGNOSIS))
-            for path in files.values():
-                client.log_artifact(run_id, str(path))
-            status = "FINISHED"
-        finally:
-            client.set_terminated(run_id, status)
-    return run_id
+    f, now = d.findings, now_ms()
+    metrics = tuple((k, v, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v))
+    record = Record(
+        id=uuid.uuid4().hex, kind="diagnosis", machine=f.machine, target=DIAGNOSIS, simulated=d.simulated,
+        name=f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {f.machine} {DIAGNOSIS}", tags=_short(_diagnosis_tags(d)),
+        params=_short({k: str(v) for k, v in {**_diagnosis_params(d), **(params or {})}.items()}), metrics=metrics,
+        started_ms=now - int(1000 * (f.seconds or 0.0)), ended_ms=now, datasets=dataset_records(_batch_table(batches)),
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as scratch:
+        for path in files.values():
+            shutil.copy(path, scratch)
+        return log_record(record, Path(scratch), settings, say)
 
 
 def diagnoses(machine: str | None = None, settings: Settings | None = None) -> pd.DataFrame:

@@ -4,6 +4,8 @@ The steps are plain functions; a `pipelines.caller.Caller` decides how they run:
 
 from __future__ import annotations
 
+import json
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,23 +14,27 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
+import pandas as pd
+
 from data.batch import Batch
 from data.checks import check_machine
-from data.errors import InputError, check_suffix, closest
+from data.errors import InputError, WorkError, check_suffix, closest
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
 from models import FAMILIES, promotion
 from models.crossing import Crossing, Plan, prepare, refit, with_target
-from models.grid import Workers, assemble, jobs_of, workers_for
+from models.grid import Pools, Workers, assemble, jobs_of, local_pools, workers_for
 from models.outlook import Outlook, outlook
-from models.result import GridResult
+from models.result import GridResult, Training
 from models.trust import Region
-from pipelines import registry, stopping, tracking
+from pipelines import registry, spool, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint
 from pipelines.diagnosing import DiagnosisOutcome, diagnose_if_grown
 from pipelines.recordings import check_channels, home_lake, load_batches
+from pipelines.runs import Record, code_version, now_ms
 from pipelines.settings import Settings, home
+from pipelines.store import StoreOutage
 from reports.comparison import figure_pngs, write_report
 
 REPORT_SUFFIXES = (".html", ".md")
@@ -104,15 +110,35 @@ class TrainOutcome:
     diagnosis_summary: str = ""  # why a diagnosis followed, and its verdict; else empty
     seconds: dict[str, float] = field(default_factory=dict)
     stopped: str = ""  # why nothing was trained
+    postponed: str = ""  # why results wait in the spool for the tracking store; else empty
+    records: dict[str, Record] = field(default_factory=dict)  # the trainings as they are tracked
 
 
-def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = lambda text: None) -> TrainOutcome:
+def train(
+    request: TrainRequest,
+    settings: Settings,
+    caller: Caller,
+    say: Say = lambda text: None,
+    pools: Pools = local_pools,
+) -> TrainOutcome:
     """Run the yearly job.
+
+    The tracking store is reached first, and gets what waits for it (see `pipelines.spool`). If it goes away later, the
+    results wait there, and nothing of them is lost. After any other failure the crossing is kept.
+
+    Args:
+        caller: how the steps run.
+        pools: where the grid, the part that takes the time, is computed.
 
     Raises:
         InputError: a request that cannot be served (see `check_request`), or too few batches to train on.
+        WorkError: the tracking store does not answer at the start, or the disk does not take what is written.
     """
     machine, targets = check_request(request, settings)
+    started_ms = now_ms()
+    tracking.open_store(settings, say)
+    for line in spool.deliver(settings, partial(promote_waiting, settings), say):
+        say(line)
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     clock = _Clock(outcome.seconds)
@@ -138,36 +164,32 @@ def train(request: TrainRequest, settings: Settings, caller: Caller, say: Say = 
     done = checkpoint.kept(say)
     left = [job for job in jobs if job not in done]
     stopping.note(checkpoint.summary)
-    with Workers(crossings, request.workers or workers_for(plan.families)) as workers:
-        done |= zip(left, caller.map("grid", checkpoint.crossed(workers.cross), left), strict=True)
-        for t in targets:
-            outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
-        clock("grid")
-        if all(settings.promotion.offered(set(r.cells["protocol"])) for r in outcome.results.values()):
-            say("trust")
+    with _kept(checkpoint):
+        with Workers(crossings, request.workers or workers_for(plan.families), pools) as workers:
+            done |= zip(left, caller.map("grid", checkpoint.crossed(workers.cross), left), strict=True)
             for t in targets:
-                outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
-            chosen = [(t, c.selector, c.family, c.n_tsp) for t, c in outcome.choices.items()]
-            for t, left_out in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
-                outcome.results[t] = replace(outcome.results[t], distances=left_out.runs, curves=left_out.curves)
-                outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
-            for t, readings in zip(targets, caller.map("readings", workers.readings, chosen), strict=True):
-                outcome.results[t] = replace(outcome.results[t], readings=readings)
-            clock("trust")
-    say("track")
-    track = partial(_track, outcome.results, plan, settings, say)
-    outcome.training_ids = dict(zip(targets, caller.map("track", track, targets, retries=RETRIES), strict=True))
-    clock("track")
-    if request.promote:
-        say("promote")
-        promote = partial(_promote, outcome, crossings, request.machine_file, settings)
-        outcome.promotions = dict(zip(targets, caller.map("promote", promote, targets, retries=RETRIES), strict=True))
-        clock("promote")
-    say("report")
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
-    outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
-    clock("report")
+                outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
+            clock("grid")
+            if all(settings.promotion.offered(set(r.cells["protocol"])) for r in outcome.results.values()):
+                say("trust")
+                _judge(outcome, workers, caller, settings)
+                clock("trust")
+        say("track")
+        token = checkpoint.token()
+        for t in targets:
+            outcome.records[t] = _record(outcome, plan, settings, t, f"{token}-{t}", started_ms)
+        caller.map("track", partial(_track, outcome, settings, say), targets, retries=RETRIES)
+        clock("track")
+        if request.promote:
+            say("promote")
+            promote = partial(_promote, outcome, crossings, request.machine_file, settings)
+            caller.map("promote", promote, targets, retries=RETRIES)
+            clock("promote")
+        say("report")
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        path = request.report or home() / "reports" / f"{machine.machine}-{stamp}.html"
+        outcome.report = caller.map("report", partial(_report, outcome, settings), [path])[0]
+        clock("report")
     checkpoint.remove()
     stopping.note(None)
     if machine.twin is not None:
@@ -208,6 +230,11 @@ def promote_tracked(
     return registry.promote(new, settings, force=force)
 
 
+def promote_waiting(settings: Settings, training_id: str, machine_file: Path) -> registry.Promotion:
+    """The promotion of a training that waited in the spool: the cell that the rule picks."""
+    return promote_tracked(training_id, machine_file, "", False, settings)
+
+
 @contextmanager
 def _naming_quarantine(ingested: IngestReport | None) -> Iterator[None]:
     """Add the files in quarantine to the error that too few batches are left to train on."""
@@ -242,23 +269,100 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
     return True
 
 
-def _track(results: dict[str, GridResult], plan: Plan, settings: Settings, say: Say, target: str) -> str:
-    result = results[target]
+def _judge(outcome: TrainOutcome, workers: Workers, caller: Caller, settings: Settings) -> None:
+    """The chosen cells, and the error to expect of them."""
+    targets = list(outcome.results)
+    for t in targets:
+        outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
+    chosen = [(t, c.selector, c.family, c.n_tsp) for t, c in outcome.choices.items()]
+    for t, left_out in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
+        outcome.results[t] = replace(outcome.results[t], distances=left_out.runs, curves=left_out.curves)
+        outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
+    for t, readings in zip(targets, caller.map("readings", workers.readings, chosen), strict=True):
+        outcome.results[t] = replace(outcome.results[t], readings=readings)
+
+
+@contextmanager
+def _kept(checkpoint: Checkpoint) -> Iterator[None]:
+    """Name what is kept of the crossing in the error of a disk or a store that does not take what is written."""
+    try:
+        yield
+    except OSError as error:
+        raise WorkError(
+            f"{error.filename or checkpoint.folder}: {error.strerror or error}; {checkpoint.summary()}"
+        ) from error
+    except WorkError as error:
+        raise WorkError(f"{error}; {checkpoint.summary()}") from error
+
+
+def _record(
+    outcome: TrainOutcome, plan: Plan, settings: Settings, target: str, record_id: str, started_ms: int
+) -> Record:
     params = {k: v if isinstance(v, str) else ", ".join(map(str, v or ("all",))) for k, v in asdict(plan).items()}
-    return tracking.log_training(result, settings, figures=figure_pngs(result), params=params, say=say)
+    return tracking.training_record(
+        outcome.results[target], settings.promotion, params, choice=outcome.choices.get(target), record_id=record_id,
+        started_ms=started_ms,
+    )  # fmt: skip
+
+
+def _track(outcome: TrainOutcome, settings: Settings, say: Say, target: str) -> None:
+    """In the store, or in the spool where it does not answer."""
+    result, record = outcome.results[target], outcome.records[target]
+    with tempfile.TemporaryDirectory() as scratch:
+        tracking.training_files(Path(scratch), result, figure_pngs(result))
+        try:
+            outcome.training_ids[target] = tracking.log_record(record, Path(scratch), settings, say)
+        except StoreOutage as error:
+            spool.keep_run(settings, record, Path(scratch))
+            _postpone(outcome, settings, error)
+
+
+def _postpone(outcome: TrainOutcome, settings: Settings, error: StoreOutage) -> None:
+    outcome.postponed = (
+        f"{error}; the results wait in {spool.folder(settings)}: the next `thermodrift train`, `status` or `schedule` "
+        "that reaches the store delivers and promotes them"
+    )
 
 
 def _promote(
     outcome: TrainOutcome, crossings: dict[str, Crossing], machine_file: Path, settings: Settings, target: str
-) -> registry.Promotion:
+) -> None:
+    """Where the training or the promotion does not reach the store, the promotion waits in the spool."""
     choice, crossing = outcome.choices[target], crossings[target]
+    text = machine_file.read_text(encoding="utf-8")
+    if target not in outcome.training_ids:
+        spool.keep_promotion(settings, outcome.records[target], text)
+        return
     family = refit(crossing, choice.selector, choice.family, choice.n_tsp)
-    text, region = machine_file.read_text(encoding="utf-8"), Region.of(crossing.batches, family.inputs)
-    training_id = outcome.training_ids[target]
+    region, training_id = Region.of(crossing.batches, family.inputs), outcome.training_ids[target]
     new = registry.Newcomer(outcome.results[target], choice, family, text, training_id, region, crossing.batches)
-    return registry.promote(new, settings)
+    try:
+        outcome.promotions[target] = registry.promote(new, settings)
+    except StoreOutage as error:
+        spool.keep_promotion(settings, outcome.records[target], text)
+        _postpone(outcome, settings, error)
 
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:
-    trainings = [tracking.load_training(i, settings) for i in outcome.training_ids.values()]
-    return write_report(trainings, path, settings.promotion)
+    """Write the report, which every training keeps as an artifact."""
+    written = write_report([_training(outcome, t) for t in outcome.results], path, settings.promotion)
+    for target, record in outcome.records.items():
+        try:
+            if target not in outcome.training_ids:
+                spool.keep_file(settings, record, written)
+            else:
+                tracking.attach(outcome.training_ids[target], written, settings)
+        except StoreOutage as error:
+            spool.keep_file(settings, record, written)
+            _postpone(outcome, settings, error)
+    return written
+
+
+def _training(outcome: TrainOutcome, target: str) -> Training:
+    """A training as `tracking.load_training` reads it, whether or not the store has it yet."""
+    record, promoted = outcome.records[target], outcome.promotions.get(target)
+    return Training(
+        outcome.training_ids.get(target, record.id), pd.Timestamp(record.started_ms, unit="ms", tz="UTC"),
+        record.simulated, outcome.results[target], dict(record.params),
+        json.loads(json.dumps(promoted.as_dict())) if promoted is not None else {}, code_version(),
+    )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.errors import one_of
+from data.errors import InputError, one_of
 from pipelines import console
 from pipelines.commands.ingest import ingest_totals, print_findings, print_ingest
 from pipelines.options import Json, MachineFile, names, split
@@ -40,6 +40,7 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
         "diagnosis_words": outcome.diagnosis_summary,
         "seconds": outcome.seconds,
         "stopped": outcome.stopped,
+        "postponed": outcome.postponed,
     }
 
 
@@ -65,6 +66,8 @@ def print_training(outcome: TrainOutcome) -> None:
     for target, training in outcome.training_ids.items():
         promotion = outcome.promotions.get(target)
         console.line(promotion.summary if promotion else f"training {target} {training}")
+    if outcome.postponed:
+        console.line(f"postponed: {outcome.postponed}")
     console.line(f"report   {outcome.report}")
     if outcome.diagnosis_summary:
         console.line(f"diagnose {outcome.diagnosis_summary}")
@@ -112,7 +115,11 @@ def train(
     protocols: Annotated[str, typer.Option(help="protocols, comma separated; default: all")] = "",
     report: Annotated[Path | None, typer.Option(help="where the report goes")] = None,
     promote: Annotated[bool, typer.Option(help="promote the best cell")] = True,
-    direct: Annotated[bool, typer.Option("--direct", help="without Prefect: same functions, same numbers")] = False,
+    engine: Annotated[str, typer.Option(help="what runs the steps: prefect, direct or dask; same numbers")] = "prefect",
+    direct: Annotated[bool, typer.Option("--direct", help="the same as --engine direct: without Prefect")] = False,
+    address: Annotated[
+        str | None, typer.Option(help="of a Dask scheduler, tcp://…; default: worker processes of this computer")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """The main job: ingest → features → grid → track → promote → report."""
@@ -124,8 +131,12 @@ def train(
     from models import FAMILIES
     from models.crossing import Plan
     from models.protocols import PROTOCOLS
+    from pipelines.engine import ENGINES, open_engine
     from pipelines.training import TrainRequest, check_request
 
+    one_of(engine, ENGINES, "--engine")
+    if direct and engine not in ("prefect", "direct"):
+        raise InputError(f"--direct is --engine direct; got --engine {engine} as well; give one of them")
     configured = settings.load()
     plan = Plan(
         names(selectors, SELECTORS, "selector") if selectors else (),
@@ -135,19 +146,13 @@ def train(
     )
     request = TrainRequest(machine, tuple(recordings or ()), split(channels), plan, report, promote)
     check_request(request, configured)  # before a server starts
-    server = None
-    if not direct:
-        from pipelines.flows import start_server, train_in_flow
+    if configured.store_file is None:
+        from pipelines.tracking import open_store
 
-        server = start_server()
-    from pipelines import training
-    from pipelines.caller import DirectCaller
-
+        open_store(configured)
+    chosen = open_engine("direct" if direct else engine, address)
     with console.progress(as_json) as (say, done):
-        if direct:
-            outcome = training.train(request, configured, DirectCaller(done=done), say)
-        else:
-            outcome = train_in_flow(request, configured, say, done, server)
+        outcome = chosen.train(request, configured, say, done)
     if as_json:
         console.print_json(training_dict(outcome))
     else:

@@ -104,7 +104,7 @@ def test_an_interrupted_registration_is_done_again(store, monkeypatch):
         with pytest.raises(OSError, match="power cut"):
             train(store, "toy-cut", [4.0] * 7)
     again = train(store, "toy-cut", [4.0] * 7)
-    assert (again.outcome, again.version) == ("champion", 3)
+    assert (again.outcome, again.version) == ("champion", 2)  # goes on with the version that is there
     assert registry.rollback("toy-cut-z", store).version == 1
 
 

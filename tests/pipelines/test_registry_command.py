@@ -18,7 +18,7 @@ from mlflow.tracking import MlflowClient
 import thermodrift as td
 from data.errors import InputError
 from models.promotion import choose
-from pipelines import audit, registry, tracking
+from pipelines import audit, registry, runs, tracking
 from tests.toys.command import Call, in_process
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
@@ -150,7 +150,7 @@ def test_every_change_is_an_entry(story: Story, store: Any, monkeypatch: pytest.
     for entry in log.entries:
         tags = client_of(store).get_model_version(story.name, str(entry.to_version)).tags
         assert entry.training_id == tags["training_id"] and entry.who and entry.model == story.name
-        assert entry.code_version == tracking.code_version() == tags["code_version"]
+        assert entry.code_version == runs.code_version() == tags["code_version"]
         assert entry.code_version.startswith(("git ", "thermodrift "))
 
 
@@ -164,10 +164,10 @@ def test_the_log_is_plain_json_in_the_registry(story: Story, store: Any) -> None
 
 def test_who_is_the_user_of_the_tracking_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "anna")
-    assert audit._who() == "anna"
+    assert audit.who() == "anna"
     monkeypatch.delenv("MLFLOW_TRACKING_USERNAME")
     monkeypatch.setattr(audit.getpass, "getuser", lambda: (_ for _ in ()).throw(KeyError("uid 1234")))
-    assert audit._who() == "unknown"
+    assert audit.who() == "unknown"
 
 
 def test_status_and_reports_know_the_roll_back(story: Story, store: Any) -> None:
@@ -197,7 +197,7 @@ def test_the_command_prints_a_history(story: Story, call: Call) -> None:
     assert lines[0] == "audit-z, times are local"
     assert lines[1].startswith("  2026-03-01 10:00:00 CET promote none → 1, ")
     assert lines[5].startswith("  2026-03-03 10:00:00 CET rollback 2 → 1, ") and lines[5].endswith("was repaired")
-    assert lines[2].startswith("    training ") and tracking.code_version() in lines[2]
+    assert lines[2].startswith("    training ") and runs.code_version() in lines[2]
     rows = json.loads(call("registry", story.name, "--json").out)
     assert [(r["from_version"], r["to_version"], r["carried_out"]) for r in rows][:2] == [(None, 1, True), (1, 2, True)]
 
@@ -224,7 +224,7 @@ def test_a_lineage_names_every_batch_with_its_digest(story: Story, store: Any, c
     assert {b["batch_id"]: b["digest"] for b in got["batches"]} == {b.batch_id: b.digest for b in batches}
     assert {b["batch_id"]: b["masked"] for b in got["batches"] if b["masked"]} == {"b02": "front", "b04": "*"}
     assert len(got["findings"]) == 4 and got["inputs"] == ["front", "bed"] and got["simulated"]
-    assert got["training_code_version"] == got["code_version"] == tracking.code_version()
+    assert got["training_code_version"] == got["code_version"] == runs.code_version()
     tags = client_of(store).get_model_version(story.name, "3").tags
     assert (got["version"], got["training_id"], got["cell"]) == (3, tags["training_id"], "none|mlr|2")
     assert got["champion"] == [["2026-03-04T09:00:00+00:00", "2026-03-05T09:00:00+00:00"]]

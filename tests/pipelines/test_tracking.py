@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import json
+import os
+import platform
+import sys
 from pathlib import Path
 
 import mlflow
@@ -10,7 +14,7 @@ from mlflow.tracking import MlflowClient
 
 from data.errors import InputError, WorkError
 from models.protocols import PromotionRule
-from pipelines import tracking
+from pipelines import audit, runs, tracking
 from pipelines.settings import NamesPart, Settings
 from tests.toys.training import toy_batches, toy_result
 
@@ -38,17 +42,49 @@ def children(settings: Settings, training_id: str) -> dict[str, object]:
 
 def test_a_run_per_selector_and_family_with_points_and_folds_as_steps(logged):
     settings, training_id, _ = logged
-    runs = children(settings, training_id)
-    assert set(runs) == {"none × zero", "none × mlr", "correlation × mlr"}
-    run = runs["correlation × mlr"]
-    assert run.data.params["best_n_tsp"] == "2"
+    runs_of = children(settings, training_id)
+    assert set(runs_of) == {"none × zero", "none × mlr", "correlation × mlr"}
+    run = runs_of["correlation × mlr"]
+    assert run.data.params["n_tsp"] == "2" and run.data.params["inputs"]
     assert run.info.status == "FINISHED"
     client = MlflowClient(settings.store_uri, registry_uri=settings.store_uri)
-    history = client.get_metric_history(run.info.run_id, "leave_batch_out/S_mean_um")
+    history = client.get_metric_history(run.info.run_id, "leave_batch_out_by_n_tsp/S_mean_um")
     assert {m.step: m.value for m in history} == {1: 5.0, 2: pytest.approx(6.5 / 3)}
-    folds = client.get_metric_history(run.info.run_id, "leave_batch_out/fold_S_um")
+    folds = client.get_metric_history(run.info.run_id, "leave_batch_out_by_fold/S_um")
     assert {m.step: m.value for m in folds} == {0: 1.0, 1: 4.0, 2: 1.5}
-    assert {"leave_batch_out/" + m for m in tracking.CELL_METRICS} <= set(run.data.metrics)
+    assert {"leave_batch_out_by_n_tsp/" + m for m in tracking.CELL_METRICS} <= set(run.data.metrics)
+
+
+def test_plain_columns_are_of_the_best_cell_in_the_parent_and_in_every_child(logged):
+    """The list of runs shows a metric's last step; the plain ones have one step, and mean the same in every row."""
+    settings, training_id, result = logged
+    parent = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id)
+    models = children(settings, training_id)
+    worse, best = models["correlation × mlr"].data, models["none × mlr"].data
+    cells = result.cells.set_index(["selector", "family", "n_tsp"])
+    for run, cell in (
+        (worse, ("correlation", "mlr", 2)),
+        (best, ("none", "mlr", 2)),
+        (parent.data, ("none", "mlr", 2)),
+    ):
+        row = cells.loc[cell]
+        wanted = {"S_mean_um": row["S_mean_um"], "S_std_um": row["S_std_um"], "max_um": row["max_abs_um"], "n_tsp": 2}
+        assert {k: run.metrics[k] for k in wanted} == pytest.approx(wanted)
+        assert run.metrics["score_um"] == pytest.approx(row["S_mean_um"] + row["S_std_um"])
+        assert (run.params["selector"], run.params["family"], run.params["n_tsp"]) == (*cell[:2], "2")
+
+
+def test_a_run_says_who_made_it_with_which_program_and_in_which_process(logged, monkeypatch):
+    settings, training_id, _ = logged
+    tags = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id).data.tags
+    assert tags["mlflow.user"] == audit.who() and tags["mlflow.source.type"] == "LOCAL"
+    assert tags["mlflow.source.name"] == "thermodrift"  # a test is another program
+    program, _, commit = runs.code_version().partition(" ")
+    assert tags.get("mlflow.source.git.commit", "") == (commit.removesuffix("-dirty") if program == "git" else "")
+    process = json.loads(tags["process"])
+    assert (process["host"], process["pid"]) == (platform.node(), os.getpid())
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/thermodrift", "train", "--machine", "x.yml"])
+    assert runs.origin()["mlflow.source.name"] == "thermodrift train"
 
 
 def test_the_parent_carries_batches_figures_and_the_best(logged):
@@ -79,7 +115,8 @@ def test_a_training_comes_back_whole(logged):
     got = tracking.load_training(training_id, settings)
     assert got.simulated
     assert got.promotion == {}
-    assert got.params == {"seed": "0"}
+    chosen = {"selector": "none", "family": "mlr", "n_tsp": "2"}
+    assert got.params.items() >= {"seed": "0", **chosen}.items() and set(got.params) == {"seed", "inputs", *chosen}
     for table in ("batches", "scores", "cells", "subsets", "predictions"):
         pd.testing.assert_frame_equal(getattr(got.result, table), getattr(result, table), check_dtype=False)
 
@@ -98,7 +135,7 @@ def test_an_unfinished_training_is_not_listed(store, monkeypatch):
     def broken(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(tracking, "_log_files", broken)
+    monkeypatch.setattr(MlflowClient, "log_artifacts", broken)
     with pytest.raises(OSError, match="disk full"):
         tracking.log_training(toy_result(toy_batches("toy-broken", 3), S_UM), store)
     assert tracking.trainings("toy-broken", None, store).empty
@@ -150,7 +187,7 @@ def test_artifacts_stay_in_the_folder_of_their_channel(store, tmp_path, target):
     """A store decodes the address of an experiment, so that an unquoted name may lead out of its folder."""
     client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
     (tmp_path / "note.txt").write_text("x")
-    run = client.create_run(tracking.experiment_id(client, store, "toy-quoted", target, True))
+    run = client.create_run(runs.experiment_id(client, store, "toy-quoted", target, True))
     client.log_artifact(run.info.run_id, str(tmp_path / "note.txt"))
     (note,) = store.home.rglob(f"{run.info.run_id}/**/note.txt")
     assert note.relative_to(store.home / "artifacts" / "toy-quoted").parts[0] == target

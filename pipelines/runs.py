@@ -1,0 +1,308 @@
+"""Runs of the tracking store: written as a whole from plain data, marked with the process that writes them.
+
+A run is RUNNING while it is written and FINISHED as the last step, so that whatever else is found there was
+interrupted. A killed process cannot close its runs; the next command that writes on the same computer does
+(`close_interrupted`). A `Record` has an id of its own, and a store gets it once, however often it is written.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from urllib.parse import quote
+
+import pandas as pd
+import psutil
+from mlflow.entities import Dataset, DatasetInput, Experiment, InputTag, Metric, Param, Run, RunStatus, RunTag
+from mlflow.tracking import MlflowClient
+from pydantic import BaseModel, ConfigDict
+
+from pipelines.audit import who
+from pipelines.settings import Settings
+
+PARENT = "mlflow.parentRunId"
+_DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
+_AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
+_SAME_START_S = 30.0  # the clock may be set while a process runs; no number of a process returns that soon
+_PROGRAM = "thermodrift"
+
+
+class Entity(BaseModel):
+    """What a parent and its children have: metrics as (name, value, step)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    tags: dict[str, str] = {}
+    params: dict[str, str] = {}
+    metrics: tuple[tuple[str, float, int], ...] = ()
+
+
+class DatasetRecord(BaseModel):
+    """A batch of the lake as a dataset input."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    digest: str
+    source: str
+    version: int
+    n_rows: int
+
+
+class Record(Entity):
+    """A run with its children and inputs as plain data; its files are a folder next to it.
+
+    `id` is unique for a piece of work; times are in ms since 1970 (UTC).
+    """
+
+    id: str
+    kind: str  # training or diagnosis
+    machine: str
+    target: str  # error channel, or "diagnosis"
+    simulated: bool
+    started_ms: int
+    ended_ms: int
+    datasets: tuple[DatasetRecord, ...] = ()
+    children: tuple[Entity, ...] = ()
+
+    @property
+    def common(self) -> dict[str, str]:
+        """Tags of parent and children."""
+        return {
+            "simulated": yes_or_no(self.simulated), "machine": self.machine, "target": self.target, "record": self.id,
+        }  # fmt: skip
+
+
+def now_ms() -> int:
+    """The time now in ms since 1970 (UTC)."""
+    return int(time.time() * 1000)
+
+
+def write_record(client: MlflowClient, settings: Settings, record: Record, files: Path) -> str:
+    """Write a run with its children, its inputs and all of the folder `files`; returns its id.
+
+    A record that the store has as a finished run is not written again. What an interrupted attempt has left is closed.
+    A run is finished last: before, no list of this program has it.
+    """
+    experiment = experiment_id(client, settings, record.machine, record.target, record.simulated)
+    for run in _runs_of(client, experiment, record.id):
+        if run.info.status == "FINISHED" and PARENT not in run.data.tags:
+            return str(run.info.run_id)
+        if run.info.status == "RUNNING":
+            _interrupt(client, run, "written again by a later attempt")
+    own = origin()
+    tags = {**own, **record.common, **record.tags, "kind": record.kind}
+    run = client.create_run(experiment, start_time=record.started_ms, tags=tags, run_name=record.name)
+    run_id, children = str(run.info.run_id), record.children
+    with _closing(client, run_id):
+        _log(client, run_id, record, record.ended_ms)
+        client.log_artifacts(run_id, str(files))
+        if record.datasets:
+            client.log_inputs(run_id, datasets=[_dataset(d, record.kind) for d in record.datasets])
+        for child in children:
+            tags = {**own, **record.common, **child.tags, "kind": "cell", PARENT: run_id}
+            made = client.create_run(experiment, start_time=record.started_ms, tags=tags, run_name=child.name)
+            with _closing(client, made.info.run_id):
+                _log(client, made.info.run_id, child, record.ended_ms)
+                client.set_terminated(made.info.run_id, "FINISHED", record.ended_ms)
+        client.set_terminated(run_id, "FINISHED", record.ended_ms)
+    return run_id
+
+
+def find_record(client: MlflowClient, settings: Settings, record_id: str, machine: str, target: str) -> str | None:
+    """The finished run of a record, None where the store has none."""
+    experiment = client.get_experiment_by_name(settings.experiment(machine, target))
+    runs = [] if experiment is None else _runs_of(client, experiment.experiment_id, record_id)
+    done = (r.info.run_id for r in runs if r.info.status == "FINISHED" and PARENT not in r.data.tags)
+    return next(done, None)
+
+
+def close_interrupted(client: MlflowClient) -> int:
+    """Mark as killed what ended processes of this computer left running; returns the number of runs."""
+    left = [r for r in _runs(client, "attributes.status = 'RUNNING'") if _is_gone(r)]
+    for run in left:
+        _interrupt(client, run, "its process ended before the run did")
+    return len(left)
+
+
+def finished_runs(client: MlflowClient, kind: str) -> list[Run]:
+    """Finished runs of a kind over all experiments of thermodrift, newest first."""
+    return list(_runs(client, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'"))
+
+
+def experiment_id(client: MlflowClient, settings: Settings, machine: str, target: str, simulated: bool) -> str:
+    """The experiment of a machine's error channel (or "diagnosis"), made where there is none."""
+    name = settings.experiment(machine, target)
+    found = client.get_experiment_by_name(name)
+    if found is not None:
+        if found.lifecycle_stage == "deleted":
+            client.restore_experiment(found.experiment_id)
+        if found.tags.get("simulated") != yes_or_no(simulated):
+            client.set_experiment_tag(found.experiment_id, "simulated", yes_or_no(simulated))
+        return str(found.experiment_id)
+    # quoted, since a store decodes an address: the name 50%2f is no folder
+    where = f"{settings.artifacts_uri}/{artifact_folder(machine, target)}" if settings.artifacts_uri else None
+    tags = {"simulated": yes_or_no(simulated), "machine": machine, "target": target, "kind": _PROGRAM}
+    return str(client.create_experiment(name, artifact_location=where, tags=tags))
+
+
+def artifact_folder(machine: str, target: str) -> str:
+    """Where the files of an experiment are, below the artifacts' address."""
+    return f"{machine}/{quote(target)}"
+
+
+def dataset_records(batches: pd.DataFrame) -> tuple[DatasetRecord, ...]:
+    """The lake's batches; `batches` has batch_id, digest, version, source, n_rows."""
+    return tuple(
+        DatasetRecord(
+            name=str(row["batch_id"]), digest=str(row["digest"]), source=str(row.get("source", "")),
+            version=int(row.get("version", 1)), n_rows=int(row["n_rows"]),
+        )
+        for row in batches.to_dict("records")
+    )  # fmt: skip
+
+
+def origin() -> dict[str, str]:
+    """Tags that say who made a run, by which program and in which process."""
+    program, _, commit = code_version().partition(" ")
+    own = psutil.Process()
+    process = {"host": platform.node(), "pid": own.pid, "started": _iso(own.create_time())}
+    tags = {
+        "code_version": code_version(), "process": json.dumps(process), "mlflow.user": who(),
+        "mlflow.source.type": "LOCAL", "mlflow.source.name": _command(),
+    }  # fmt: skip
+    return tags | ({"mlflow.source.git.commit": commit.removesuffix("-dirty")} if program == "git" else {})
+
+
+def started(run: Run) -> pd.Timestamp:
+    """The start time, UTC."""
+    return pd.Timestamp(run.info.start_time, unit="ms", tz="UTC")
+
+
+@cache
+def code_version() -> str:
+    """The version of this program: ``git COMMIT`` of a checkout, -dirty with changes; else ``thermodrift VERSION``."""
+    root = Path(__file__).resolve().parents[1]
+    if (root / ".git").exists():  # an installation inside another project's checkout has none of its own
+        command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=True, timeout=20,
+                env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+            )  # fmt: skip
+            return f"git {done.stdout.strip()}"
+        except (OSError, subprocess.SubprocessError):
+            pass  # without git, or a checkout of another user: the package's version is what is known
+    return f"{_PROGRAM} {version(_PROGRAM)}"
+
+
+def yes_or_no(value: bool) -> str:
+    """A flag as tags hold it."""
+    return "true" if value else "false"
+
+
+class _closing:
+    """A run that fails is closed as FAILED, as far as the store still answers; what is raised stays the cause."""
+
+    def __init__(self, client: MlflowClient, run_id: str) -> None:
+        self._client, self._run_id = client, run_id
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
+        if kind is not None:
+            with suppress(Exception):
+                self._client.set_terminated(self._run_id, "FAILED")
+
+
+def _log(client: MlflowClient, run_id: str, what: Entity, at_ms: int) -> None:
+    """In one call, or in a few where there are many metrics."""
+    metrics = [Metric(key, value, at_ms, step) for key, value, step in what.metrics]
+    for first in range(0, len(metrics) or 1, _AT_ONCE):
+        params = [Param(k, v) for k, v in what.params.items()] if not first else []
+        client.log_batch(run_id, metrics=metrics[first : first + _AT_ONCE], params=params)
+
+
+def _dataset(batch: DatasetRecord, context: str) -> DatasetInput:
+    source = json.dumps({"source": batch.source, "batch": batch.name, "version": batch.version})
+    digest = batch.digest or f"v{batch.version}"
+    dataset = Dataset(
+        name=batch.name, digest=digest[:_DIGEST_LENGTH], source_type="thermodrift_lake", source=source,
+        profile=json.dumps({"num_rows": batch.n_rows}),
+    )  # fmt: skip
+    return DatasetInput(dataset, [InputTag("mlflow.data.context", context), InputTag("digest", digest)])
+
+
+def experiments(client: MlflowClient) -> list[Experiment]:
+    """Every experiment of thermodrift."""
+    found, token = [], None
+    while True:
+        page = client.search_experiments(filter_string=f"tags.kind = '{_PROGRAM}'", page_token=token)
+        found += page
+        if not (token := page.token):
+            return found
+
+
+def _runs(client: MlflowClient, which: str) -> Iterator[Run]:
+    ids, token = [e.experiment_id for e in experiments(client)], None
+    while ids:
+        page = client.search_runs(ids, which, page_token=token, order_by=["attributes.start_time DESC"])
+        yield from page
+        if not (token := page.token):
+            return
+
+
+def _runs_of(client: MlflowClient, experiment: str, record_id: str) -> list[Run]:
+    """Parent and children, of every attempt; the newest first."""
+    return list(client.search_runs([experiment], f"tags.record = '{record_id}'", max_results=1000))
+
+
+def _interrupt(client: MlflowClient, run: Run, why: str) -> None:
+    client.log_batch(run.info.run_id, tags=[RunTag("interrupted", why)])
+    client.set_terminated(run.info.run_id, RunStatus.to_string(RunStatus.KILLED))
+
+
+def _is_gone(run: Run) -> bool:
+    """Whether the process of a run was one of this computer that has ended; of others nothing is known."""
+    try:
+        process = json.loads(run.data.tags.get("process", ""))
+        host, pid, began = process["host"], int(process["pid"]), pd.Timestamp(process["started"])
+    except (ValueError, KeyError, TypeError):
+        return False
+    if host != platform.node():
+        return False
+    try:
+        now = psutil.Process(pid)
+        other = abs(now.create_time() - began.timestamp()) > _SAME_START_S
+        return other or now.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+    except psutil.AccessDenied:
+        return False
+
+
+def _iso(time_s: float) -> str:
+    return pd.Timestamp(time_s, unit="s", tz="UTC").isoformat(timespec="milliseconds")
+
+
+def _command() -> str:
+    """``thermodrift train``; ``thermodrift`` where another program calls the library."""
+    called, *rest = sys.argv or [""]
+    own = Path(called).stem == _PROGRAM and rest and not rest[0].startswith("-")
+    return f"{_PROGRAM} {rest[0]}" if own else _PROGRAM
+
+
+def tag_run(client: MlflowClient, run_id: str, tags: Mapping[str, str]) -> None:
+    """Set tags of a run in one call."""
+    client.log_batch(run_id, tags=[RunTag(k, v) for k, v in tags.items()])
