@@ -16,8 +16,8 @@ from data.machine import load_machine
 from tests import chaos
 
 WHOLE: dict[str, Any] = {
-    "lake": {"20250114": ["a"]}, "lake_trouble": [], "quarantine": [], "running": [],
-    "trainings": {"t": [["x", "mlr", 3, 1.0]]}, "newest": "t", "versions": {"1": "champion"}, "champion": 1, "logged": 1, "shown": 1, "noted": [],
+    "lake": {"20250114": ["a"]}, "lake_trouble": [], "quarantine": [], "running": [], "noted": [], "newest": "t",
+    "trainings": {"t": [["x", "mlr", 3, 1.0]]}, "versions": {"1": "champion"}, "champion": 1, "logged": 1, "shown": 1,
     "predicted": [0.0, 1.5], "cell": "none|mlr|3",
 }  # fmt: skip
 
