@@ -24,8 +24,11 @@ _MAX_DIGITS = 100  # Python takes quadratic time for long numbers, and does not 
 _SHOWN = 300  # characters of a wrong value that an error line shows
 
 
-def load_yaml(path: Path, model: type[M], what: str) -> M:
+def load_yaml(path: Path, model: type[M], what: str, every: bool = False) -> M:
     """Read and check a file; `what` names its kind in error lines ("machine file").
+
+    Args:
+        every: a line for every mistake, instead of the first with the number of the others.
 
     Raises:
         InputError: file missing, not YAML, a key given twice or misspelt (with the closest), a wrong value, or more
@@ -38,10 +41,10 @@ def load_yaml(path: Path, model: type[M], what: str) -> M:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} {path}: cannot be read ({reason}); give the path of a .yml file") from None
-    return parse_yaml(text, model, f"{what} {path}")
+    return parse_yaml(text, model, f"{what} {path}", every)
 
 
-def parse_yaml(text: str, model: type[M], where: str) -> M:
+def parse_yaml(text: str, model: type[M], where: str, every: bool = False) -> M:
     """The same from text; an empty text is an empty mapping."""
     raw, node = _plain(text, where)
     if raw is None:
@@ -49,7 +52,7 @@ def parse_yaml(text: str, model: type[M], where: str) -> M:
     if not isinstance(raw, dict):
         needed = [k for k, f in model.model_fields.items() if f.is_required()] or list(model.model_fields)
         raise InputError(f"{where}: expected a mapping with the keys {' and '.join(needed)}, got {type(raw).__name__}")
-    return _checked(raw, model, where, "", node)
+    return _checked(raw, model, where, "", node, every)
 
 
 def parse_plain(text: str, where: str) -> Any:
@@ -87,16 +90,21 @@ def parse_part(raw: Any, model: type[M], where: str, key: str = "") -> M:
     return _checked(raw, model, where, key, None)
 
 
-def _checked(raw: Any, model: type[M], where: str, above: str, node: yaml.Node | None) -> M:
+def _checked(raw: Any, model: type[M], where: str, above: str, node: yaml.Node | None, every: bool = False) -> M:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
         # a misspelt key also leaves the right one missing: the misspelling is what the user corrects
         problems = sorted(error.errors(), key=lambda p: p["type"] != "extra_forbidden")
-        line = _line(node, problems[0]["loc"])
-        at = f" line {line}" if line else ""
-        more = f" (and {len(problems) - 1} more problem{'s' * (len(problems) > 2)})" if len(problems) > 1 else ""
-        raise InputError(f"{where}{at}: {_in_words(problems[0], model, above)}{more}") from None
+        shown = problems if every else problems[:1]
+        numbers = [_line(node, p["loc"]) for p in shown]
+        lines = [
+            f"{where}{f' line {n}' if n else ''}: {_in_words(p, model, above)}"
+            for n, p in zip(numbers, shown, strict=True)
+        ]
+        left = len(problems) - len(shown)
+        more = f" (and {left} more problem{'s' * (left > 1)})" if left else ""
+        raise InputError("\n".join(lines) + more) from None
 
 
 class _Bounded(yaml.SafeLoader):

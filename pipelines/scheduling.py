@@ -1,114 +1,199 @@
-"""Retraining on a schedule: the flow of one retraining, and the waiting for its dates."""
+"""The process that waits for the machines of a fleet and has each retrained in a process of its own.
+
+It decides nothing about models and imports little: what comes due is a `Source` (dates and watched folders here, a
+Prefect server in `pipelines.deployments`), what a run does is in `pipelines.apart`. One run per machine at a time; a
+date that passes while a run goes on, or while this process does not run, is caught up once.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Sequence
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from zoneinfo import ZoneInfo, available_timezones
+from typing import Any, Protocol
+from zoneinfo import available_timezones
 
-from cronsim import CronSim, CronSimError
-from prefect import flow
-from prefect import settings as prefect_settings
-from prefect.client.schemas.schedules import CronSchedule
-from prefect.server.api.server import SubprocessASGIServer
-from prefect.task_runners import ThreadPoolTaskRunner
-from prefect.types.entrypoint import EntrypointType
+from filelock import FileLock, Timeout
 
+from data.endings import ending
 from data.errors import InputError, WorkError
-from data.machine import load_machine
-from pipelines import stopping
-from pipelines.caller import LANES, Say
-from pipelines.flows import PrefectCaller, quiet_prefect, start_server
-from pipelines.settings import load
-from pipelines.training import TrainRequest, train
+from pipelines import alerts, fleet_state
+from pipelines.caller import Say
+from pipelines.fleet import Fleet, FleetMachine
+from pipelines.folders import Folders
+
+TICK_S = 1.0
+RUN = (sys.executable, "-m", "pipelines.apart", "run")
+END_S = 2.5  # for a run to end after SIGTERM; an operator waits 5 s for all of it
 
 
-@flow(name="thermodrift-retrain", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)
-def retrain(machine_file: str, recordings: list[str]) -> str:
-    """Ingest what arrived since the last time and train if there is anything new; returns a summary.
+@dataclass(frozen=True)
+class Job:
+    """A machine whose turn has come; `flow_run_id` where a server scheduled it."""
 
-    An error is printed in one line, and the run counts as failed.
-    """
-    quiet_prefect()
-    request = TrainRequest(Path(machine_file), tuple(Path(r) for r in recordings), only_if_new=True)
-    try:
-        outcome = train(request, load(), PrefectCaller(machine=load_machine(request.machine_file).machine))
-    except (InputError, WorkError) as error:
-        print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {error}", flush=True)
-        raise
-    summary = outcome.stopped or "; ".join(p.summary for p in outcome.promotions.values())
-    quarantined = len(outcome.ingested.quarantined) if outcome.ingested else 0
-    summary += f" (files in quarantine: {quarantined})" if quarantined else ""
-    waiting = len(outcome.ingested.waiting) if outcome.ingested else 0
-    summary += f" (files still being written: {waiting})" if waiting else ""
-    summary += f"; {outcome.diagnosis_summary}" if outcome.diagnosis_summary else ""
-    print(f"{datetime.now():%Y-%m-%d %H:%M} {outcome.machine}: {summary}", flush=True)
-    return summary
+    machine: FleetMachine
+    flow_run_id: str | None = None
 
 
-def serve_schedule(
-    machine_file: Path,
-    recordings: Sequence[Path],
-    cron: str,
-    say: Say = lambda text: None,
-    rounds: int | None = None,
-) -> None:
-    """Retrain on a cron schedule in local time until interrupted (or for `rounds`).
+class Source(Protocol):
+    """What comes due, and when."""
 
-    Where PREFECT_API_URL names a server, a deployment is served whose runs that server schedules. Without one this
-    process waits by itself and starts Prefect's temporary server for each run, because such a server schedules
-    nothing. An error in one run is printed; the next one follows all the same.
+    def due(self, now: datetime) -> list[Job]:
+        """Every job that could begin now, again and again until it begins."""
 
-    Raises:
-        InputError: `cron` is no cron expression.
-    """
-    zone = ZoneInfo(local_timezone())
-    try:
-        schedule = CronSchedule(cron=cron, timezone=zone.key)
-        CronSim(cron, datetime.now(zone))
-    except (ValueError, CronSimError):
-        raise InputError(
-            f"--cron: got {cron!r}, expected five fields (minute hour day month weekday), such as '0 5 * * 1' for "
-            "Mondays at 5:00"
-        ) from None
-    parameters = {"machine_file": str(machine_file.resolve()), "recordings": [str(r.resolve()) for r in recordings]}
-    if prefect_settings.PREFECT_API_URL.value():
-        say(f"retraining of {machine_file.stem} at '{cron}' ({zone.key}); Ctrl-C ends it")
-        stopping.release()  # Prefect ends its runs and pauses the schedule on the server
-        retrain.serve(
-            name=f"retrain-{machine_file.stem}",
-            schedule=schedule,
-            parameters=parameters,
-            limit=1,
-            print_starting_message=False,
-            entrypoint_type=EntrypointType.MODULE_PATH,  # a file path would be relative to the working directory
-        )
-        return
-    while rounds is None or rounds > 0:
-        due = next(CronSim(cron, datetime.now(zone)))  # from now on: a run may last past the next date
-        say(f"retraining of {machine_file.stem} next at {due:%Y-%m-%d %H:%M %Z}; Ctrl-C ends it")
-        _wait_until(due)
-        server = start_server()
+    def begin(self, job: Job, now: datetime) -> bool:
+        """The job begins; False where it is no longer to be done."""
+
+    def ended(self, job: Job, ok: bool | None) -> None:
+        """The job ended; `ok` None: its process did not say how, or was ended."""
+
+    def next(self) -> Mapping[str, datetime | None]:
+        """The next date of each machine by name, None where none is known."""
+
+
+class Clock:
+    """Dates that this process computes, and folders that it watches; `last` is when each machine last had its turn."""
+
+    def __init__(self, fleet: Fleet, last: Mapping[str, datetime], folders: Folders, now: datetime) -> None:
+        self._fleet, self._folders = fleet, folders
+        self._next: dict[str, datetime | None] = {}
+        for m in fleet.machines:
+            if m.when.watch:
+                folders.touch(m.name, now - timedelta(days=1))  # what arrived while nobody watched
+            since = last.get(m.name)
+            due = m.when.next(now if since is None else since, fleet.zone)
+            self._next[m.name] = due if due is None else max(due, now)
+
+    def due(self, now: datetime) -> list[Job]:
+        changed = self._folders.settled(now)
+        passed = {name for name, due in self._next.items() if due is not None and due <= now}
+        return [Job(m) for m in self._fleet.machines if m.name in changed | passed]
+
+    def begin(self, job: Job, now: datetime) -> bool:
+        self._next[job.machine.name] = job.machine.when.next(now, self._fleet.zone)
+        self._folders.taken(job.machine.name)
+        return True
+
+    def ended(self, job: Job, ok: bool | None) -> None:
+        pass
+
+    def next(self) -> Mapping[str, datetime | None]:
+        return self._next
+
+
+@dataclass
+class Run:
+    """A retraining under way in its process."""
+
+    job: Job
+    process: subprocess.Popen[str]
+    result: Path
+    log: Path
+    began: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+    def outcome(self) -> dict[str, Any]:
+        """`ok` (None: it did not say) and `summary`, of a process that has ended."""
         try:
-            if server is not None:
-                server.join()
-            retrain(**parameters)
-        except (InputError, WorkError):
-            pass  # the flow has printed it
-        except Exception as error:
-            print(f"{datetime.now():%Y-%m-%d %H:%M} not retrained: {type(error).__name__}: {error}", flush=True)
+            said: dict[str, Any] = json.loads(self.result.read_text(encoding="utf-8"))
+            return said
+        except (OSError, ValueError):
+            code = self.process.returncode
+            how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+            return {"ok": None, "summary": f"its process ended {how}; see {self.log}"}
         finally:
-            SubprocessASGIServer().stop()
-        rounds = None if rounds is None else rounds - 1
+            self.result.unlink(missing_ok=True)
+
+    def kill(self) -> None:
+        """End it with all processes that it started."""
+        if self.process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self.process.stdin.close()
+        if hasattr(os, "killpg"):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.kill()
+        self.process.wait()
 
 
-def _wait_until(due: datetime) -> None:
-    """In short sleeps, since a computer may be suspended or its clock set."""
-    while (left_s := (due - datetime.now(UTC)).total_seconds()) > 0:
-        time.sleep(min(left_s, 30.0))
+class Scheduler:
+    """The loop: begins what is due, at most `at_once` runs and one per machine, and states how they ended."""
+
+    def __init__(self, fleet: Fleet, source: Source, home: Path, say: Say) -> None:
+        self.fleet, self.source, self.home, self.say = fleet, source, home, say
+        self.running: dict[str, Run] = {}
+        self.ended = 0
+        self._told: Mapping[str, datetime | None] = {}
+
+    def serve(self, rounds: int | None = None, sleep: Callable[[float], None] = time.sleep) -> None:
+        """Until interrupted, or until `rounds` runs have ended."""
+        with ending(self.stop):
+            while rounds is None or self.ended < rounds:
+                self.step(datetime.now(UTC))
+                sleep(TICK_S)
+
+    def step(self, now: datetime) -> None:
+        """Take note of what ended, begin what is due."""
+        for run in [r for r in self.running.values() if r.process.poll() is not None]:
+            self._end(run)
+        for job in self.source.due(now):
+            name = job.machine.name
+            if name in self.running or len(self.running) >= self.fleet.at_once or not self.source.begin(job, now):
+                continue
+            self.running[name] = self._begin(job, now)
+        if (upcoming := dict(self.source.next())) != self._told:
+            self._told = upcoming
+            fleet_state.write_schedule(self.home, self.fleet, upcoming)
+
+    def stop(self) -> None:
+        """End every run, within `END_S`."""
+        runs = list(self.running.values())
+        for run in runs:
+            run.process.terminate()
+        end_s = time.monotonic() + END_S
+        while any(r.process.poll() is None for r in runs) and time.monotonic() < end_s:
+            time.sleep(0.02)
+        for run in runs:
+            run.kill()
+            run.result.unlink(missing_ok=True)
+            self.source.ended(run.job, None)
+
+    def _begin(self, job: Job, now: datetime) -> Run:
+        machine = job.machine
+        fleet_state.note_turn(self.home, self.fleet, machine.name, now)
+        folder = fleet_state.folder_of(self.home)
+        result, log = (folder / f"{fleet_state.file_name(machine.name)}{suffix}" for suffix in (".result", ".log"))
+        result.unlink(missing_ok=True)
+        with log.open("w", encoding="utf-8") as out:
+            process = subprocess.Popen(
+                RUN, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            )  # fmt: skip
+        assert process.stdin is not None
+        line = {"machine": machine.as_plain(), "flow_run_id": job.flow_run_id, "result": str(result)}
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(json.dumps(line) + "\n")
+            process.stdin.flush()  # it stays open: the run ends with this process
+        return Run(job, process, result, log, now)
+
+    def _end(self, run: Run) -> None:
+        name = run.job.machine.name
+        del self.running[name]
+        run.kill()  # what it may have left behind
+        outcome = run.outcome()
+        ok, summary = outcome["ok"], " ".join(str(outcome["summary"]).split())
+        self.source.ended(run.job, ok)
+        self.say(f"{datetime.now():%Y-%m-%d %H:%M} {name}: {'' if ok else 'not retrained: '}{summary}")
+        fleet_state.note_run(self.home, name, run.began, bool(ok), summary)
+        alerts.after_run(self.home, self.fleet, name, self.say)
+        self.ended += 1
 
 
 def local_timezone() -> str:
@@ -116,3 +201,90 @@ def local_timezone() -> str:
     named = os.environ.get("TZ", "").lstrip(":")
     linked = Path("/etc/localtime").resolve().as_posix().partition("zoneinfo/")[2]
     return next((z for z in (named, linked) if z in available_timezones()), "UTC")
+
+
+def checked(fleet: Fleet, say: Say) -> tuple[Fleet, dict[str, Any]]:
+    """The fleet with the machines' names, and the schema of a run's parameters; in a process of its own.
+
+    Raises:
+        InputError: a line for every machine file, channel or family that cannot be used.
+        WorkError: the process of the check fails.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "pipelines.apart", "check"], input=fleet.as_json() + "\n", capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise WorkError(f"the check of {fleet.source} failed: {(done.stderr.strip() or '?').splitlines()[-1]}")
+    found = json.loads(done.stdout.splitlines()[-1])
+    if found["problems"]:
+        raise InputError("\n".join(found["problems"]))
+    for note in found["notes"]:
+        say(note)
+    machines = tuple(replace(m, name=n) for m, n in zip(fleet.machines, found["names"], strict=True))
+    return replace(fleet, machines=machines), found["schema"]
+
+
+@contextmanager
+def alone(home: Path, fleet: Fleet) -> Iterator[None]:
+    """One process per fleet file and home.
+
+    Raises:
+        InputError: another process serves this fleet.
+    """
+    lock = FileLock(fleet_state.lock_file(home, fleet.key), timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            f"{fleet.source}: another `thermodrift schedule` serves it with home {home}; end that one first"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -> None:
+    """Retrain the machines of a checked fleet when they are due, until interrupted (or for `rounds` runs).
+
+    Where PREFECT_API_URL names a server, each machine is a deployment there. Without one this process waits by itself,
+    and each run starts Prefect's temporary server.
+
+    Raises:
+        InputError: another process serves the fleet, or the machine files cannot be used.
+    """
+    with alone(home, fleet):
+        fleet, schema = checked(fleet, say)
+        folders = Folders(fleet, say)
+        with folders.watching():
+            if _has_server(home):
+                from pipelines.deployments import Deployments
+
+                with Deployments(fleet, schema, folders, say) as source:
+                    say(_first_line(fleet, f"as scheduled by {source.url}"))
+                    Scheduler(fleet, source, home, say).serve(rounds)
+            else:
+                clock = Clock(fleet, fleet_state.last_turns(home, fleet), folders, datetime.now(UTC))
+                dates = {n: d for n, d in clock.next().items() if d is not None}
+                first = min(dates, key=lambda n: dates[n], default="")
+                say(_first_line(fleet, f"next at {dates[first]:%Y-%m-%d %H:%M %Z}" if first else "when files arrive"))
+                Scheduler(fleet, clock, home, say).serve(rounds)
+
+
+def _has_server(home: Path) -> bool:
+    """Whether PREFECT_API_URL is set, in the environment or in a profile of Prefect's."""
+    folder = Path(os.environ.setdefault("PREFECT_HOME", str(home / "prefect"))).expanduser()
+    if os.environ.get("PREFECT_API_URL", "").strip():
+        folder.mkdir(parents=True, exist_ok=True)
+        return True
+    if not (folder / "profiles.toml").exists():
+        return False
+    from prefect.settings import PREFECT_API_URL
+
+    return bool(PREFECT_API_URL.value())
+
+
+def _first_line(fleet: Fleet, when: str) -> str:
+    n = len(fleet.machines)
+    return f"retraining of {fleet.machines[0].name if n == 1 else f'{n} machines'} {when}; Ctrl-C ends it"

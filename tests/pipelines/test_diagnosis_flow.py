@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,13 +10,9 @@ import pytest
 
 from data.errors import InputError, WorkError
 from diagnosis.findings.schema import read_findings
-from models.crossing import Plan
 from pipelines import diagnosing, training
 from pipelines.tracking import diagnoses
-from pipelines.training import TrainRequest
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
-
-SMALL = Plan(("none",), ("zero",), ("leave-batch-out",))
 
 
 @pytest.fixture
@@ -67,11 +62,12 @@ def test_what_stops_it_is_one_line_and_is_not_tried_again(
 def test_retraining_tells_of_the_diagnosis(
     flows: ModuleType, toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines import scheduling
+    from pipelines import retraining
 
-    monkeypatch.setattr(scheduling, "TrainRequest", functools.partial(TrainRequest, targets=("z",), plan=SMALL))
     monkeypatch.setattr(training, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
     machine = write_machine(tmp_path / "m.yml", "flow-season")
-    words = scheduling.retrain(str(machine), [str(write_recordings(tmp_path / "in"))])
+    words = retraining.retrain(
+        str(machine), [str(write_recordings(tmp_path / "in"))], channels=["z"], selectors=["none"], families=["zero"]
+    )
     assert words.startswith("flow-season-z version 1 is challenger: no trustworthy model")
     assert words.endswith("; z: left-out S has grown; diagnosed")

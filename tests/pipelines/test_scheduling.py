@@ -1,95 +1,206 @@
-"""Retraining on a schedule: when it is due, through a server, and after trouble."""
+"""The process that waits: what is due, one run per machine, failures that stay where they are, and its end."""
 
 from __future__ import annotations
 
-import functools
-from datetime import UTC, datetime
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
 
 from data.errors import InputError
-from models.crossing import Plan
-from pipelines.training import TrainRequest
-from tests.toys.small_year import write_machine, write_year
+from pipelines import fleet_state, scheduling
+from pipelines.fleet import Fleet, FleetMachine, When
+from pipelines.folders import Folders
+from pipelines.scheduling import Clock, Scheduler, alone, local_timezone
+from tests.toys.small_year import write_machine
 
-SMALL = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
+ROOT = Path(__file__).parents[2]
+MONDAY = datetime(2026, 11, 30, 5, 0, tzinfo=UTC)
+WEEK = timedelta(days=7)
+# A run that does what its machine's name says.
+TOY = """
+import json, os, signal, subprocess, sys, time
+job = json.loads(sys.stdin.readline())
+name = job["machine"]["name"]
+if name.startswith("killed"): os.kill(os.getpid(), signal.SIGKILL)
+if name.startswith("slow"):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    print(child.pid, flush=True)
+    time.sleep(600)
+outcome = {"ok": not name.startswith("bad"), "summary": f"{name} has run"}
+open(job["result"], "w").write(json.dumps(outcome))
+"""
+
+
+def fleet_of(*names: str, at_once: int = 1, when: When | None = None) -> Fleet:
+    machines = tuple(FleetMachine(n, f"/m/{n}.yml", ("/in",), when or When(cron="0 5 * * 1")) for n in names)
+    return Fleet("/m/fleet.yml", machines, at_once, "UTC")
 
 
 @pytest.fixture
-def scheduling(flows: ModuleType) -> ModuleType:
-    """Imported after the environment of Prefect is set."""
-    from pipelines import scheduling as module
-
-    return module
+def said() -> list[str]:
+    return []
 
 
-@pytest.fixture
-def small_retrain(scheduling: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Retraining with a quick plan."""
-    monkeypatch.setattr(scheduling, "TrainRequest", functools.partial(TrainRequest, targets=("z",), plan=SMALL))
-    return scheduling
+@pytest.fixture(autouse=True)
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scheduling, "RUN", (sys.executable, "-c", TOY))
+    monkeypatch.setattr(scheduling, "TICK_S", 0.02)
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path))
 
 
-def test_retraining_learns_once(small_retrain: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    machine = write_machine(tmp_path / "m.yml", "flow-again")
-    write_year(tmp_path / "in", 5)
-    first = small_retrain.retrain(str(machine), [str(tmp_path / "in")])
-    again = small_retrain.retrain(str(machine), [str(tmp_path / "in")])
-    assert "flow-again-z version 1 is champion" in first
-    assert again == "the last training saw the same batches; nothing new to learn"
-    (tmp_path / "in" / "20251015.csv").write_text("nothing")
-    assert small_retrain.retrain(str(machine), [str(tmp_path / "in")]).endswith("(files in quarantine: 1)")
-    assert f"flow-again: {again}" in capfd.readouterr().out
+def served(fleet: Fleet, home: Path, said: list[str], last: dict[str, datetime] | None = None) -> Scheduler:
+    """A scheduler whose machines are due as `last` says; by default all of them are."""
+    now = datetime.now(UTC)
+    turns = dict.fromkeys((m.name for m in fleet.machines), now - WEEK - timedelta(days=1)) if last is None else last
+    clock = Clock(fleet, turns, Folders(fleet, said.append), now)
+    return Scheduler(fleet, clock, home, said.append)
 
 
-def test_the_schedule_runs_when_it_is_due_and_goes_on_after_trouble(
-    small_retrain: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    waited: list[datetime] = []
-    said: list[str] = []
-    monkeypatch.setattr(small_retrain, "_wait_until", waited.append)
-    monkeypatch.setattr(small_retrain.SubprocessASGIServer, "stop", lambda self: None)  # other tests need it
-    monkeypatch.setattr(small_retrain, "local_timezone", lambda: "Asia/Tokyo")
-    machine = write_machine(tmp_path / "m.yml", "flow-due")
-    write_year(tmp_path / "in", 1)
-    before = datetime.now(UTC)
-    small_retrain.serve_schedule(machine, [tmp_path / "in"], "0 5 * * 1", said.append, rounds=2)
-    assert len(waited) == 2
-    for due in waited:
-        assert (due.weekday(), due.hour, due.minute, due.utcoffset().total_seconds()) == (0, 5, 0, 9 * 3600)
-        assert 0 < (due - before).total_seconds() <= 7 * 86400 + 60
-    assert said[0] == f"retraining of m next at {waited[0]:%Y-%m-%d} 05:00 JST; Ctrl-C ends it"
-    shown = capfd.readouterr()
-    assert shown.out.count("not retrained: flow-due: got 1 batch(es) with a usable z, need at least 2") == 2
-    assert "Traceback" not in shown.out + shown.err
+def until(condition: Callable[[], object], scheduler: Scheduler, limit_s: float = 60.0) -> None:
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s
+        scheduler.step(datetime.now(UTC))
+        time.sleep(0.02)
 
 
-def test_a_running_server_gets_a_deployment_with_the_cron(
-    flows: ModuleType, scheduling: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from prefect.client.orchestration import get_client
-    from prefect.runner import Runner
-    from prefect.settings import PREFECT_API_URL, temporary_settings
-
-    async def at_once(self: Any, *args: Any, **more: Any) -> None:
-        return None
-
-    server = flows.SubprocessASGIServer()
-    assert server.api_url.startswith("http://127.0.0.1:")
-    monkeypatch.setattr(Runner, "start", at_once)
-    machine = write_machine(tmp_path / "lathe.yml", "flow-served")
-    with temporary_settings({PREFECT_API_URL: server.api_url}):
-        scheduling.serve_schedule(machine, [tmp_path], "30 4 * * 2")
-        with get_client(sync_client=True) as client:
-            deployment = client.read_deployment_by_name("thermodrift-retrain/retrain-lathe")
-    assert [s.schedule.cron for s in deployment.schedules] == ["30 4 * * 2"]
-    assert deployment.parameters == {"machine_file": str(machine), "recordings": [str(tmp_path)]}
-    assert deployment.entrypoint == "pipelines.scheduling.retrain"
+def test_dates_come_due_one_after_another() -> None:
+    fleet = fleet_of("mill", "lathe")
+    clock = Clock(fleet, {}, Folders(fleet, print), MONDAY - timedelta(hours=1))
+    assert clock.next() == {"mill": MONDAY, "lathe": MONDAY} and not clock.due(MONDAY - timedelta(seconds=1))
+    jobs = clock.due(MONDAY)
+    assert [j.machine.name for j in jobs] == ["mill", "lathe"]
+    assert clock.begin(jobs[0], MONDAY) and [j.machine.name for j in clock.due(MONDAY)] == ["lathe"]
+    assert clock.next()["mill"] == MONDAY + WEEK
 
 
-def test_what_is_no_cron_is_told(scheduling: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--cron: got 'monday', expected five fields \(minute hour day month weekday"):
-        scheduling.serve_schedule(tmp_path / "m.yml", [tmp_path], "monday")
+@pytest.mark.parametrize("when", [When(cron="0 5 * * 1"), When(every_h=1.0)])
+def test_missed_dates_are_caught_up_once(when: When) -> None:
+    fleet = fleet_of("mill", when=when)
+    now = MONDAY + 3 * WEEK + timedelta(hours=2)
+    clock = Clock(fleet, {"mill": MONDAY}, Folders(fleet, print), now)
+    (job,) = clock.due(now)
+    clock.begin(job, now)
+    assert not clock.due(now) and clock.next()["mill"] == when.next(now, fleet.zone)
+    awake = now + timedelta(days=30)  # the computer was suspended
+    (job,) = clock.due(awake)
+    clock.begin(job, awake)
+    assert not clock.due(awake)
+
+
+def test_a_machine_that_never_had_its_turn_waits_for_its_first_date() -> None:
+    fleet = fleet_of("mill")
+    assert not Clock(fleet, {}, Folders(fleet, print), MONDAY + timedelta(minutes=1)).due(MONDAY + timedelta(minutes=1))
+
+
+def test_one_machine_s_failure_stays_with_it(tmp_path: Path, said: list[str]) -> None:
+    fleet = fleet_of("bad", "killed", "good")
+    served(fleet, tmp_path, said).serve(rounds=3)
+    lines = [line[17:] for line in said if not line.startswith("alert")]
+    log = tmp_path / "fleet" / "killed.log"
+    assert lines == [
+        "bad: not retrained: bad has run", f"killed: not retrained: its process ended by signal SIGKILL; see {log}",
+        "good: good has run",
+    ]  # fmt: skip
+    runs = {n: fleet_state.read(tmp_path, n, "run") for n in ("bad", "killed", "good")}
+    assert [runs[n]["last"]["ok"] for n in runs] == [False, False, True]
+    assert runs["bad"]["failed"]["summary"] == "bad has run" and runs["good"]["failed"] is None
+    assert "alert bad: the last retraining failed: bad has run" in said
+    assert not list(tmp_path.glob("fleet/*.result"))
+
+
+def test_a_failure_stays_known_after_a_success(tmp_path: Path) -> None:
+    fleet_state.note_run(tmp_path, "mill", MONDAY, False, "no share")
+    fleet_state.note_run(tmp_path, "mill", MONDAY + WEEK, True, "trained")
+    run = fleet_state.read(tmp_path, "mill", "run")
+    assert (run["last"]["summary"], run["failed"]["summary"]) == ("trained", "no share")
+
+
+def test_no_more_runs_at_once_than_allowed_and_one_per_machine(tmp_path: Path, said: list[str]) -> None:
+    scheduler = served(fleet_of("slow1", "slow2", "slow3", at_once=2), tmp_path, said)
+    try:
+        scheduler.step(datetime.now(UTC))
+        scheduler.step(datetime.now(UTC) + WEEK)  # the next date of the running ones passes
+        assert list(scheduler.running) == ["slow1", "slow2"]
+    finally:
+        scheduler.stop()
+
+
+def test_what_runs_ends_with_the_scheduler_and_all_that_it_started(tmp_path: Path, said: list[str]) -> None:
+    scheduler = served(fleet_of("slow"), tmp_path, said)
+    log = tmp_path / "fleet" / "slow.log"
+    until(lambda: log.exists() and log.read_text().strip(), scheduler)
+    own, started = scheduler.running["slow"].process, int(log.read_text())
+    scheduler.stop()
+    assert own.poll() is not None
+    for _ in range(200):
+        if not _lives(started):
+            break
+        time.sleep(0.02)
+    assert not _lives(started)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_turns_and_next_dates_are_kept(tmp_path: Path, said: list[str]) -> None:
+    fleet = fleet_of("mill")
+    with alone(tmp_path, fleet):
+        before = datetime.now(UTC)
+        served(fleet, tmp_path, said).serve(rounds=1)
+        ((kept, live),) = fleet_state.schedules(tmp_path)
+        assert live and datetime.fromisoformat(kept["next"]["mill"]) > before
+        assert fleet_state.last_turns(tmp_path, fleet)["mill"] >= before
+        with pytest.raises(InputError, match=r"another `thermodrift schedule` serves it"), alone(tmp_path, fleet):
+            pass
+    assert [live for _, live in fleet_state.schedules(tmp_path)] == [False]
+    again = served(fleet, tmp_path, said, fleet_state.last_turns(tmp_path, fleet))
+    assert not again.source.due(datetime.now(UTC))
+
+
+def test_it_waits_in_little_memory() -> None:
+    """The process that waits imports neither pandas nor mlflow, prefect or torch."""
+    code = (
+        "import sys; import pipelines.commands.schedule, pipelines.scheduling, pipelines.folders, pipelines.alerts\n"
+        "print(sorted({'pandas', 'numpy', 'mlflow', 'prefect', 'torch', 'sklearn'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_a_signal_ends_the_command(tmp_path: Path, number: int) -> None:
+    (tmp_path / "in").mkdir()
+    fleet = tmp_path / "fleet.yml"
+    write_machine(tmp_path / "mill.yml", "mill")
+    fleet.write_text("machines: [{machine: mill.yml, recordings: [in], channels: [z]}]")
+    environment = {k: v for k, v in os.environ.items() if k != "PREFECT_API_URL"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pipelines.cli", "schedule", str(fleet)], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**environment, "THERMODRIFT_HOME": str(tmp_path / "home")},
+    )  # fmt: skip
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    assert first.startswith("retraining of mill next at ") and first.endswith("; Ctrl-C ends it\n")
+    process.send_signal(number)
+    error = process.communicate(timeout=60)[1]
+    assert (process.returncode, error) == (128 + number, "thermodrift: stopped\n")
+
+
+def test_the_local_time_zone_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    assert local_timezone() == "Asia/Tokyo"
+    assert json.loads(fleet_of("m").as_json())["timezone"] == "UTC"

@@ -1,0 +1,109 @@
+"""What is kept about a fleet below the home folder, as small JSON files that are read without heavy imports.
+
+fleet/KEY.schedule.json   a fleet: its file, next dates, last turns; KEY.lock is held while a process serves it
+fleet/MACHINE.run.json    a machine's last run and its last failure
+fleet/MACHINE.state.json  its champions, their drift and the state of its sensors, see `pipelines.watching`
+fleet/MACHINE.alerts.json the alerts that were last reported
+fleet/MACHINE.log         what its last run printed
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from filelock import FileLock, Timeout
+
+from data.files import write_atomic
+from pipelines.fleet import Fleet
+
+
+def folder_of(home: Path) -> Path:
+    """The folder, made where it is not there."""
+    folder = home / "fleet"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def file_name(machine: str) -> str:
+    """A machine's name as part of a file name."""
+    return quote(machine, safe=" ")
+
+
+def lock_file(home: Path, key: str) -> Path:
+    """The file that is locked while a process serves the fleet."""
+    return folder_of(home) / f"{key}.lock"
+
+
+def read(home: Path, machine: str, what: str) -> dict[str, Any]:
+    """MACHINE.`what`.json; empty where there is none, or none that can be read."""
+    return _read(home / "fleet" / f"{file_name(machine)}.{what}.json")
+
+
+def write(home: Path, machine: str, what: str, content: Mapping[str, Any]) -> None:
+    """MACHINE.`what`.json, in one step."""
+    write_atomic(folder_of(home) / f"{file_name(machine)}.{what}.json", json.dumps(content, ensure_ascii=False))
+
+
+def write_schedule(home: Path, fleet: Fleet, upcoming: Mapping[str, datetime | None]) -> None:
+    """Note the next date of every machine."""
+    _update(home, fleet, {"next": {name: None if due is None else due.isoformat() for name, due in upcoming.items()}})
+
+
+def note_turn(home: Path, fleet: Fleet, machine: str, now: datetime) -> None:
+    """A machine has its turn: dates up to now are done."""
+    kept = _schedule(home, fleet.key).get("turns", {})
+    _update(home, fleet, {"turns": {**kept, machine: now.isoformat()}})
+
+
+def last_turns(home: Path, fleet: Fleet) -> dict[str, datetime]:
+    """When each machine last had its turn."""
+    return {m: datetime.fromisoformat(when) for m, when in _schedule(home, fleet.key).get("turns", {}).items()}
+
+
+def note_run(home: Path, machine: str, began: datetime, ok: bool, summary: str) -> None:
+    """Note how a run ended; the last failure stays known after a later success."""
+    run = {"began": began.isoformat(), "ended": datetime.now(UTC).isoformat(), "ok": ok, "summary": summary}
+    failed = read(home, machine, "run").get("failed")
+    write(home, machine, "run", {"last": run, "failed": failed if ok else run})
+
+
+def schedules(home: Path) -> Iterator[tuple[dict[str, Any], bool]]:
+    """Every fleet that was served with this home, and whether a process serves it now."""
+    for path in sorted((home / "fleet").glob("*.schedule.json")):
+        kept = _read(path)
+        if kept:
+            yield kept, _served(path.with_name(path.name.replace(".schedule.json", ".lock")))
+
+
+def _served(path: Path) -> bool:
+    lock = FileLock(path, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        return True
+    lock.release()
+    return False
+
+
+def _schedule(home: Path, key: str) -> dict[str, Any]:
+    return _read(home / "fleet" / f"{key}.schedule.json")
+
+
+def _update(home: Path, fleet: Fleet, changes: Mapping[str, Any]) -> None:
+    machines = {m.name: {"when": m.when.summary, "file": m.file} for m in fleet.machines}
+    content = {**_schedule(home, fleet.key), "source": fleet.source, "machines": machines,
+               "alerts": fleet.alerts.model_dump(exclude={"webhook"}), **changes}  # fmt: skip
+    write_atomic(folder_of(home) / f"{fleet.key}.schedule.json", json.dumps(content, ensure_ascii=False))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,84 @@
+"""Watched folders: which machines have new recordings, and whether they are complete."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from watchfiles import watch
+
+from pipelines.caller import Say
+from pipelines.fleet import Fleet
+
+LOOK_AGAIN_S = 30.0  # for folders that were not there
+
+
+class Folders:
+    """Notes when files below the folders of watched machines change, in a thread."""
+
+    def __init__(self, fleet: Fleet, say: Say) -> None:
+        self._say = say
+        self._of = {Path(r): m for m in fleet.machines if m.when.watch for r in m.recordings}
+        self._quiet = {m.name: timedelta(minutes=m.when.quiet_min) for m in fleet.machines if m.when.watch}
+        self._changed: dict[str, datetime] = {}
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """The thread runs in the context."""
+        thread = threading.Thread(target=self._watch, name="folders", daemon=True)
+        if self._of:
+            thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            if self._of:
+                thread.join(5.0)
+
+    def touch(self, name: str, when: datetime) -> None:
+        """A machine's folders changed."""
+        with self._lock:
+            self._changed[name] = max(when, self._changed.get(name, when))
+
+    def settled(self, now: datetime) -> set[str]:
+        """Machines whose folders have changed, and not for their quiet time."""
+        with self._lock:
+            return {name for name, when in self._changed.items() if now - when >= self._quiet[name]}
+
+    def taken(self, name: str) -> None:
+        """A run of the machine begins: it takes what is there now."""
+        with self._lock:
+            self._changed.pop(name, None)
+
+    def _watch(self) -> None:
+        while not self._stop.is_set():
+            there = {p for p in self._of if p.exists()}
+            try:
+                if not there:
+                    self._stop.wait(LOOK_AGAIN_S)
+                    continue
+                self._watch_these(there)
+            except (OSError, RuntimeError) as error:  # a share went away, or the system's limit of watches is reached
+                self._say(f"watched folders: {error}; trying again in {LOOK_AGAIN_S:g} s")
+                self._stop.wait(LOOK_AGAIN_S)
+
+    def _watch_these(self, there: set[Path]) -> None:
+        """Returns where other folders are there than are watched."""
+        looks_ms = round(1000 * LOOK_AGAIN_S)
+        for changes in watch(*there, stop_event=self._stop, yield_on_timeout=True, rust_timeout=looks_ms,
+                             raise_interrupt=False):  # fmt: skip
+            now = datetime.now(UTC)
+            for _, path in changes:
+                for folder, machine in self._of.items():
+                    if folder == Path(path) or folder in Path(path).parents:
+                        self.touch(machine.name, now)
+            if {p for p in self._of if p.exists()} != there:
+                for folder in set(self._of) - there:
+                    if folder.exists():
+                        self.touch(self._of[folder].name, now)
+                return

@@ -1,0 +1,292 @@
+"""The state of every machine and error channel: champion, drift of inputs and error, failed sensors.
+
+It takes seconds per machine to gather: models and runs are loaded. It is kept per machine (`fleet_state`), with what it
+was made from, and gathered again only for machines whose champions or batches have changed; `refresh` does so at the
+end of a training or ingest. All of it together with the tables of `thermodrift status` is in one file, which `warm`
+reads without any heavy import, as long as the files behind it are unchanged.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data.errors import InputError, WorkError
+from data.files import write_atomic
+from pipelines import fleet_state
+from pipelines.caller import Say
+from pipelines.home import home
+
+if TYPE_CHECKING:
+    from data.batch import Batch
+    from data.lake import Lake
+    from pipelines.model_store import StoredModel
+    from pipelines.settings import Settings
+
+SCHEMA = "thermodrift.status/1"
+KEPT_RUNS = 20  # of each channel, the newest
+_STATUS = "status.json"
+_VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE", "MLFLOW_TRACKING_URI")
+
+
+@dataclass(frozen=True)
+class Champion:
+    """A champion as the registry has it; `version` None: the model has none, and `reason` says why."""
+
+    name: str
+    target: str
+    version: int | None
+    since: str
+    source: str
+    tags: Mapping[str, str]
+
+    @property
+    def mark(self) -> list[Any]:
+        """What the state of its channel depends on."""
+        return [self.name, self.version, self.source]
+
+
+def warm() -> dict[str, Any] | None:
+    """The kept status, None where something behind it has changed, or is on a server and may have."""
+    try:
+        kept: dict[str, Any] = json.loads((home() / "fleet" / _STATUS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if kept.get("schema") != SCHEMA or kept["made_from"] is None:
+        return None
+    return kept if kept["made_from"] == _stats(Path(name) for name in kept["made_from"]["files"]) else None
+
+
+def kept_channels() -> list[dict[str, Any]]:
+    """The states of all channels as they were last gathered, whether or not they are warm."""
+    try:
+        kept = json.loads((home() / "fleet" / _STATUS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    found: list[dict[str, Any]] = kept["channels"] if kept.get("schema") == SCHEMA else []
+    return found
+
+
+def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
+    """Gather what has changed, and keep it; the whole status.
+
+    Returns:
+        `models`, `trainings`, `diagnoses`: rows of the tables of `thermodrift status`; `lake`: batches and quarantined
+        files by machine; `channels`: the state of every machine and channel, see `_channel`; `as_of` (UTC).
+
+    Raises:
+        WorkError: the store or the lake does not answer.
+    """
+    from pipelines import registry, tracking
+    from pipelines.console import records
+    from pipelines.recordings import home_lake
+
+    lake = home_lake()
+    tracking.open_store(settings, say)  # the first use takes seconds
+    before = _made_from(settings, lake)
+    tables = {
+        "models": registry.status(settings),
+        "trainings": tracking.trainings(settings=settings),
+        "diagnoses": tracking.diagnoses(settings=settings),
+    }
+    champions = _champions(settings)
+    held = {m: {"batches": len(lake.batch_ids(m)), "quarantined": len(lake.quarantined(m))} for m in lake.machines()}
+    channels = []
+    for machine in sorted({*champions, *held}):
+        channels += _machine(settings, lake, machine, champions.get(machine, []), say)
+    status = {
+        "schema": SCHEMA, "as_of": datetime.now(UTC).isoformat(timespec="seconds"), "home": str(settings.home),
+        "made_from": before, **{k: records(t) for k, t in tables.items()}, "lake": held, "channels": channels,
+    }  # fmt: skip
+    write_atomic(fleet_state.folder_of(settings.home) / _STATUS, json.dumps(status, ensure_ascii=False, default=str))
+    return status
+
+
+def _champions(settings: Settings) -> dict[str, list[Champion]]:
+    """Champions by machine."""
+    from pipelines import audit
+    from pipelines.tracking import open_store, store_errors
+
+    client, found = open_store(settings), dict[str, list[Champion]]()
+    with store_errors(settings):
+        for model in client.search_registered_models(max_results=1000):
+            log = audit.read(model)
+            if not log.machine or not log.target:
+                continue
+            version, since, source, tags = log.champion, "", "", dict[str, str]()
+            if version is not None:
+                v = client.get_model_version_by_alias(model.name, audit.CHAMPION)
+                source, tags = str(v.source), dict(v.tags)
+                reigns = [r for r in log.reigns if r.until is None]
+                since = reigns[-1].since.isoformat(timespec="seconds") if reigns else tags.get("trained_at", "")
+            champion = Champion(model.name, log.target, version, since, source, tags)
+            found.setdefault(log.machine, []).append(champion)
+    return found
+
+
+def _machine(
+    settings: Settings, lake: Lake, machine: str, champions: Sequence[Champion], say: Say
+) -> list[dict[str, Any]]:
+    """The states of a machine's channels, as kept where nothing has changed."""
+    current = {i: v[-1] for i, v in (lake.contents(machine) if machine in lake.machines() else {}).items()}
+    mark = [SCHEMA, [c.mark for c in champions], sorted([i, v.digest, *v.files] for i, v in current.items())]
+    kept = fleet_state.read(settings.home, machine, "state")
+    if kept.get("made_from") == json.loads(json.dumps(mark)):
+        found: list[dict[str, Any]] = kept["channels"]
+        return found
+    say(f"state of {machine}")
+    found = _gathered(settings, lake, machine, champions, bool(current))
+    fleet_state.write(settings.home, machine, "state", {"made_from": mark, "channels": found})
+    return found
+
+
+def _gathered(
+    settings: Settings, lake: Lake, machine: str, champions: Sequence[Champion], recorded: bool
+) -> list[dict[str, Any]]:
+    from pipelines import model_store, registry
+    from pipelines.recordings import load_batches
+
+    models: dict[str, StoredModel] = {}
+    trouble: dict[str, str] = {}
+    for c in champions:
+        try:
+            if c.version is not None:
+                models[c.target] = model_store.load(Path(registry.local_folder(c.source, settings)))
+        except (InputError, WorkError) as error:
+            trouble[c.target] = str(error)
+    batches: list[Batch] = []
+    try:
+        if recorded:
+            described = next((m.machine for m in models.values()), None)
+            batches = load_batches(lake, described) if described is not None else lake.load_all(machine)
+    except (InputError, WorkError) as error:
+        trouble |= {c.target: str(error) for c in champions}
+    targets = [c.target for c in champions]
+    unlearned = [t for t in dict.fromkeys(t for b in batches for t in b.names("error")) if t not in targets]
+    out = []
+    for c in [*champions, *(Champion("", t, None, "", "", {}) for t in unlearned)]:
+        out.append(_channel(settings, machine, c, models.get(c.target), batches, trouble.get(c.target, "")))
+    return out
+
+
+def _channel(
+    settings: Settings, machine: str, c: Champion, model: StoredModel | None, batches: Sequence[Batch], trouble: str
+) -> dict[str, Any]:
+    """A channel: machine, channel, model; of the champion: version, cell, since, trained_at, reason, the error to
+    expect; `seen`: runs that it was trained on, with the last one's start; `runs`: the newest runs in the lake, oldest
+    first, with their distance from the trained region in widths and, where they are newer than the training, the
+    champion's S; `sensors`: channels without usable values in them; `unknown`: why something could not be found out."""
+    from pipelines.tracking import load_training
+
+    ids, starts = set[str](), list[str]()
+    if c.version is not None:
+        try:
+            table = load_training(c.tags.get("training_id", ""), settings).result.batches
+            ids, starts = set(table["batch_id"].astype(str)), sorted(s for s in table["start"].map(_date) if s)
+        except (InputError, WorkError) as error:
+            trouble = trouble or str(error)
+    last_seen = starts[-1] if starts else ""
+    runs = [_run(b, c, model, ids, last_seen) for b in batches[-KEPT_RUNS:]]
+    return {
+        "machine": machine, "channel": c.target, "model": c.name, "version": c.version,
+        "cell": c.tags.get("cell", ""), "family": c.tags.get("family", ""), "since": c.since,
+        "trained_at": c.tags.get("trained_at", ""), "reason": c.tags.get("reason", ""),
+        "simulated": any(b.simulated for b in batches) or c.tags.get("simulated") == "true",
+        "expected_S_um": _number(c.tags.get("expected_S_um")),
+        "bound90_S_um": _number(c.tags.get("expected_S_bound90_um")),
+        "expected_by": c.tags.get("expected_by", ""), "n_seen": len(ids), "last_seen": last_seen, "runs": runs,
+        "sensors": [s for b in batches[-KEPT_RUNS:] for s in _failed(b, model)], "unknown": trouble,
+    }  # fmt: skip
+
+
+def _run(batch: Batch, c: Champion, model: StoredModel | None, ids: set[str], last_seen: str) -> dict[str, Any]:
+    """One run: how far outside, and the error of the champion where it is newer than the training."""
+    from models.trust import SLACK, farthest, watched
+
+    start = _date(batch.start)
+    newer = bool(ids) and batch.batch_id not in ids and (not start or not last_seen or start > last_seen)
+    out: dict[str, Any] = {"batch_id": batch.batch_id, "start": start, "newer": newer, "distance": None,
+                           "outside": False, "why": "", "S_um": None}  # fmt: skip
+    if model is None:
+        return out
+    values = watched(batch, model.family.inputs)
+    beyond = model.region.beyond(values)
+    if beyond:
+        distance, quantity = farthest(beyond)
+        out["distance"], out["outside"] = distance, distance > SLACK
+        out["why"] = model.region.excess(quantity, values) if distance > SLACK else ""
+    if newer:
+        out["S_um"] = _S_um(batch, model, c.target)
+    return out
+
+
+def _S_um(batch: Batch, model: StoredModel, target: str) -> float | None:
+    from features.rises import zeroed_error_um
+    from models.metrics import residual_std_um
+
+    try:
+        return _number(residual_std_um(zeroed_error_um(batch, target) - model.predict(batch)))
+    except InputError:  # an input or the error is not recorded
+        return None
+
+
+def _failed(batch: Batch, model: StoredModel | None) -> list[dict[str, Any]]:
+    """Channels that lack more than a fifth of a run's values, for a reason of their own."""
+    import numpy as np
+
+    from data.checks import MOST_MASKED
+
+    inputs = {i.partition("@")[0] for i in model.family.inputs} if model is not None else set()
+    out = []
+    for name in batch.names("temperature", "ambient", "driver", "error"):
+        checks = sorted({f.check for f in batch.findings if f.channel == name and f.masks and not f.overruled})
+        values = batch.masked(name) if name in batch.table else np.full(batch.n_rows, np.nan)
+        lacking = float(np.mean(~np.isfinite(values))) if batch.n_rows else 0.0
+        if checks and lacking > MOST_MASKED:
+            out.append({"batch_id": batch.batch_id, "start": _date(batch.start), "channel": name, "checks": checks,
+                        "share": round(lacking, 3), "input": name in inputs})  # fmt: skip
+    return out
+
+
+def _date(start: Any) -> str:
+    """ISO date and time; empty where it is not known."""
+    import pandas as pd
+
+    when = pd.to_datetime(start, errors="coerce")
+    return "" if pd.isna(when) else str(when.isoformat(timespec="seconds"))
+
+
+def _number(value: Any) -> float | None:
+    import math
+
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _made_from(settings: Settings, lake: Lake) -> dict[str, Any] | None:
+    """The files that decide the status; None where the store or the lake is elsewhere."""
+    store, root = settings.store_file, getattr(lake, "root", None)
+    if store is None or not isinstance(root, Path):
+        return None
+    logs = [root / "_quarantine", *sorted(root.glob("_quarantine/*/reasons.jsonl"))]
+    return _stats([Path("mlflow.yml").resolve(), store, Path(f"{store}-wal"), root / "_manifest.json", *logs])
+
+
+def _stats(files: Iterable[Path]) -> dict[str, Any]:
+    """Size and time of change of files, None where one is not there, and the variables that name them."""
+    found: dict[str, list[int] | None] = {}
+    for file in files:
+        try:
+            seen = file.stat()
+            found[str(file)] = [seen.st_size, seen.st_mtime_ns]
+        except OSError:
+            found[str(file)] = None
+    return {"files": found, "variables": [os.environ.get(v, "") for v in _VARIABLES], "folder": str(Path.cwd())}
