@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from data.arrays import Array, Index
 from data.errors import InputError
@@ -74,6 +73,8 @@ class Readings:
         Raises:
             InputError: more readings than rows, or one whose row is more than `most_s` from its time.
         """
+        from scipy.optimize import isotonic_regression  # takes long to load
+
         time_s, position, errors = self._averaged(step_s)
         step_hint = f"recording.step_s is {step_s:g} s; lower it, a sweep takes one row for each position"
         if len(time_s) > n_rows:

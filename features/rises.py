@@ -18,7 +18,6 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import lfilter
 
 from data.arrays import Array
 from data.batch import Batch
@@ -91,6 +90,8 @@ def first_order_lag(values: Array, tau_s: float, step_s: float, start: float | N
     """
     if tau_s == 0 or len(values) == 0:
         return values.copy()
+    from scipy.signal import lfilter  # takes long to load
+
     held = hold_last(values)
     keep = float(np.exp(-step_s / tau_s))
     out = np.empty_like(held)

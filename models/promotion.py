@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from data.errors import InputError
 from models.protocols import PromotionRule
@@ -307,7 +307,7 @@ def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) ->
     new_mean = float(both["S_um_new"].mean()) if n else float("nan")
     old_mean = float(both["S_um_old"].mean()) if n else float("nan")
     mean = float(d.mean()) if n else float("nan")
-    half = float(stats.t.ppf(0.5 + _INTERVAL / 2, n - 1) * d.std(ddof=1) / np.sqrt(n)) if n > 1 else float("nan")
+    half = float(stdtrit(n - 1, 0.5 + _INTERVAL / 2) * d.std(ddof=1) / np.sqrt(n)) if n > 1 else float("nan")
     p = sign_flip_p(d) if n else float("nan")
     better = n >= rule.min_batches and mean > 0 and p <= rule.significance
     n_better = int((d > 0).sum())
@@ -334,7 +334,9 @@ def sign_flip_p(difference: NDArray[np.float64]) -> float:
         """Rounded, so that equal sums of different rounding errors are ties."""
         return np.round(flipped.sum(axis=axis) / size, 9)
 
-    found = stats.permutation_test(
+    from scipy.stats import permutation_test  # takes long to load
+
+    found = permutation_test(
         (d,), total, permutation_type="samples", alternative="greater", n_resamples=_SIGN_PATTERNS, rng=0
     )
     return float(found.pvalue)

@@ -21,7 +21,6 @@ from typing import Any, Self
 import numpy as np
 import pandas as pd
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 
 from data.arrays import Array, Index, Mask
 from data.errors import InputError
@@ -143,6 +142,8 @@ class Updater:
         Raises:
             InputError: fewer than 2 runs with 2 known residuals after their first row.
         """
+        from scipy.optimize import minimize  # takes long to load
+
         sampled = [(track, rows) for track in tracks if len(rows := _sampled(track)) > 1]
         if len(sampled) < _LEAST_RUNS:
             raise InputError(

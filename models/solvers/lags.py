@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from data.arrays import Array
 from data.errors import InputError
@@ -243,6 +242,8 @@ def _lagged(x: Array, before: Array, tau: float) -> Array:
     if tau == 0 or len(x) < 2:
         return x
     keep = float(np.exp(-1.0 / tau))
+    from scipy.signal import lfilter  # takes long to load
+
     rest, _ = lfilter([1.0 - keep], [1.0, -keep], x[1:], axis=0, zi=keep * before[None])
     return np.vstack([before, rest])
 

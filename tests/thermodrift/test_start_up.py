@@ -50,3 +50,9 @@ def test_help_loads_what_prints_it(every: bool, tmp_path: Path) -> None:
     names = loaded(HELP.format(group=every), tmp_path)
     heavy = names & (HEAVY - {"pydantic"} if every else HEAVY)  # typer reads the options of a command with pydantic
     assert names >= OUTPUT and not heavy, sorted(heavy)
+
+
+def test_what_status_and_predict_need_loads_no_large_part_of_scipy(tmp_path: Path) -> None:
+    used = "data.recording, features.design, models.promotion, models.trust, models.updating, models.solvers.lags"
+    code = f"import {used}, json, sys; print(json.dumps([m.replace('scipy.', 'scipy_') for m in sys.modules]))"
+    assert not loaded(code, tmp_path) & {"scipy_signal", "scipy_stats", "scipy_optimize", "sklearn", "torch", "twin"}
