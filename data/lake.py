@@ -1,4 +1,5 @@
-"""Parquet lake: versioned storage of batches, atomic and safe for concurrent writers.
+"""Parquet lake: versioned storage of batches, atomic and safe for concurrent writers, in a folder or any other place
+that `lakestore` reaches.
 
     ROOT/machine=NAME/year=YYYY/BATCH.parquet      the current version, for any reader (hive partitions)
     ROOT/_versions/machine=NAME/BATCH/*.parquet    every version ever stored, read-only
@@ -23,27 +24,24 @@ deletes its content. Withdrawn content is not stored again.
 
 from __future__ import annotations
 
-import filecmp
 import hashlib
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from data import manifest as listing
 from data.batch import Batch
 from data.errors import InputError, WorkError, closest
-from data.lakefile import content_digest, decode, encode, measured_digest, read_body, remarks_digest, safe_name
+from data.lakefile import content_digest, decode, encode, measured_digest, remarks_digest, safe_name, unreadable
+from data.lakestore import LOCK_WAIT_S, Folder, Locked, open_store
 from data.manifest import Entry, Staged, Stored, Version
 
 LOG = "reasons.jsonl"
+MANIFEST = "_manifest.json"
 
 
 @dataclass(frozen=True)
@@ -59,17 +57,8 @@ class Quarantined:
     copy: Path | None
 
 
-def read_log(folder: Path) -> list[Quarantined]:
-    """All entries of one machine's quarantine folder, oldest first."""
-    log = folder / LOG
-    if not log.exists():
-        return []
-    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines() if line]
-    return [Quarantined(**{**row, "copy": folder / row["copy"] if row["copy"] else None}) for row in rows]
-
-
 def log_text(entries: list[Quarantined]) -> str:
-    """The inverse of `read_log`: one JSON line per entry."""
+    """One JSON line per entry."""
     rows: list[dict[str, Any]] = [{**asdict(e), "copy": e.copy.name if e.copy else None} for e in entries]
     return "".join(json.dumps(row) + "\n" for row in rows)
 
@@ -86,27 +75,46 @@ def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) ->
     return Quarantined(machine, path.name, str(path), sha256, reason, _now(), copy)
 
 
-def copy_bytes(source: Path, target: Path) -> None:
-    """A plain copy in bounded memory."""
-    with source.open("rb") as a, target.open("wb") as b:
-        shutil.copyfileobj(a, b, 1 << 20)
-
-
 def ascii_if_broken(name: str) -> str:
     """A file name with undecodable bytes escaped."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-LOCK_WAIT_S = 600.0
-
-
 class Lake:
-    """Batches of all machines under one folder, which the first write makes."""
+    """Batches of all machines under one root, which the first write makes.
+
+    Args:
+        root: a folder, or an address of fsspec such as ``s3://bucket/lake``.
+
+    Raises:
+        InputError: an address of a file system that is unknown or not installed.
+    """
 
     def __init__(self, root: Path | str) -> None:
-        self.root = Path(root)
-        self._lock = FileLock(self.root / ".lock", timeout=LOCK_WAIT_S)
-        self._known: tuple[tuple[int, int, int] | None, dict[str, str]] = (None, {})
+        self._store = open_store(root)
+        self._known: tuple[Hashable, dict[str, str]] = (None, {})
+
+    @property
+    def name(self) -> str:
+        """The root as messages have it."""
+        return self._store.name
+
+    @property
+    def root(self) -> Path:
+        """The folder.
+
+        Raises:
+            InputError: the lake is in none on this computer.
+        """
+        if not isinstance(self._store, Folder):
+            raise InputError(
+                f"lake {self.name}: is no folder of this computer; `thermodrift lake pull` makes one of it"
+            )
+        return self._store.root
+
+    def size(self, file: str) -> int:
+        """Size of a file of `Version.files` in bytes, 0 where it is gone."""
+        return self._store.size(file)
 
     def put(self, batch: Batch) -> Stored:
         """Store one batch: nothing is ever overwritten; the same content twice is stored once.
@@ -131,12 +139,12 @@ class Lake:
         file = f"{folder}/{digest[:12]}-{remarks_digest(batch)[:8]}.parquet"
         noted = self._noted(file)
         sha256 = self._intact(file, digest, noted)
-        healed = sha256 is None and (noted is not None or (self.root / file).exists())
+        healed = sha256 is None and (noted is not None or self._store.exists(file))
         if sha256 is None:
             body = encode(batch, digest)
             sha256 = hashlib.sha256(body).hexdigest()
             with self._writing():
-                self._replace(self.root / file, body)
+                self._store.write(file, body)
         year = batch.start.year if batch.start is not None else 0
         return Staged(
             batch.machine, batch.batch_id, digest, measured_digest(batch), file, batch.source, batch.n_rows, year,
@@ -154,9 +162,9 @@ class Lake:
             copies = {m: self._copies(manifest, m) for m in {s.machine for s in staged}} if distinct else {}
             stored = [listing.enter(manifest, s, _now(), copies.get(s.machine)) for s in staged]
             entered = [s for s, done in zip(staged, stored, strict=True) if not done.left_out]
-            gone = [s.file for s in entered if not (self.root / s.file).exists()]
+            gone = [s.file for s in entered if not self._store.exists(s.file)]
             if gone:
-                raise WorkError(f"lake {self.root}: {gone[0]} was deleted during the ingest; ingest again")
+                raise WorkError(f"lake {self.name}: {gone[0]} was deleted during the ingest; ingest again")
             for s in entered:
                 touch(s.machine, s.batch_id)
         self.discard([s for s, done in zip(staged, stored, strict=True) if done.left_out])
@@ -170,7 +178,7 @@ class Lake:
             machines = self._manifest()["machines"]
             for s in staged:
                 if s.file not in listing.files_kept(machines.get(s.machine, {}).get(s.batch_id, [])):
-                    self._delete(self.root / s.file)
+                    self._store.delete(s.file)
 
     def withdraw(self, machine: str, batch_ids: Sequence[str], reason: str) -> list[str]:
         """Take batches out of use, with all their versions, until `restore`; their content stays in the lake.
@@ -188,7 +196,7 @@ class Lake:
             raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
         with self._changing() as (manifest, touch):
             batches = self._batches(machine, manifest)
-            where = f"lake {self.root}: {machine} has no batch in use that fits"
+            where = f"lake {self.name}: {machine} has no batch in use that fits"
             ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
             listing.withdraw(batches, ids, reason.strip(), _now())
             for batch_id in ids:
@@ -237,8 +245,9 @@ class Lake:
                 touch(machine, batch_id)
         if quarantined:
             with self._writing():
-                for file in sorted(self._quarantine(machine).glob("*"), key=lambda f: f.name == LOG):
-                    self._delete(file)
+                folder = _quarantine(machine)
+                for file in sorted(self._store.files(folder), key=lambda name: name == LOG):
+                    self._store.delete(f"{folder}/{file}")
         return ids
 
     def load(self, machine: str, batch_id: str, version: int | None = None) -> Batch:
@@ -253,13 +262,13 @@ class Lake:
         number = entries[-1]["version"] if version is None else version
         if number not in by_number:
             raise InputError(
-                f"lake {self.root}: batch {batch_id} of {machine} has no version {version}; "
+                f"lake {self.name}: batch {batch_id} of {machine} has no version {version}; "
                 f"expected {', '.join(map(str, by_number))}"
             )
         gone = listing.withdrawal(by_number[number])
         if gone is not None:
             raise InputError(
-                f"lake {self.root}: batch {batch_id} of {machine} is withdrawn ({gone.reason}); "
+                f"lake {self.name}: batch {batch_id} of {machine} is withdrawn ({gone.reason}); "
                 f"`thermodrift lake restore {machine} {batch_id}` brings it back"
             )
         return self._read(by_number[number], f"batch {batch_id} of {machine}")
@@ -274,10 +283,14 @@ class Lake:
         held = listing.active(self._batches(machine))
         if not held:
             raise InputError(
-                f"lake {self.root}: every batch of machine {machine!r} is withdrawn; "
+                f"lake {self.name}: every batch of machine {machine!r} is withdrawn; "
                 f"`thermodrift lake restore {machine} '*'` brings them back"
             )
-        batches = [self._read(entries[-1], f"batch {i} of {machine}") for i, entries in held.items()]
+        bodies = self._store.read_many([entries[-1]["file"] for entries in held.values()])
+        batches = [
+            self._read(entries[-1], f"batch {i} of {machine}", body)
+            for (i, entries), body in zip(held.items(), bodies, strict=True)
+        ]
         return sorted(
             batches, key=lambda b: (b.start is None, "" if b.start is None else b.start.isoformat(), b.batch_id)
         )
@@ -306,40 +319,42 @@ class Lake:
     def quarantine(self, path: Path, machine: str, reason: str) -> Path:
         """Keep an unusable file's bytes and the reason; the file itself stays where it is.
 
-        Returns the copy's path (the log's, where the file cannot be read). The same bytes under the same name
-        with the same reason are entered once.
+        Returns the copy's path (the log's, where the file cannot be read), below the root where that is no folder of
+        this computer. The same bytes under the same name with the same reason are entered once.
         """
-        folder = self._quarantine(machine)
+        folder = _quarantine(machine)
         with self._writing():
-            entry = entry_for(path, machine, reason, folder, safe_name(ascii_if_broken(path.name)))
-            entries = read_log(folder)
-            if entry.copy is not None and not entry.copy.exists():
-                self._replace(entry.copy, path)
+            name = safe_name(ascii_if_broken(path.name))
+            entry = entry_for(path, machine, reason, self._store.path(folder), name)
+            entries = self.quarantined(machine)
+            if entry.copy is not None and not self._store.exists(copy := f"{folder}/{entry.copy.name}"):
+                self._store.write(copy, path)
             if not any(replace(e, at=entry.at) == entry for e in entries):
-                self._replace(folder / LOG, log_text([*entries, entry]).encode())
-        return entry.copy or folder / LOG
+                self._store.write(f"{folder}/{LOG}", log_text([*entries, entry]).encode(), keep=False)
+        return entry.copy or self._store.path(f"{folder}/{LOG}")
 
     def quarantined(self, machine: str) -> list[Quarantined]:
         """Quarantined files of a machine, oldest first."""
-        return read_log(self._quarantine(machine))
-
-    def _quarantine(self, machine: str) -> Path:
-        return self.root / "_quarantine" / f"machine={safe_name(machine)}"
-
-    @property
-    def _manifest_path(self) -> Path:
-        return self.root / "_manifest.json"
+        folder = _quarantine(machine)
+        try:
+            text = self._store.read(f"{folder}/{LOG}").decode()
+        except FileNotFoundError:
+            return []
+        at, rows = self._store.path(folder), [json.loads(line) for line in text.splitlines() if line]
+        return [Quarantined(**{**row, "copy": at / row["copy"] if row["copy"] else None}) for row in rows]
 
     def _manifest(self) -> dict[str, Any]:
         try:
-            manifest: dict[str, Any] = json.loads(self._manifest_path.read_text(encoding="utf-8"))
+            manifest: dict[str, Any] = json.loads(self._store.read(MANIFEST))
         except FileNotFoundError:
             return listing.empty()
         except (OSError, ValueError) as error:
-            raise WorkError(f"lake {self._manifest_path}: cannot be read ({error}); restore it from a backup") from None
+            raise WorkError(
+                f"lake {self.name}/{MANIFEST}: cannot be read ({error}); restore it from a backup"
+            ) from None
         if manifest.get("schema") != listing.SCHEMA:
             raise WorkError(
-                f"lake {self._manifest_path}: got schema {manifest.get('schema')!r}, expected {listing.SCHEMA!r}; "
+                f"lake {self.name}/{MANIFEST}: got schema {manifest.get('schema')!r}, expected {listing.SCHEMA!r}; "
                 "use another lake folder"
             )
         return manifest
@@ -348,46 +363,63 @@ class Lake:
         machines = (manifest or self._manifest())["machines"]
         if machine not in machines:
             hint = closest(machine, machines) if machines else "it is empty"
-            raise InputError(f"lake {self.root}: no batch of machine {machine!r}; {hint}. Run thermodrift ingest first")
+            raise InputError(f"lake {self.name}: no batch of machine {machine!r}; {hint}. Run thermodrift ingest first")
         batches: dict[str, list[Entry]] = machines[machine]
         return batches
 
     def _entries(self, machine: str, batch_id: str) -> list[Entry]:
         batches = self._batches(machine)
         if batch_id not in batches:
-            raise InputError(f"lake {self.root}: {machine} has no batch {batch_id!r}; {closest(batch_id, batches)}")
+            raise InputError(f"lake {self.name}: {machine} has no batch {batch_id!r}; {closest(batch_id, batches)}")
         return batches[batch_id]
 
-    def _read(self, entry: Entry, name: str) -> Batch:
-        """A version as it was ingested; `name` is that of its batch.
+    def _read(self, entry: Entry, name: str, body: bytes | OSError | None = None) -> Batch:
+        """A version as it was ingested; `name` is that of its batch, `body` what was read of its file already.
 
         Raises:
             WorkError: its file is missing, damaged, or holds something else than was ingested.
         """
-        path = self.root / entry["file"]
+        where = f"{self.name}/{entry['file']}"
         remedy = (
             f"restore it from a backup or ingest its source {entry['source'] or '(unknown)'} again, "
             "which writes it anew where the content is the same"
         )
         noted = entry.get("sha256", {}).get(entry["file"])
-        body = read_body(path, f"{name}: ", remedy)
+        body = self._body(entry["file"]) if body is None else body
+        if isinstance(body, OSError):
+            raise unreadable(where, body, f"{name}: ", remedy)
         if noted is not None and (got := hashlib.sha256(body).hexdigest()) != noted:
             raise WorkError(
-                f"lake file {path}: {name} cannot be read (the file was changed or cut after its ingest: sha256 "
+                f"lake file {where}: {name} cannot be read (the file was changed or cut after its ingest: sha256 "
                 f"{got[:12]}…, expected {noted[:12]}…); {remedy}"
             )
-        batch = replace(decode(body, path, entry["version"]), source=entry["source"])
+        batch = replace(decode(body, where, entry["version"]), source=entry["source"])
         if noted is None and content_digest(batch) != entry["digest"]:  # a lake of an earlier program
-            raise WorkError(f"lake file {path}: {name} cannot be read (other content than was ingested); {remedy}")
+            raise WorkError(f"lake file {where}: {name} cannot be read (other content than was ingested); {remedy}")
         return batch
+
+    def _body(self, file: str) -> bytes | OSError:
+        try:
+            return self._store.read(file)
+        except OSError as error:
+            return error
+
+    def read(self, version: Version) -> Batch:
+        """A version of `contents` or `versions`, withdrawn or not, as its file has it.
+
+        Raises:
+            WorkError: its file is gone or damaged.
+        """
+        where, body = f"{self.name}/{version.files[-1]}", self._body(version.files[-1])
+        if isinstance(body, OSError):
+            raise unreadable(where, body)
+        return decode(body, where, version.version)
 
     def _noted(self, file: str) -> str | None:
         """The hash of a file under the root as the manifest has it; the manifest is read where it has changed."""
-        try:
-            seen = self._manifest_path.stat()
-        except OSError:
+        look = self._store.stamp(MANIFEST)
+        if look is None:
             return None
-        look = (seen.st_ino, seen.st_size, seen.st_mtime_ns)
         if self._known[0] != look:
             machines = self._manifest()["machines"].values()
             found = listing.hashes(e for batches in machines for entries in batches.values() for e in entries)
@@ -399,13 +431,14 @@ class Lake:
 
         Where the manifest has no hash of it, the content itself is compared.
         """
-        path = self.root / file
+        body = self._body(file)
+        if isinstance(body, OSError):
+            return None
+        sha256 = hashlib.sha256(body).hexdigest()
         try:
-            body = read_body(path)
-            sha256 = hashlib.sha256(body).hexdigest()
             if noted is None:
-                batch = decode(body, path)
-                same = content_digest(batch) == digest and path.stem.endswith(remarks_digest(batch)[:8])
+                batch = decode(body, file)
+                same = content_digest(batch) == digest and file.endswith(f"{remarks_digest(batch)[:8]}.parquet")
                 return sha256 if same else None
         except (InputError, WorkError):
             return None
@@ -417,7 +450,7 @@ class Lake:
         """A machine's batches, and the ids with withdrawn versions among those wanted."""
         batches = self._batches(machine, manifest)
         gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
-        return batches, listing.chosen(gone, batch_ids, f"lake {self.root}: {machine} has no withdrawn batch that fits")
+        return batches, listing.chosen(gone, batch_ids, f"lake {self.name}: {machine} has no withdrawn batch that fits")
 
     def _copies(self, manifest: dict[str, Any], machine: str) -> listing.Copies:
         """Versions by their measured values; a lake of an earlier program gets the digests."""
@@ -442,102 +475,53 @@ class Lake:
             yield manifest, lambda machine, batch_id: touched.add((machine, batch_id))
             if json.dumps(manifest) != before:
                 manifest["pending"] = sorted(touched)
-                self._replace(self._manifest_path, json.dumps(manifest).encode())
+                self._store.write(MANIFEST, json.dumps(manifest).encode(), keep=False)
             self._publish(manifest, touched)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """Exclusive access, with files of an interrupted writer removed."""
         try:
-            (self.root / "_tmp").mkdir(parents=True, exist_ok=True)
-            with self._lock:
-                for leftover in (self.root / "_tmp").iterdir():
-                    leftover.unlink()
+            with self._store.locked():
                 yield
-        except Timeout:
+        except Locked:
             raise WorkError(
-                f"lake {self.root}: locked by another ingest for {LOCK_WAIT_S / 60:.0f} min; wait for it or end it"
+                f"lake {self.name}: locked by another ingest for {LOCK_WAIT_S / 60:.0f} min; wait for it or end it"
             ) from None
         except OSError as error:
-            raise WorkError(f"lake {self.root}: cannot be written ({error}); nothing stored was lost") from error
-
-    def _replace(self, target: Path, body: Any) -> None:
-        """Put bytes, or the copy of a file, at `target` in one step that survives a power cut."""
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.root / "_tmp" / "next"
-        if isinstance(body, Path):
-            copy_bytes(body, temporary)
-        else:
-            temporary.write_bytes(body)
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        if target.parent != self.root and target.name != LOG:
-            temporary.chmod(0o444)
-        temporary.replace(target)
-        _sync(target.parent)
+            raise WorkError(f"lake {self.name}: cannot be written ({error}); nothing stored was lost") from error
 
     def _publish(self, manifest: dict[str, Any], batches: Iterable[Sequence[str]]) -> None:
         """Replace the current files of these batches by those that the manifest names; delete purged files."""
-        folders = set()
+        store, changed = self._store, list[str]()
         for machine, batch_id in batches:
             entries: list[Entry] = manifest["machines"].get(machine, {}).get(batch_id, [])
             purged = {f for e in entries for f in (*e["earlier"], e["file"])} - listing.files_kept(entries)
             for file in purged:
-                self._delete(self.root / file)
-            folder, name = self.root / f"machine={safe_name(machine)}", f"{safe_name(batch_id)}.parquet"
-            elsewhere = [folder / f"year={year}" / name for year in {e["year"] for e in entries}]
+                store.delete(file)
+            folder, name = f"machine={safe_name(machine)}", f"{safe_name(batch_id)}.parquet"
+            elsewhere = [f"{folder}/year={year}/{name}" for year in {e["year"] for e in entries}]
             if not entries or "withdrawn" in entries[-1]:
                 for gone in elsewhere:
-                    self._delete(gone)
+                    store.delete(gone)
                 continue
-            version = self.root / entries[-1]["file"]
-            target = folder / f"year={entries[-1]['year']}" / name
-            standing = [p for p in elsewhere if p != target and p.exists()]
+            target = f"{folder}/year={entries[-1]['year']}/{name}"
+            standing = [f for f in elsewhere if f != target and store.exists(f)]
             # a batch that changed its year is first replaced where it stands, then moved: never absent, never double
-            at = standing[0] if standing and not target.exists() else target
-            if not _same(at, version):
-                at.parent.mkdir(parents=True, exist_ok=True)
-                temporary = self.root / "_tmp" / "current"
-                temporary.unlink(missing_ok=True)
-                try:
-                    os.link(version, temporary)
-                except OSError:  # a file system without hard links
-                    shutil.copyfile(version, temporary)
-                temporary.replace(at)
-                folders.add(target.parent)
+            at = standing[0] if standing and not store.exists(target) else target
+            if store.repeat(at, entries[-1]["file"]):
+                changed.append(target)
             if at != target:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                at.replace(target)
-                folders.add(target.parent)
+                store.move(at, target)
+                changed.append(target)
             for stale in standing:
-                stale.unlink(missing_ok=True)
-        for changed in folders:
-            _sync(changed)
+                store.delete(stale)
+        store.settle(changed)
 
-    def _delete(self, file: Path) -> None:
-        """Delete a file and the folders below the root that it leaves empty."""
-        file.unlink(missing_ok=True)
-        for folder in file.parents:
-            if folder == self.root or not folder.exists() or any(folder.iterdir()):
-                break
-            folder.rmdir()
+
+def _quarantine(machine: str) -> str:
+    return f"_quarantine/machine={safe_name(machine)}"
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _same(current: Path, version: Path) -> bool:
-    if not current.exists():
-        return False
-    return current.samefile(version) or filecmp.cmp(current, version, shallow=False)
-
-
-def _sync(folder: Path) -> None:
-    """Make a rename in this folder durable; a system that cannot open folders does it on its own."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -95,20 +95,13 @@ def encode(batch: Batch, digest: str) -> pa.Buffer:
     return sink.getvalue()
 
 
-def read_body(path: Path, name: str = "", remedy: str = "ingest its source again") -> bytes:
-    """The bytes of a stored file; `name` and `remedy` go into the error line.
-
-    Raises:
-        WorkError: the file cannot be read.
-    """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise WorkError(f"lake file {path}: {name}cannot be read ({error.strerror}); {remedy}") from None
+def unreadable(where: str, error: OSError, name: str = "", remedy: str = "ingest its source again") -> WorkError:
+    """The error of a stored file that cannot be read; `where` is its place, `name` that of its batch."""
+    return WorkError(f"lake file {where}: {name}cannot be read ({error.strerror or error}); {remedy}")
 
 
-def decode(body: bytes, path: Path, version: int = 1) -> Batch:
-    """The batch of a stored file's bytes; `path` names the file in error lines, `version` is the lake's number of it.
+def decode(body: bytes, where: str, version: int = 1) -> Batch:
+    """The batch of a stored file's bytes; `where` is its place in error lines, `version` the lake's number of it.
 
     Raises:
         WorkError: damaged, or not a file that the lake wrote.
@@ -122,7 +115,7 @@ def decode(body: bytes, path: Path, version: int = 1) -> Batch:
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise WorkError(
-            f"lake file {path}: cannot be read ({reason}); expected a batch stored by ingest; "
+            f"lake file {where}: cannot be read ({reason}); expected a batch stored by ingest; "
             "restore it from a backup or ingest its source again"
         ) from None
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from types import TracebackType
-from typing import Self
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,17 +25,43 @@ from models.result import CELL_KEYS, GridResult
 from models.trust import LeftOut, left_out_runs
 from models.updating import COLUMNS, updated_scores
 
+R = TypeVar("R")
+
+
+class Pool(Protocol):
+    """Where jobs run: worker processes of this computer (`data.processes.Processes`), or of others."""
+
+    def __enter__(self) -> object: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def shared(self, value: Any) -> Any:
+        """A handle on state that every worker loads once; a job receives it as a `data.processes.Shared`."""
+
+    def submit(self, work: Callable[..., R], *args: Any) -> Callable[[], R]:
+        """Begin a job; what is returned waits for its result."""
+
+
+Pools = Callable[[int], tuple[Pool, Pool]]  # of n processes; the second one for families that share work
+
+
+def local_pools(n: int) -> tuple[Pool, Pool]:
+    """`n` processes of this computer, and one more for families that share work; n = 1: all in this one."""
+    return Processes(n, _start), Processes(1, _start, spawn=n > 1)
+
 
 class Workers:
-    """Crosses families of the given crossings (by error channel) in `n` processes; n = 1: in this one.
+    """Crosses families of the given crossings (by error channel) in `n` processes; results do not depend on where.
 
     Most of a small fit's time is Python's own, so threads would take turns; processes do not. Calls may come from
-    several threads. Families that share work over the error channels have one process more, all in it.
+    several threads. Families that share work over the error channels are all in one process.
     """
 
-    def __init__(self, crossings: Mapping[str, Crossing], n: int) -> None:
-        self._pool, self._sharing = Processes(n, _start), Processes(1, _start, spawn=n > 1)
-        self._crossings = self._pool.shared(dict(crossings))
+    def __init__(self, crossings: Mapping[str, Crossing], n: int, pools: Pools = local_pools) -> None:
+        self._pool, self._sharing = pools(n)
+        self._crossings: Any = dict(crossings)
 
     def cross(self, job: tuple[str, str]) -> FamilyResult:
         """`cross_family` of (error channel, family); waits for it."""
@@ -51,13 +77,13 @@ class Workers:
             return pd.DataFrame(columns=COLUMNS)
         return self._pool_of(cell[2]).submit(_readings, self._crossings, cell)()
 
-    def _pool_of(self, family: str) -> Processes:
+    def _pool_of(self, family: str) -> Pool:
         return self._sharing if FAMILIES[family].shares_targets else self._pool
 
     def __enter__(self) -> Self:
         self._pool.__enter__()
         self._sharing.__enter__()
-        self._crossings = self._pool.shared(self._crossings.get())
+        self._crossings = self._pool.shared(self._crossings)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

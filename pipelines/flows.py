@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -19,17 +20,20 @@ from prefect.server.api.server import SubprocessASGIServer
 from prefect.task_runners import ThreadPoolTaskRunner
 from threadpoolctl import threadpool_limits
 
+from data.endings import at_end, without_interrupt
 from data.errors import InputError, WorkError
 from data.machine import load_machine
-from data.processes import at_end, without_interrupt
+from models.grid import Pools, local_pools
 from pipelines.caller import LANES, Done, Say, counted, label
 from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
+from pipelines.engine import no_address
 from pipelines.settings import Settings, load
 from pipelines.training import TrainOutcome, TrainRequest, train
 
 T = TypeVar("T")
 R = TypeVar("R")
 RETRY_DELAY_S = 2.0
+SERVER_START_S = 180  # its imports on a busy computer
 POPEN_S = 1.0  # for the operating system to start a process
 
 
@@ -89,8 +93,8 @@ def start_server() -> threading.Thread | None:
 
 
 def _serve() -> None:
-    with without_interrupt():
-        SubprocessASGIServer().start(timeout=60)
+    with without_interrupt(), suppress(RuntimeError):  # too late: the flow waits for it, or starts another
+        SubprocessASGIServer().start(timeout=SERVER_START_S)
 
 
 def _kill_server(starting: threading.Thread) -> None:
@@ -115,21 +119,43 @@ def train_in_flow(
     say: Say = lambda text: None,
     done: Done | None = None,
     server: threading.Thread | None = None,
+    pools: Pools = local_pools,
+    lanes: int = LANES,
 ) -> TrainOutcome:
-    """`pipelines.training.train` as a flow; same functions, same numbers."""
+    """`pipelines.training.train` as a flow; same functions, same numbers.
 
+    Args:
+        server: the start of a temporary server, see `start_server`.
+        pools: where the grid is computed.
+        lanes: steps under way at a time.
+    """
     machine = load_machine(request.machine_file).machine
     run_name = " ".join(("train", machine, *request.targets))
 
-    @flow(name=f"thermodrift-train-{machine}", flow_run_name=run_name, task_runner=ThreadPoolTaskRunner(LANES),
+    @flow(name=f"thermodrift-train-{machine}", flow_run_name=run_name, task_runner=ThreadPoolTaskRunner(lanes),
           persist_result=False, validate_parameters=False)  # fmt: skip
     def training() -> TrainOutcome:
-        return train(request, settings, PrefectCaller(done, machine), say)
+        return train(request, settings, PrefectCaller(done, machine), say, pools)
 
     if server is not None:
         server.join()
     quiet_prefect()
     return training()
+
+
+class PrefectEngine:
+    """Trainings as Prefect flows, on the server that PREFECT_API_URL names, else on a temporary one."""
+
+    def __init__(self, address: str | None = None) -> None:
+        if address is not None:
+            raise no_address("prefect")
+        self._server = start_server()
+
+    def train(
+        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
+    ) -> TrainOutcome:
+        """See `train_in_flow`."""
+        return train_in_flow(request, settings, say, done, self._server)
 
 
 @flow(name="thermodrift-diagnose", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)

@@ -14,7 +14,7 @@ from data.lake import Lake
 from data.machine import Machine
 from data.recording import read_batches, recording_files
 from pipelines.caller import Say
-from pipelines.settings import home
+from pipelines.settings import load
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Gathered:
 
 
 def home_lake() -> Lake:
-    """The lake in `home()`."""
-    return Lake(home() / "lake")
+    """The lake that `mlflow.yml` or THERMODRIFT_LAKE names, by default in `home()`."""
+    return Lake(load().lake)
 
 
 def check_recordings(recordings: Sequence[Path]) -> None:
@@ -70,7 +70,7 @@ def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> No
     raise InputError(
         f"machine file {name}: {len(unfit)} of {len(batches)} batches in the lake ({_few(unfit)}) have other channels; "
         f"{what}; ingest their recordings again with this machine file, or where these are gone their copies in the "
-        f"lake (`thermodrift ingest {lake.root / f'machine={name}'} --machine FILE`; a renamed channel is empty then), "
+        f"lake (`thermodrift ingest {lake.name}/machine={name} --machine FILE`; a renamed channel is empty then), "
         f"or withdraw them (`thermodrift lake withdraw {name} BATCH... --reason TEXT`)"
     )
 

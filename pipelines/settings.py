@@ -1,12 +1,14 @@
 """`mlflow.yml`: store, names and rules; and the home folder, which everything is written to.
 
 Both are looked for in the working directory, never in the installation: `var/` is the home unless THERMODRIFT_HOME
-names another folder; without an `mlflow.yml` the defaults below hold.
+names another folder; without an `mlflow.yml` the defaults below hold. An address may take parts, such as a password,
+from the environment: ``{env:NAME}``. What is shown of an address is `masked`.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import string
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +20,7 @@ from data.errors import InputError, closest
 from data.yaml_file import load_yaml
 from models.protocols import PromotionRule
 from pipelines import TELEMETRY_OFF
+from pipelines.home import home as home
 
 FILE = "mlflow.yml"
 _prefect_home_set_here = ""
@@ -28,15 +31,15 @@ class _Part(BaseModel):
 
 
 class TrackingPart(_Part):
-    """Where runs and their files go; `{home}` stands for `home()`."""
+    """Where runs and their files go; `{home}` stands for `home()`, `{env:NAME}` for a variable of the environment."""
 
     store: str = "sqlite:///{home}/mlflow.db"
     artifacts: str | None = "{home}/artifacts"
 
     @field_validator("store", "artifacts")
     @classmethod
-    def _only_home(cls, value: str | None) -> str | None:
-        return None if value is None else _placeholders(value, {"home"}, set())
+    def _only_home_and_environment(cls, value: str | None) -> str | None:
+        return None if value is None else _placeholders(value, {"home", "env"}, set())
 
 
 class NamesPart(_Part):
@@ -65,22 +68,38 @@ class DiagnoseRule(_Part):
 
 
 class _File(_Part):
+    lake: str = "{home}/lake"
     tracking: TrackingPart = TrackingPart()
     names: NamesPart = NamesPart()
     promotion: PromotionRule = PromotionRule()
     diagnose: DiagnoseRule = DiagnoseRule()
 
+    @field_validator("lake")
+    @classmethod
+    def _only_home_and_environment(cls, value: str) -> str:
+        return _placeholders(value, {"home", "env"}, set())
+
 
 @dataclass(frozen=True)
 class Settings:
-    """`mlflow.yml` with the home folder filled in."""
+    """`mlflow.yml` with the home folder and the environment filled in.
+
+    `store_uri` may hold a password; what people read gets `store_name`. `lake` is a folder, or the address of one on
+    another file system.
+    """
 
     home: Path
-    store_uri: str
-    artifacts_uri: str | None
+    store_uri: str = field(repr=False)
+    artifacts_uri: str | None = field(repr=False)
     names: NamesPart
     promotion: PromotionRule
     diagnose: DiagnoseRule = field(default_factory=DiagnoseRule)
+    lake: str = field(default="", repr=False)
+
+    @property
+    def store_name(self) -> str:
+        """The address of the store without its password."""
+        return masked(self.store_uri)
 
     def experiment(self, machine: str, target: str) -> str:
         """Name of the experiment of one machine's error channel."""
@@ -94,11 +113,6 @@ class Settings:
     def store_file(self) -> Path | None:
         """The SQLite file of the store, None for a server."""
         return Path(self.store_uri.removeprefix("sqlite:///")) if self.store_uri.startswith("sqlite:") else None
-
-
-def home() -> Path:
-    """The folder that everything is written to: THERMODRIFT_HOME, else var/ in the working directory; absolute."""
-    return Path(os.environ.get("THERMODRIFT_HOME", "").strip() or "var").expanduser().resolve()
 
 
 def configure_environment() -> None:
@@ -123,7 +137,7 @@ def load(path: Path | str | None = None) -> Settings:
     where = Path(path or FILE)
     parsed = _File() if path is None and not where.exists() else load_yaml(where, _File, "settings file")
     base = home()
-    store = parsed.tracking.store.format(home=base.as_posix())
+    store = _filled(parsed.tracking.store, base, f"settings file {where}: key 'tracking.store'")
     if store.startswith("sqlite:") and not Path(store.removeprefix("sqlite:///")).is_absolute():
         raise InputError(
             f"settings file {where}: key 'tracking.store': got {store!r}; a SQLite store needs an absolute path, "
@@ -131,13 +145,44 @@ def load(path: Path | str | None = None) -> Settings:
         )
     artifacts = parsed.tracking.artifacts
     if artifacts is not None:
-        artifacts = artifacts.format(home=base.as_posix())
+        artifacts = _filled(artifacts, base, f"settings file {where}: key 'tracking.artifacts'")
         artifacts = artifacts if "://" in artifacts else (base / artifacts).as_uri()
-    return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose)
+    lake = os.environ.get("THERMODRIFT_LAKE", "").strip() or _filled(
+        parsed.lake, base, f"settings file {where}: key 'lake'"
+    )
+    lake = lake if "://" in lake else str(base / Path(lake).expanduser())
+    return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose, lake)
+
+
+def masked(text: str) -> str:
+    """An address, or a text with one, without its password."""
+    text = re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
+    return re.sub(r"(?i)([?&](?:password|passwd|secret|token|key)=)[^&\s]*", r"\1***", text)
+
+
+class _Environment:
+    """In a format string, ``{env:NAME}`` is the value of the variable NAME."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+
+    def __format__(self, name: str) -> str:
+        if not os.environ.get(name):
+            raise InputError(
+                f"{self._where}: environment variable {name} is not set; set it, or leave {{env:{name}}} out"
+            )
+        return os.environ[name]
+
+
+def _filled(address: str, base: Path, where: str) -> str:
+    return address.format(home=base.as_posix(), env=_Environment(where))
 
 
 def _placeholders(value: str, allowed: set[str], needed: set[str]) -> str:
-    found = {name for _, name, _, _ in string.Formatter().parse(value) if name is not None}
+    parts = [(name, spec) for _, name, spec, _ in string.Formatter().parse(value) if name is not None]
+    if any((name == "env") != bool(spec) for name, spec in parts):
+        raise ValueError("only {env:NAME}, a variable of the environment, has a colon, and it needs a NAME")
+    found = {name for name, _ in parts}
     if found - allowed:
         unknown = sorted(found - allowed)[0]
         raise ValueError(f"unknown placeholder {{{unknown}}}; {closest(unknown, allowed)}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -41,7 +40,7 @@ def list_(
         console.line("the lake is empty; `thermodrift ingest` fills it")
     else:
         hidden = ("digest", "year", "withdrawn_at")
-        _print_rows(machine or str(lake.root), [{k: v for k, v in r.items() if k not in hidden} for r in rows])
+        _print_rows(machine or lake.name, [{k: v for k, v in r.items() if k not in hidden} for r in rows])
 
 
 @app.command()
@@ -51,15 +50,13 @@ def show(
     as_json: Json = False,
 ) -> None:
     """One batch: versions, sources, findings, withdrawal, and the trainings and models that used it."""
-    from data.lakefile import decode, read_body
     from pipelines.recordings import home_lake
 
     lake = home_lake()
     versions = lake.versions(machine, batch)
     last = versions[-1]
     kept = last.withdrawn is None or not last.withdrawn.purged_at
-    file = lake.root / last.files[-1]
-    content = decode(read_body(file), file, last.version) if kept else None
+    content = lake.read(last) if kept else None
     findings = [f.as_dict() for f in content.findings] if content else []
     used = _trainings_with(machine, [batch])
     if as_json:
@@ -134,10 +131,10 @@ def purge(
     contents = lake.contents(machine)
     doomed = {i: files for i, versions in contents.items() if (files := _withdrawn_files(lake, versions))}
     if not doomed and not quarantined:
-        raise InputError(f"lake {lake.root}: no withdrawn batch of {machine} has content; nothing to purge")
-    where = f"lake {lake.root}: {machine} has no withdrawn batch with content that fits"
+        raise InputError(f"lake {lake.name}: no withdrawn batch of {machine} has content; nothing to purge")
+    where = f"lake {lake.name}: {machine} has no withdrawn batch with content that fits"
     wanted = list(doomed) if batches is None else chosen(list(doomed), batches, where)
-    size_MB = sum(f.stat().st_size for i in wanted for f in doomed[i]) / 1e6
+    size_MB = sum(lake.size(f) for i in wanted for f in doomed[i]) / 1e6
     if not yes:
         more = f" and {len(lake.quarantined(machine))} quarantined files" if quarantined else ""
         what = f"withdrawn batches of {machine}: {len(wanted)}, {size_MB:.1f} MB{more}"
@@ -152,9 +149,9 @@ def purge(
         console.line(f"{machine} {batch_id}: purged")
 
 
-def _withdrawn_files(lake: Lake, versions: Sequence[Version]) -> list[Path]:
+def _withdrawn_files(lake: Lake, versions: Sequence[Version]) -> list[str]:
     """Files of withdrawn versions that are still there."""
-    return [f for v in versions if v.withdrawn for name in v.files if (f := lake.root / name).exists()]
+    return [f for v in versions if v.withdrawn and not v.withdrawn.purged_at for f in v.files if lake.size(f)]
 
 
 def _print_withdrawn(machine: str, ids: Sequence[str], as_json: bool) -> None:
@@ -201,12 +198,12 @@ def _trainings_with(machine: str, batch_ids: Sequence[str]) -> list[dict[str, An
 
 def _machine_row(lake: Lake, machine: str) -> dict[str, Any]:
     contents = lake.contents(machine)
-    files = {lake.root / f for versions in contents.values() for v in versions for f in v.files}
+    files = {f for versions in contents.values() for v in versions for f in v.files}
     gone = sum(versions[-1].withdrawn is not None for versions in contents.values())
     return {
         "machine": machine, "batches": len(contents) - gone, "withdrawn": gone,
         "versions": sum(map(len, contents.values())), "quarantined": len(lake.quarantined(machine)),
-        "size_MB": round(sum(f.stat().st_size for f in files if f.exists()) / 1e6, 2),
+        "size_MB": round(sum(map(lake.size, files)) / 1e6, 2),
     }  # fmt: skip
 
 

@@ -1,0 +1,64 @@
+"""Engines: what runs the steps of a training. The numbers are the same with each.
+
+A new engine is a file with a class that has the methods of `Engine`, and a line in `ENGINES`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from data.errors import InputError
+from data.registry import Registry
+from pipelines.caller import DirectCaller, Done, Say
+from pipelines.settings import Settings
+from pipelines.training import TrainOutcome, TrainRequest, train
+
+ENGINES = Registry(
+    "engine",
+    {
+        "prefect": "pipelines.flows:PrefectEngine",
+        "direct": "pipelines.engine:DirectEngine",
+        "dask": "pipelines.dask_engine:DaskEngine",
+    },
+)
+
+
+class Engine(Protocol):
+    """Made before the work begins, so that what takes time to come up can begin to."""
+
+    def __init__(self, address: str | None = None) -> None:
+        """Raises InputError where the engine cannot be used, or takes no address."""
+
+    def train(
+        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
+    ) -> TrainOutcome:
+        """`pipelines.training.train`; raises what that raises."""
+
+
+class DirectEngine:
+    """Plain calls in this process, and worker processes where they pay."""
+
+    def __init__(self, address: str | None = None) -> None:
+        if address is not None:
+            raise no_address("direct")
+
+    def train(
+        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
+    ) -> TrainOutcome:
+        """See `Engine`."""
+        return train(request, settings, DirectCaller(done), say)
+
+
+def open_engine(key: str, address: str | None = None) -> Engine:
+    """The engine of a key, ready to train.
+
+    Raises:
+        InputError: an unknown key, an engine whose packages are not installed, or one that takes no address.
+    """
+    made: Engine = ENGINES[key](address)
+    return made
+
+
+def no_address(key: str) -> InputError:
+    """The error of an engine that runs on this computer alone."""
+    return InputError(f"--address: engine {key} takes none; it is of the scheduler of --engine dask")

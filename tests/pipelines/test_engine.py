@@ -1,0 +1,149 @@
+"""Engines: names and addresses; the grid on a real Dask cluster gives the numbers of plain calls, bit for bit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from data.errors import InputError, WorkError
+from models.crossing import FamilyResult, Plan, prepare
+from models.grid import Workers, jobs_of
+from pipelines.engine import ENGINES, DirectEngine, open_engine
+from pipelines.training import TrainRequest
+from tests.conftest import make_toy_batches
+from tests.toys.command import in_process
+from tests.toys.postgres import free_port
+from tests.toys.small_year import write_machine, write_year
+
+dask_engine = pytest.importorskip("pipelines.dask_engine", exc_type=InputError)
+PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))
+LONGER = Plan(("none", "correlation"), ("zero", "ridge", "pls", "lssvm", "random_forest", "bp"), ("leave-batch-out",))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with dask_engine.Cluster(workers=2) as running:
+        yield running
+
+
+def test_an_unknown_engine_or_an_address_without_use_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    call = in_process(monkeypatch, capsys)
+    machine = write_machine(tmp_path / "m.yml", "engine-toy")
+    done = call("train", "--machine", machine, "--engine", "dusk")
+    assert done.code == 2 and "--engine: unknown value 'dusk': did you mean 'dask'?" in done.err
+    done = call("train", "--machine", machine, "--engine", "dask", "--direct")
+    assert done.code == 2 and "--direct is --engine direct; got --engine dask" in done.err
+    for key in ("direct", "prefect"):
+        with pytest.raises(InputError, match=f"--address: engine {key} takes none"):
+            open_engine(key, "tcp://127.0.0.1:8786")
+    with pytest.raises(InputError, match="--address: got 'host:8786', expected that of a Dask scheduler"):
+        open_engine("dask", "host:8786")
+    assert list(ENGINES) == ["prefect", "direct", "dask"]
+
+
+def test_a_missing_package_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.delitem(sys.modules, "pipelines.dask_engine")
+    with pytest.raises(InputError, match=r"engine dask: .*run pip install 'thermodrift\[dask\]'"):
+        open_engine("dask")
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_engine, "ANSWER_S", 0.5)
+    with pytest.raises(WorkError, match=r"^Dask cluster tcp://127.0.0.1:\d+: does not answer \([^\n]*\)$"):
+        dask_engine.Cluster(f"tcp://127.0.0.1:{free_port()}").__enter__()
+
+
+def test_the_cluster_listens_on_this_computer_alone(cluster: Any) -> None:
+    import psutil
+
+    processes = [psutil.Process(), *(psutil.Process(pid) for pid in cluster.client.run(os.getpid).values())]
+    found = [c.laddr.ip for p in processes for c in p.net_connections("inet") if c.status == psutil.CONN_LISTEN]
+    assert len(found) >= 3 and set(found) == {"127.0.0.1"}
+
+
+def test_the_grid_on_workers_gives_the_same_numbers(cluster: Any) -> None:
+    batches = make_toy_batches(4, 30)
+    crossings = {"z": prepare(batches, "z", PLAN)}
+    jobs = jobs_of(PLAN, ("z",))
+    with Workers(crossings, 1) as here, Workers(crossings, 1, cluster.pools) as workers:
+        for job in jobs:
+            assert_same(workers.cross(job), here.cross(job))
+
+
+@pytest.mark.slow
+def test_the_grid_goes_on_after_all_workers_ended(cluster: Any) -> None:
+    """Then nobody holds the crossings any more."""
+    crossings = {"z": prepare(make_toy_batches(4, 30), "z", PLAN)}
+    jobs = jobs_of(PLAN, ("z",))
+    with Workers(crossings, 1) as here, Workers(crossings, 1, cluster.pools) as workers:
+        assert_same(workers.cross(jobs[0]), here.cross(jobs[0]))
+        for pid in cluster.client.run(os.getpid).values():
+            os.kill(pid, signal.SIGKILL)
+        assert_same(workers.cross(jobs[1]), here.cross(jobs[1]))
+
+
+def assert_same(got: FamilyResult, wanted: FamilyResult) -> None:
+    """Bit for bit."""
+    pd.testing.assert_frame_equal(got.scores, wanted.scores, check_exact=True)
+    pd.testing.assert_frame_equal(got.cells, wanted.cells, check_exact=True)
+    bits = [{k: v.tobytes() for k, v in result.predictions.items()} for result in (got, wanted)]
+    assert bits[0] == bits[1]
+
+
+def test_a_worker_with_another_program_is_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_engine, "_program", lambda: {"numpy": "0.1"})
+    with pytest.raises(WorkError, match="a Dask worker has another version of numpy; install the same"):
+        dask_engine.ClusterPool(cluster).submit(len, "abc")()
+
+
+def test_what_the_work_raises_is_raised_here(cluster: Any) -> None:
+    pool = dask_engine.ClusterPool(cluster)
+    assert pool.submit(len, "abc")() == 3
+    with pytest.raises(InputError, match="unknown family 'rigde'"):
+        pool.submit(_family, "rigde")()
+
+
+def _family(key: str) -> str:
+    from models import FAMILIES
+
+    return str(FAMILIES[key].key)
+
+
+@pytest.mark.slow
+def test_a_training_on_three_workers_one_of_which_ends(
+    store: Any, store_home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    write_year(tmp_path / "in")
+
+    def request(name: str) -> TrainRequest:
+        return TrainRequest(write_machine(tmp_path / f"{name}.yml", name), (tmp_path / "in",), ("z",), LONGER)
+
+    engine = dask_engine.DaskEngine(workers=3)
+    ended: list[int] = []
+    clusters: list[Any] = []
+    enter = dask_engine.Cluster.__enter__
+    monkeypatch.setattr(dask_engine.Cluster, "__enter__", lambda self: clusters.append(enter(self)) or self)
+
+    def done(step: str, n: int, of: int) -> None:
+        if step.startswith("grid") and n == 1:
+            ended.append(next(iter(clusters[0].client.run(os.getpid).values())))
+            os.kill(ended[0], signal.SIGKILL)
+
+    far = engine.train(request("engine-dask"), store, done=done)
+    near = DirectEngine().train(request("engine-direct"), store)
+    assert len(ended) == 1
+    a, b = far.results["z"], near.results["z"]
+    for table in ("scores", "cells", "subsets", "predictions", "distances", "readings"):
+        pd.testing.assert_frame_equal(getattr(a, table), getattr(b, table), check_exact=True)
+    assert far.promotions["z"].summary == near.promotions["z"].summary.replace("engine-direct", "engine-dask")
