@@ -222,10 +222,16 @@ class Progress:
         }  # fmt: skip
         text = json.dumps(asked, indent=1, ensure_ascii=False)
         noted, file = request.out / ARRIVALS, request.out / PROGRESS
-        if noted.is_file() and json.loads(noted.read_text(encoding="utf-8")) == json.loads(text):
+        if noted.is_file():
+            known, wanted = json.loads(noted.read_text(encoding="utf-8")), json.loads(text)
+            if other := [k for k in wanted if known.get(k) != wanted[k]]:
+                raise InputError(
+                    f"--out {request.out}: holds a replay with other {', '.join(other).replace('_', ' ')}; give the "
+                    "same to go on with it, or another folder"
+                )
             return cls._read(file) if file.is_file() else cls(file)
         if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):
-            raise InputError(f"--out {request.out}: holds something else than this replay; give another folder")
+            raise InputError(f"--out {request.out}: holds something else than a replay; give another folder")
         for folder in (request.home, request.inbox):
             folder.mkdir(parents=True, exist_ok=True)
         write_atomic(noted, text)
@@ -303,7 +309,8 @@ class _Year:
         past = tracking.trainings(self.machine.machine, target, self.settings)
         training = tracking.load_training(str(past.iloc[0]["training_id"]), self.settings)
         n, why, version, kind = len(training.result.batches), outcome.stopped, None, "not trained"
-        if made := training.promotion:
+        repeated = any(r.training_id == training.training_id for r in self.progress.retrainings)
+        if (made := training.promotion) and not (outcome.stopped and repeated):
             version, kind = int(made["version"]), str(made["outcome"])
             why = str(made["words"])
         if target in outcome.promotions:

@@ -39,6 +39,7 @@ class ChannelPart:
     facts: tuple[Fact, ...]
     picture: Panel
     retrainings: Table
+    reasons: Table
     runs: Table
 
 
@@ -74,7 +75,10 @@ def replay_page(r: Replay) -> ReplayPage:
 
 
 def _channel(r: Replay, target: str) -> ChannelPart:
-    return ChannelPart(target, _facts(r.score(target)), _picture(r, target), _retrainings(r, target), _runs(r, target))
+    return ChannelPart(
+        target, _facts(r.score(target)), _picture(r, target), _retrainings(r, target), _reasons(r, target),
+        _runs(r, target),
+    )  # fmt: skip
 
 
 def _facts(s: Score) -> tuple[Fact, ...]:
@@ -98,16 +102,17 @@ def _paired(p: Paired) -> str:
 
 def _retrainings(r: Replay, target: str) -> Table:
     columns = (
-        Column("date"), Column("runs known", kind="number"), Column("champion before", kind="number"),
+        Column("date"), Column("runs known", kind="number"), Column("before", kind="number"),
         Column("after", kind="number"), Column("expected S", "µm", "number"), Column("90 % below", "µm", "number"),
-        Column("runs until the next", kind="number"), Column("S champion", "µm", "number"),
+        Column("runs after", kind="number"), Column("S champion", "µm", "number"),
         Column("S frozen", "µm", "number"), Column("S no model", "µm", "number"),
         Column("frozen − champion", "µm", "number"), Column("below bound", kind="number"),
-        Column("outcome and reason", kind="wide"),
+        Column("outcome"),
     )  # fmt: skip
     rows = [_retraining(g, r.score(target, g.number)) for g in r.retrainings_of(target)]
     notes = (
-        "S is the residual standard deviation of a run; means over the runs that arrived until the next training. "
+        "Before and after: version of the champion. Expected S and its bound are those of the champion after. S is the "
+        "residual standard deviation of a run; means over the runs that arrived until the next training. "
         "Frozen − champion: paired mean and standard error, plus where retraining was better. Below bound: runs below "
         "the 90 % bound of their own prediction.",
     )
@@ -122,9 +127,20 @@ def _retraining(g: Retraining, s: Score) -> Row:
     bound = f"{s.covered} of {s.bounded}" if s.bounded else NOTHING
     runs = f"{s.n}" + (f" (+{s.without})" if s.without else "")
     return Row.of(
-        f"{g.number}: {g.date[:10] or f'arrival {g.arrival}'}", str(g.n_batches), *version, *expected, runs, *followed,
-        paired, bound, f"{g.outcome}: {g.why}", mark="promoted" if g.promoted else "",
+        f"{g.number}: {_date(g)}", str(g.n_batches), *version, *expected, runs, *followed,
+        paired, bound, g.outcome, mark="promoted" if g.promoted else "",
     )  # fmt: skip
+
+
+def _date(g: Retraining) -> str:
+    """The date with hyphens at which no line breaks."""
+    return g.date[:10].replace("-", "\u2011") or f"arrival {g.arrival}"
+
+
+def _reasons(r: Replay, target: str) -> Table:
+    rows = tuple(Row.of(str(g.number), g.why) for g in r.retrainings_of(target))
+    columns = (Column("training"), Column("reason", kind="wide"))
+    return Table("Why each training was promoted or not", columns, rows, r.simulated)
 
 
 def _runs(r: Replay, target: str) -> Table:

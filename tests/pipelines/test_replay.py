@@ -142,7 +142,7 @@ def test_what_is_done_is_not_done_again(recorded: Replay, given: Given) -> None:
     before = (given.folder / "recorded" / "progress.json").stat().st_mtime_ns
     assert given.replay("recorded") == recorded
     assert (given.folder / "recorded" / "progress.json").stat().st_mtime_ns == before
-    with pytest.raises(InputError, match="holds something else than this replay; give another folder"):
+    with pytest.raises(InputError, match="holds a replay with other every; give the same to go on with it, or another folder"):
         given.replay("recorded", every=3)
 
 

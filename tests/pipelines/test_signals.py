@@ -175,7 +175,7 @@ def test_a_signal_ends_the_command(
         os.close(writing)
     assert not ended.left, ended
     assert ended.seconds < LIMIT_S, ended
-    if when == 0.1 and ended.code == -number:
-        return  # Python itself was starting
+    if not callable(when) and ended.code == -number:
+        return  # Python was still loading the command; a shell reports 128 + signal all the same
     assert ended.code == 128 + number, ended
     assert "Traceback" not in ended.error, ended
