@@ -91,8 +91,8 @@ def _error_drift(state: State, rules: AlertRules) -> str:
     if not S_um or bound_um is None or (mean_um := sum(S_um) / len(S_um)) <= bound_um:
         return ""
     runs = "the newest run" if len(S_um) == 1 else f"the {len(S_um)} newest runs on average"
-    expected = f"expected {state['expected_S_um']:.3g} µm, " if state["expected_S_um"] is not None else ""
-    return f"error S {mean_um:.3g} µm in {runs}, above the 90 % bound of {bound_um:.3g} µm ({expected}since training)"
+    expected = f" (expected {state['expected_S_um']:.3g} µm)" if state["expected_S_um"] is not None else ""
+    return f"error S {mean_um:.3g} µm in {runs}, above the 90 % bound of {bound_um:.3g} µm{expected}"
 
 
 def _inputs_outside(runs: Sequence[Mapping[str, Any]], rules: AlertRules) -> str:
@@ -129,7 +129,9 @@ def after_run(home: Path, fleet: Fleet, machine: str, say: Say) -> None:
             "raised": [texts[k] for k in sorted(texts.keys() - sent.keys())],
             "cleared": [sent[k] for k in sorted(sent.keys() - texts.keys())],
         }  # fmt: skip
-        threading.Thread(target=_deliver, args=(home, machine, url, message, texts, say), daemon=True).start()
+        threading.Thread(
+            target=_deliver, args=(home, machine, url, message, texts, say), name="alerts", daemon=True
+        ).start()
 
 
 def _current(home: Path, rules: AlertRules, machine: str) -> list[Alert]:

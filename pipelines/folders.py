@@ -23,7 +23,8 @@ class Folders:
         self._say = say
         self._of = {Path(r): m for m in fleet.machines if m.when.watch for r in m.recordings}
         self._quiet = {m.name: timedelta(minutes=m.when.quiet_min) for m in fleet.machines if m.when.watch}
-        self._changed: dict[str, datetime] = {}
+        # What arrived while nobody watched is looked for at once.
+        self._changed = dict.fromkeys(self._quiet, datetime.fromtimestamp(0, UTC))
         self._lock = threading.Lock()
         self._stop = threading.Event()
 
@@ -43,7 +44,7 @@ class Folders:
     def touch(self, name: str, when: datetime) -> None:
         """A machine's folders changed."""
         with self._lock:
-            self._changed[name] = max(when, self._changed.get(name, when))
+            self._changed[name] = when
 
     def settled(self, now: datetime) -> set[str]:
         """Machines whose folders have changed, and not for their quiet time."""

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 from zoneinfo import available_timezones
@@ -67,8 +67,6 @@ class Clock:
         self._fleet, self._folders = fleet, folders
         self._next: dict[str, datetime | None] = {}
         for m in fleet.machines:
-            if m.when.watch:
-                folders.touch(m.name, now - timedelta(days=1))  # what arrived while nobody watched
             since = last.get(m.name)
             due = m.when.next(now if since is None else since, fleet.zone)
             self._next[m.name] = due if due is None else max(due, now)

@@ -60,6 +60,7 @@ class FleetPage:
     """What the template shows."""
 
     title: str
+    simulated: bool  # every row
     summary: str
     figures: tuple[tuple[str, str, str], ...]  # label, number, below
     alerts: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]  # machine -> (channel, reason)
@@ -110,7 +111,9 @@ def fleet_page(
         f"{f['source']}: {count(f['machines'], 'machine')}, {'served now' if f['served'] else 'not served now'}"
         for f in fleets
     )
-    return FleetPage("Fleet", summary, figures, grouped, tuple(_row(r, now) for r in rows), unknown, served)
+    simulated = bool(rows) and all(r["simulated"] for r in rows if r["n_seen"])
+    made = tuple(_row(r, now) for r in rows)
+    return FleetPage("Fleet", simulated, summary, figures, grouped, made, unknown, served)
 
 
 def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:

@@ -1,0 +1,181 @@
+"""The state of machines and channels: what drifted by how much, what failed, and when it is gathered again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from data.ingest import ingest
+from data.machine import load_machine
+from features.rises import zeroed_error_um
+from models.crossing import Plan
+from models.metrics import residual_std_um
+from models.trust import farthest, watched
+from pipelines import model_store, registry, settings, training, watching
+from pipelines.caller import DirectCaller
+from pipelines.fleet_view import fleet_view
+from pipelines.recordings import home_lake, load_batches
+from pipelines.training import TrainRequest
+from tests.toys.small_year import recording, write_machine, write_year
+
+NAME = "watched"
+PLAN = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
+Call = Callable[..., Any]
+
+
+def unlike(k: int) -> pd.DataFrame:
+    """A recording under the conditions of the k-th, and no copy of it."""
+    table = recording(k)
+    rng = np.random.default_rng(100 + k)
+    for column in ("front", "bed", "room", "z"):
+        table[column] = (table[column] + rng.normal(0, 0.03, len(table))).round(2)
+    return table
+
+
+class Place:
+    """A home with one trained machine, and three newer runs: as before, hot and drifting, with a frozen sensor."""
+
+    def __init__(self, folder: Path) -> None:
+        self.home, self.incoming = folder / "home", folder / "in"
+        self.machine = write_machine(folder / "m.yml", NAME)
+        write_year(self.incoming, 6)
+        self.settings = settings.load()
+        request = TrainRequest(self.machine, (self.incoming,), ("z",), PLAN, report=folder / "r.html")
+        self.outcome = training.train(request, self.settings, DirectCaller())
+        newer = [unlike(3), unlike(4), unlike(2)]
+        newer[1]["room"] += 0.002 * newer[1]["time_s"]
+        newer[1]["z"] += 0.002 * newer[1]["time_s"]
+        newer[2]["front"] = 21.37
+        for k, table in enumerate(newer):
+            table.to_csv(self.incoming / f"202509{14 + k}.csv", index=False)
+        ingest([self.incoming], load_machine(self.machine), home_lake())
+
+    def states(self) -> dict[str, dict[str, Any]]:
+        return {s["channel"]: s for s in watching.refresh(self.settings)["channels"] if s["machine"] == NAME}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("watching")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THERMODRIFT_HOME", str(folder / "home"))
+        patch.chdir(folder)
+        yield Place(folder)
+
+
+def test_the_state_of_a_champion(place: Place) -> None:
+    states = place.states()
+    z, x = states["z"], states["x"]
+    expected = place.outcome.outlooks["z"]
+    assert (z["model"], z["version"], z["n_seen"], z["simulated"]) == (f"{NAME}-z", 1, 6, True)
+    assert z["last_seen"] == "2025-06-14T00:00:00" and z["unknown"] == ""
+    assert z["expected_S_um"] == pytest.approx(expected.S_um) and z["bound90_S_um"] == pytest.approx(expected.bound_um)
+    assert x["version"] is None and x["expected_S_um"] is None and x["n_seen"] == 0
+
+
+def test_drift_is_what_model_and_region_say_of_the_newer_runs(place: Place) -> None:
+    runs = {r["batch_id"]: r for r in place.states()["z"]["runs"]}
+    assert [r["newer"] for r in runs.values()] == [False] * 6 + [True] * 3
+    client = registry.open_store(place.settings)
+    source = registry.find_version(client, f"{NAME}-z", "champion").source
+    model = model_store.load(Path(registry.local_folder(str(source), place.settings)))
+    batches = {b.batch_id: b for b in load_batches(home_lake(), model.machine)}
+    for batch_id in ("20250914", "20250915"):
+        b = batches[batch_id]
+        values = watched(b, model.family.inputs)
+        distance, quantity = farthest(model.region.beyond(values))
+        assert runs[batch_id]["distance"] == pytest.approx(distance)
+        assert runs[batch_id]["why"] == (model.region.excess(quantity, values) if batch_id == "20250915" else "")
+        S_um = residual_std_um(zeroed_error_um(b, "z") - model.predict(b))
+        assert runs[batch_id]["S_um"] == pytest.approx(float(S_um))
+    assert not runs["20250914"]["outside"] and runs["20250914"]["S_um"] < 2.0
+    assert runs["20250915"]["outside"] and runs["20250915"]["S_um"] > 5.0
+    assert all(r["S_um"] is None for r in list(runs.values())[:6])
+
+
+def test_a_failed_sensor_is_named(place: Place) -> None:
+    (sensor,) = place.states()["z"]["sensors"]
+    assert (sensor["batch_id"], sensor["channel"], sensor["input"]) == ("20250916", "front", True)
+    assert sensor["checks"] and sensor["share"] > 0.9
+
+
+def test_the_view_has_the_alerts_worst_first(place: Place) -> None:
+    status = watching.refresh(place.settings)
+    view = fleet_view(place.home, status["channels"], datetime(2025, 9, 20, tzinfo=UTC))
+    assert [r["channel"] for r in view.rows] == ["z", "x"]
+    rules = sorted(a.rule for a in view.alerts)
+    assert rules == ["error_drift", "old_champion", "sensor_failed front"]
+    z = view.rows[0]
+    assert z["seen_days_ago"] == pytest.approx(98, abs=1) and z["outside_runs"] >= 1 and z["sensors"] == ["front"]
+    assert np.isclose(z["drift"], z["newer_S_mean_um"] / z["bound90_S_um"]) and z["next_run"] is None
+    assert fleet_view(place.home, [], datetime(2025, 9, 20, tzinfo=UTC)).rows == []
+
+
+def test_only_what_changed_is_gathered_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    watching.refresh(place.settings)
+    warm = watching.warm()
+    assert warm is not None and {s["channel"] for s in warm["channels"]} == {"x", "z"}
+    said: list[str] = []
+    watching.refresh(place.settings, said.append)
+    assert not [line for line in said if line.startswith("state of")]
+    unlike(1).to_csv(place.incoming / "20250920.csv", index=False)
+    ingest([place.incoming], load_machine(place.machine), home_lake())
+    assert watching.warm() is None
+    status = watching.refresh(place.settings, said.append)
+    assert f"state of {NAME}" in said and watching.warm() == json.loads(json.dumps(status, default=str))
+    (place.incoming / "20250921.csv").write_text("nothing")
+    ingest([place.incoming], load_machine(place.machine), home_lake())
+    assert watching.warm() is None
+    assert watching.refresh(place.settings)["lake"][NAME]["quarantined"] == 1
+
+
+def test_a_model_that_cannot_be_read_is_said(place: Place) -> None:
+    client = registry.open_store(place.settings)
+    source = registry.find_version(client, f"{NAME}-z", "champion").source
+    folder = Path(registry.local_folder(str(source), place.settings)) / "artifacts"
+    arrays = (folder / "arrays.npz").read_bytes()
+    kept = place.home / "fleet" / f"{NAME}.state.json"
+    try:
+        (folder / "arrays.npz").write_bytes(arrays[:-1])
+        kept.unlink()
+        z = place.states()["z"]
+        assert "not a stored model" in z["unknown"] and all(r["distance"] is None for r in z["runs"])
+        row = fleet_view(place.home, [z]).rows[0]
+        assert row["outside_runs"] is None and row["newer_S_mean_um"] is None and row["unknown"]
+    finally:
+        (folder / "arrays.npz").write_bytes(arrays)
+        kept.unlink(missing_ok=True)
+
+
+def test_the_command_shows_it_and_fails_on_alert(
+    place: Place, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipelines import cli
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["thermodrift", "status", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        shown = capfd.readouterr()
+        return int(ended.value.code or 0), shown.out, shown.err
+
+    code, out, _ = call()
+    table = out.partition("Alerts")[0].splitlines()
+    assert code == 0 and max(map(len, table)) <= 80
+    assert any(line.startswith(f"! {NAME}") and " z " in line and "v1 ridge" in line for line in table)
+    code, out, err = call("--alert", "--json", "--html", str(tmp_path / "fleet.html"))
+    found = json.loads(out)
+    assert code == 3 and err.count(f"alert {NAME}") == len(found["alerts"]) > 0
+    assert {"models", "trainings", "diagnoses", "lake", "fleet", "alerts"} <= found.keys()
+    assert found["models"][0]["name"] == f"{NAME}-z" and found["lake"][NAME]["batches"] >= 9
+    page = (tmp_path / "fleet.html").read_text()
+    assert NAME in page and "SIMULATED" in page and "older than a season" in page
+    code, _, err = call("--html", str(tmp_path / "fleet.pdf"))
+    assert code == 2 and "unsupported file extension" in err

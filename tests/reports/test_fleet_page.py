@@ -1,0 +1,71 @@
+"""The page of a fleet: worst first, alerts in words, and nothing claimed that is not known."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from data.errors import InputError
+from reports.fleet import fleet_page, write_fleet_page
+
+NOW = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
+RUN = {"began": "2026-11-24T05:00:00+00:00", "ended": "2026-11-24T05:10:00+00:00", "ok": False, "summary": "no <share>"}
+
+
+def row_of(machine: str, **more: Any) -> dict[str, Any]:
+    return {
+        "machine": machine, "channel": "z", "model": f"{machine}-z", "version": 3, "cell": "none|ridge|2",
+        "family": "ridge", "since": "", "trained_at": "", "reason": "", "simulated": False, "last_seen": "2026-11-01",
+        "expected_S_um": 2.0, "bound90_S_um": 4.0, "expected_by": "forward", "n_seen": 6, "unknown": "",
+        "age_days": 3.2, "seen_days_ago": 24.5, "newer_S_um": [], "newer_S_mean_um": None, "drift": None,
+        "outside_runs": 0, "of_runs": 5, "outside_why": "", "sensors": [], "next_run": None, "schedule": "",
+        "scheduled": False, "last_run": None, "last_failure": None, "alerts": [], "machine_alerts": 0, **more,
+    }  # fmt: skip
+
+
+DRIFTING = row_of(
+    "mill", newer_S_um=[3.0, 9.0], newer_S_mean_um=6.0, drift=1.5, alerts=["error S 6 µm above"], last_run=RUN,
+    last_failure=RUN, next_run="2026-11-30T04:00:00+00:00", schedule="cron 0 5 * * 1", scheduled=True,
+)  # fmt: skip
+UNKNOWN = row_of(
+    "lathe", version=None, family="", last_seen="", expected_S_um=None, bound90_S_um=None, n_seen=0, age_days=None,
+    seen_days_ago=None, outside_runs=None, of_runs=0, unknown="the lake has other channels",
+)  # fmt: skip
+
+
+def test_values_and_reasons() -> None:
+    page = fleet_page([DRIFTING, row_of("hmc"), UNKNOWN], [("mill", "z", "error S 6 µm above")], [], NOW)
+    mill, hmc, lathe = page.rows
+    assert page.summary == "1 alert on 1 of 3 machines." and page.alerts == (("mill", (("z", "error S 6 µm above"),)),)
+    assert (mill.state, hmc.state, lathe.state) == ("alert", "ok", "none")
+    assert mill.newer.bad and mill.newer.text == "6 µm" and mill.failure.bad and mill.failure.below == "no <share>"
+    assert mill.drift is not None and mill.drift.dots == (50.0, 100.0) and mill.drift.beyond
+    assert mill.drift.bound == pytest.approx(66.7) and mill.drift.expected == pytest.approx(33.3)
+    assert (hmc.newer.text, hmc.drift, hmc.next_run.text, hmc.failure.text) == (
+        "not measured", None, "not known", "no run known",
+    )  # fmt: skip
+    assert lathe.champion.text == "none" and lathe.expected.text == lathe.outside.text == ""
+    assert page.unknown == ("lathe z: the lake has other channels",)
+
+
+def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.html"
+    alerts = [("mill", "z", "error S 6 µm above"), ("mill", "", "the last retraining failed: no <share>")]
+    fleets = [{"source": "/etc/fleet.yml", "served": True, "machines": 2}]
+    write_fleet_page(path, [DRIFTING, row_of("hmc", simulated=True)], alerts, fleets, NOW)
+    text = path.read_text(encoding="utf-8")
+    assert "no &lt;share&gt;" in text and "<share>" not in text and text.count("SIMULATED") == 1
+    assert "http" not in text.replace("http-equiv", "")  # nothing is loaded
+    assert "2 machines, served now" in text
+    page = fleet_page([row_of("mill", simulated=True), row_of("hmc", simulated=True)], [], [], NOW)
+    assert page.simulated  # then the title says so, and no row
+    with pytest.raises(InputError, match="unsupported file extension"):
+        write_fleet_page(tmp_path / "fleet.md", [], [], [], NOW)
+
+
+def test_an_empty_fleet(tmp_path: Path) -> None:
+    page = fleet_page([], [], [], NOW)
+    assert page.summary == "No alert on 0 machines." and not page.rows
