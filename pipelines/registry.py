@@ -43,7 +43,6 @@ from models.updating import Updater, out_of_fold
 from pipelines import audit, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
 from pipelines.runs import close_interrupted, code_version
-from pipelines.serving import write_served
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
@@ -147,11 +146,13 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
         begun = next((v for v in same if _is_unfinished(client, v, new.training_id)), None)
         done = [v for v in same if OUTCOME in v.tags]
         if begun is None and done and (champion is not None or force or not new.choice.trusted):
-            kept = _keep(client, done[0], champion, new, force)
+            outcome = _keep(client, done[0], champion, new, force)
+            known = done[0].tags.get("training_id") == new.training_id and not force  # what became of it is recorded
         else:
-            kept = _register(client, name, champion, new, settings, force, begun)
-        record_promotion(client, new.training_id, kept.as_dict())
-        return kept
+            outcome, known = _register(client, name, champion, new, settings, force, begun), False
+        if not known:
+            record_promotion(client, new.training_id, outcome.as_dict())
+        return outcome
 
 
 def _is_unfinished(client: MlflowClient, version: ModelVersion, training_id: str) -> bool:
@@ -457,6 +458,8 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
 
     Models from code: MLflow keeps `pyfunc_model.py` and the plain files of `model_store`; nothing is pickled.
     """
+    from pipelines.serving import write_served  # loads onnx
+
     choice, result, info = new.choice, new.result, _info(new)
     tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | tags
     bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)

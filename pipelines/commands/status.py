@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipelines import console
+from pipelines.home import home
 from pipelines.options import Json
 
 if TYPE_CHECKING:
@@ -127,6 +129,7 @@ def status(
     """Which champion runs on which machine, whether it still holds, and what needs attention; models, the lake."""
     from pipelines import watching
 
+    _deliver()
     found = watching.warm() or _gathered(as_json)
     from pipelines.fleet_view import fleet_view
 
@@ -151,6 +154,21 @@ def status(
             console.note(f"alert {a.text}")
         if view.alerts:
             raise typer.Exit(ALERT_CODE)
+
+
+def _deliver() -> None:
+    """What waits for a tracking server that did not answer, see `pipelines.spool`."""
+    if not any((home() / "spool").glob("[0-9]*")):
+        return
+    from pipelines import settings
+
+    settings.configure_environment()
+    from pipelines import spool
+    from pipelines.training import promote_waiting
+
+    configured = settings.load()
+    for line in spool.deliver(configured, partial(promote_waiting, configured), console.note):
+        console.note(line)
 
 
 def _gathered(quiet: bool) -> dict[str, Any]:

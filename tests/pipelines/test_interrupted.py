@@ -182,7 +182,7 @@ def check_finished_by_the_next(store: Any, new: registry.Newcomer, version: int,
     tags = client.get_model_version(name, str(version)).tags
     assert (tags["outcome"], tags["training_id"]) == ("champion", new.training_id)
     kept = json.loads(client.get_run(new.training_id).data.tags["promotion"])
-    assert (kept["outcome"], kept["version"]) == (outcome, version)
+    assert (kept["outcome"], kept["version"]) == ("champion", version)
     models = client.search_logged_models([run.info.experiment_id], f"source_run_id = '{new.training_id}'")
     assert not [m for m in models if m.status == "PENDING"]
 

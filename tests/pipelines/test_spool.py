@@ -1,0 +1,199 @@
+"""A tracking server that does not answer: at the start one line, later the results wait and are delivered once."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import pytest
+from mlflow.tracking import MlflowClient
+
+from models.crossing import Plan
+from pipelines import registry, settings, spool, tracking
+from pipelines.caller import DirectCaller
+from pipelines.commands.train import training_dict
+from pipelines.recordings import home_lake
+from pipelines.store import StoreOutage
+from pipelines.training import TrainRequest, promote_waiting, train
+from tests.toys.command import Call, in_process
+from tests.toys.mlflow_server import MlflowServer
+from tests.toys.postgres import free_port
+from tests.toys.small_year import write_machine, write_year
+from tests.toys.training import toy_batches, toy_result
+
+PLAN = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
+DOWN = "tracking store http://127.0.0.1:5000: does not answer (connection refused)"
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
+    """The command in a folder and home of the test's own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
+    return in_process(monkeypatch, capsys)
+
+
+def down(*_: object, **__: object) -> Any:
+    raise StoreOutage(DOWN)
+
+
+def trained(name: str, folder: Path, store: Any, caller: DirectCaller | None = None) -> Any:
+    machine, _ = write_machine(folder / "m.yml", name), write_year(folder / "in")
+    return train(TrainRequest(machine, (folder / "in",), ("z",), PLAN), store, caller or DirectCaller())
+
+
+def test_a_server_that_does_not_answer_is_one_line_before_anything_is_computed(call: Call, tmp_path: Path) -> None:
+    machine, _ = write_machine(tmp_path / "m.yml", "small-down"), write_year(tmp_path / "in")
+    address = f"http://127.0.0.1:{free_port()}"
+    (tmp_path / "mlflow.yml").write_text(f'tracking: {{store: "{address}", artifacts: null}}\n')
+    done = call("train", "--machine", machine, "--recordings", tmp_path / "in", "--direct")
+    assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
+    assert done.err.startswith(f"thermodrift: tracking store {address}: does not answer")
+    assert not (tmp_path / "home" / "lake").exists() and not (tmp_path / "home" / "spool").exists()
+
+
+def test_results_wait_and_are_delivered_once(
+    store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Call
+) -> None:
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    with monkeypatch.context() as patch:
+        for name in ("log_record", "attach"):
+            patch.setattr(tracking, name, down)
+        outcome = trained("small-spool", tmp_path, store)
+    assert outcome.postponed.startswith(f"{DOWN}; the results wait in {store_home / 'spool'}: the next `thermodrift ")
+    assert training_dict(outcome)["postponed"] == outcome.postponed
+    assert not outcome.training_ids and not outcome.promotions and outcome.report.exists()
+    names = [p.name for p in spool.waiting(store)]
+    assert names == ["000001-run-small-spool-z", "000002-promotion-small-spool-z", "000003-file-small-spool-z"]
+    assert tracking.trainings("small-spool", None, store).empty
+    kept = tmp_path / "kept"
+    shutil.copytree(store_home / "spool", kept)
+
+    done = call("status", "--json")
+    assert done.code == 0 and [line.partition(":")[0] for line in done.err.splitlines()[:4]] == [
+        "delivers 3 results that were kept while the tracking server did not answer",
+        *(f"delivered {kind} of small-spool z" for kind in ("run", "promotion", "file")),
+    ]
+    (training,) = [t for t in json.loads(done.out)["trainings"] if t["machine"] == "small-spool"]
+    assert (training["promotion"], training["model"]) == ("champion", "small-spool-z version 1")
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    run = client.get_run(training["training_id"])
+    assert run.info.start_time == outcome.records["z"].started_ms
+    folder = mlflow.artifacts.download_artifacts(run_id=run.info.run_id, tracking_uri=store.store_uri)
+    assert (Path(folder) / "report" / outcome.report.name).read_bytes() == outcome.report.read_bytes()
+    assert (Path(folder) / "grid" / "result.json").exists() and list((Path(folder) / "figures").iterdir())
+    assert not spool.waiting(store)
+
+    shutil.copytree(
+        kept, store_home / "spool", dirs_exist_ok=True
+    )  # as if the delivery had died before it removed them
+    spool.deliver(store, partial(promote_waiting, store))
+    assert not spool.waiting(store)
+    table = tracking.trainings("small-spool", None, store)
+    assert table["training_id"].tolist() == [training["training_id"]] and table["promotion"].tolist() == ["champion"]
+    status = registry.status(store)
+    assert status[status["name"] == "small-spool-z"]["version"].tolist() == [1]
+
+
+def test_a_promotion_that_does_not_reach_the_server_waits(
+    store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "promote", down)
+        outcome = trained("small-later", tmp_path, store)
+    assert list(outcome.training_ids) == ["z"] and not outcome.promotions and outcome.postponed.startswith(DOWN)
+    assert [p.name for p in spool.waiting(store)] == ["000001-promotion-small-later-z"]
+    with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 1 results wait in "):
+        patch.setattr(spool, "open_store", down)
+        spool.deliver(store, partial(promote_waiting, store))
+    lines = spool.deliver(store, partial(promote_waiting, store))
+    assert len(lines) == 1 and "small-later-z version 1 is champion" in lines[0] and not spool.waiting(store)
+
+
+def test_what_is_refused_for_good_blocks_nothing(
+    store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A promotion whose batches are withdrawn."""
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "promote", down)
+        trained("small-refused", tmp_path, store)
+    home_lake().forget_machine("small-refused", "sold")
+    (line,) = spool.deliver(store, partial(promote_waiting, store))
+    assert line.startswith("not delivered: promotion of small-refused z (lake ") and "is withdrawn (sold)" in line
+    (refused,) = (store_home / "spool" / "refused").iterdir()
+    assert (refused / "reason.txt").read_text().strip() in line and not spool.waiting(store)
+
+
+def test_no_item_is_half_written(store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = toy_result(toy_batches("toy-torn", 3), {"none|mlr|2": [1.0, 2.0, 1.5]})
+    record, own = tracking.training_record(result, store.promotion), replace(store, home=tmp_path)
+    files = tmp_path / "files"
+    files.mkdir()
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(Path, "write_text", _full)
+        spool.keep_run(own, record, files)
+    assert not [p for p in spool.folder(own).iterdir() if p.is_dir()]
+    spool.keep_run(own, record, files)
+    spool.keep_run(own, record, files)  # waits already
+    assert len(spool.waiting(own)) == 1
+
+
+def _full(*_: object, **__: object) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class Interfering(DirectCaller):
+    """Calls something before a step."""
+
+    def __init__(self, step: str, before: Callable[[], object]) -> None:
+        super().__init__()
+        self._step, self._before = step, before
+
+    def map(self, step: str, work: Callable[[Any], Any], items: Sequence[Any], retries: int = 0) -> list[Any]:
+        if step == self._step:
+            self._before()
+        return super().map(step, work, items, retries)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when", ["track", "promote", "within"])
+def test_a_real_server_that_goes_away(when: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed before the training is tracked, before it is promoted, or while it is tracked."""
+    with MlflowServer(tmp_path) as server:
+        (tmp_path / "mlflow.yml").write_text(f'tracking: {{store: "{server.address}", artifacts: null}}\n')
+        store = settings.load()
+        with monkeypatch.context() as patch:
+            caller = DirectCaller()
+            if when == "within":
+                patch.setattr(
+                    MlflowClient, "log_inputs", lambda client, *_, **__: (server.kill(), client.get_run("0" * 32))
+                )
+            else:
+                caller = Interfering(when, server.kill)
+            outcome = trained("small-gone", tmp_path, store, caller)
+        assert "does not answer (connection refused); the results wait in " in outcome.postponed
+        assert len(outcome.training_ids) == (when == "promote") and not outcome.promotions
+        assert call("status").code == 1
+        server.start()
+        done = call("status", "--json")
+        assert done.code == 0, done.err
+        (training,) = json.loads(done.out)["trainings"]
+        assert (training["promotion"], training["model"]) == ("champion", "small-gone-z version 1")
+        client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+        found = client.search_runs([client.get_run(training["training_id"]).info.experiment_id])
+        status = sorted(r.info.status for r in found if r.data.tags["kind"] == "training")
+        assert status == (["FINISHED", "KILLED"] if when == "within" else ["FINISHED"])
+        assert {f.path for f in client.list_artifacts(training["training_id"])} >= {"grid", "figures", "report"}
+        assert not spool.waiting(store)
+        again = trained("small-gone", tmp_path, store)
+        assert not again.postponed and again.promotions["z"].outcome == "unchanged"
