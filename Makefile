@@ -2,8 +2,9 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 READY := .venv/.ready
+FREEZE := $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f
 
-.PHONY: run test lint prove bench clean lock
+.PHONY: run test lint docs prove bench clean lock
 
 run: $(READY)  ## the main job on the built-in sample year, then a sealed demonstration of the diagnosis
 	$(BIN)/thermodrift simulate --sample-year --out var/sample_year
@@ -17,6 +18,11 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: .venv/.docs-ready  ## the site in var/site, which opens from disk; a broken link or an external script is an error
+	$(BIN)/python -m docs.pictures
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open var/site/index.html"
 
 prove: $(READY)  ## the diagnosis examined on 60 concealed cases that nobody has seen; about half an hour on two cores
 	$(BIN)/thermodrift prove --cases 60 --suite development --out var/proof/$$(date -u +%Y%m%d-%H%M%S)
@@ -33,10 +39,14 @@ bench: $(READY)
 clean:
 	rm -rf .venv var .mypy_cache .ruff_cache .hypothesis *.egg-info
 
-lock: $(READY)  ## renew the lock file within the ranges of pyproject.toml
+lock: $(READY)  ## renew the lock files within the ranges of pyproject.toml
 	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]'
+	sed -n 's/==.*/==/p' requirements-docs.lock > .venv/docs-names
 	(echo "# Every direct and indirect version, within pyproject.toml's ranges; \`make lock\` renews it."; \
-	 $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f) > requirements.lock
+	 $(FREEZE) | grep -viFf .venv/docs-names) > .venv/new.lock && mv .venv/new.lock requirements.lock
+	$(BIN)/pip install --quiet --upgrade -c requirements.lock -e '.[docs]'
+	(echo "# What \`make docs\` needs beyond requirements.lock; \`make lock\` renews it."; \
+	 $(FREEZE) | grep -vxFf requirements.lock) > .venv/new.lock && mv .venv/new.lock requirements-docs.lock
 
 # What is imported is compiled at its first use: compiling every module of every package takes a third of the set-up.
 $(READY): requirements.lock pyproject.toml
@@ -44,4 +54,8 @@ $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+.venv/.docs-ready: requirements-docs.lock $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements-docs.lock
 	@touch $@

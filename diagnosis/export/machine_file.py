@@ -228,7 +228,7 @@ def _frame(held: Any) -> Any:
 
 
 def with_deviations(fitted: Fitted) -> TwinPart:
-    """The twin part whose `per_batch` values are the deviations that the batches really have."""
+    """The twin part whose `per_batch` values are the deviations that the batches have."""
     part, problem = fitted.part, fitted.problem
     for name, sd in deviations(fitted).items():
         parameter = problem.network.parameters[problem.network.index(name)]

@@ -198,7 +198,7 @@ def _less_likely_than_nothing(best: Tried, threshold: float, temperature: float)
 def _independent_refinement(criteria: Criteria, best: Tried, tried: Sequence[Tried]) -> Tried | None:
     """A finer network that neither the best effect nor the next explains, at its optimum; None where there is none.
 
-    What heat or a lever really adds makes a network look too coarse, and with it in that is over; castings stay too
+    What heat or a lever adds makes a network look too coarse, and with it in that is over; castings stay too
     coarse whatever is added, and an effect is better judged where they are not.
     """
     batches, least = len(criteria.now.batches), POLICY.coarse_min_gain_nats

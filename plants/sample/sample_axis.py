@@ -106,7 +106,7 @@ def _drive(rng: np.random.Generator) -> Drive:
 
 @dataclass(frozen=True)
 class AxisTruth:
-    """What really happened, before any instrument: the longest run sets S.
+    """What happened, before any instrument: the longest run sets S.
 
     body_degC (S + 1, B, N), room_degC, speed_rpm and feed_mm_per_min (S + 1, B); a speed is that of the step that ends.
     """

@@ -156,7 +156,7 @@ def _working_day(day: int, taken: set[date]) -> date:
 
 @dataclass(frozen=True)
 class Truth:
-    """What really happened in the batches, before any instrument: the longest batch sets S.
+    """What happened in the batches, before any instrument: the longest batch sets S.
 
     node_degC (S + 1, B, 14), room_degC and speed_rpm (S + 1, B), error_um per channel (S + 1, B).
     """

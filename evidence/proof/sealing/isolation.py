@@ -73,7 +73,7 @@ def allowed(place: Path | None = None, import_from: Iterable[Path] = ()) -> Allo
 def confine(to: Allowed, witness: Path) -> str:
     """Put up both walls around this process, for good.
 
-    `witness` is a readable file outside: whether the kernel really refuses it is tried, not assumed.
+    `witness` is a readable file outside: whether the kernel refuses it is tried, not assumed.
     Returns which protection holds: "landlock and audit hook" or "audit hook".
     """
     landlocked = _landlock(to)
