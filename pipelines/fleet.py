@@ -28,6 +28,7 @@ from models import FAMILIES
 
 CRON = "0 5 * * 1"
 SEASON_DAYS = 92.0
+LIMIT_H = 24.0
 
 
 def check_cron(text: str) -> None:
@@ -111,13 +112,15 @@ class AlertRules(_Part):
 
 
 class _Training(_Part):
-    """How a machine is trained. Empty lists: all channels; families and selectors by effort."""
+    """How a machine is trained. Empty lists: all channels; families and selectors by effort. A run that takes longer
+    than `limit_h` is ended, so that it does not keep the other machines waiting."""
 
     when: When = When(cron=CRON)
     effort: str = "usual"
     channels: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
     selectors: tuple[str, ...] = ()
+    limit_h: Annotated[float, Field(gt=0.0)] = LIMIT_H
 
     @field_validator("effort")
     @classmethod
@@ -170,6 +173,7 @@ class FleetMachine:
     channels: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
     selectors: tuple[str, ...] = ()
+    limit_h: float = LIMIT_H
 
     @property
     def parameters(self) -> dict[str, Any]:

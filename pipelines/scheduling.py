@@ -16,8 +16,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Protocol
 from zoneinfo import available_timezones
@@ -32,7 +32,7 @@ from pipelines.fleet import Fleet, FleetMachine
 from pipelines.folders import Folders
 
 TICK_S = 1.0
-RUN = (sys.executable, "-m", "pipelines.apart", "run")
+APART = (sys.executable, "-m", "pipelines.apart")
 END_S = 2.5  # for a run to end after SIGTERM; an operator waits 5 s for all of it
 
 
@@ -96,10 +96,19 @@ class Run:
     process: subprocess.Popen[str]
     result: Path
     log: Path
-    began: datetime = field(default_factory=lambda: datetime.now(UTC))
+    began: datetime
+    too_long: bool = False  # it was ended for that
+
+    def over(self) -> bool:
+        """Whether the process has ended; its id stays taken until `kill`, which ends what it may have left behind."""
+        if self.process.returncode is not None or not hasattr(os, "waitid"):
+            return self.process.poll() is not None
+        return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def outcome(self) -> dict[str, Any]:
         """`ok` (None: it did not say) and `summary`, of a process that has ended."""
+        if self.too_long:
+            return {"ok": None, "summary": f"ended after {self.job.machine.limit_h:g} h (limit_h); see {self.log}"}
         try:
             said: dict[str, Any] = json.loads(self.result.read_text(encoding="utf-8"))
             return said
@@ -111,7 +120,7 @@ class Run:
             self.result.unlink(missing_ok=True)
 
     def kill(self) -> None:
-        """End it with all processes that it started."""
+        """End it with all processes that it started, and take note of how it ended."""
         if self.process.stdin is not None:
             with contextlib.suppress(OSError):
                 self.process.stdin.close()
@@ -140,16 +149,23 @@ class Scheduler:
 
     def step(self, now: datetime) -> None:
         """Take note of what ended, begin what is due."""
-        for run in [r for r in self.running.values() if r.process.poll() is not None]:
-            self._end(run)
+        for run in list(self.running.values()):
+            run.too_long = now - run.began > timedelta(hours=run.job.machine.limit_h)
+            if run.too_long or run.over():
+                self._end(run)
         for job in self.source.due(now):
             name = job.machine.name
             if name in self.running or len(self.running) >= self.fleet.at_once or not self.source.begin(job, now):
                 continue
-            self.running[name] = self._begin(job, now)
+            try:
+                self.running[name] = self._begin(job, now)
+            except OSError as error:  # no space, no memory for a process: the next date may fare better
+                self.source.ended(job, None)
+                self._report(name, now, False, str(error))
         if (upcoming := dict(self.source.next())) != self._told:
+            with contextlib.suppress(OSError):  # tried again at the next change
+                fleet_state.write_schedule(self.home, self.fleet, upcoming)
             self._told = upcoming
-            fleet_state.write_schedule(self.home, self.fleet, upcoming)
 
     def stop(self) -> None:
         """End every run, within `END_S`."""
@@ -157,7 +173,7 @@ class Scheduler:
         for run in runs:
             run.process.terminate()
         end_s = time.monotonic() + END_S
-        while any(r.process.poll() is None for r in runs) and time.monotonic() < end_s:
+        while not all(r.over() for r in runs) and time.monotonic() < end_s:
             time.sleep(0.02)
         for run in runs:
             run.kill()
@@ -172,7 +188,8 @@ class Scheduler:
         result.unlink(missing_ok=True)
         with log.open("w", encoding="utf-8") as out:
             process = subprocess.Popen(
-                RUN, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+                (*APART, "run"), stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True,
+                start_new_session=True,
             )  # fmt: skip
         assert process.stdin is not None
         line = {"machine": machine.as_plain(), "flow_run_id": job.flow_run_id, "result": str(result)}
@@ -184,14 +201,19 @@ class Scheduler:
     def _end(self, run: Run) -> None:
         name = run.job.machine.name
         del self.running[name]
-        run.kill()  # what it may have left behind
+        run.kill()
         outcome = run.outcome()
-        ok, summary = outcome["ok"], " ".join(str(outcome["summary"]).split())
-        self.source.ended(run.job, ok)
-        self.say(f"{datetime.now():%Y-%m-%d %H:%M} {name}: {'' if ok else 'not retrained: '}{summary}")
-        fleet_state.note_run(self.home, name, run.began, bool(ok), summary)
-        alerts.after_run(self.home, self.fleet, name, self.say)
+        self.source.ended(run.job, outcome["ok"])
+        self._report(name, run.began, bool(outcome["ok"]), " ".join(str(outcome["summary"]).split()))
+
+    def _report(self, name: str, began: datetime, ok: bool, summary: str) -> None:
         self.ended += 1
+        self.say(f"{datetime.now():%Y-%m-%d %H:%M} {name}: {'' if ok else 'not retrained: '}{summary}")
+        try:
+            fleet_state.note_run(self.home, name, began, ok, summary)
+            alerts.after_run(self.home, self.fleet, name, self.say)
+        except OSError as error:
+            self.say(f"{name}: its state cannot be kept ({error})")
 
 
 def local_timezone() -> str:
@@ -208,13 +230,15 @@ def checked(fleet: Fleet, say: Say) -> tuple[Fleet, dict[str, Any]]:
         InputError: a line for every machine file, channel or family that cannot be used.
         WorkError: the process of the check fails.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "pipelines.apart", "check"], input=fleet.as_json() + "\n", capture_output=True,
-        text=True, check=False,
+    process = subprocess.Popen(
+        (*APART, "check"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
     )  # fmt: skip
-    if done.returncode:
-        raise WorkError(f"the check of {fleet.source} failed: {(done.stderr.strip() or '?').splitlines()[-1]}")
-    found = json.loads(done.stdout.splitlines()[-1])
+    with ending(process.kill):
+        out, error = process.communicate(fleet.as_json() + "\n")
+    if process.returncode:
+        raise WorkError(f"the check of {fleet.source} failed: {(error.strip() or '?').splitlines()[-1]}")
+    found = json.loads(out.splitlines()[-1])
     if found["problems"]:
         raise InputError("\n".join(found["problems"]))
     for note in found["notes"]:

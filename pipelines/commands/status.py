@@ -37,8 +37,8 @@ def print_fleet(view: FleetView) -> None:
     for r in view.rows:
         table.add_row(*_cells(r))
     console.out.print(table)
-    console.line("expect: S in the next season < its 90 % bound; newer: S in runs newer than the training;")
-    console.line("out: runs outside the trained region, of the last ones; next: run, month-day")
+    console.line("expect: S in the next season < 90 % bound; newer: S in runs after the training;")
+    console.line("out: of the last runs those outside the trained region; next: run, month-day")
     if view.alerts:
         console.out.print("Alerts", style="bold")
     for a in view.alerts:

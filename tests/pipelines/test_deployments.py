@@ -124,7 +124,8 @@ def test_a_watched_folder_makes_a_run(served: Served, client: Any, tmp_path: Pat
     assert client.read_flow_run(job.flow_run_id).name == "retrain arrived"
     assert client.read_deployment_by_name("thermodrift-retrain/retrain-arrived").schedules == []
     (same,) = source.due(datetime.now(UTC) + SOON)
-    assert same == job and source.next() == {"arrived": None}
+    assert same == job and source.begin(job, datetime.now(UTC))
+    assert source.due(datetime.now(UTC) + SOON) == [] and source.next() == {"arrived": None}
 
 
 def test_an_hour_without_the_server_is_two_lines(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def said() -> list[str]:
 
 @pytest.fixture(autouse=True)
 def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scheduling, "RUN", (sys.executable, "-c", TOY))
+    monkeypatch.setattr(scheduling, "APART", (sys.executable, "-c", TOY))
     monkeypatch.setattr(scheduling, "TICK_S", 0.02)
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path))
 
@@ -147,6 +148,33 @@ def test_what_runs_ends_with_the_scheduler_and_all_that_it_started(tmp_path: Pat
             break
         time.sleep(0.02)
     assert not _lives(started)
+
+
+def test_a_run_that_takes_too_long_is_ended(tmp_path: Path, said: list[str]) -> None:
+    fleet = fleet_of("slow", "good")
+    fleet = replace(fleet, machines=(replace(fleet.machines[0], limit_h=1.0), fleet.machines[1]))
+    scheduler = served(fleet, tmp_path, said)
+    try:
+        now = datetime.now(UTC)
+        scheduler.step(now)
+        scheduler.step(now + timedelta(minutes=59))
+        assert list(scheduler.running) == ["slow"] and not said
+        scheduler.step(now + timedelta(minutes=61))
+        assert list(scheduler.running) == ["good"]
+        assert said[0].endswith(f"slow: not retrained: ended after 1 h (limit_h); see {tmp_path}/fleet/slow.log")
+    finally:
+        scheduler.stop()
+
+
+def test_a_process_that_cannot_be_started_is_a_line(
+    tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduling, "APART", (str(tmp_path / "nowhere"),))
+    scheduler = served(fleet_of("mill", "lathe"), tmp_path, said)
+    scheduler.step(datetime.now(UTC))
+    lines = [line for line in said if not line.startswith("alert")]
+    assert [line[17:].partition(":")[0] for line in lines] == ["mill", "lathe"] and not scheduler.running
+    assert all("No such file or directory" in line for line in lines)
 
 
 def _lives(pid: int) -> bool:

@@ -40,7 +40,7 @@ def unlike(k: int) -> pd.DataFrame:
 
 
 class Place:
-    """A home with one trained machine, and three newer runs: as before, hot and drifting, with a frozen sensor."""
+    """A home with one trained machine, and three newer runs: as before, hot and drifting, with a broken sensor."""
 
     def __init__(self, folder: Path) -> None:
         self.home, self.incoming = folder / "home", folder / "in"
@@ -52,7 +52,7 @@ class Place:
         newer = [unlike(3), unlike(4), unlike(2)]
         newer[1]["room"] += 0.002 * newer[1]["time_s"]
         newer[1]["z"] += 0.002 * newer[1]["time_s"]
-        newer[2]["front"] = 21.37
+        newer[2].loc[10:, "front"] = 250.0
         for k, table in enumerate(newer):
             table.to_csv(self.incoming / f"202509{14 + k}.csv", index=False)
         ingest([self.incoming], load_machine(self.machine), home_lake())
@@ -103,7 +103,7 @@ def test_drift_is_what_model_and_region_say_of_the_newer_runs(place: Place) -> N
 def test_a_failed_sensor_is_named(place: Place) -> None:
     (sensor,) = place.states()["z"]["sensors"]
     assert (sensor["batch_id"], sensor["channel"], sensor["input"]) == ("20250916", "front", True)
-    assert sensor["checks"] and sensor["share"] > 0.9
+    assert sensor["checks"] and sensor["share"] > 0.8
 
 
 def test_the_view_has_the_alerts_worst_first(place: Place) -> None:
