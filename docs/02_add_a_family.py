@@ -2,7 +2,8 @@
 
 In the project the class would be `models/nearest_batch.py` and the line
 `"nearest_batch": "models.nearest_batch:NearestBatch"` in `models/__init__.py`; here both are made on the spot.
-From then on the grid crosses it, the report ranks it and the tests over the registry check it.
+From then on the grid crosses it, the report ranks it and the tests over the registry check it. The same checks run on a
+class that is in no registry: `td.testing.check_family`.
 """
 
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import numpy as np
 from data.arrays import Array
 from features.design import Design
 from models.base import Family
+from models.solvers.batches import too_few_rows
 
 
 class NearestBatch(Family):
@@ -24,6 +26,9 @@ class NearestBatch(Family):
     rowwise = False
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
+        usable = int(np.isfinite(design.y_um[np.isin(design.group, list(train))]).sum())
+        if usable < 2:
+            raise too_few_rows(self.key, design, train, usable, 2)
         n = min(design.rows(k).stop - design.rows(k).start for k in train)
         x = np.stack([design.x[design.rows(k)][:n] for k in train])
         y = np.stack([design.y_um[design.rows(k)][:n] for k in train])
@@ -52,7 +57,9 @@ if __name__ == "__main__":
     from models.crossing import Plan
     from models.grid import run_grid
     from plants.sample.sample_year import write_sample_year
+    from thermodrift.testing import check_family
 
+    check_family(NearestBatch)  # a failed check says what was expected, what came and why it matters
     models.FAMILIES.add("nearest_batch", f"{__name__}:NearestBatch")
 
     machine = load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 __all__ = [
     "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "diagnose",
     "export", "ingest", "load_machine", "load_model", "predict", "read", "registry", "rehearse", "replay", "simulate",
-    "train",
+    "testing", "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",
@@ -69,6 +69,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         value: Any = version("thermodrift")
+    elif name == "testing":
+        value = import_module("thermodrift.testing")
     else:
         value = getattr(import_module(_MODULES.get(name, "thermodrift.api")), name)
     globals()[name] = value

@@ -4,29 +4,9 @@ import numpy as np
 
 from data.arrays import Array
 from features.design import Design
+from thermodrift.testing.runs import LENGTHS, P, stack, year
 
-LENGTHS = [30, 42, 25, 37, 33]
-P = 7
-
-
-def stack(x: Array, y: Array, lengths: list[int], inputs: tuple[str, ...] | None = None) -> Design:
-    inputs = inputs or tuple(f"t{i}" for i in range(x.shape[1]))
-    ids = tuple(f"b{k}" for k in range(len(lengths)))
-    time_s = np.concatenate([300.0 * np.arange(n) for n in lengths])
-    return Design(inputs, "z_um", ids, x, y, time_s, np.cumsum([0, *lengths]), 300.0)
-
-
-def year(seed: int = 11, p: int = P) -> tuple[Array, Array]:
-    """Rises of sensors that share three slow modes, as a machine's do, and an error made from them."""
-    rng = np.random.default_rng(seed)
-    modes = []
-    for n in LENGTHS:
-        t = 300.0 * np.arange(n)
-        taus = np.array([1500.0, 6000.0, 20000.0])
-        modes.append((1 - np.exp(-t[:, None] / taus)) * rng.uniform(0.3, 2.0, 3) * [1, 1, rng.choice([-1, 1])])
-    m = np.concatenate(modes)
-    x = m @ rng.uniform(0, 6, (3, p)) + rng.normal(0, 0.1, (len(m), p))
-    return x, m @ [20.0, 9.0, -12.0] + rng.normal(0, 0.5, len(m))
+__all__ = ["LENGTHS", "P", "chain", "orthonormal", "stack", "year"]
 
 
 def orthonormal(n: int, p: int, seed: int = 0) -> Array:

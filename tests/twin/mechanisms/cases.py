@@ -1,43 +1,23 @@
-"""Of every mechanism: its equation once more with units that pint checks.
+"""Of every mechanism: its equation once more with units that pint checks, see `thermodrift.testing.points.Case`.
 
-An equation here sees quantities, each in the unit that its Spec (or driver) states: `q.area`, `q.speed`; temperatures
-as `q.T_port` (absolute, K) and `q.rise_port`; what a sensor sees as `q.seen` = `q.s0` + `q.slope` `q.t`. Constants of
-empirical laws carry their units too. The law itself sees bare numbers; both must agree, so a Spec that states the
-wrong unit, by dimension or by a factor, is found out.
+The law itself sees bare numbers; both must agree, so a Spec that states the wrong unit, by dimension or by a factor, is
+found out. Constants of empirical laws carry their units too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from data.units import unit_registry
+from thermodrift.testing.points import ZERO, Case, U
 
-U = unit_registry()
 K = U.kelvin
-ZERO = U.Quantity(273.15, "K")
 SIGMA = U.Quantity(5.670374419e-8, "W/m**2/K**4")
 PALMGREN = U.Quantity(1.047e-4, "W/rpm/N/mm")
-
-Formula = Callable[[SimpleNamespace], Any]
-
-
-@dataclass(frozen=True)
-class Case:
-    """`values` and `ports` (degC over time in h) shape the point of the test.
-
-    Effects that a class has besides its first one stand in `more`.
-    """
-
-    formula: Formula | None  # None: structural, nothing to evaluate
-    values: Mapping[str, float] = field(default_factory=dict)
-    ports: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
-    more: Mapping[str, Formula] = field(default_factory=dict)
 
 
 def _viscous(q: SimpleNamespace) -> Any:
@@ -172,42 +152,44 @@ CASES: Mapping[str, Case] = {
         more={"surrounding_K": lambda q: -q.drop * _open(q)},
     ),
     "joint_conductance": Case(lambda q: q.ratio ** q.closed[0]),
-    "heat_bridge": Case(None),
-    "jacket_chiller": Case(_chiller, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}),
-    "coolant_jacket": Case(lambda q: q.conductance * (q.supply + q.follow * (q.T_room - ZERO - 20 * K) - q.T_jacket)),
+    "heat_bridge": Case(),
+    "jacket_chiller": Case(_chiller, ports={"jacket": lambda t_h: 24.0 - 1.7 * t_h}, either_way=True),
+    "coolant_jacket": Case(
+        lambda q: q.conductance * (q.supply + q.follow * (q.T_room - ZERO - 20 * K) - q.T_jacket), either_way=True
+    ),
     "cutting_fluid": Case(lambda q: q.conductance * q.flow * (q.T_tank - q.T_body)),
-    "enclosure_air": Case(None),
+    "enclosure_air": Case(open=True),
     "stratification": Case(lambda q: q.gradient * q.height),
-    "floor_sink": Case(None),
+    "floor_sink": Case(open=True),
     "cabinet_heat": Case(lambda q: q.heat * q.running),
     "hydraulic_unit": Case(_cycle, {"period": 11.3}),
     "sun": Case(_sun),
     "cutting_heat": Case(lambda q: q.share * q.power),
     "electrical_heat": Case(lambda q: q.gain * q.level),
     "supply_sag": Case(lambda q: 1 - q.sag * q.other / q.rated),
-    "ohmic_heat": Case(_ohmic),
-    "voltage_loss_heat": Case(_voltage_loss, {"capacity": 30.0, "start": 28.0}),
-    "charge_strain": Case(_charge_strain, {"capacity": 30.0, "start": 28.0}),
-    "column_bending": Case(None),
-    "spindle_growth": Case(None),
+    "ohmic_heat": Case(_ohmic, either_way=True),
+    "voltage_loss_heat": Case(_voltage_loss, {"capacity": 30.0, "start": 28.0}, either_way=True),
+    "charge_strain": Case(_charge_strain, {"capacity": 30.0, "start": 28.0}, unit="um/m"),
+    "column_bending": Case(),
+    "spindle_growth": Case(),
     "speed_shift": Case(lambda q: q.shift * (q.speed / q.rated) ** 2),
     "screw_elongation": Case(
         lambda q: q.expansion * np.maximum(q.rise_screw - q.pretension, 0 * K) * (q.position - q.fixed_end),
         ports={"screw": lambda t_h: 20.0 + 6.0 * t_h},
     ),
     "joint_slip": Case(lambda q: np.minimum(q.gain * q.rise_part, q.limit), {"limit": 3.1}),
-    "mandrel_fixture": Case(None),
+    "mandrel_fixture": Case(),
     "sensor_lag": Case(_lag, {"lag": 900.0}),
     "sensor_bonding": Case(lambda q: q.T_air + q.bonding * (q.seen - q.T_air)),
     "sensor_offset": Case(lambda q: q.seen + q.offset),
     "sensor_drift": Case(lambda q: q.seen + q.rate * q.t),
     "sensor_place": Case(lambda q: q.seen + q.share * (q.T_towards - q.seen)),
     "sensor_self_heat": Case(lambda q: q.seen + q.excess),
-    "sensor_swap": Case(None),
+    "sensor_swap": Case(),
     "sensor_stuck": Case(lambda q: q.s0 + q.slope * np.minimum(q.t, q.start)),
-    "sensor_quantised": Case(_steps, {"step": 0.13}),
+    "sensor_quantised": Case(_steps, {"step": 0.13}, stepped=("seen", "step")),
     "time_skew": Case(_skew),
-    "initial_state": Case(lambda q: q.excess),
-    "free_flux": Case(lambda q: q.constant + _free(q, q.T_body - ZERO - 20 * K)),
-    "free_shift": Case(lambda q: _free(q, q.rise_body)),
+    "initial_state": Case(lambda q: q.excess, open=True),
+    "free_flux": Case(lambda q: q.constant + _free(q, q.T_body - ZERO - 20 * K), either_way=True, undriven=True),
+    "free_shift": Case(lambda q: _free(q, q.rise_body), undriven=True),
 }

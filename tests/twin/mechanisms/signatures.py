@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from signatures_heat import HEAT, usual
-from small_machine import network_with
 
 from data.arrays import Numeric
+from thermodrift.testing.small_machine import network_with
 from twin.mechanisms.base import Mechanism, View
 
 TIME_S = np.arange(0.0, 4 * 3600.0, 60.0)

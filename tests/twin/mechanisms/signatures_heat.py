@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_machine import network_with
 
 from data.arrays import Numeric
+from thermodrift.testing.small_machine import network_with
 from twin.mechanisms.base import Mechanism, View
 
 USUAL_RPM = np.array([1000.0, 2000.0, 4000.0, 8000.0])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from small_machine import machine_with
 
 from data.errors import InputError
 from data.machine import Machine
+from thermodrift.testing.small_machine import machine_with
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 
@@ -33,8 +33,3 @@ def test_a_channel_that_is_not_there_is_told_for_any_unit_too() -> None:
     machine = machine_with(MECHANISMS["free_flux"](), drivers={"level": "motor_rmp"})
     with pytest.raises(InputError, match=r"drivers\.level: no channel 'motor_rmp'; did you mean 'motor_rpm'"):
         compile_network(machine)
-
-
-@pytest.mark.parametrize("key", list(MECHANISMS))
-def test_any_unit_names_drivers(key: str) -> None:
-    assert MECHANISMS[key].any_unit <= set(MECHANISMS[key].drivers)

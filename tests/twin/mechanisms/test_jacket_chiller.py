@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_machine import network_with
 
 from data.errors import InputError
+from thermodrift.testing.small_machine import network_with
 from twin.mechanisms.base import View
 from twin.mechanisms.fluids import CoolantJacket, JacketChiller
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from small_machine import network_with, part_with
 
 from data.errors import InputError
+from thermodrift.testing.small_machine import network_with, part_with
 from twin.compile import expanded
 from twin.mechanisms.base import View
 from twin.mechanisms.sensors import (

@@ -41,7 +41,7 @@ def _instance(mechanism: Mechanism, parameters: dict[str, Any] | None) -> dict[s
     """The mechanism as a machine file writes it, every parameter free under its usual prior."""
     targets = {
         "link": "first-second", "exposure": "third-room", "heat": "warmth", "surrounding": "room",
-        "sensor": ["first", "second"] if mechanism.key == "sensor_swap" else "first", "error": "z",
+        "sensor": list(BODIES[: mechanism.together]) if mechanism.together > 1 else "first", "error": "z",
     }  # fmt: skip
     out: dict[str, Any] = {"law": mechanism.key, "parameters": parameters or usual(mechanism)}
     on = next((targets[t] for t in mechanism.acts_at if t in targets), None)

@@ -1,24 +1,58 @@
-"""A point at which a law is looked at: drivers, temperatures and parameters away from anything special."""
+"""A point at which a law is evaluated, away from anything special, and its equation once more with units."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from cases import CASES, ZERO, U
 
 from data.arrays import Numeric
+from data.units import unit_registry
 from twin.mechanisms.base import Mechanism, View
 from twin.quantity import Spec
 
+U = unit_registry()
+ZERO = U.Quantity(273.15, "K")
 TIME_S = np.arange(13) * 600.0
 STARTS_AT_H = 8.5
 SEEN_DEGC, SLOPE_K_PER_S = 21.3, 1.1e-3
 DRIVER = {"rpm": 3700.0, "mm/min": 5200.0, "mm": 430.0, "1": 0.6, "W": 900.0, "A": 12.0, "V": 3.4}
 PORTS_DEGC = (34.0, 22.0)
+
+
+Formula = Callable[[SimpleNamespace], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a suite must be told of a mechanism.
+
+    Attributes:
+        formula: its equation over quantities with units: `q.area`, `q.speed` in the unit of the Spec or driver,
+            `q.T_port` (absolute, K), `q.rise_port`, `q.seen` = `q.s0` + `q.slope` `q.t`. None: structural, or no
+            dimensional check.
+        values: parameters at the point of the checks, where a value next to the usual one shows nothing.
+        ports: temperature in °C over time in h, by port.
+        more: the equations of further effects.
+        unit: of a displacement, where it is not µm.
+        either_way: heat of both signs within the prior.
+        undriven: it goes on without its driver.
+        open: it exchanges with a surrounding or starts elsewhere, so it has no balance of its own.
+        stepped: parameters by which its derivative is that of its mean.
+    """
+
+    formula: Formula | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+    ports: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    more: Mapping[str, Formula] = field(default_factory=dict)
+    unit: str = "um"
+    either_way: bool = False
+    undriven: bool = False
+    open: bool = False
+    stepped: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -31,8 +65,8 @@ class Point:
     values: Mapping[str, Numeric]
 
     @classmethod
-    def of(cls, mechanism: Mechanism) -> Point:
-        case, hours = CASES[mechanism.key], TIME_S / 3600.0
+    def of(cls, mechanism: Mechanism, case: Case) -> Point:
+        hours = TIME_S / 3600.0
         courses = {port: PORTS_DEGC[k] + (1.5 + k) * hours for k, port in enumerate(mechanism.ports)}
         courses |= {port: course(hours) for port, course in case.ports.items()}
         rise = {port: course - course[0] for port, course in courses.items()}
