@@ -31,6 +31,7 @@ from pipelines.commands.schedule import schedule
 from pipelines.commands.simulate import simulate
 from pipelines.commands.status import status
 from pipelines.commands.train import train
+from pipelines.home import home
 
 app = typer.Typer(
     name="thermodrift",
@@ -49,6 +50,14 @@ app.add_typer(prove, name="prove")
 app.add_typer(lake, name="lake")
 
 
+_ROOM = "make room on the disk"
+_RIGHTS = "make it writable or let THERMODRIFT_HOME name another folder"
+_DISK = {
+    errno.ENOSPC: _ROOM, errno.EDQUOT: _ROOM, errno.EFBIG: _ROOM, errno.EROFS: _RIGHTS, errno.EACCES: _RIGHTS,
+    errno.EPERM: _RIGHTS,
+}  # fmt: skip
+
+
 def main() -> None:
     """Entry point: input errors are one line and exit code 2, failed work exit code 1, a stop 128 + signal."""
     try:
@@ -64,6 +73,10 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
     except OSError as error:
+        if error.errno in _DISK:
+            where = error.filename or home()
+            console.error(f"{where}: {error.strerror or error}; {_DISK[error.errno]}, then run the same command again")
+            sys.exit(1)
         if error.errno != errno.ENAMETOOLONG:
             raise
         console.error(f"{str(error.filename)[:60]}…: the path is too long; give a shorter one")

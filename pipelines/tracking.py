@@ -8,10 +8,12 @@ experiment "diagnosis", with every file of OUT as an artifact.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import platform
 import re
 import shutil
+import sqlite3
 import tempfile
 import threading
 import uuid
@@ -19,12 +21,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mlflow
 import numpy as np
 import pandas as pd
-from filelock import FileLock
 from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
 from mlflow.tracking import MlflowClient
@@ -33,13 +34,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from data.batch import Batch
 from data.errors import InputError, WorkError
-from diagnosis.result import Diagnosis
 from models import FAMILIES
 from models.outlook import outlook
 from models.promotion import Choice, choose, judged
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
-from pipelines import store
+from pipelines import local_store, store
 from pipelines.audit import CHAMPION
 from pipelines.caller import Say
 from pipelines.runs import (
@@ -57,11 +57,15 @@ from pipelines.runs import (
 from pipelines.settings import Settings, load, masked
 from pipelines.store import StoreOutage
 
+if TYPE_CHECKING:
+    from diagnosis.result import Diagnosis
+
 CELL_METRICS = (
     "S_mean_um", "S_std_um", "max_abs_um", "eta", "compensation_effect", "grey_degree", "rmse_um", "tsp_stability",
 )  # fmt: skip
 _GRID = "grid"
 
+logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)  # every retry; an error is one line of ours
 _OPENING = threading.Lock()  # MLflow's own lock on a first migration holds between processes only
 _opened = set[str]()  # by this process
 
@@ -77,9 +81,12 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
     """
     file = settings.store_file
     with _OPENING, store_errors(settings):
-        if file is not None and not file.exists():
+        if file is not None and not local_store.is_made(file):
             say(f"first use: making the tracking store {file} (takes some seconds, once)")
-            _make_store(file)
+            local_store.make(file, lambda made: MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1))
+        own = settings.artifacts_uri
+        if file is not None and own and settings.store_uri not in _opened and local_store.follow(file, own):
+            say(f"the home has moved: addresses in the tracking store now lead to {own}")
         # MLflow looks up a logged model's files in the process-wide store, whatever store is requested.
         mlflow.set_tracking_uri(settings.store_uri)
         mlflow.set_registry_uri(settings.store_uri)
@@ -88,16 +95,6 @@ def open_store(settings: Settings, say: Say = lambda text: None) -> MlflowClient
             client.search_experiments(max_results=1)
         _opened.add(settings.store_uri)
     return client
-
-
-def _make_store(file: Path) -> None:
-    """All or nothing: MLflow cannot open a store whose first migration was interrupted."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{file}.lock"), tempfile.TemporaryDirectory(dir=file.parent, prefix=".making-") as scratch:
-        made = Path(scratch) / file.name
-        MlflowClient(f"sqlite:///{made}").search_experiments(max_results=1)
-        if not file.exists():  # made by another process meanwhile
-            made.rename(file)
 
 
 @contextmanager
@@ -117,7 +114,7 @@ def store_errors(settings: Settings) -> Iterator[None]:
             text = f"it is of an older MLflow; make a copy, then run: mlflow db upgrade {settings.store_name}"
         outage = remote and error.error_code in _OUTAGE
         raise (StoreOutage if outage else WorkError)(f"tracking store {settings.store_name}: {_brief(text)}") from error
-    except (RequestException, SQLAlchemyError) as error:
+    except (RequestException, SQLAlchemyError, sqlite3.Error) as error:
         text = _brief(masked(str(error).splitlines()[0]))
         raise (StoreOutage if remote else WorkError)(f"tracking store {settings.store_name}: {text}") from error
     except OSError as error:
