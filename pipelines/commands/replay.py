@@ -67,12 +67,11 @@ def replay_year(
     every: int, seed: int | None, say: console.Say, done: console.Done,
     processes: int = 0,
 ) -> Replay:  # fmt: skip
-    """Replay and write its files."""
+    """Replay and write its files; nothing is written elsewhere, so the home's environment is not configured."""
     from pipelines import settings
     from pipelines.caller import DirectCaller
     from pipelines.replay import ReplayRequest, replay
 
-    settings.configure_environment()
     request = ReplayRequest(machine, recordings, out, targets, plan, start, every, seed, processes)
     result = replay(request, settings.load(), DirectCaller(), say, done)
     write_replay_files(result, out)

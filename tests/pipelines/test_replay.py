@@ -81,7 +81,10 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Given:
 def recorded(given: Given) -> Replay:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THERMODRIFT_HOME", str(given.folder / "mine"))
-        result = given.replay("recorded")
+        result = replay_year(
+            given.machine, (given.year,), given.folder / "recorded", ("z",), PLAN, START, EVERY, None,
+            lambda text: None, lambda step, n, of: None, 1,
+        )  # fmt: skip
     assert not (given.folder / "mine").exists()
     return result
 
@@ -142,7 +145,9 @@ def test_what_is_done_is_not_done_again(recorded: Replay, given: Given) -> None:
     before = (given.folder / "recorded" / "progress.json").stat().st_mtime_ns
     assert given.replay("recorded") == recorded
     assert (given.folder / "recorded" / "progress.json").stat().st_mtime_ns == before
-    with pytest.raises(InputError, match="holds a replay with other every; give the same to go on with it, or another folder"):
+    with pytest.raises(
+        InputError, match="holds a replay with other every; give the same to go on with it, or another folder"
+    ):
         given.replay("recorded", every=3)
 
 

@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 
 from plants.sample.sample_year import write_sample_year
+from tests.toys.one_round import write_fleet
 from tests.toys.signalled import Command
 from tests.toys.small_year import write_machine, write_year
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "machines" / "sample_vmc.yml"
 LIMIT_S = 5.0
-STARTED_S = 180.0  # until a moment is reached on a slow computer
+STARTED_S = 600.0  # until a moment is reached on a slow computer
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes below /proc")
 Moment = float | Callable[[Command], object]
 
@@ -85,7 +86,8 @@ ARGUMENTS: dict[str, Callable[[Path], list[object]]] = {
     "train torch": lambda g: ["train", *train(g), "--families", "zero,lstm", "--direct"],
     "train torch in flow": lambda g: ["train", *train(g), "--families", "zero,lstm"],
     "ingest": lambda g: ["ingest", g / "whole", "--machine", SAMPLE],
-    "schedule": lambda g: ["schedule", "--machine", g / "m.yml", "--recordings", g / "in", "--cron", "* * * * *"],
+    "schedule": lambda g: ["schedule", "--machine", g / "m.yml", "--recordings", g / "in", "--cron", "0 5 * * 1"],
+    "schedule run": lambda g: ["schedule", write_fleet(g / "fleet.yml", g / "m.yml", g / "in")],
     "replay": lambda g: ["replay", "--machine", g / "m.yml", "--recordings", g / "in", "--start", "3", "--out",
                          g / f"replay{time.monotonic_ns()}", "--channels", "z"],
     "diagnose": lambda g: ["diagnose", "--machine", SAMPLE, "--recordings", g / "year", "--out",
@@ -123,9 +125,9 @@ CASES: list[tuple[str, str, Moment, int]] = [
     ("ingest", "reads, terminated", 3.0, TERM),
     ("schedule", "waits", then(printed("next at"), 0.5), TERM),
     ("schedule", "waits, interrupted", then(printed("next at"), 0.5), INT),
-    ("schedule", "server comes up", server, TERM),
-    ("schedule", "in a round", then(unfinished, 0.5), INT),
-    ("schedule", "in a round, terminated", then(unfinished, 2.0), TERM),
+    ("schedule run", "server comes up", server, TERM),
+    ("schedule run", "in a round", then(unfinished, 0.5), INT),
+    ("schedule run", "in a round, terminated", then(unfinished, 2.0), TERM),
     ("replay", "in a training", unfinished, INT),
     ("replay", "promotes", then(printed("promote"), 0.3), TERM),
     ("diagnose", "begins", 4.0, TERM),

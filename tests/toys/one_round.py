@@ -1,28 +1,35 @@
-"""One round of a schedule now: `python -m tests.toys.one_round MACHINE RECORDINGS`, with a small plan.
-
-The lines of the run, which go to Prefect's server, are printed as well.
-"""
+"""`thermodrift schedule FLEET` that ends after one run: `python -m tests.toys.one_round FLEET`."""
 
 from __future__ import annotations
 
-import logging
 import sys
+from pathlib import Path
 
-from pipelines import settings, stopping
+from pipelines import stopping
+
+FLEET = """
+machines:
+  - machine: {machine}
+    recordings: [{recordings}]
+    when: {{watch: true, quiet_min: 0}}
+    channels: [z]
+    families: [zero, mlr]
+    selectors: [none]
+"""
+
+
+def write_fleet(path: Path, machine: Path, recordings: Path) -> Path:
+    """A fleet of one machine that is retrained at once, with a small plan."""
+    path.write_text(FLEET.format(machine=machine, recordings=recordings), encoding="utf-8")
+    return path
 
 
 def main() -> None:
-    settings.configure_environment()
-    from pipelines.flows import start_server
-    from pipelines.retraining import retrain
+    from pipelines.fleet import load_fleet
+    from pipelines.home import home
+    from pipelines.scheduling import local_timezone, serve_fleet
 
-    logging.getLogger("prefect.flow_runs").addHandler(logging.StreamHandler(sys.stderr))
-    server = start_server()
-    if server is not None:
-        server.join()
-    retrain(
-        machine_file=sys.argv[1], recordings=sys.argv[2:], channels=["z"], families=["zero", "mlr"], selectors=["none"]
-    )
+    serve_fleet(load_fleet(Path(sys.argv[1]), local_timezone()), home(), lambda text: print(text, flush=True), rounds=1)
 
 
 if __name__ == "__main__":
