@@ -172,3 +172,15 @@ def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> N
                 f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r};"
                 f" write unit: {kept} and unit_in_file: {unit!r}"
             )
+
+
+_SPELT = {"um": "µm", "degC": "°C", "ohm": "Ω", "**2": "²", "**3": "³", "*": "·"}
+
+
+def unit_label(unit: str) -> str:
+    """A unit as people write it: ``µm/K`` for um/K, ``N·m`` for N*m, nothing for 1."""
+    if unit == "1":
+        return ""
+    for written, read in _SPELT.items():
+        unit = unit.replace(written, read)
+    return unit

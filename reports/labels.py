@@ -22,8 +22,6 @@ _SELECTORS = {"none": "all sensors", "pca_elimination": "PCA elimination", "fcgc
               "main_factor_bp": "main factor BP", "mrmr": "mRMR", "elastic_net_path": "elastic net",
               "vif_pruning": "VIF pruning", "kmedoids": "k-medoids", "exhaustive": "all subsets"}  # fmt: skip
 _SHOUTED = {"mlr", "pls", "bp"}
-_UNITS = {"1": "", "um": "µm", "um/K": "µm/K", "um/m": "µm/m", "um/m/K": "µm/m/K", "degC": "°C", "m**2": "m²",
-          "mm**2/s": "mm²/s", "W/m**2/K": "W/m²/K"}  # fmt: skip
 
 
 def family_label(key: str) -> str:
@@ -55,11 +53,6 @@ def family_style(key: str) -> tuple[str, str]:
 def tex_escaped(name: str) -> str:
     """A name that matplotlib reads as text, not as mathematics."""
     return name.replace("$", r"\$")
-
-
-def unit_label(unit: str) -> str:
-    """A unit as people write it: ``µm`` of ``um``; none of ``1``."""
-    return _UNITS.get(unit, unit)
 
 
 def three_digits(value: float) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from data.arrays import Array
+from data.units import unit_label
 from diagnosis.contracts import COLUMNS, CandidateKind, Fitted, Where
 from diagnosis.findings.schema import rms_key
 from diagnosis.fitting.fitted import LeftOutRows
@@ -22,8 +23,6 @@ from twin.calibration.whiteness import lagged_sums
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
 from twin.schema import MechanismPart, TwinPart
-
-_SPELT = {"um": "µm", "degC": "°C", "ohm": "Ω", "**2": "²", "**3": "³", "*": "·"}
 
 
 @dataclass(frozen=True)
@@ -41,18 +40,9 @@ class Estimate:
         return math.isfinite(self.low) and math.isfinite(self.high)
 
 
-def spelt(unit: str) -> str:
-    """``µm/K`` for um/K, ``N·m`` for N*m, nothing for 1."""
-    if unit == "1":
-        return ""
-    for written, read in _SPELT.items():
-        unit = unit.replace(written, read)
-    return unit
-
-
 def with_unit(number: str, unit: str) -> str:
     """``10 W/K``, ``0.035/K`` for 1/K, ``0.4`` for a share."""
-    said = spelt(unit)
+    said = unit_label(unit)
     return f"{number}{said[1:]}" if said.startswith("1/") else f"{number} {said}".strip()
 
 

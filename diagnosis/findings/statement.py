@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from data.units import unit_label
 from diagnosis.contracts import CandidateKind, Where
 from diagnosis.findings.report_data import (
     Estimate,
@@ -21,7 +22,6 @@ from diagnosis.findings.report_data import (
     few,
     listed,
     percent,
-    spelt,
     times_noise,
     with_unit,
 )
@@ -294,7 +294,7 @@ def _size(found: Found) -> str:
         return f", {amount(found.size)}"
     if found.kind is CandidateKind.VARIES_BETWEEN_RUNS:
         return "".join(f", by ±{_share(found.parameters[p])}" for p in found.main)
-    named = len(found.main) > 1 or any(not spelt(found.parameters[p].unit) for p in found.main)
+    named = len(found.main) > 1 or any(not unit_label(found.parameters[p].unit) for p in found.main)
     said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
     return f", {listed(said)}" if said else ""
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError, WorkError
+from data.units import unit_label
 from pipelines import console
 from pipelines.options import Json, split
-from reports.labels import count, number, unit_label
+from reports.labels import count, number
 
 if TYPE_CHECKING:
     from rich.table import Table

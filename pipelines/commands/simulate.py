@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError
+from data.units import unit_label
 from pipelines import console
 from pipelines.caller import Done, Say
 from pipelines.options import Json
-from reports.labels import number, unit_label
+from reports.labels import number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -360,6 +361,22 @@ def _heats(table: pd.DataFrame) -> Table:
     return shown
 
 
+def _write_sample_year(folder: Path, seed: int) -> None:
+    """The recordings of the sample machine and its machine file; a file of that name is kept, it may be edited."""
+    from data.files import write_atomic
+    from plants.sample.sample_machine import FILE
+    from plants.sample.sample_year import write_sample_year
+
+    files = write_sample_year(folder, seed=seed)
+    console.line(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+    own = folder / FILE.name
+    if own.exists():
+        console.line(f"{own}: kept as it is")
+    else:
+        write_atomic(own, FILE.read_bytes())
+        console.line(f"{own}: its machine file")
+
+
 def simulate(
     plans: Annotated[list[Path] | None, typer.Argument(help="run plans: stages (.yml) or tables over time")] = None,
     machine: Annotated[Path | None, typer.Option("--machine", help="machine file (.yml) with a twin part")] = None,
@@ -376,11 +393,7 @@ def simulate(
     if sample_year:
         if plans or machine is not None:
             raise InputError("simulate: --sample-year has its own machine and plans; leave out --machine and PLANS")
-        from plants.sample.sample_year import write_sample_year
-
-        folder = to or Path("sample_year")
-        files = write_sample_year(folder, seed=seed)
-        console.line(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+        _write_sample_year(to or Path("sample_year"), seed)
         return
     if not plans and machine is None:
         raise InputError(

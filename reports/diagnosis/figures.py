@@ -13,10 +13,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from data.units import unit_label
 from reports.diagnosis.map import KINDS
 from reports.diagnosis.tables import SEEN_Z, ordered, strongest
 from reports.drawing import MUTED, SIGNED, WIDTH_IN, calm, head, legend_row
-from reports.labels import BLUE, INK, ORANGE, number, tex_escaped, unit_label
+from reports.labels import BLUE, INK, ORANGE, number, tex_escaped
 
 FLOOR = "#cfd6dd"
 _ROW_IN, _MOST_ROWS, _MOST_RUNS = 0.27, 12, 30

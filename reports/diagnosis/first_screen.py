@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from data.units import unit_label
 from diagnosis.findings.schema import DetectionLimit, Finding, Findings
 from reports.diagnosis import tables
-from reports.labels import count, listed, three_digits, unit_label
+from reports.labels import count, listed, three_digits
 
 Outcome = Literal["found", "found_and_more", "other_place", "in_set", "missed", "wrong", "false_alarm", "nothing_right"]
 RIGHT: tuple[Outcome, ...] = ("found", "nothing_right")  # outcomes of an answer that is right as a whole

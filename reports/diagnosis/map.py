@@ -11,7 +11,8 @@ from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from reports.labels import BLUE, INK, number, unit_label
+from data.units import unit_label
+from reports.labels import BLUE, INK, number
 from reports.twin.glyphs import SOFT, Point, Rect, box, pills, pills_width, say, width_in
 from reports.twin.network_picture import (
     NAME_PT,

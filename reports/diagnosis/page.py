@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from data.units import unit_label
 from diagnosis.findings.schema import Finding
 from diagnosis.result import Diagnosis
 from reports.diagnosis import figures as evidence
@@ -15,7 +16,7 @@ from reports.diagnosis.first_screen import Continued, Unsealed, limits_sentence,
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, telling
 from reports.drawing import Picture, picture
-from reports.labels import number, unit_label
+from reports.labels import number
 from reports.layout import Table
 from reports.rendering import write_page
 from twin.compile import compile_network, expanded

@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2
 
+from data.units import unit_label
 from diagnosis.findings.schema import Finding, FoundParameter, NextExperiment
 from diagnosis.policy import POLICY
-from reports.labels import NOTHING, between, count, listed, number, percent, three_digits, unit_label
+from reports.labels import NOTHING, between, count, listed, number, percent, three_digits
 from reports.layout import Column, Row, Table
 from reports.twin.tables import quantity
 

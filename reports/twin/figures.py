@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 
 from data.arrays import Array
 from data.batch import Batch
+from data.units import unit_label
 from reports.drawing import LINES, MUTED, SIGNED, SIZE, WIDTH_IN, calm, head, legend_row, picture_bytes
-from reports.labels import BLUE, INK, ORANGE, count, number, tex_escaped, unit_label
+from reports.labels import BLUE, INK, ORANGE, count, number, tex_escaped
 from reports.twin.iso230_3 import side_legend, stacked
 from twin.views.compared import Compared
 from twin.views.overview import ModeView, time_words

@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from data.batch import Batch
 from data.errors import InputError
 from data.files import write_atomic
+from data.units import unit_label
 from features.iso230_3 import HOUR_S, ProbePair, ThermalTest, Trace, clock, thermal_test
 from reports.drawing import GREY, LINES, MUTED, data_address, picture_bytes
-from reports.labels import INK, ORANGE, count, listed, number, tex_escaped, unit_label
+from reports.labels import INK, ORANGE, count, listed, number, tex_escaped
 from reports.layout import Column, Row, Table
 from reports.rendering import rendered
 

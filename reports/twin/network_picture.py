@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.labels import INK, ORANGE, count, number, unit_label
+from data.units import unit_label
+from reports.labels import INK, ORANGE, count, number
 from reports.twin.glyphs import (
     CHAINS,
     EDGE,

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from reports.labels import NOTHING, number, percent, three_digits, unit_label
+from data.units import unit_label
+from reports.labels import NOTHING, number, percent, three_digits
 from reports.layout import Column, Row, Table
 from reports.twin.network_picture import capacity_label
 from twin.calibration.identifiability import Interval

@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from data.arrays import Array
+from data.units import unit_label
 from evidence.proof.report.labels import GROUPS, key_label, method_label, origin, plant_letter, plant_origin
 from evidence.proof.report.tables import SIZES
 from reports.drawing import GREY, MUTED, SIZE, Picture, panel
 from reports.drawing import picture as drawn
-from reports.labels import BLUE, GREEN, INK, ORANGE, number, tex_escaped, unit_label
+from reports.labels import BLUE, GREEN, INK, ORANGE, number, tex_escaped
 
 WIDE_IN, HALF_IN = 10.5, 5.5
 _PLANTS = {
