@@ -4,16 +4,18 @@ that `lakestore` reaches.
     ROOT/machine=NAME/year=YYYY/BATCH.parquet      the current version, for any reader (hive partitions)
     ROOT/_versions/machine=NAME/BATCH/*.parquet    every version ever stored, read-only
     ROOT/_quarantine/machine=NAME/                 files that could not be used, and reasons.jsonl
-    ROOT/_manifest.json                            versions of every batch; decides what exists
+    ROOT/_manifest/machine=NAME.json               versions of every batch of a machine; decides what exists
+    ROOT/_manifest.json                            that this is a lake, and when it was changed last
 
 Names with a leading underscore are skipped by the dataset discovery of pyarrow and pandas; DuckDB reads
 ``ROOT/*/*/*.parquet``.
 
 A version is identified by its content (see `lakefile.content_digest`). New findings, repairs or channel descriptions
 for the same content *refresh* the version: number and digest stay, a new file holds the new remarks, and the earlier
-file is kept. Replacing `_manifest.json` commits a write: `load` gives the old state before it and the new state after.
+file is kept. Replacing a machine's manifest commits a write: `load` gives the old state before it and the new state
+after. A machine costs the same however many others there are.
 The current file is replaced next. If the process is killed in between, plain readers see the old version until the
-next write, which finds the batch under `pending`.
+machine's next write, which finds the batch under `pending`.
 
 The manifest has the hash of every file, and `load` verifies it: a file that was changed or cut after its ingest is
 refused, and the next ingest of its source *heals* it, which writes it anew.
@@ -42,6 +44,7 @@ from data.manifest import Entry, Staged, Stored, Version
 
 LOG = "reasons.jsonl"
 MANIFEST = "_manifest.json"
+MANIFESTS = "_manifest"
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ class Lake:
 
     def __init__(self, root: Path | str) -> None:
         self._store = open_store(root)
-        self._known: tuple[Hashable, dict[str, str]] = (None, {})
+        self._known: dict[str, tuple[Hashable, dict[str, str]]] = {}
 
     @property
     def name(self) -> str:
@@ -100,17 +103,9 @@ class Lake:
         return self._store.name
 
     @property
-    def root(self) -> Path:
-        """The folder.
-
-        Raises:
-            InputError: the lake is in none on this computer.
-        """
-        if not isinstance(self._store, Folder):
-            raise InputError(
-                f"lake {self.name}: is no folder of this computer; `thermodrift lake pull` makes one of it"
-            )
-        return self._store.root
+    def root(self) -> Path | str:
+        """The folder, or the address."""
+        return self._store.root if isinstance(self._store, Folder) else self._store.name
 
     def size(self, file: str) -> int:
         """Size of a file of `Version.files` in bytes, 0 where it is gone."""
@@ -126,7 +121,7 @@ class Lake:
         return self.put_many([batch])[0]
 
     def put_many(self, batches: Iterable[Batch]) -> list[Stored]:
-        """Store batches, taken one by one, in one commit: all become visible together."""
+        """Store batches, taken one by one, in one commit: those of a machine become visible together."""
         return self.commit([self.stage(b) for b in batches])
 
     def stage(self, batch: Batch, digest: str | None = None) -> Staged:
@@ -152,13 +147,13 @@ class Lake:
         )  # fmt: skip
 
     def commit(self, staged: Sequence[Staged], distinct: bool = False) -> list[Stored]:
-        """Make staged batches visible, all at once, in their order, except withdrawn content.
+        """Make staged batches visible, those of a machine at once, in their order, except withdrawn content.
 
         With `distinct`, the measured values of a batch are stored under one id only (see `manifest.enter`).
         """
         if not staged:
             return []
-        with self._changing() as (manifest, touch):
+        with self._changing(*{s.machine for s in staged}) as (manifest, touch):
             copies = {m: self._copies(manifest, m) for m in {s.machine for s in staged}} if distinct else {}
             stored = [listing.enter(manifest, s, _now(), copies.get(s.machine)) for s in staged]
             entered = [s for s, done in zip(staged, stored, strict=True) if not done.left_out]
@@ -175,9 +170,9 @@ class Lake:
         if not staged:
             return
         with self._writing():
-            machines = self._manifest()["machines"]
             for s in staged:
-                if s.file not in listing.files_kept(machines.get(s.machine, {}).get(s.batch_id, [])):
+                batches = self._manifest(s.machine)["machines"].get(s.machine, {})
+                if s.file not in listing.files_kept(batches.get(s.batch_id, [])):
                     self._store.delete(s.file)
 
     def withdraw(self, machine: str, batch_ids: Sequence[str], reason: str) -> list[str]:
@@ -194,7 +189,7 @@ class Lake:
         """
         if not reason.strip():
             raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
-        with self._changing() as (manifest, touch):
+        with self._changing(machine) as (manifest, touch):
             batches = self._batches(machine, manifest)
             where = f"lake {self.name}: {machine} has no batch in use that fits"
             ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
@@ -216,7 +211,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-        with self._changing() as (manifest, touch):
+        with self._changing(machine) as (manifest, touch):
             batches, ids = self._withdrawn(manifest, machine, batch_ids)
             listing.restore(batches, ids)
             if not batches:
@@ -237,7 +232,7 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-        with self._changing() as (manifest, touch):
+        with self._changing(machine) as (manifest, touch):
             self._copies(manifest, machine)  # states the digests of measured values, which outlive the content
             batches, ids = self._withdrawn(manifest, machine, batch_ids)
             listing.purge(batches, ids, _now())
@@ -297,12 +292,12 @@ class Lake:
 
     def machines(self, withdrawn: bool = False) -> list[str]:
         """Names of machines with at least one batch in use; with `withdrawn` also those with withdrawn ones alone."""
-        machines = self._manifest()["machines"]
+        machines = self._every_machine()
         return sorted(m for m, batches in machines.items() if withdrawn or listing.active(batches))
 
     def batch_ids(self, machine: str) -> list[str]:
         """Ids of a machine's batches in use, sorted; empty for an unknown machine."""
-        return sorted(listing.active(self._manifest()["machines"].get(machine, {})))
+        return sorted(listing.active(self._manifest(machine)["machines"].get(machine, {})))
 
     def contents(self, machine: str) -> dict[str, list[Version]]:
         """Every version of every batch of a machine by id, oldest first, withdrawn ones included.
@@ -343,26 +338,49 @@ class Lake:
         at, rows = self._store.path(folder), [json.loads(line) for line in text.splitlines() if line]
         return [Quarantined(**{**row, "copy": at / row["copy"] if row["copy"] else None}) for row in rows]
 
-    def _manifest(self) -> dict[str, Any]:
+    def _manifest(self, machine: str) -> dict[str, Any]:
+        """The manifest of a machine, without any batch where there is none."""
+        whole = self._manifest_of_all()
+        if whole is None:
+            return self._json(_manifest_file(machine), listing.SCHEMA) or listing.empty()
+        batches = whole["machines"].get(machine)
+        pending = [[m, batch_id] for m, batch_id in whole["pending"] if m == machine]
+        return {**listing.empty(), "pending": pending, "machines": {} if batches is None else {machine: batches}}
+
+    def _every_machine(self) -> dict[str, dict[str, list[Entry]]]:
+        """The batches of every machine; the only look-up whose cost grows with the machines."""
+        whole = self._manifest_of_all()
+        if whole is not None:
+            found: dict[str, dict[str, list[Entry]]] = whole["machines"]
+            return found
+        each = (self._json(f"{MANIFESTS}/{name}", listing.SCHEMA) for name in self._store.files(MANIFESTS))
+        return {m: batches for manifest in each if manifest for m, batches in manifest["machines"].items()}
+
+    def _manifest_of_all(self) -> dict[str, Any] | None:
+        """That of an earlier program, until the next write; else None."""
+        head = self._json(MANIFEST, listing.SCHEMA, listing.SCHEMA_OF_ALL)
+        return head if head is not None and head["schema"] == listing.SCHEMA_OF_ALL else None
+
+    def _json(self, file: str, *schemas: str) -> dict[str, Any] | None:
+        """A manifest, None where there is none."""
+        where = f"{self.name}/{file}"
         try:
-            manifest: dict[str, Any] = json.loads(self._store.read(MANIFEST))
+            manifest: dict[str, Any] = json.loads(self._store.read(file))
         except FileNotFoundError:
-            return listing.empty()
+            return None
         except (OSError, ValueError) as error:
+            raise WorkError(f"lake {where}: cannot be read ({error}); restore it from a backup") from None
+        if manifest.get("schema") not in schemas:
             raise WorkError(
-                f"lake {self.name}/{MANIFEST}: cannot be read ({error}); restore it from a backup"
-            ) from None
-        if manifest.get("schema") != listing.SCHEMA:
-            raise WorkError(
-                f"lake {self.name}/{MANIFEST}: got schema {manifest.get('schema')!r}, expected {listing.SCHEMA!r}; "
-                "use another lake folder"
+                f"lake {where}: got schema {manifest.get('schema')!r}, expected {schemas[0]!r}; use another lake folder"
             )
         return manifest
 
     def _batches(self, machine: str, manifest: dict[str, Any] | None = None) -> dict[str, list[Entry]]:
-        machines = (manifest or self._manifest())["machines"]
+        machines = (manifest or self._manifest(machine))["machines"]
         if machine not in machines:
-            hint = closest(machine, machines) if machines else "it is empty"
+            others = self._every_machine()
+            hint = closest(machine, others) if others else "it is empty"
             raise InputError(f"lake {self.name}: no batch of machine {machine!r}; {hint}. Run thermodrift ingest first")
         batches: dict[str, list[Entry]] = machines[machine]
         return batches
@@ -416,15 +434,20 @@ class Lake:
         return decode(body, where, version.version)
 
     def _noted(self, file: str) -> str | None:
-        """The hash of a file under the root as the manifest has it; the manifest is read where it has changed."""
-        look = self._store.stamp(MANIFEST)
+        """The hash of a stored file as its machine's manifest has it; that is read where it has changed."""
+        if self._store.stamp(MANIFEST) is None:
+            return None
+        whole = self._manifest_of_all() is not None
+        manifest = MANIFEST if whole else f"{MANIFESTS}/{file.split('/')[1]}.json"
+        look = self._store.stamp(manifest)
         if look is None:
             return None
-        if self._known[0] != look:
-            machines = self._manifest()["machines"].values()
+        if self._known.get(manifest, (None, {}))[0] != look:
+            listed = self._json(manifest, listing.SCHEMA, listing.SCHEMA_OF_ALL) or listing.empty()
+            machines = listed["machines"].values()
             found = listing.hashes(e for batches in machines for entries in batches.values() for e in entries)
-            self._known = look, found
-        return self._known[1].get(file)
+            self._known[manifest] = look, found
+        return self._known[manifest][1].get(file)
 
     def _intact(self, file: str, digest: str, noted: str | None) -> str | None:
         """The hash of a stored file, None where it must be written: it is not there, or damaged.
@@ -463,20 +486,43 @@ class Lake:
         return listing.copies_of(batches)
 
     @contextmanager
-    def _changing(self) -> Iterator[tuple[dict[str, Any], Callable[[str, str], None]]]:
-        """Exclusive access to the manifest and a function that names the batches touched.
+    def _changing(self, *machines: str) -> Iterator[tuple[dict[str, Any], Callable[[str, str], None]]]:
+        """Exclusive access to the manifest of these machines and a function that names the batches touched.
 
-        Changes are committed when the block ends, then the current files of these batches follow.
+        Changes are committed when the block ends, machine by machine, then the current files of these batches follow.
         """
         with self._writing():
-            manifest = self._manifest()
+            self._split()
+            stored = {m: self._manifest(m) for m in machines}
+            manifest = listing.empty()
+            for own in stored.values():
+                manifest["machines"] |= own["machines"]
+                manifest["pending"] += own["pending"]
             self._publish(manifest, manifest["pending"])
-            before, touched = json.dumps(manifest), set[tuple[str, str]]()
+            before, touched = json.dumps(manifest["machines"]), set[tuple[str, str]]()
             yield manifest, lambda machine, batch_id: touched.add((machine, batch_id))
-            if json.dumps(manifest) != before:
-                manifest["pending"] = sorted(touched)
-                self._store.write(MANIFEST, json.dumps(manifest).encode(), keep=False)
+            if json.dumps(manifest["machines"]) != before:
+                for m in machines:
+                    own = {k: v for k, v in manifest["machines"].items() if k == m}
+                    self._write_manifest(m, own, sorted(t for t in touched if t[0] == m))
+                head = json.dumps({"schema": listing.SCHEMA, "changed_at": datetime.now(UTC).isoformat()})
+                self._store.write(MANIFEST, head.encode(), keep=False)
             self._publish(manifest, touched)
+
+    def _write_manifest(self, machine: str, own: dict[str, dict[str, list[Entry]]], pending: Sequence[Any]) -> None:
+        file, body = _manifest_file(machine), {"schema": listing.SCHEMA, "pending": pending, "machines": own}
+        if own:
+            self._store.write(file, json.dumps(body).encode(), keep=False)
+        else:
+            self._store.delete(file)
+
+    def _split(self) -> None:
+        """Give each machine the manifest of its own that an earlier program did not write."""
+        whole = self._manifest_of_all()
+        if whole is not None:
+            for m, batches in whole["machines"].items():
+                self._write_manifest(m, {m: batches}, [p for p in whole["pending"] if p[0] == m])
+            self._store.write(MANIFEST, json.dumps({"schema": listing.SCHEMA}).encode(), keep=False)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -517,6 +563,10 @@ class Lake:
             for stale in standing:
                 store.delete(stale)
         store.settle(changed)
+
+
+def _manifest_file(machine: str) -> str:
+    return f"{MANIFESTS}/machine={safe_name(machine)}.json"
 
 
 def _quarantine(machine: str) -> str:

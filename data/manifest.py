@@ -1,6 +1,7 @@
-"""The lake's manifest as plain data: which versions of which batches exist, which are withdrawn, and changes to them.
+"""A machine's manifest as plain data: which versions of which batches exist, which are withdrawn, and changes to them.
 
-``{"schema", "pending": [[machine, batch], …], "machines": {machine: {batch: [version, …]}}}``, versions oldest first.
+``{"schema", "pending": [[machine, batch], …], "machines": {machine: {batch: [version, …]}}}``, versions oldest first;
+the stored one has one machine, the one that a change works on has those that it concerns.
 A version's ``"sha256"`` has the hash of the bytes of each of its files; versions of an earlier program have none.
 A withdrawn version has ``"withdrawn": {"reason", "at", "purged_at"}``; `purged_at` is empty while its file is kept. A
 batch is withdrawn where its last version is. Functions change the manifest that they are given; nothing is written.
@@ -15,7 +16,8 @@ from typing import Any, Literal
 
 from data.errors import InputError, closest
 
-SCHEMA = "thermodrift.lake/1"
+SCHEMA = "thermodrift.lake/2"
+SCHEMA_OF_ALL = "thermodrift.lake/1"  # of an earlier program: one manifest of all machines
 Status = Literal["new", "unchanged", "refreshed", "healed", "new_version", "duplicate", "withdrawn"]
 Entry = dict[str, Any]  # one version of a batch as it is stored
 Copies = dict[str, dict[str, Entry]]  # digest of measured values -> batch id -> version

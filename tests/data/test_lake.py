@@ -300,7 +300,7 @@ def test_a_file_changed_after_its_ingest_is_refused_and_healed(tmp_path: Path, d
     lake = Lake(tmp_path)
     batch = make(findings=(FINDING,))
     digest = lake.put_many([batch, make("run2", seed=2)])[0].digest
-    file, listed = stored_file(lake), tmp_path / "_manifest.json"
+    file, listed = stored_file(lake), tmp_path / "_manifest/machine=vmc.json"
     if not hashes:
         manifest = json.loads(listed.read_text())
         for entries in manifest["machines"]["vmc"].values():
@@ -329,7 +329,7 @@ def test_a_file_changed_after_its_ingest_is_refused_and_healed(tmp_path: Path, d
 
 
 def test_a_lake_of_an_earlier_program_gets_hashes_with_the_next_ingest(tmp_path: Path) -> None:
-    lake, listed = Lake(tmp_path), tmp_path / "_manifest.json"
+    lake, listed = Lake(tmp_path), tmp_path / "_manifest/machine=vmc.json"
     lake.put(make())
     manifest = json.loads(listed.read_text())
     (entry,) = manifest["machines"]["vmc"]["run1"]
@@ -409,3 +409,34 @@ def test_hidden_folders_stay_out_of_a_cold_interpreter(tmp_path: Path) -> None:
     code = f"import pandas; print(len(pandas.read_parquet({str(tmp_path)!r})))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "5"
+
+
+def test_a_lake_of_an_earlier_program_has_one_manifest_of_all_machines(tmp_path: Path) -> None:
+    """It is read as it is, and the next write gives each machine its own."""
+    lake = Lake(tmp_path)
+    lake.put_many([make(), make("run2", seed=2), replace(make("run3", seed=3), machine="lathe")])
+    head, own = tmp_path / "_manifest.json", sorted((tmp_path / "_manifest").iterdir())
+    assert [f.name for f in own] == ["machine=lathe.json", "machine=vmc.json"]
+    machines = {m: b for f in own for m, b in json.loads(f.read_text())["machines"].items()}
+    head.write_text(json.dumps({"schema": "thermodrift.lake/1", "pending": [["vmc", "run2"]], "machines": machines}))
+    for file in own:
+        file.unlink()
+    (current,) = tmp_path.glob("machine=vmc/year=*/run2.parquet")
+    current.unlink()  # the earlier program was interrupted
+    old = Lake(tmp_path)
+    assert old.machines() == ["lathe", "vmc"] and old.batch_ids("vmc") == ["run1", "run2"]
+    same(old.load("lathe", "run3"), replace(make("run3", seed=3), machine="lathe"))
+    assert old.put(make()).status == "unchanged"
+    assert [f.name for f in sorted((tmp_path / "_manifest").iterdir())] == ["machine=lathe.json", "machine=vmc.json"]
+    assert json.loads(head.read_text())["schema"] == "thermodrift.lake/2" and current.exists()
+    assert Lake(tmp_path).machines() == ["lathe", "vmc"] and len(Lake(tmp_path).load_all("vmc")) == 2
+
+
+def test_a_write_touches_the_manifest_of_its_machine_alone(tmp_path: Path) -> None:
+    lake = Lake(tmp_path)
+    lake.put_many([make(), replace(make("run3", seed=3), machine="lathe")])
+    other, head = tmp_path / "_manifest/machine=lathe.json", tmp_path / "_manifest.json"
+    before, changed = other.stat().st_mtime_ns, head.read_text()
+    lake.put(make("run2", seed=2))
+    assert other.stat().st_mtime_ns == before and head.read_text() != changed
+    assert lake.batch_ids("lathe") == ["run3"]
