@@ -66,10 +66,10 @@ class TimeColumn(Section):
     """
 
     column: str | int = "time_s"  # a header, or a 0-based position where the file has none
-    unit: Literal["s", "min", "h", "d", "ms", "timestamp"] = "s"
-    format: str | None = None
-    date: str | int | None = None
-    step: str | None = None
+    unit: Literal["s", "min", "h", "d", "ms", "timestamp"] = "s"  # of elapsed time, or timestamp
+    format: str | None = None  # strptime pattern of time stamps; default: found by itself
+    date: str | int | None = None  # column of the dates where `column` holds times of day
+    step: str | None = None  # between two rows of a recording without a clock, such as "60 s"
 
     @model_validator(mode="after")
     def _one_clock(self) -> TimeColumn:
@@ -100,8 +100,8 @@ class Stage(Section):
 class Schedule(Section):
     """Drivers from a table next to the recordings: one row per batch, one or more stages."""
 
-    file: str
-    batch_column: str
+    file: str  # name of the table, next to the recordings
+    batch_column: str  # which column holds the batch's name
     stages: list[Stage]
     labels: dict[str, str] = {}  # batch label -> column
 
@@ -109,8 +109,8 @@ class Schedule(Section):
 class Split(Section):
     """Cut one long recording into batches where `driver` rises from 0; the stop that follows belongs to the batch."""
 
-    driver: str
-    min_run_s: Annotated[float, Field(gt=0)] = 600.0
+    driver: str  # channel
+    min_run_s: Annotated[float, Field(gt=0)] = 600.0  # a shorter run makes no batch
 
 
 class Joined(Section):
@@ -139,14 +139,14 @@ class Recording(Section):
     """How a recording file becomes batches."""
 
     files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
-    header: bool = True
+    header: bool = True  # the file has a row of names
     time: TimeColumn = TimeColumn()
-    step_s: Annotated[float, Field(gt=0)] = 60.0
+    step_s: Annotated[float, Field(gt=0)] = 60.0  # of the regular grid in the lake
     max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
     start_from_name: str | None = None  # strptime pattern of the file's stem or its sheet, e.g. "%Y%m%d"
-    split: Split | None = None
-    schedule: Schedule | None = None
-    joined: dict[str, Joined] = {}
+    split: Split | None = None  # one long recording into runs
+    schedule: Schedule | None = None  # drivers from a table
+    joined: dict[str, Joined] = {}  # further files or sheets of the same runs, by a name of your choice
 
 
 class ChannelPart(Section):
@@ -160,13 +160,13 @@ class ChannelPart(Section):
     """
 
     role: Role
-    unit: str
-    column: str | int | None = None
-    unit_in_file: str | None = None
+    unit: str  # in the lake and in models
+    column: str | int | None = None  # a header, or a 0-based position; default: the channel's name
+    unit_in_file: str | None = None  # default: `unit`
     source: str = "file"  # or "schedule", or a key of recording.joined
-    resolution: Annotated[float, Field(gt=0)] | None = None
-    range: tuple[float, float] | None = None
-    position: str | None = None
+    resolution: Annotated[float, Field(gt=0)] | None = None  # smallest step of the instrument, in `unit`
+    range: tuple[float, float] | None = None  # plausible values in `unit`; others are masked
+    position: str | None = None  # of an error along an axis: the position channel
     columns: str | dict[str | int, float] | None = None  # positions in the position channel's unit in the file
     fixed_end: float | None = None  # of a position channel: where the axis' screw is held, in `unit`
     guessed: list[str] = []  # keys that `describe` guessed and nobody has confirmed
@@ -181,13 +181,13 @@ class ChannelPart(Section):
 class Overrule(Section):
     """An overruled check: matching findings lose their mask; `mask: true` adds a mask instead."""
 
-    batch: str = "*"
-    channel: str = "*"
-    check: str = "*"
-    mask: bool = False
-    start_s: float | None = None
+    batch: str = "*"  # id or pattern
+    channel: str = "*"  # name or pattern
+    check: str = "*"  # key or pattern
+    mask: bool = False  # true: mask instead of lifting masks
+    start_s: float | None = None  # from the batch's start; default: the whole batch
     end_s: float | None = None
-    reason: str
+    reason: str  # reports repeat it
 
 
 class Machine(Section):
@@ -195,12 +195,12 @@ class Machine(Section):
 
     machine: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_\-]*$", max_length=MAX_NAME)]
     description: str = ""
-    simulated: bool = False
+    simulated: bool = False  # true: every result is labelled
     recording: Recording = Recording()
-    channels: dict[ChannelName, ChannelPart]
+    channels: dict[ChannelName, ChannelPart]  # by name
     ignore: list[str] = []  # columns known and not wanted
-    overrule: list[Overrule] = []
-    twin: dict[str, Any] | None = None  # read by the twin
+    overrule: list[Overrule] = []  # masks of checks lifted or added
+    twin: dict[str, Any] | None = None  # see the twin part; read by the twin
 
     def channel(self, name: str) -> Channel:
         c = self.channels[name]

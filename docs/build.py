@@ -345,7 +345,8 @@ def api_page() -> str:
     for name in sorted(td.__all__, key=str.lower):
         member = getattr(td, name)
         if inspect.isclass(member) or inspect.isfunction(member):
-            lines += [f"## td.{name}", "", f"::: {member.__module__}.{member.__qualname__}", ""]
+            where = f"{member.__module__}.{member.__qualname__}"
+            lines += [f"::: {where}", "    options:", f"      heading: td.{name}", f"      toc_label: td.{name}", ""]
     return _text(lines)
 
 
