@@ -18,6 +18,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_language.py
 
 docs: .venv/.docs-ready  ## the site in var/site, which opens from disk; a broken link or an external script is an error
 	$(BIN)/python -m docs.pictures
