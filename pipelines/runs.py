@@ -23,6 +23,7 @@ from urllib.parse import quote
 import pandas as pd
 import psutil
 from mlflow.entities import Dataset, DatasetInput, Experiment, InputTag, Metric, Param, Run, RunStatus, RunTag
+from mlflow.entities.model_registry import RegisteredModel
 from mlflow.tracking import MlflowClient
 from pydantic import BaseModel, ConfigDict
 
@@ -34,6 +35,8 @@ _DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
 _AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
 _SAME_START_S = 30.0  # the clock may be set while a process runs; no number of a process returns that soon
 _PROGRAM = "thermodrift"
+DIAGNOSIS = "diagnosis"  # in the place of the error channel
+_NOTE, _SHARED, _VIEW = "mlflow.note.content", "mlflow.sharedViewState.", "trainings"
 
 
 class Entity(BaseModel):
@@ -121,7 +124,7 @@ def write_record(client: MlflowClient, settings: Settings, record: Record, files
 
 def find_record(client: MlflowClient, settings: Settings, record_id: str, machine: str, target: str) -> str | None:
     """The finished run of a record, None where the store has none."""
-    experiment = client.get_experiment_by_name(settings.experiment(machine, target))
+    experiment = find_experiment(client, settings, machine, target)
     runs = [] if experiment is None else _runs_of(client, experiment.experiment_id, record_id)
     done = (r.info.run_id for r in runs if r.info.status == "FINISHED" and PARENT not in r.data.tags)
     return next(done, None)
@@ -135,25 +138,71 @@ def close_interrupted(client: MlflowClient) -> int:
     return len(left)
 
 
-def finished_runs(client: MlflowClient, kind: str) -> list[Run]:
-    """Finished runs of a kind over all experiments of thermodrift, newest first."""
-    return list(_runs(client, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'"))
+def finished_runs(client: MlflowClient, kind: str, **tags: str | None) -> list[Run]:
+    """Finished runs of a kind, newest first; with tags of an experiment (machine, target) those of such ones alone, so
+    that the cost does not grow with the number of machines."""
+    return list(_runs(client, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'", **tags))
 
 
 def experiment_id(client: MlflowClient, settings: Settings, machine: str, target: str, simulated: bool) -> str:
-    """The experiment of a machine's error channel (or "diagnosis"), made where there is none."""
-    name = settings.experiment(machine, target)
-    found = client.get_experiment_by_name(name)
+    """The experiment of a machine's error channel (or "diagnosis"), made where there is none.
+
+    One that has another name, by earlier settings, gets the present one.
+    """
+    found = find_experiment(client, settings, machine, target)
     if found is not None:
         if found.lifecycle_stage == "deleted":
             client.restore_experiment(found.experiment_id)
-        if found.tags.get("simulated") != yes_or_no(simulated):
-            client.set_experiment_tag(found.experiment_id, "simulated", yes_or_no(simulated))
+        elif found.name != settings.experiment(machine, target):
+            client.rename_experiment(found.experiment_id, settings.experiment(machine, target))
+        tags = {"simulated": yes_or_no(simulated), **_page(str(found.experiment_id), machine, target)}
+        for key, text in tags.items():
+            if found.tags.get(key) != text and (key != _NOTE or _NOTE not in found.tags):  # a note may be the user's
+                client.set_experiment_tag(found.experiment_id, key, text)
         return str(found.experiment_id)
     # quoted, since a store decodes an address: the name 50%2f is no folder
     where = f"{settings.artifacts_uri}/{artifact_folder(machine, target)}" if settings.artifacts_uri else None
     tags = {"simulated": yes_or_no(simulated), "machine": machine, "target": target, "kind": _PROGRAM}
-    return str(client.create_experiment(name, artifact_location=where, tags=tags))
+    made = client.create_experiment(settings.experiment(machine, target), artifact_location=where, tags=tags)
+    for key, text in _page(str(made), machine, target).items():
+        client.set_experiment_tag(made, key, text)
+    return str(made)
+
+
+def find_experiment(client: MlflowClient, settings: Settings, machine: str, target: str) -> Experiment | None:
+    """The experiment of a machine's error channel, by its name or by what it is of."""
+    named = client.get_experiment_by_name(settings.experiment(machine, target))
+    if named is not None:
+        return named
+    which = " and ".join(
+        f"tags.{key} = '{text}'"
+        for key, text in (("kind", _PROGRAM), ("machine", machine), ("target", _quoted(target)))
+    )
+    return next(iter(client.search_experiments(filter_string=which)), None)
+
+
+def _quoted(text: str) -> str:
+    return text.replace("'", "''")
+
+
+def _page(experiment: str, machine: str, target: str) -> dict[str, str]:
+    """How MLflow's page shows an experiment: as trainings, with a note that leads to the list with the right columns.
+
+    By itself the list has no column of a metric. `viewStateShareKey` names a view that is kept with the experiment.
+    """
+    columns = [
+        *(f"metrics.`{m}`" for m in ("S_mean_um", "S_std_um", "max_um", "n_tsp", "nested_S_mean_um", "expected_S_um")),
+        *(f"params.`{p}`" for p in ("family", "selector")), "tags.`outcome`",
+    ]  # fmt: skip
+    view = {
+        "orderByKey": "attributes.start_time",
+        "orderByAsc": False,
+        "selectedColumns": ["attributes.`Source`", *columns],
+    }
+    about = f"Thermal error {target} of {machine}"
+    note = f"{about}. [Compare trainings](#/experiments/{experiment}/runs?viewStateShareKey={_VIEW})"
+    tags = {"mlflow.experimentKind": "custom_model_development", _NOTE: note, _SHARED + _VIEW: json.dumps(view)}
+    return tags if target != DIAGNOSIS else {**tags, _NOTE: f"Diagnoses of {machine}", _SHARED + _VIEW: "{}"}
 
 
 def artifact_folder(machine: str, target: str) -> str:
@@ -244,18 +293,30 @@ def _dataset(batch: DatasetRecord, context: str) -> DatasetInput:
     return DatasetInput(dataset, [InputTag("mlflow.data.context", context), InputTag("digest", digest)])
 
 
-def experiments(client: MlflowClient) -> list[Experiment]:
-    """Every experiment of thermodrift."""
+def experiments(client: MlflowClient, **tags: str | None) -> list[Experiment]:
+    """Every experiment of thermodrift, or those with these tags."""
     found, token = [], None
+    wanted = {"kind": _PROGRAM} | {k: v for k, v in tags.items() if v is not None and "'" not in v}
+    which = " and ".join(f"tags.{k} = '{v}'" for k, v in wanted.items())
     while True:
-        page = client.search_experiments(filter_string=f"tags.kind = '{_PROGRAM}'", page_token=token)
+        page = client.search_experiments(filter_string=which, page_token=token)
         found += page
         if not (token := page.token):
             return found
 
 
-def _runs(client: MlflowClient, which: str) -> Iterator[Run]:
-    ids, token = [e.experiment_id for e in experiments(client)], None
+def registered_models(client: MlflowClient) -> Iterator[RegisteredModel]:
+    """Every registered model; the store gives 1000 at a time."""
+    token = None
+    while True:
+        page = client.search_registered_models(max_results=1000, page_token=token)
+        yield from page
+        if not (token := page.token):
+            return
+
+
+def _runs(client: MlflowClient, which: str, **tags: str | None) -> Iterator[Run]:
+    ids, token = [e.experiment_id for e in experiments(client, **tags)], None
     while ids:
         page = client.search_runs(ids, which, page_token=token, order_by=["attributes.start_time DESC"])
         yield from page

@@ -45,7 +45,7 @@ class TrackingPart(_Part):
 class NamesPart(_Part):
     """Patterns of names; both carry `{machine}` and `{target}`."""
 
-    experiment: str = "{machine}/{target}"
+    experiment: str = "{machine} {target}"
     model: str = "{machine}-{target}"
 
     @field_validator("experiment", "model")

@@ -43,6 +43,7 @@ from pipelines import local_store, store
 from pipelines.audit import CHAMPION
 from pipelines.caller import Say
 from pipelines.runs import (
+    DIAGNOSIS,
     Entity,
     Record,
     close_interrupted,
@@ -60,9 +61,9 @@ from pipelines.store import StoreOutage
 if TYPE_CHECKING:
     from diagnosis.result import Diagnosis
 
-CELL_METRICS = (
-    "S_mean_um", "S_std_um", "max_abs_um", "eta", "compensation_effect", "grey_degree", "rmse_um", "tsp_stability",
-)  # fmt: skip
+# By n_tsp; the store takes most of a second for a thousand values, and the tables below grid/ have all scores.
+CURVES = {"S_mean_um": "S_mean_um", "S_std_um": "S_std_um", "max_abs_um": "max_um", "tsp_stability": "tsp_stability"}
+PLAIN = CURVES | {n: n for n in ("score_um", "eta", "compensation_effect", "grey_degree", "rmse_um")}  # best cell
 _GRID = "grid"
 
 logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)  # every retry; an error is one line of ours
@@ -190,13 +191,14 @@ def training_record(
         started_ms: when the training began, ms since 1970; by default now.
     """
     ended_ms = now_ms()
-    name = f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {result.machine} {result.target}"
+    name = f"{pd.Timestamp.now():%Y-%m-%d %H:%M}"
     counts = {"n_batches": len(result.batches), "n_cells": len(result.cells), "n_findings": len(result.findings)}
     metrics: dict[str, float] = {}
     plain, tags = {k: str(v) for k, v in (params or {}).items()}, {}
     if rule.offered(set(result.cells["protocol"])):
         best = choice or choose(result.cells, rule)
         expected = outlook(result, best)
+        name += f" {best.family} {best.n_tsp} {best.selector}"
         metrics |= _cell_metrics(_judged_row(result.cells, rule, best)) | {
             "nested_S_mean_um": best.nested_S_mean_um, "nested_S_std_um": best.nested_S_std_um,
             "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,
@@ -209,7 +211,7 @@ def training_record(
         }
         tags = {"best": best.name, "best_cell": best.cell, "trusted": yes_or_no(best.trusted)}
         tags["mlflow.note.content"] = best.summary + (f"; {best.caution}" if best.caution else "")
-    values = tuple((k, float(v), 0) for k, v in {**metrics, **counts}.items() if np.isfinite(v))
+    values = tuple((k, _read(v), 0) for k, v in {**metrics, **counts}.items() if np.isfinite(v))
     groups = result.cells.groupby(["selector", "family"], sort=False)
     return Record(
         id=record_id or uuid.uuid4().hex, kind="training", machine=result.machine, target=result.target,
@@ -238,7 +240,7 @@ def trainings(machine: str | None = None, target: str | None = None, settings: S
     settings = settings or load()
     client = open_store(settings)
     with store_errors(settings):
-        runs = finished_runs(client, "training")
+        runs = finished_runs(client, "training", machine=machine, target=target)
     columns = ["training_id", "machine", "target", "started", "n_batches", "best", "score_um", "simulated",
                "promotion", "model"]  # fmt: skip
     table = pd.DataFrame([_training_row(r) for r in runs], columns=columns)
@@ -320,8 +322,12 @@ def _judged_row(cells: pd.DataFrame, rule: PromotionRule, choice: Choice) -> pd.
 
 def _cell_metrics(row: pd.Series) -> dict[str, float]:
     """The plain metrics of a cell, a row of `judged`: the same in parent and child, so that a list compares them."""
-    names = {"S_mean_um": "S_mean_um", "S_std_um": "S_std_um", "max_abs_um": "max_um", "score_um": "score_um"}
-    return {shown: float(row[name]) for name, shown in names.items()} | {"n_tsp": float(row["n_tsp"])}
+    return {shown: _read(row[name]) for name, shown in PLAIN.items()} | {"n_tsp": float(row["n_tsp"])}
+
+
+def _read(value: float) -> float:
+    """Five digits: a list shows a number up to its last one. The tables below grid/ have all of them."""
+    return float(f"{value:.5g}")
 
 
 def _short(texts: Mapping[str, str]) -> dict[str, str]:
@@ -334,7 +340,7 @@ def _child(cells: pd.DataFrame, result: GridResult, rule: PromotionRule) -> Enti
     metrics: list[tuple[str, float, int]] = []
     for row in cells.to_dict("records"):
         prefix = str(row["protocol"]).replace("-", "_")
-        metrics += [(f"{prefix}_by_n_tsp/{name}", float(row[name]), int(row["n_tsp"])) for name in CELL_METRICS]
+        metrics += [(f"{prefix}_by_n_tsp/{to}", _read(row[name]), int(row["n_tsp"])) for name, to in CURVES.items()]
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
     try:
@@ -350,7 +356,7 @@ def _child(cells: pd.DataFrame, result: GridResult, rule: PromotionRule) -> Enti
             & (s["family"].to_numpy() == family) & (s["n_tsp"].to_numpy() == best["n_tsp"])
         ]  # fmt: skip
         key = f"{str(best['protocol']).replace('-', '_')}_by_fold/S_um"
-        metrics += [(key, float(v), i) for i, v in enumerate(picked.groupby("fold", sort=False)["S_um"].mean())]
+        metrics += [(key, _read(v), i) for i, v in enumerate(picked.groupby("fold", sort=False)["S_um"].mean())]
     finite = tuple(m for m in metrics if np.isfinite(m[1]))
     tags = {"selector": selector, "family": family}
     return Entity(name=f"{selector} × {family}", tags=tags, params=_short(params), metrics=finite)
@@ -374,7 +380,6 @@ def _training_row(run: Run) -> dict[str, Any]:
     }
 
 
-DIAGNOSIS = "diagnosis"  # in an experiment's name, in the place of the error channel
 DIAGNOSIS_COLUMNS = (
     "run_id",
     "machine",
@@ -412,7 +417,7 @@ def log_diagnosis(
     metrics = tuple((k, v, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v))
     record = Record(
         id=uuid.uuid4().hex, kind="diagnosis", machine=f.machine, target=DIAGNOSIS, simulated=d.simulated,
-        name=f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {f.machine} {DIAGNOSIS}", tags=_short(_diagnosis_tags(d)),
+        name=f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {f.verdict.replace('_', ' ')}", tags=_short(_diagnosis_tags(d)),
         params=_short({k: str(v) for k, v in {**_diagnosis_params(d), **(params or {})}.items()}), metrics=metrics,
         started_ms=now - int(1000 * (f.seconds or 0.0)), ended_ms=now, datasets=dataset_records(_batch_table(batches)),
     )  # fmt: skip

@@ -64,7 +64,7 @@ def test_the_files_and_the_batches_are_with_it(logged: Any, tmp_path: Path) -> N
 def test_its_experiment_carries_the_machines_name_and_is_no_training(logged: Any) -> None:
     store, run_id, _ = logged
     experiment = MlflowClient(store.store_uri).get_experiment(run_of(store, run_id).info.experiment_id)
-    assert experiment.name == f"{MACHINE}/diagnosis" and experiment.tags["simulated"] == "true"
+    assert experiment.name == f"{MACHINE} diagnosis" and experiment.tags["simulated"] == "true"
     assert run_id not in tracking.trainings(settings=store)["training_id"].tolist()
 
 

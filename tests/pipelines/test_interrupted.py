@@ -85,7 +85,7 @@ def test_a_killed_training_is_closed_by_the_next_one(store: Any, store_home: Pat
     done = subprocess.run(command, env=environment, cwd=Path(__file__).parents[2], check=False)
     assert done.returncode == -signal.SIGKILL
     client = client_of(store)
-    experiment = client.get_experiment_by_name("toy-killed/z")
+    experiment = client.get_experiment_by_name("toy-killed z")
     (left,) = client.search_runs([experiment.experiment_id])
     assert left.info.status == "RUNNING" and json.loads(left.data.tags["process"])["host"] == platform.node()
     tracking.log_training(toy_result(toy_batches("toy-other", 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), store)

@@ -40,7 +40,7 @@ def test_names_follow_the_patterns(tmp_path):
     file.write_text('names: {model: "{target}.{machine}"}\n')
     loaded = settings.load(file)
     assert loaded.model("vmc", "z") == "z.vmc"
-    assert loaded.experiment("vmc", "z") == "vmc/z"
+    assert loaded.experiment("vmc", "z") == "vmc z"
 
 
 @pytest.mark.parametrize(
