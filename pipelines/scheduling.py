@@ -14,18 +14,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Protocol
-from zoneinfo import available_timezones
-
-from filelock import FileLock, Timeout
 
 from data.endings import ending
-from data.errors import InputError, WorkError
 from pipelines import alerts, fleet_state
 from pipelines.caller import Say
 from pipelines.fleet import Fleet, FleetMachine
@@ -214,99 +209,3 @@ class Scheduler:
             alerts.after_run(self.home, self.fleet, name, self.say)
         except OSError as error:
             self.say(f"{name}: its state cannot be kept ({error})")
-
-
-def local_timezone() -> str:
-    """The IANA name of the local time zone, UTC where the system does not state it."""
-    named = os.environ.get("TZ", "").lstrip(":")
-    linked = Path("/etc/localtime").resolve().as_posix().partition("zoneinfo/")[2]
-    return next((z for z in (named, linked) if z in available_timezones()), "UTC")
-
-
-def checked(fleet: Fleet, say: Say) -> tuple[Fleet, dict[str, Any]]:
-    """The fleet with the machines' names, and the schema of a run's parameters; in a process of its own.
-
-    Raises:
-        InputError: a line for every machine file, channel or family that cannot be used.
-        WorkError: the process of the check fails.
-    """
-    process = subprocess.Popen(
-        (*APART, "check"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
-    )  # fmt: skip
-    with ending(process.kill):
-        out, error = process.communicate(fleet.as_json() + "\n")
-    if process.returncode:
-        raise WorkError(f"the check of {fleet.source} failed: {(error.strip() or '?').splitlines()[-1]}")
-    found = json.loads(out.splitlines()[-1])
-    if found["problems"]:
-        raise InputError("\n".join(found["problems"]))
-    for note in found["notes"]:
-        say(note)
-    machines = tuple(replace(m, name=n) for m, n in zip(fleet.machines, found["names"], strict=True))
-    return replace(fleet, machines=machines), found["schema"]
-
-
-@contextmanager
-def alone(home: Path, fleet: Fleet) -> Iterator[None]:
-    """One process per fleet file and home.
-
-    Raises:
-        InputError: another process serves this fleet.
-    """
-    lock = FileLock(fleet_state.lock_file(home, fleet.key), timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InputError(
-            f"{fleet.source}: another `thermodrift schedule` serves it with home {home}; end that one first"
-        ) from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -> None:
-    """Retrain the machines of a checked fleet when they are due, until interrupted (or for `rounds` runs).
-
-    Where PREFECT_API_URL names a server, each machine is a deployment there. Without one this process waits by itself,
-    and each run starts Prefect's temporary server.
-
-    Raises:
-        InputError: another process serves the fleet, or the machine files cannot be used.
-    """
-    with alone(home, fleet):
-        fleet, schema = checked(fleet, say)
-        folders = Folders(fleet, say)
-        with folders.watching():
-            if _has_server(home):
-                from pipelines.deployments import Deployments
-
-                with Deployments(fleet, schema, folders, say) as source:
-                    say(_first_line(fleet, f"as scheduled by {source.url}"))
-                    Scheduler(fleet, source, home, say).serve(rounds)
-            else:
-                clock = Clock(fleet, fleet_state.last_turns(home, fleet), folders, datetime.now(UTC))
-                dates = {n: d for n, d in clock.next().items() if d is not None}
-                first = min(dates, key=lambda n: dates[n], default="")
-                say(_first_line(fleet, f"next at {dates[first]:%Y-%m-%d %H:%M %Z}" if first else "when files arrive"))
-                Scheduler(fleet, clock, home, say).serve(rounds)
-
-
-def _has_server(home: Path) -> bool:
-    """Whether PREFECT_API_URL is set, in the environment or in a profile of Prefect's."""
-    folder = Path(os.environ.setdefault("PREFECT_HOME", str(home / "prefect"))).expanduser()
-    if os.environ.get("PREFECT_API_URL", "").strip():
-        folder.mkdir(parents=True, exist_ok=True)
-        return True
-    if not (folder / "profiles.toml").exists():
-        return False
-    from prefect.settings import PREFECT_API_URL
-
-    return bool(PREFECT_API_URL.value())
-
-
-def _first_line(fleet: Fleet, when: str) -> str:
-    n = len(fleet.machines)
-    return f"retraining of {fleet.machines[0].name if n == 1 else f'{n} machines'} {when}; Ctrl-C ends it"

@@ -110,11 +110,12 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
 def _champions(settings: Settings) -> dict[str, list[Champion]]:
     """Champions by machine."""
     from pipelines import audit
+    from pipelines.runs import registered_models
     from pipelines.tracking import open_store, store_errors
 
     client, found = open_store(settings), dict[str, list[Champion]]()
     with store_errors(settings):
-        for model in client.search_registered_models(max_results=1000):
+        for model in registered_models(client):
             log = audit.read(model)
             if not log.machine or not log.target:
                 continue
@@ -277,11 +278,12 @@ def _made_from(settings: Settings, lake: Lake) -> dict[str, Any] | None:
     if store is None or not isinstance(root, Path):
         return None
     logs = [root / "_quarantine", *sorted(root.glob("_quarantine/*/reasons.jsonl"))]
-    return _stats([Path("mlflow.yml").resolve(), store, Path(f"{store}-wal"), root / "_manifest.json", *logs])
+    return _stats([store, Path(f"{store}-wal"), root / "_manifest.json", *logs])
 
 
 def _stats(files: Iterable[Path]) -> dict[str, Any]:
-    """Size and time of change of files, None where one is not there, and the variables that name them."""
+    """Size and time of change of files, None where one is not there; the settings file of the working directory, and
+    the variables that decide where store and lake are."""
     found: dict[str, list[int] | None] = {}
     for file in files:
         try:
@@ -289,4 +291,6 @@ def _stats(files: Iterable[Path]) -> dict[str, Any]:
             found[str(file)] = [seen.st_size, seen.st_mtime_ns]
         except OSError:
             found[str(file)] = None
-    return {"files": found, "variables": [os.environ.get(v, "") for v in _VARIABLES], "folder": str(Path.cwd())}
+    settings = Path("mlflow.yml").resolve()
+    own = [str(settings), settings.stat().st_size, settings.stat().st_mtime_ns] if settings.exists() else None
+    return {"files": found, "variables": [os.environ.get(v, "") for v in _VARIABLES], "settings": own}

@@ -22,8 +22,8 @@ def schedule(
 ) -> None:
     """Retrain machines when they are due: new batches are ingested and learned; runs until interrupted."""
     from pipelines.fleet import Fleet, load_fleet, of_one
+    from pipelines.fleet_service import checked, local_timezone, serve_fleet
     from pipelines.home import home
-    from pipelines.scheduling import checked, local_timezone, serve_fleet
 
     served: Fleet
     if fleet is not None:
