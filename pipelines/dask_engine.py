@@ -37,6 +37,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from pipelines.training import TrainOutcome, TrainRequest
 
+logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters reaches the user as an error
 R = TypeVar("R")
 LOOPBACK = "127.0.0.1"
 ANSWER_S = 15.0  # for a scheduler to accept a connection

@@ -42,7 +42,7 @@ from models.trust import Region, fit_siblings
 from models.updating import Updater, out_of_fold
 from pipelines import audit, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
-from pipelines.runs import close_interrupted, code_version
+from pipelines.runs import close_interrupted, code_version, registered_models
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
@@ -310,7 +310,7 @@ def status(settings: Settings) -> pd.DataFrame:
                "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
-        for model in client.search_registered_models(max_results=1000):
+        for model in registered_models(client):
             log = audit.read(model)
             ends = audit.latest_ends(log.reigns, log.champion)
             for v in versions_of(client, model.name):
@@ -339,7 +339,7 @@ def find_model(client: MlflowClient, name: str) -> RegisteredModel:
     except MlflowException as error:
         if error.error_code != ErrorCode.Name(RESOURCE_DOES_NOT_EXIST):
             raise
-        names = [m.name for m in client.search_registered_models(max_results=1000)]
+        names = [m.name for m in registered_models(client)]
         hint = closest(name, names) if names else "the registry is empty; train first"
         raise InputError(f"unknown model {name!r}; {hint}") from None
 

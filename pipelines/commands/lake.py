@@ -178,7 +178,7 @@ def _trainings_with(machine: str, batch_ids: Sequence[str]) -> list[dict[str, An
 
     client = tracking.open_store(configured)
     with tracking.store_errors(configured):
-        runs = [r for r in tracking.finished_runs(client, "training") if r.data.tags.get("machine") == machine]
+        runs = tracking.finished_runs(client, "training", machine=machine)
         versions = registry.status(configured)
     rows = []
     for run in runs:

@@ -16,8 +16,9 @@ import pytest
 from data.errors import InputError, WorkError
 from models.crossing import FamilyResult, Plan, prepare
 from models.grid import Workers, jobs_of
+from pipelines.caller import DirectCaller
 from pipelines.engine import ENGINES, DirectEngine, open_engine
-from pipelines.training import TrainRequest
+from pipelines.training import TrainOutcome, TrainRequest, train
 from tests.conftest import make_toy_batches
 from tests.toys.command import in_process
 from tests.toys.postgres import free_port
@@ -122,29 +123,46 @@ def _family(key: str) -> str:
 
 @pytest.mark.slow
 def test_a_training_on_three_workers_one_of_which_ends(
+    store: Any, store_home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    ended: list[int] = []
+    with dask_engine.Cluster(workers=3) as three:
+
+        def done(step: str, n: int, of: int) -> None:
+            if step.startswith("grid") and n == 1:
+                ended.append(next(iter(three.client.run(os.getpid).values())))
+                os.kill(ended[0], signal.SIGKILL)
+
+        far = train(request(tmp_path, "engine-dask"), store, DirectCaller(done), pools=three.pools)
+    near = DirectEngine().train(request(tmp_path, "engine-direct"), store)
+    assert len(ended) == 1
+    assert_same_training(far, near, "engine-dask", "engine-direct")
+    assert "distributed" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.slow
+def test_the_engine_as_prefect_runs_it(
     flows: ModuleType, store: Any, store_home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
-    write_year(tmp_path / "in")
+    said: list[str] = []
+    far = dask_engine.DaskEngine(workers=2).train(request(tmp_path, "engine-flow"), store, said.append)
+    near = DirectEngine().train(request(tmp_path, "engine-plain"), store)
+    assert "Dask cluster 127.0.0.1: 2 workers" in said
+    assert_same_training(far, near, "engine-flow", "engine-plain")
 
-    def request(name: str) -> TrainRequest:
-        return TrainRequest(write_machine(tmp_path / f"{name}.yml", name), (tmp_path / "in",), ("z",), LONGER)
 
-    engine = dask_engine.DaskEngine(workers=3)
-    ended: list[int] = []
-    clusters: list[Any] = []
-    enter = dask_engine.Cluster.__enter__
-    monkeypatch.setattr(dask_engine.Cluster, "__enter__", lambda self: clusters.append(enter(self)) or self)
+def request(folder: Path, name: str) -> TrainRequest:
+    """A training of a machine of this name."""
+    if not (folder / "in").exists():
+        write_year(folder / "in")
+    return TrainRequest(write_machine(folder / f"{name}.yml", name), (folder / "in",), ("z",), LONGER)
 
-    def done(step: str, n: int, of: int) -> None:
-        if step.startswith("grid") and n == 1:
-            ended.append(next(iter(clusters[0].client.run(os.getpid).values())))
-            os.kill(ended[0], signal.SIGKILL)
 
-    far = engine.train(request("engine-dask"), store, done=done)
-    near = DirectEngine().train(request("engine-direct"), store)
-    assert len(ended) == 1
+def assert_same_training(far: TrainOutcome, near: TrainOutcome, name: str, other: str) -> None:
+    """Bit for bit."""
     a, b = far.results["z"], near.results["z"]
     for table in ("scores", "cells", "subsets", "predictions", "distances", "readings"):
         pd.testing.assert_frame_equal(getattr(a, table), getattr(b, table), check_exact=True)
-    assert far.promotions["z"].summary == near.promotions["z"].summary.replace("engine-direct", "engine-dask")
+    assert far.promotions["z"].summary == near.promotions["z"].summary.replace(other, name)
