@@ -455,7 +455,7 @@ def main() -> None:
     if given.facts:
         print("FACTS " + json.dumps(facts(given.facts)))
         return
-    only = [k for k in given.only.split(",") if k]
+    only = list(dict.fromkeys(k for k in given.only.split(",") if k))
     if unknown := set(only) - set(CASES):
         parser.error(f"--only: unknown {', '.join(sorted(unknown))}; expected {', '.join(CASES)}")
     for row in summary(run(given.out, given.kills, given.seed, only)):
