@@ -10,23 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_exports_programs import (
-    PROGRAMS,
-    Batches,
-    SomeLimits,
-    dynamic,
-    every_operation,
-    export_of,
-    fitted,
-    offset_only,
-    rows_with_holes,
-    straight,
-)
+from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
 from compensation.safety import Limits
 from models.program import replay
+from thermodrift.testing.exports import SomeLimits, export_of, offset_only, straight
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the C export")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")

@@ -7,20 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_exports_programs import (
-    PROGRAMS,
-    Batches,
-    SomeLimits,
-    dynamic,
-    every_operation,
-    export_of,
-    fitted,
-    rows_with_holes,
-)
+from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel
 from models.program import Program, replay
+from thermodrift.testing.exports import SomeLimits, export_of
 
 onnxruntime = pytest.importorskip("onnxruntime")
 

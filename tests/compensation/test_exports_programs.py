@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,26 +12,19 @@ import numpy as np
 import pytest
 
 from compensation.exports import EXPORTS
-from compensation.exports.base import AxisModel, Export, identifiers
+from compensation.exports.base import AxisModel, identifiers
 from compensation.exports.straight_line import formulas
 from data.batch import Batch, Channel
 from data.errors import InputError
 from models import FAMILIES
 from models.program import Builder, Program, replay
+from thermodrift.testing import ContractCheck, check_export
+from thermodrift.testing.exports import SomeLimits, export_of, offset_only, straight
 
-DIGEST = "0123456789abcdef" * 4
 PROGRAMS = tuple(k for k, f in FAMILIES.items() if f.has_program())
 Batches = Callable[..., list[Batch]]
 STRAIGHT = ("sinumerik", "heidenhain", "fanuc")
 LINEAR = ("mlr", "ridge", "pcr", "pls", "huber", "elastic_net", "axis_coupled")
-
-
-@dataclass(frozen=True)
-class SomeLimits:
-    max_offset_um: float = 40.0
-    rate_um_per_s: float = 0.02
-    hold_s: float = 900.0
-    stale_s: float = 30.0
 
 
 def along_y(batch: Batch) -> Batch:
@@ -102,49 +94,13 @@ def rows_with_holes(program: Program, n: int = 60) -> np.ndarray:
     return rows
 
 
-def straight(region: Mapping[str, tuple[float, float]] | None = None) -> AxisModel:
-    """3 (t0 − t0 first) − 2 t1 + 1.5, and with a slope of 0.01 (t0 − t0 first) along y."""
-    known = {n: Channel(n, "temperature", "degC") for n in ("t0", "t1")}
-    b = Builder(known, 300.0)
-    x = b.channels(["t0", "t1"])
-    rise = b.since_first(b.pick(x, [0]))
-    error = b.affine(b.join(rise, b.pick(x, [1])), np.array([[3.0, -2.0]]), 1.5)
-    program = b.program([error, b.affine(rise, np.array([[0.01]]))], False, "y", 100.0)
-    trained = {"t0": (10.0, 30.0), "t1": (15.0, 25.0), "y": (0.0, 500.0)} if region is None else region
-    return AxisModel("y", program, trained, SomeLimits())
-
-
-def offset_only() -> AxisModel:
-    a = straight()
-    program = replace(a.program, outputs=a.program.outputs[:1], along="", reference_mm=0.0)
-    return replace(a, program=program)
-
-
-def export_of(*axes: AxisModel, machine: str = "mill 1", simulated: bool = True) -> Export:
-    return Export(machine, "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", simulated, axes)
-
-
 def dynamic(axis: str = "z") -> AxisModel:
     return AxisModel(axis, every_operation(), {"a": (5.0, 35.0), "y": (0.0, 500.0)}, SomeLimits())
 
 
-@pytest.mark.parametrize("key", list(EXPORTS))
-def test_every_file_states_what_it_is(key: str, tmp_path: Path) -> None:
-    paths = EXPORTS[key]().write(export_of(offset_only()), tmp_path)
-    assert paths and all(p.is_file() and p.name.startswith("mill_1") for p in paths)
-    for path in paths:
-        text = path.read_bytes().decode(errors="replace")
-        for told in ("mill 1", "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", "SIMULATED", "degC", "um",
-                     "-error_um", "hold"):  # fmt: skip
-            assert told in text or (path.suffix == ".c" and told in (tmp_path / "mill_1.h").read_text()), told
-    for path in EXPORTS[key]().write(export_of(offset_only(), simulated=False), tmp_path):
-        assert not re.search(rb"(?<!_)SIMULATED", path.read_bytes())
-
-
-@pytest.mark.parametrize("key", list(EXPORTS))
-def test_it_has_a_summary_and_file_names(key: str) -> None:
-    exporter = EXPORTS[key]
-    assert exporter.key == key and exporter.summary and exporter.suffix
+@pytest.mark.parametrize("check", [c for key in EXPORTS for c in check_export(key, generate_only=True)], ids=str)
+def test_contract(check: ContractCheck) -> None:
+    check()
 
 
 @pytest.mark.parametrize("key", STRAIGHT)

@@ -11,24 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_exports_programs import (
-    PROGRAMS,
-    Batches,
-    SomeLimits,
-    dynamic,
-    every_operation,
-    export_of,
-    fitted,
-    offset_only,
-    rows_with_holes,
-    straight,
-)
+from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, fitted, rows_with_holes
 
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel
 from compensation.exports.structured_text import StructuredTextExport, real
 from data.errors import InputError
 from models.program import replay
+from thermodrift.testing.exports import SomeLimits, export_of, offset_only, straight
 
 WORDS = {
     "IF", "THEN", "ELSE", "END_IF", "FOR", "TO", "DO", "END_FOR", "WHILE", "END_WHILE", "AND", "OR", "NOT", "TRUE",

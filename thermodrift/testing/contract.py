@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -65,26 +65,42 @@ class Suite(Generic[S]):
         return add
 
     def of(
-        self, registry: Registry, plugin: Any, subject: Callable[[Any], S], generate_only: bool
+        self, registry: Registry, plugin: Any, subject: Callable[[Any], S], generate_only: bool, key: str = ""
     ) -> Iterator[ContractCheck]:
         """The checks of one plug-in: a class, or the key of a registered one, which loads at the first check.
 
-        Unless `generate_only` they have been run.
+        A class is registered under its key while a check runs. Unless `generate_only` the checks have been run.
 
         Raises:
             ContractError: checks failed; each is named.
         """
-        key = plugin if isinstance(plugin, str) else getattr(plugin, "key", plugin.__name__)
-        known = cache(lambda: subject(registry[key]))
+        if isinstance(plugin, str):
+            return self.checks(f"{registry.kind} {plugin}", lambda: subject(registry[plugin]), generate_only)
+        key = key or getattr(plugin, "key", plugin.__name__)
+        during = partial(registry.trying, key, plugin)
+        return self.checks(f"{registry.kind} {key}", lambda: subject(plugin), generate_only, during)
+
+    def checks(
+        self,
+        named: str,
+        subject: Callable[[], S],
+        generate_only: bool,
+        during: Callable[[], AbstractContextManager[object]] = nullcontext,
+    ) -> Iterator[ContractCheck]:
+        """The checks of a subject; each runs in the context `during`. Unless `generate_only` they have been run.
+
+        Raises:
+            ContractError: checks failed; each is named.
+        """
+        known = cache(subject)
 
         def bound(check: Callable[[S], None]) -> Callable[[], None]:
             def run() -> None:
-                with nullcontext() if isinstance(plugin, str) else registry.trying(key, plugin):
+                with during():
                     check(known())
 
             return run
 
-        named = f"{registry.kind} {key}"
         every = [ContractCheck(named, name, why, bound(check)) for name, (why, check) in self._checks.items()]
         if not generate_only:
             run_all(every)
@@ -127,8 +143,8 @@ def expect_close(got: Any, want: Any, what: str, *, atol: float = 0.0, rtol: flo
     raise ContractError(f"expected {what} {bound}, got a difference of {worst:.3g}, or NaN on one side alone")
 
 
-def expect_refused(do: Callable[[], object], *named: str) -> str:
-    """The message of the InputError that `do` raises: one line with every text of `named`.
+def expect_refused(do: Callable[[], object], *named: str, kind: type[Exception] = InputError) -> str:
+    """The message of the error (`kind`) that `do` raises: one line with every text of `named`.
 
     Raises:
         ContractError: no error, or another one.
@@ -136,8 +152,8 @@ def expect_refused(do: Callable[[], object], *named: str) -> str:
     words = f", which names {' and '.join(named)}" if named else ""
     try:
         got = do()
-    except InputError as error:
+    except kind as error:
         text = str(error)
-        expect("\n" not in text and all(n in text for n in named), f"an InputError of one line{words}", repr(text))
+        expect("\n" not in text and all(n in text for n in named), f"a {kind.__name__} of one line{words}", repr(text))
         return text
-    raise ContractError(f"expected an InputError of one line{words}, got {type(got).__name__}")
+    raise ContractError(f"expected a {kind.__name__} of one line{words}, got {type(got).__name__}")

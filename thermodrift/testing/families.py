@@ -23,6 +23,7 @@ from thermodrift.testing.runs import INPUTS, N
 
 TRAIN = (0, 1, 2, 3)
 LEFT = 4
+TURNS = 9  # seed of a run that begins like one training run and goes on like another
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,11 @@ class FamilyCase:
     @cached_property
     def fitted(self) -> Family:
         return self.family().fit_design(self.design, TRAIN)
+
+    @cached_property
+    def of_one(self) -> Family:
+        """Fitted on one run."""
+        return self.family().fit_design(self.design, [1])
 
     @cached_property
     def predicted(self) -> Array:
@@ -123,9 +129,11 @@ def prediction_does_not_read_the_error_channel(c: FamilyCase) -> None:
 
 @SUITE.check("at the machine the later rows are not there yet")
 def prediction_does_not_look_ahead(c: FamilyCase) -> None:
-    whole, half = c.batches[LEFT], N // 2
-    begun = Batch(whole.machine, whole.batch_id, whole.table.iloc[:half].reset_index(drop=True), whole.channels)
-    c.near(c.fitted.predict(begun), c.fitted.predict(whole)[:half], "the prediction of a run and of its first half")
+    whole = runs.runs(c.along, TURNS)[-1]
+    predicted = c.fitted.predict(whole)
+    for rows in (6, N // 4, N // 2):
+        begun = Batch(whole.machine, whole.batch_id, whole.table.iloc[:rows].reset_index(drop=True), whole.channels)
+        c.near(c.fitted.predict(begun), predicted[:rows], f"the prediction of {N} rows and of the first {rows} of them")
 
 
 @SUITE.check("the control starts with a correction of 0; along an axis throughout the first sweep")
@@ -178,8 +186,8 @@ def stated_sd_does_not_shrink_from_the_start(c: FamilyCase) -> None:
 
 @SUITE.check("the grid fits all folds at once; scores must be those of each fold alone")
 def folds_at_once_are_the_folds_one_by_one(c: FamilyCase) -> None:
-    together = c.family().fit_folds(c.design, [list(TRAIN), [2]])
-    for model, alone in zip(together, [c.fitted, c.family().fit_design(c.design, [2])], strict=True):
+    together = c.family().fit_folds(c.design, [list(TRAIN), [1]])
+    for model, alone in zip(together, [c.fitted, c.of_one], strict=True):
         want = alone.predict_design(c.design, [LEFT])[0]
         c.near(model.predict_design(c.design, [LEFT])[0], want, "predictions of fit_folds and fit_design")
     (first,), (_, second) = c.fitted.predict_folds(c.design, together, [[LEFT], [0, LEFT]])
@@ -197,7 +205,7 @@ def fitting_accuracy_is_that_of_the_predictions(c: FamilyCase) -> None:
 
 @SUITE.check("train-on-one is a protocol: one run is all there is in the first week")
 def one_batch_is_enough(c: FamilyCase) -> None:
-    own = c.family().fit_design(c.design, [1]).predict_design(c.design, [1])[0]
+    own = c.of_one.predict_design(c.design, [1])[0]
     error_um = c.design.y_um[c.design.rows(1)]
     expect(np.isfinite(own).all(), "finite predictions after a fit on one batch", "NaN or infinity")
     if c.learns:
