@@ -28,7 +28,9 @@ if group:
     for path, command in tree:
         tree += [((*path, name), below) for name, below in getattr(command, "commands", {{}}).items()]
         done = CliRunner().invoke(app, [*path, "--help"])
-        assert done.exit_code == 0, (path, done.output)
+        assert done.exit_code == 0 and "Usage: " in done.output, (path, done.output)
+        assert path != ("train",) or "--direct" in done.output
+    assert len(tree) > 25
 print(json.dumps(sorted(sys.modules)))
 """
 
