@@ -72,6 +72,7 @@ def summarized(outcome: TrainOutcome) -> str:
     summary += f" (files in quarantine: {quarantined})" if quarantined else ""
     waiting = len(outcome.ingested.waiting) if outcome.ingested else 0
     summary += f" (files still being written: {waiting})" if waiting else ""
+    summary += f"; postponed: {outcome.postponed}" if outcome.postponed else ""
     return summary + (f"; {outcome.diagnosis_summary}" if outcome.diagnosis_summary else "")
 
 

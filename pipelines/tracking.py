@@ -349,7 +349,8 @@ def _child(cells: pd.DataFrame, result: GridResult, rule: PromotionRule) -> Enti
         best = None
     if best is not None:
         params |= {"n_tsp": str(best["n_tsp"]), "inputs": str(best["inputs"]).replace("|", ", ")}
-        metrics += [(name, value, 0) for name, value in _cell_metrics(best).items()]
+        # First, as the page of a run lists them.
+        metrics = [*((name, value, 0) for name, value in _cell_metrics(best).items()), *metrics]
         s = result.scores
         picked = s[
             (s["protocol"].to_numpy() == best["protocol"]) & (s["selector"].to_numpy() == selector)
