@@ -161,7 +161,7 @@ def _runs(r: Replay, target: str) -> Table:
 
 
 def _arrivals(r: Replay) -> Table:
-    columns = (Column("arrival", kind="number"), Column("run"), Column("how"), Column("fault", kind="wide"))
+    columns = (Column("arrival"), Column("run"), Column("how"), Column("fault", kind="wide"))
     rows = tuple(Row.of(str(a.number), a.batch_id, a.how, a.fault) for a in r.arrivals if a.how != "as recorded")
     others = len(r.arrivals) - len(rows)
     notes = (f"The other {count(others, 'arrival')} came as recorded.", *(f"Left out: {t}" for t in r.left_out))
