@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from data.errors import InputError, WorkError
+from data.errors import InputError, WorkError, one_of
 from models.crossing import FamilyResult, Plan, prepare
 from models.grid import Workers, jobs_of
 from pipelines.caller import DirectCaller
@@ -111,14 +111,8 @@ def test_a_worker_with_another_program_is_refused(cluster: Any, monkeypatch: pyt
 def test_what_the_work_raises_is_raised_here(cluster: Any) -> None:
     pool = dask_engine.ClusterPool(cluster)
     assert pool.submit(len, "abc")() == 3
-    with pytest.raises(InputError, match="unknown family 'rigde'"):
-        pool.submit(_family, "rigde")()
-
-
-def _family(key: str) -> str:
-    from models import FAMILIES
-
-    return str(FAMILIES[key].key)
+    with pytest.raises(InputError, match="--family: unknown value 'rigde': did you mean 'ridge'"):
+        pool.submit(one_of, "rigde", ("ridge", "pls"), "--family")()
 
 
 @pytest.mark.slow
