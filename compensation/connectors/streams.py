@@ -111,7 +111,8 @@ class LineParser:
     The first line that is no JSON object is the table's header, unless the machine file says ``header: false``. Its
     columns are channels (by `column` or name, see `Names`) and one time: the machine file's time column, or `time_s`,
     `time` or `timestamp` (Unix seconds or ISO). The separator is found from the header; with one other than the comma,
-    a comma may be the decimal mark. An unreadable line is skipped with one line on standard error.
+    a comma may be the decimal mark. Lines that begin with ``# `` are comments. An unreadable line is skipped with one
+    line on standard error.
 
     Raises:
         InputError: the first header has no time or no known channel.
@@ -133,9 +134,9 @@ class LineParser:
         self._columns, self._broken_header = None, False
 
     def sample(self, line: bytes, row: int) -> Sample | None:
-        """The sample of a line; None for a header, an empty or an unreadable line. `row` is its number."""
+        """The sample of a line; None for a header, a comment, an empty or an unreadable line. `row` is its number."""
         text = _decoded(line).strip("\r\n\ufeff\0 ")
-        if not text:
+        if not text or text.startswith("# "):
             return None
         where = f"{self._where} line {row}"
         try:

@@ -97,6 +97,11 @@ def test_empty_cells_are_absent_and_a_probe_that_did_not_measure_gives_no_readin
     assert sample == Sample(5.0, {}, {})
 
 
+def test_comments_are_no_samples(machine: Machine, capsys: pytest.CaptureFixture[str]) -> None:
+    (sample,) = from_text("# simulated recording\ntime_s,front\n# pause\n5,20\n", machine)
+    assert sample == Sample(5.0, {"front": 20.0}, {}) and not capsys.readouterr().err
+
+
 def test_semicolons_decimal_commas_and_a_byte_order_mark(machine: Machine) -> None:
     (sample,) = from_text("\ufefftime;FRONT;room\r\n1700000000,5;25,125;20\r\n", machine)
     assert sample == Sample(1700000000.5, {"front": 25.125, "room": 20.0})
