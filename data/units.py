@@ -6,12 +6,13 @@ import re
 import unicodedata
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from data.errors import InputError, closest
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 # pint sees no difference between angle, rotation and ratio, which a channel must not mix
 _QUANTITIES: dict[str, tuple[str, ...]] = {
