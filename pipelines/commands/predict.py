@@ -57,7 +57,7 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
         try:
             open_store(settings).get_run(run_id)
         except MlflowException:
-            raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_uri}") from None
+            raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_name}") from None
         return Path(local_folder(model_uri, settings))
     match = _REGISTERED.match(model_uri)
     if match is None:
