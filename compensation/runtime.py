@@ -128,6 +128,7 @@ class Compensator:
         self._wanted = tuple(dict.fromkeys(c for a in axes for c in a.program.channels))
         self._run = {a.axis: self._fresh(a) for a in axes}
         self._grid_s: float | None = None  # time stamp of the grid's last row
+        self._restored = False  # and no sample has come since
         self._held: dict[str, float] = {}
         self._arrived_s: dict[str, float] = {}  # time stamp at which each channel last had a value
         self._patience_s = max(a.limits.stale_s for a in axes)
@@ -195,10 +196,21 @@ class Compensator:
             reasons[a.axis] = "; ".join(r for r in (reason, why, notes) if r)
         return Correction(time_s, offset, slope, state, reasons)
 
+    def _check_clock(self, time_s: float) -> None:
+        """After a restart: a state from the future belongs to a clock that was set back, and no time since is known."""
+        self._restored = False
+        if self._grid_s is not None and (behind_s := self._grid_s - time_s) > self._patience_s:
+            self.log(f"the clock is {behind_s / 3600:.1f} h behind the saved state: a new run begins")
+            self._watch = self.guard.begin() if self.guard is not None else None
+            self._held = {}
+            self.begin_run()
+
     def _advance(self, sample: Sample) -> tuple[str | None, str]:
         """Takes the models to the time of the sample: why it cannot be used, and what was replaced in it."""
         if not math.isfinite(sample.time_s):
             return None, ""  # the state machine refuses the time stamp
+        if self._restored:
+            self._check_clock(sample.time_s)
         values, fault, notes = dict(sample.values), None, ""
         if self.guard is not None and self._watch is not None:
             self._watch, checked = self.guard.step(self._watch, sample.time_s, sample.values)
@@ -317,7 +329,7 @@ class Compensator:
                 f"state of a compensation: got {got}, expected {expected}; delete the file, the compensation then "
                 "starts afresh"
             )
-        self._grid_s = plain["grid_s"]
+        self._grid_s, self._restored = plain["grid_s"], True
         self._held = {c: float(v) for c, v in plain["held"].items()}
         if self.guard is not None and plain["watch"] is not None:
             self._watch = Watch.from_plain(plain["watch"])

@@ -123,6 +123,20 @@ def test_readings_correct_what_the_model_misses_and_odd_ones_are_rejected() -> N
     assert any("w: reading not used: no such axis" in line for line in lines)
 
 
+def test_a_restart_with_a_clock_that_was_set_back_begins_a_new_run() -> None:
+    """The saved state is from the future then: without a new run the models would wait for it, as if all were well."""
+    *train, left = make_toy_batches(8, 60)
+    lines: list[str] = []
+    first = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s)
+    run(first, samples(left))
+    again = Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s, lines.append)
+    again.restore(json.loads(json.dumps(first.as_plain())))
+    earlier = run(again, samples(left, 1e9 - 7200.0))
+    whole = run(Compensator("toy", [model_of(train)], Substitutes.learn(train, INPUTS), left.step_s), samples(left))
+    assert [c.offset_um["z"] for c in earlier[5:]] == pytest.approx([c.offset_um["z"] for c in whole[5:]], abs=1e-9)
+    assert lines and lines[0].endswith("h behind the saved state: a new run begins")
+
+
 def test_a_restart_keeps_what_was_learned_and_does_not_jump() -> None:
     *train, left = make_toy_batches(8, 60)
     given = samples(left)
