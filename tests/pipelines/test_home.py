@@ -112,7 +112,17 @@ def test_a_home_that_cannot_be_written_is_one_line(
         tracking.open_store(Settings(tmp_path, f"sqlite:///{tmp_path}/home/mlflow.db", None, NamesPart(), None))
 
 
-@pytest.mark.parametrize("where", ["crossing", "artifacts", pytest.param("report", marks=pytest.mark.slow)])
+def test_a_disk_that_is_full_while_a_training_is_tracked_is_one_line(
+    store: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MlflowClient, "log_artifacts", full)
+    with pytest.raises(WorkError, match=r"artifacts: cannot be written or read \(No space left on device\)$"):
+        tracking.log_training(toy_result(toy_batches("toy-full", 3), S_UM), store)
+    assert tracking.trainings("toy-full", None, store).empty
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["crossing", "artifacts", "report"])
 def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
     where: str, store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,7 +130,12 @@ def test_a_disk_that_is_full_at_a_step_keeps_the_crossing(
     name = f"small-full-{where}"
     machine, _ = write_machine(tmp_path / "m.yml", name), write_year(tmp_path / "in", 4)
     request = TrainRequest(
-        machine, (tmp_path / "in",), ("z",), Plan(("none",), ("zero", "ridge"), ("leave-batch-out",)), promote=False
+        machine,
+        (tmp_path / "in",),
+        ("z",),
+        Plan(("none",), ("zero", "ridge"), ("leave-batch-out",)),
+        promote=False,
+        workers=1,
     )
     point = {
         "crossing": (checkpoint, "_fill"), "artifacts": (MlflowClient, "log_artifacts"),

@@ -137,7 +137,7 @@ def test_a_promotion_leaves_its_training_finished_at_every_moment(store: Any, mo
     assert model.status == "READY" and {m.key: m.value for m in model.metrics} == after.data.metrics
 
 
-@pytest.mark.parametrize("write", ["log_outputs", "set_registered_model_alias", "set_model_version_tag"])
+@pytest.mark.parametrize("write", ["log_outputs", "set_model_version_tag"])
 def test_a_promotion_that_dies_is_finished_by_the_next(store: Any, write: str) -> None:
     new = newcomer(store, f"toy-dies-{write}", S_UM)
     with dying(write), pytest.raises(Killed):
@@ -193,7 +193,7 @@ def test_after_a_killed_promotion_nothing_is_crossed_or_tracked_again(
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     machine, _ = write_machine(tmp_path / "m.yml", "small-killed"), write_year(tmp_path / "in")
     plan = Plan(("none",), ("zero", "ridge"), ("leave-batch-out",))
-    request = TrainRequest(machine, (tmp_path / "in",), ("z",), plan)
+    request = TrainRequest(machine, (tmp_path / "in",), ("z",), plan, workers=1)
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(registry, "_crown", _die)
         train(request, store, DirectCaller())

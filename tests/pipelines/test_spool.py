@@ -47,7 +47,7 @@ def down(*_: object, **__: object) -> Any:
 
 def trained(name: str, folder: Path, store: Any, caller: DirectCaller | None = None) -> Any:
     machine, _ = write_machine(folder / "m.yml", name), write_year(folder / "in")
-    return train(TrainRequest(machine, (folder / "in",), ("z",), PLAN), store, caller or DirectCaller())
+    return train(TrainRequest(machine, (folder / "in",), ("z",), PLAN, workers=1), store, caller or DirectCaller())
 
 
 def test_a_server_that_does_not_answer_is_one_line_before_anything_is_computed(call: Call, tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_results_wait_and_are_delivered_once(
     assert status[status["name"] == "small-spool-z"]["version"].tolist() == [1]
 
 
-def test_a_promotion_that_does_not_reach_the_server_waits(
+def test_a_promotion_that_does_not_reach_the_server_waits_and_one_that_is_refused_blocks_nothing(
     store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
@@ -115,21 +115,10 @@ def test_a_promotion_that_does_not_reach_the_server_waits(
     with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 1 results wait in "):
         patch.setattr(spool, "open_store", down)
         spool.deliver(store, partial(promote_waiting, store))
-    lines = spool.deliver(store, partial(promote_waiting, store))
-    assert len(lines) == 1 and "small-later-z version 1 is champion" in lines[0] and not spool.waiting(store)
-
-
-def test_what_is_refused_for_good_blocks_nothing(
-    store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A promotion whose batches are withdrawn."""
-    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
-    with monkeypatch.context() as patch:
-        patch.setattr(registry, "promote", down)
-        trained("small-refused", tmp_path, store)
-    home_lake().forget_machine("small-refused", "sold")
+    assert len(spool.waiting(store)) == 1
+    home_lake().forget_machine("small-later", "sold")
     (line,) = spool.deliver(store, partial(promote_waiting, store))
-    assert line.startswith("not delivered: promotion of small-refused z (lake ") and "is withdrawn (sold)" in line
+    assert line.startswith("not delivered: promotion of small-later z (lake ") and "is withdrawn (sold)" in line
     (refused,) = (store_home / "spool" / "refused").iterdir()
     assert (refused / "reason.txt").read_text().strip() in line and not spool.waiting(store)
 
