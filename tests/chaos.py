@@ -378,10 +378,11 @@ class Chaos:
         while True:
             self.work.renew(template)
             moment_s = rng.uniform(0.02, 0.98) * longest_s
+            begun_s = time.monotonic()
             command = Command(self.work.home, *self.case.arguments(self.work), module=self.case.module)
             try:
                 command.process.wait(moment_s)
-                longest_s *= 0.8
+                longest_s = time.monotonic() - begun_s  # the computer is less busy than it was for the reference
                 continue
             except subprocess.TimeoutExpired:
                 os.killpg(command.process.pid, signal.SIGKILL)
