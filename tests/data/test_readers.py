@@ -313,6 +313,7 @@ def test_unknown_suffix_lists_the_known_ones():
     assert type(reader_for(Path("RUN.CSV"))) is READERS["csv"]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     kind=st.sampled_from(["csv", "xlsx", "parquet"]),

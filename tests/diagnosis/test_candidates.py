@@ -362,6 +362,7 @@ def registry(monkeypatch: pytest.MonkeyPatch) -> Registry:
     return MECHANISMS
 
 
+@pytest.mark.slow
 def test_a_mechanism_added_at_run_time_is_proposed_and_found(registry: Registry) -> None:
     known = two_bodies()
     assert names(known, *registry) == names(known)

@@ -84,6 +84,7 @@ def test_files_of_channels_that_the_model_does_not_use_are_not_needed(store, tmp
     assert not got["outside_region"].any()
 
 
+@pytest.mark.slow
 def test_a_new_process_in_another_folder_finds_the_model(promoted, store, tmp_path):
     """Nothing that an earlier call left in this process may be needed, and nothing may be written where one stands."""
     table = toy_batches("toy-predict", 3)[2].table

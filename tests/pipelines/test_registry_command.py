@@ -276,6 +276,7 @@ def test_what_cannot_be_answered_is_one_line(story: Story, call: Call, args: lis
     assert done.err.startswith(f"thermodrift: {line}")
 
 
+@pytest.mark.slow
 def test_every_prefix_of_a_promotion_is_consistent(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The process dies at the first, second and third write of a promotion; look-ups now and after the next one."""
     writes = ["entry", "alias", "done"]

@@ -32,6 +32,7 @@ def test_machines_differ_and_sensors_sit_in_their_bodies(seed: int) -> None:
         assert source.share.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_both_kinds_of_plant_have_the_same_features() -> None:
     for kind in PLANTS:
         p = draw_plant(SEED, frozenset(FEATURES), NONE, kind)

@@ -288,6 +288,7 @@ def test_a_promoted_cell_of_ones_own_choice_is_the_one_shown(toy_batches: Maker,
     assert "Version 3, MLR on 1 point by correlation, is champion" in text
 
 
+@pytest.mark.slow
 def test_two_trainings_are_compared_on_the_batches_they_share(toy_batches: Maker, tmp_path: Path) -> None:
     now, before = results(toy_batches, k=6)["z"], results(toy_batches, k=5)["z"]
     before = replace(before, batches=before.batches.assign(digest=now.batches["digest"].iloc[:5].to_numpy()))

@@ -271,6 +271,7 @@ def test_one_at_a_time_works_on_a_proof(tmp_path: Path, asked: Asked) -> None:
     assert not asked
 
 
+@pytest.mark.slow
 def test_answers_come_from_processes_of_their_own(tmp_path: Path) -> None:
     proof = opened(tmp_path / "proof")
     stored = tmp_path / "proof" / "answers" / "case_0002"

@@ -17,6 +17,7 @@ def result(request: pytest.FixtureRequest) -> StudyResult:
     return run_studies([request.param], 2)[request.param]
 
 
+@pytest.mark.slow
 def test_every_figure_of_every_seed_is_a_number(result: StudyResult) -> None:
     names = [f.key for f in result.study.figures]
     assert len(set(names)) == len(names)
