@@ -133,6 +133,7 @@ def run(function: str, module: str = "test_lake_crash") -> subprocess.Popen[byte
     return subprocess.Popen([sys.executable, "-c", code + f"t.{function}"], cwd=Path(__file__).parents[2])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_step_leaves_the_old_or_the_new_state(tmp_path: Path) -> None:
     (tmp_path / "junk.csv").write_text("junk")

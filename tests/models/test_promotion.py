@@ -243,6 +243,7 @@ def _many_lucky_cells(seed: int, cells: int, gain_um: float) -> GridResult:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
     rule = PromotionRule(tie_percent=0, score="S_mean")
     choices = [promotion.decide(_many_lucky_cells(seed, 15, 0.0), rule) for seed in range(30)]

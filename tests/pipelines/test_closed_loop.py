@@ -19,7 +19,10 @@ from tests.compensation.test_mqtt import BROKER, Broker
 from tests.pipelines.test_compensating import INPUTS, last_recording, store_model
 from tests.toys.small_year import write_machine, write_year
 
-pytestmark = pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto: apt-get install mosquitto"),
+]
 ROOT = Path(__file__).parents[2]
 
 

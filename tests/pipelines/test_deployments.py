@@ -14,6 +14,8 @@ import pytest
 from pipelines.fleet import Fleet, FleetMachine, When
 from pipelines.folders import Folders
 
+pytestmark = pytest.mark.slow
+
 SOON = timedelta(seconds=1)
 
 

@@ -25,6 +25,8 @@ from pipelines.training import TrainRequest, train
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
+pytestmark = pytest.mark.slow
+
 READS = ("get_", "search_", "__", "_", "download_", "list_", "load_")
 S_UM = [5.0, 6.0, 5.5, 6.5, 5.0, 6.0]
 

@@ -70,7 +70,7 @@ class Training:
 @pytest.mark.parametrize(
     ("options", "endless", "number", "group"),
     [
-        (["--direct"], "worker", signal.SIGINT, True),
+        pytest.param(["--direct"], "worker", signal.SIGINT, True, marks=pytest.mark.slow),
         pytest.param(["--direct"], "here", signal.SIGTERM, False, marks=pytest.mark.slow),
         pytest.param([], "worker", signal.SIGTERM, True, marks=pytest.mark.slow),
         pytest.param([], "here", signal.SIGINT, False, marks=pytest.mark.slow),

@@ -16,6 +16,8 @@ from plants.runs import Now
 from plants.structure import FEATURES, Plant
 from tests.plants.plant_cases import NONE, SEED
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", range(2))
 def test_machines_differ_and_sensors_sit_in_their_bodies(seed: int) -> None:

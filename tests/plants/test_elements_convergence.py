@@ -9,6 +9,8 @@ from plants.convergence import ELEMENTS_STEP_S, sensed_degC
 from plants.elements.geometry import draw_castings
 from tests.plants.plant_cases import Array
 
+pytestmark = pytest.mark.slow
+
 SEED, EFFECT = 4, "preload_feedback"  # friction that the temperatures change: integrated explicitly
 
 

@@ -25,6 +25,8 @@ from evidence.proof.baselines.evaluate import ABLATIONS, BASELINES
 from tests.diagnosis.small_cases import cold_floor, consistent
 from twin.mechanisms import MECHANISMS
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def floor() -> Search:

@@ -25,6 +25,8 @@ from tests.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
 from tests.evidence.proof.answered import answer, term
 from twin.schema import twin_part
 
+pytestmark = pytest.mark.slow
+
 SHORT: dict[str, Any] = {"batches": 4, "hours": 5.0, "before_h": 5.0, "solver_s": 50.0}
 
 
