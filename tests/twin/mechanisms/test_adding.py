@@ -29,7 +29,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> tuple[str, Any]:
     module = ModuleType("wipers")
     exec(law, module.__dict__)
     monkeypatch.setitem(sys.modules, "wipers", module)
-    monkeypatch.setitem(MECHANISMS._members, KEY, "wipers:WiperFriction")
+    monkeypatch.setattr(MECHANISMS, "_members", {**MECHANISMS._members, KEY: "wipers:WiperFriction"})
     return text, (module, contract, test)
 
 
