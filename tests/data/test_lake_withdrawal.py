@@ -1,5 +1,6 @@
 """Batches out of use and back: withdrawn, restored, purged; copies under another name; kills in between."""
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator
