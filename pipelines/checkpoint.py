@@ -22,7 +22,7 @@ from pipelines.caller import Say
 
 Job = tuple[str, str]  # error channel, family
 _SOURCES = ("data", "features", "models", "twin")
-_LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
+LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
 _TOKEN = "token"
 _SUMS = "sums.json"  # the digest of every other file of a kept job
 
@@ -130,7 +130,7 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _digest(crossings: Mapping[str, Crossing]) -> str:
-    digest = hashlib.sha256(f"{_source()} {[_version(name) for name in _LIBRARIES]}".encode())
+    digest = hashlib.sha256(f"{source_digest()} {[library_version(name) for name in LIBRARIES]}".encode())
     for target, crossing in sorted(crossings.items()):
         d = crossing.design
         twin = d.machine.model_dump_json() if d.machine is not None else ""
@@ -141,20 +141,17 @@ def _digest(crossings: Mapping[str, Crossing]) -> str:
     return digest.hexdigest()[:24]
 
 
-def _version(library: str) -> str:
+def library_version(library: str) -> str:
+    """The installed version, empty for none."""
     try:
         return version(library)
     except PackageNotFoundError:  # torch may be missing
         return ""
 
 
+@cache
 def source_digest() -> str:
     """SHA-256 (hex) of the program's source that decides the numbers."""
-    return _source()
-
-
-@cache
-def _source() -> str:
     digest = hashlib.sha256()
     root = Path(__file__).parent.parent
     for folder in _SOURCES:

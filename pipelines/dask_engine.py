@@ -12,7 +12,6 @@ import logging
 import threading
 from collections.abc import Callable
 from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -21,7 +20,7 @@ from data.errors import InputError, WorkError
 from data.processes import Shared, one_thread
 from models.grid import Pool
 from pipelines.caller import LANES, Done, Say
-from pipelines.checkpoint import source_digest
+from pipelines.checkpoint import LIBRARIES, library_version, source_digest
 from pipelines.settings import Settings, masked
 
 try:
@@ -43,7 +42,6 @@ LOOPBACK = "127.0.0.1"
 ANSWER_S = 15.0  # for a scheduler to accept a connection
 WORKERS_S = 60.0  # for the first worker to come
 LOST = 3  # times that a job is sent again because all workers that held its data ended
-_LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers
 
 
 class DaskEngine:
@@ -199,14 +197,7 @@ class _Scattered:
 @cache
 def _program() -> dict[str, str]:
     """What decides the numbers besides the data."""
-    return {"thermodrift": source_digest(), **{name: _version(name) for name in _LIBRARIES}}
-
-
-def _version(library: str) -> str:
-    try:
-        return version(library).partition("+")[0]
-    except PackageNotFoundError:
-        return ""
+    return {"thermodrift": source_digest(), **{n: library_version(n).partition("+")[0] for n in LIBRARIES}}
 
 
 def _alone(program: dict[str, str], work: Callable[..., R], *args: Any) -> R:

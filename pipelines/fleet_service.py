@@ -15,8 +15,8 @@ from zoneinfo import available_timezones
 
 from filelock import FileLock, Timeout
 
+from data.endings import ending
 from data.errors import InputError, WorkError
-from data.processes import ending
 from pipelines import fleet_state
 from pipelines.caller import Say
 from pipelines.fleet import Fleet

@@ -41,7 +41,7 @@ def lock_file(home: Path, key: str) -> Path:
 
 def read(home: Path, machine: str, what: str) -> dict[str, Any]:
     """MACHINE.`what`.json; empty where there is none, or none that can be read."""
-    return _read(home / "fleet" / f"{file_name(machine)}.{what}.json")
+    return read_file(home / "fleet" / f"{file_name(machine)}.{what}.json")
 
 
 def write(home: Path, machine: str, what: str, content: Mapping[str, Any]) -> None:
@@ -75,7 +75,7 @@ def note_run(home: Path, machine: str, began: datetime, ok: bool, summary: str) 
 def schedules(home: Path) -> Iterator[tuple[dict[str, Any], bool]]:
     """Every fleet that was served with this home, and whether a process serves it now."""
     for path in sorted((home / "fleet").glob("*.schedule.json")):
-        kept = _read(path)
+        kept = read_file(path)
         if kept:
             yield kept, _served(path.with_name(path.name.replace(".schedule.json", ".lock")))
 
@@ -91,7 +91,7 @@ def _served(path: Path) -> bool:
 
 
 def _schedule(home: Path, key: str) -> dict[str, Any]:
-    return _read(home / "fleet" / f"{key}.schedule.json")
+    return read_file(home / "fleet" / f"{key}.schedule.json")
 
 
 def _update(home: Path, fleet: Fleet, changes: Mapping[str, Any]) -> None:
@@ -101,7 +101,8 @@ def _update(home: Path, fleet: Fleet, changes: Mapping[str, Any]) -> None:
     write_atomic(folder_of(home) / f"{fleet.key}.schedule.json", json.dumps(content, ensure_ascii=False))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
+    """A file with a JSON object; empty where there is none, or none that can be read."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

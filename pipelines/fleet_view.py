@@ -31,7 +31,7 @@ def fleet_view(home: Path, channels: Sequence[Mapping[str, Any]], now: datetime 
     training), reason, simulated, last_seen and seen_days_ago, expected_S_um, bound90_S_um, newer_S_um (a list),
     newer_S_mean_um, drift (of it to the bound), outside_runs, of_runs, outside_why, sensors, next_run, schedule,
     scheduled (a process serves it now), last_run and last_failure (began, ended, ok, summary), alerts (texts),
-    unknown.
+    rules (theirs), unknown.
     """
     now = now or datetime.now(UTC)
     plans: dict[str, dict[str, Any]] = {}
@@ -55,8 +55,10 @@ def fleet_view(home: Path, channels: Sequence[Mapping[str, Any]], now: datetime 
         for k, state in enumerate(own or [_untrained(name)]):
             found = alerts_of(state, plan["rules"], now)
             alerts += found
-            texts = [a.reason for a in [*found, *(whole if k == 0 else [])]]
-            rows.append(_row(state, plan, run, now) | {"alerts": texts, "machine_alerts": len(whole)})
+            shown = [*found, *(whole if k == 0 else [])]
+            texts, broken = [a.reason for a in shown], [a.rule for a in shown]
+            more = {"alerts": texts, "rules": broken, "machine_alerts": len(whole)}
+            rows.append(_row(state, plan, run, now) | more)
     rows.sort(key=_worst_first)
     order = {r["machine"]: k for k, r in reversed(list(enumerate(rows)))}
     alerts.sort(key=lambda a: order[a.machine])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -575,10 +574,9 @@ def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.Dat
 
 
 def _requirements(family: Family) -> list[str]:
-    torch = ("torch",) if hasattr(sys.modules[type(family).__module__], "torch") else ()
-    if family.has_program():
-        return [f"{p}=={installed(p).partition('+')[0]}" for p in _SERVED_PACKAGES]
-    return [f"{p}=={installed(p).partition('+')[0]}" for p in (*_MODEL_PACKAGES, *torch)]
+    """What a prediction needs; packages that only learning needs (`Family.packages`) are none of it."""
+    packages = _SERVED_PACKAGES if family.has_program() else _MODEL_PACKAGES
+    return [f"{p}=={installed(p).partition('+')[0]}" for p in packages]
 
 
 CHALLENGER = "challenger"

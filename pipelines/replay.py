@@ -245,7 +245,7 @@ class Progress:
         return cls(file, **plain, retrainings=retrainings, runs=runs)
 
     def write(self) -> None:
-        plain = asdict(self) | {"file": None}
+        plain = asdict(self)
         del plain["file"]
         write_atomic(self.file, json.dumps(plain, indent=1, ensure_ascii=False))
 
@@ -386,7 +386,7 @@ def deliver(arrival: Arrival, recording: Recording, machine: Machine, inbox: Pat
         _put(target, b"")
     elif recording.own_file:
         _put(target, recording.file.read_bytes())
-        _beside(recording, machine, target.parent)
+        _deliver_schedule(recording, machine, target.parent)
     else:
         _put(target, _encoded(recording.batch))
 
@@ -411,7 +411,7 @@ def _encoded(batch: Batch) -> bytes:
     return bytes(encode(batch, content_digest(batch)))
 
 
-def _beside(recording: Recording, machine: Machine, folder: Path) -> None:
+def _deliver_schedule(recording: Recording, machine: Machine, folder: Path) -> None:
     """The schedule, which stands next to the recordings."""
     schedule = machine.recording.schedule
     if schedule is not None and (source := recording.file.parent / schedule.file).is_file():

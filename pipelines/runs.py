@@ -174,15 +174,7 @@ def find_experiment(client: MlflowClient, settings: Settings, machine: str, targ
     named = client.get_experiment_by_name(settings.experiment(machine, target))
     if named is not None:
         return named
-    which = " and ".join(
-        f"tags.{key} = '{text}'"
-        for key, text in (("kind", _PROGRAM), ("machine", machine), ("target", _quoted(target)))
-    )
-    return next(iter(client.search_experiments(filter_string=which)), None)
-
-
-def _quoted(text: str) -> str:
-    return text.replace("'", "''")
+    return next(iter(experiments(client, machine=machine, target=target)), None)
 
 
 def _page(experiment: str, machine: str, target: str) -> dict[str, str]:
@@ -296,11 +288,12 @@ def _dataset(batch: DatasetRecord, context: str) -> DatasetInput:
 def experiments(client: MlflowClient, **tags: str | None) -> list[Experiment]:
     """Every experiment of thermodrift, or those with these tags."""
     found, token = [], None
-    wanted = {"kind": _PROGRAM} | {k: v for k, v in tags.items() if v is not None and "'" not in v}
-    which = " and ".join(f"tags.{k} = '{v}'" for k, v in wanted.items())
+    wanted = {"kind": _PROGRAM} | {k: v for k, v in tags.items() if v is not None}
+    # MLflow's language of filters has no way to write a quote.
+    which = " and ".join(f"tags.{k} = '{v}'" for k, v in wanted.items() if "'" not in v)
     while True:
         page = client.search_experiments(filter_string=which, page_token=token)
-        found += page
+        found += [e for e in page if wanted.items() <= e.tags.items()]
         if not (token := page.token):
             return found
 

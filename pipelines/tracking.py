@@ -243,11 +243,7 @@ def trainings(machine: str | None = None, target: str | None = None, settings: S
         runs = finished_runs(client, "training", machine=machine, target=target)
     columns = ["training_id", "machine", "target", "started", "n_batches", "best", "score_um", "simulated",
                "promotion", "model"]  # fmt: skip
-    table = pd.DataFrame([_training_row(r) for r in runs], columns=columns)
-    for column, wanted in (("machine", machine), ("target", target)):
-        if wanted is not None:
-            table = table[table[column] == wanted]
-    return table.reset_index(drop=True)
+    return pd.DataFrame([_training_row(r) for r in runs], columns=columns)
 
 
 def load_training(training_id: str, settings: Settings) -> Training:
@@ -437,11 +433,8 @@ def diagnoses(machine: str | None = None, settings: Settings | None = None) -> p
     settings = settings or load()
     client = open_store(settings)
     with store_errors(settings):
-        runs = finished_runs(client, "diagnosis")
-    table = pd.DataFrame([_diagnosis_row(r) for r in runs], columns=list(DIAGNOSIS_COLUMNS))
-    if machine is not None:
-        table = table[table["machine"] == machine]
-    return table.reset_index(drop=True)
+        runs = finished_runs(client, "diagnosis", machine=machine)
+    return pd.DataFrame([_diagnosis_row(r) for r in runs], columns=list(DIAGNOSIS_COLUMNS))
 
 
 def _diagnosis_metrics(d: Diagnosis) -> dict[str, float]:

@@ -53,23 +53,21 @@ class Champion:
 
 def warm() -> dict[str, Any] | None:
     """The kept status, None where something behind it has changed, or is on a server and may have."""
-    try:
-        kept: dict[str, Any] = json.loads((home() / "fleet" / _STATUS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if kept.get("schema") != SCHEMA or kept["made_from"] is None:
+    kept = _kept()
+    if not kept or kept["made_from"] is None:
         return None
     return kept if kept["made_from"] == _stats(Path(name) for name in kept["made_from"]["files"]) else None
 
 
 def kept_channels() -> list[dict[str, Any]]:
     """The states of all channels as they were last gathered, whether or not they are warm."""
-    try:
-        kept = json.loads((home() / "fleet" / _STATUS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
-    found: list[dict[str, Any]] = kept["channels"] if kept.get("schema") == SCHEMA else []
+    found: list[dict[str, Any]] = _kept().get("channels", [])
     return found
+
+
+def _kept() -> dict[str, Any]:
+    kept = fleet_state.read_file(home() / "fleet" / _STATUS)
+    return kept if kept.get("schema") == SCHEMA else {}
 
 
 def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:

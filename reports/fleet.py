@@ -120,7 +120,6 @@ def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:
     has = r["version"] is not None
     state = "alert" if r["alerts"] else "ok" if has else "none"
     label = count(len(r["alerts"]), "alert") if r["alerts"] else "ok" if has else "no champion"
-    rules = " ".join(r["alerts"])
     newer, bound = r["newer_S_mean_um"], r["bound90_S_um"]
     drifted = newer is not None and bound is not None and newer > bound
     seen = r["last_seen"] or ""
@@ -128,13 +127,13 @@ def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:
         r["machine"], r["channel"], r["simulated"], state, label,
         FleetCell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else FleetCell("none", r["reason"]),
         FleetCell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
-                  "older than a season" in rules),
+                  "old_champion" in r["rules"]),
         FleetCell(*_expected(r)),
         FleetCell(f"{newer:.3g} µm" if newer is not None else "not measured" if has else "",
                   count(len(r["newer_S_um"]), "run") if newer is not None else "", drifted),
         _drift(r),
         FleetCell(f"{r['outside_runs']} of {r['of_runs']}" if r["outside_runs"] is not None else
-                  "not known" if has else "", r["outside_why"], "inputs outside" in rules),
+                  "not known" if has else "", r["outside_why"], "inputs_outside" in r["rules"]),
         FleetCell(", ".join(r["sensors"]) or ("none failed" if r["n_seen"] else ""), "", bool(r["sensors"])),
         FleetCell(*_next(r, now)),
         FleetCell(*_failure(r)),

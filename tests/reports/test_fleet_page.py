@@ -22,13 +22,14 @@ def row_of(machine: str, **more: Any) -> dict[str, Any]:
         "expected_S_um": 2.0, "bound90_S_um": 4.0, "expected_by": "forward", "n_seen": 6, "unknown": "",
         "age_days": 3.2, "seen_days_ago": 24.5, "newer_S_um": [], "newer_S_mean_um": None, "drift": None,
         "outside_runs": 0, "of_runs": 5, "outside_why": "", "sensors": [], "next_run": None, "schedule": "",
-        "scheduled": False, "last_run": None, "last_failure": None, "alerts": [], "machine_alerts": 0, **more,
+        "scheduled": False, "last_run": None, "last_failure": None, "alerts": [], "rules": [],
+        "machine_alerts": 0, **more,
     }  # fmt: skip
 
 
 DRIFTING = row_of(
-    "mill", newer_S_um=[3.0, 9.0], newer_S_mean_um=6.0, drift=1.5, alerts=["error S 6 µm above"], last_run=RUN,
-    last_failure=RUN, next_run="2026-11-30T04:00:00+00:00", schedule="cron 0 5 * * 1", scheduled=True,
+    "mill", newer_S_um=[3.0, 9.0], newer_S_mean_um=6.0, drift=1.5, alerts=["error S 6 µm above"], rules=["error_drift"],
+    last_run=RUN, last_failure=RUN, next_run="2026-11-30T04:00:00+00:00", schedule="cron 0 5 * * 1", scheduled=True,
 )  # fmt: skip
 UNKNOWN = row_of(
     "lathe", version=None, family="", last_seen="", expected_S_um=None, bound90_S_um=None, n_seen=0, age_days=None,

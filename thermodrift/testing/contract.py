@@ -129,6 +129,14 @@ def expect(holds: object, expected: str, got: object) -> None:
         raise ContractError(f"expected {expected}, got {got}")
 
 
+def expect_described(cls: type, base: type, *texts: str) -> None:
+    """Raises ContractError unless a class is a subclass of `base` with these attributes as texts that are not empty."""
+    expect(issubclass(cls, base), f"a subclass of {base.__module__}.{base.__qualname__}", cls)
+    for name in texts:
+        text = getattr(cls, name, None)
+        expect(isinstance(text, str) and text, f"a text {name}", text)
+
+
 def expect_close(got: Any, want: Any, what: str, *, atol: float = 0.0, rtol: float = 0.0) -> None:
     """Raises ContractError unless two arrays agree, NaN with NaN; the message has the largest difference."""
     a, b = np.asarray(got), np.asarray(want)

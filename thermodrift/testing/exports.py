@@ -14,7 +14,7 @@ from compensation.exports.base import AxisModel, Export, Exporter
 from data.batch import Channel
 from data.errors import InputError
 from models.program import Builder
-from thermodrift.testing.contract import Suite, expect
+from thermodrift.testing.contract import Suite, expect, expect_described
 
 DIGEST = "0123456789abcdef" * 4
 
@@ -89,10 +89,7 @@ SUITE: Suite[ExportCase] = Suite()
 
 @SUITE.check("the command line and the documentation show these")
 def says_what_it_is(c: ExportCase) -> None:
-    cls = c.exporter
-    expect(issubclass(cls, Exporter), "a subclass of compensation.exports.base.Exporter", cls)
-    for name in ("key", "summary", "suffix"):
-        expect(getattr(cls, name, None), f"a text {name}", getattr(cls, name, None))
+    expect_described(c.exporter, Exporter, "key", "summary", "suffix")
 
 
 @SUITE.check("a file at a control for years must say which model it is and what it assumes")
@@ -101,10 +98,10 @@ def every_file_states_what_it_is(c: ExportCase) -> None:
     expect(files and all(name.startswith("mill_1") for name in files), "files that begin with mill_1", list(files))
     for name, content in files.items():
         text = content.decode(errors="replace")
-        beside = "".join(b.decode(errors="replace") for n, b in files.items() if Path(n).stem == Path(name).stem)
+        companions = "".join(b.decode(errors="replace") for n, b in files.items() if Path(n).stem == Path(name).stem)
         for stated in ("mill 1", "champion@production", "v7", DIGEST, "2026-01-02T03:04:05Z", "degC", "um", "-error_um",
                        "hold"):  # fmt: skip
-            expect(stated in text or stated in beside, f"{stated!r} in {name}, or in a file of its name", "none")
+            expect(stated in text or stated in companions, f"{stated!r} in {name}, or in a file of its name", "none")
 
 
 @SUITE.check("a model of simulated runs must not reach a real machine unseen")

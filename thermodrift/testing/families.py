@@ -18,7 +18,7 @@ from models.base import Family, family_from_plain
 from models.metrics import residual_std_um
 from models.program import replay
 from thermodrift.testing import runs
-from thermodrift.testing.contract import Suite, expect, expect_close, expect_refused
+from thermodrift.testing.contract import Suite, expect, expect_close, expect_described, expect_refused
 from thermodrift.testing.runs import INPUTS, N
 
 TRAIN = (0, 1, 2, 3)
@@ -77,11 +77,7 @@ SUITE: Suite[FamilyCase] = Suite()
 @SUITE.check("reports and the registry show these; ties between models go to the smaller rank")
 def says_what_it_is(c: FamilyCase) -> None:
     cls = c.family
-    expect(issubclass(cls, Family), "a subclass of models.base.Family", cls)
-    for name in ("key", "summary", "source"):
-        expect(
-            isinstance(getattr(cls, name, None), str) and getattr(cls, name), f"a text {name}", getattr(cls, name, None)
-        )
+    expect_described(cls, Family, "key", "summary", "source")
     expect(isinstance(cls.rank, int) and cls.effort in EFFORTS, "a whole rank and an effort", (cls.rank, cls.effort))
 
 

@@ -34,7 +34,7 @@ N_INTERVALS, STEP_S = 120, 60.0
 
 @dataclass(frozen=True)
 class MechanismCase:
-    """A mechanism with what a suite must be told of it."""
+    """A mechanism with what a suite needs to know of it."""
 
     m: Mechanism
     case: Case
@@ -55,7 +55,7 @@ class MechanismCase:
     @property
     def off(self) -> Point:
         """The point with the mechanism switched off."""
-        return self.point.told(**(self.m.off or {}))
+        return self.point.at(**(self.m.off or {}))
 
     @cached_property
     def without(self) -> Machine:
@@ -190,7 +190,7 @@ def finite_and_of_its_sign_over_the_whole_prior(c: MechanismCase) -> None:
     rng = np.random.default_rng(0)
     for _ in range(50 if c.laws else 0):
         values = {s.name: _draw(parameter("p", s, None), float(s.spread or 0.0), rng) for s in c.m.parameters}
-        drawn = c.point.told(**values)
+        drawn = c.point.at(**values)
         for effect in c.laws:
             got = drawn.effect(effect)
             expect(np.isfinite(got).all(), f"a finite {effect}", f"{got} at {values}")
@@ -222,7 +222,7 @@ def _movable(point: Point) -> dict[str, Callable[[complex], Point]]:
     """By name: the same point with a parameter, a port's temperature or rise, or what a sensor sees moved by a step."""
 
     def parameter_moved(name: str, h: complex) -> Point:
-        return point.told(**{name: point.values[name] + h})
+        return point.at(**{name: point.values[name] + h})
 
     def port_moved(kind: str, port: str, h: complex) -> Point:
         old = getattr(point.view, kind)
@@ -238,8 +238,8 @@ def _movable(point: Point) -> dict[str, Callable[[complex], Point]]:
 def parameter_sets_broadcast_against_time(c: MechanismCase) -> None:
     factors = np.array([1.0, 0.9, 0.8])[:, None]
     for effect in c.laws:
-        together = c.point.told(**{n: v * factors for n, v in c.point.values.items()}).effect(effect)
-        apart = [c.point.told(**{n: v * f for n, v in c.point.values.items()}).effect(effect) for f in factors[:, 0]]
+        together = c.point.at(**{n: v * factors for n, v in c.point.values.items()}).effect(effect)
+        apart = [c.point.at(**{n: v * f for n, v in c.point.values.items()}).effect(effect) for f in factors[:, 0]]
         got = np.broadcast_to(together, (3, len(TIME_S)))
         expect_close(got, np.array(apart), f"{effect} of three parameter sets together and apart", rtol=1e-12)
 
@@ -350,14 +350,14 @@ def switched_off_it_does_nothing(c: MechanismCase) -> None:
     expect(_does_nothing(c.off), f"no effect at {dict(m.off)}", "one")
     expect(not _does_nothing(c.point), "an effect at the usual values", "none")
     for name in m.off:
-        alone = c.off.told(**{name: c.point.values[name]})
+        alone = c.off.at(**{name: c.point.values[name]})
         expect(not _does_nothing(alone), f"an effect with {name} alone switched on, or no {name} in `off`", "none")
 
 
 @SUITE.check("screening takes the derivative at `off`; without one the candidate is never seen")
 def switched_off_every_amplitude_has_a_slope(c: MechanismCase) -> None:
     for name in (c.m.off or {}) if c.laws else ():
-        slopes = [np.imag(c.off.told(**{name: c.off.values[name] + 1e-30j}).effect(e)) / 1e-30 for e in c.laws]
+        slopes = [np.imag(c.off.at(**{name: c.off.values[name] + 1e-30j}).effect(e)) / 1e-30 for e in c.laws]
         expect(all(np.isfinite(s).all() for s in slopes), f"a finite slope by {name} at `off`", slopes)
         seen = c.m.proposable == any(s.any() for s in slopes) or c.case.undriven
         expect(seen, f"a slope by {name} at `off` of a proposable mechanism, and none of another", slopes)
@@ -370,7 +370,7 @@ def shape_changes_more_than_the_size(c: MechanismCase) -> None:
     rising = np.linspace(0.4, 1.0, len(TIME_S))
     point = c.point.seeing(driver={role: d * rising for role, d in c.point.view.driver.items()})
     for name in c.m.shape:
-        other = point.told(**{name: 0.75 * point.values[name] + 0.01})
+        other = point.at(**{name: 0.75 * point.values[name] + 0.01})
         changed = any(not np.allclose(_form(c, point, e), _form(c, other, e), rtol=1e-6, atol=1e-6) for e in c.laws)
         expect(changed, f"another form over time with another {name}", "the same form")
 

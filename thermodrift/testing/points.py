@@ -28,7 +28,7 @@ Formula = Callable[[SimpleNamespace], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """What a suite must be told of a mechanism.
+    """What a suite needs to know of a mechanism.
 
     Attributes:
         formula: its equation over quantities with units: `q.area`, `q.speed` in the unit of the Spec or driver,
@@ -72,7 +72,7 @@ class Point:
         rise = {port: course - course[0] for port, course in courses.items()}
         driver = {role: np.full(TIME_S.shape, DRIVER[unit]) for role, unit in mechanism.drivers.items()}
         view = View(courses, rise, driver, TIME_S, STARTS_AT_H + hours, float(TIME_S[1]))
-        values = {s.name: np.array(_beside(s)) for s in mechanism.parameters}
+        values = {s.name: np.array(_near_usual(s)) for s in mechanism.parameters}
         values |= {name: np.array(v) for name, v in case.values.items()}
         return cls(mechanism, view, SEEN_DEGC + SLOPE_K_PER_S * TIME_S, values)
 
@@ -82,7 +82,7 @@ class Point:
         out = law(self.seen, self.view, self.values) if name == "reading" else law(self.view, self.values)
         return np.asarray(out) + np.zeros(TIME_S.shape)
 
-    def told(self, **values: Any) -> Point:
+    def at(self, **values: Any) -> Point:
         """With other parameter values."""
         return replace(self, values={**self.values, **{k: np.asarray(v) for k, v in values.items()}})
 
@@ -122,8 +122,8 @@ def _quantity(number: Numeric, unit: str) -> Any:
     return U.Quantity(number, "dimensionless" if unit == "1" else unit)
 
 
-def _beside(spec: Spec) -> float:
-    """A value beside the usual one, within the bounds."""
+def _near_usual(spec: Spec) -> float:
+    """A value near the usual one, within the bounds."""
     assert spec.value is not None and spec.spread is not None
     if spec.scale == "linear":
         return min(spec.value + 0.4 * spec.spread, spec.high)

@@ -13,7 +13,7 @@ from data.batch import Batch, Channel
 from data.registry import EFFORTS
 from features.design import Design
 from features.selectors.base import Selector
-from thermodrift.testing.contract import Suite, expect, expect_refused
+from thermodrift.testing.contract import Suite, expect, expect_described, expect_refused
 from thermodrift.testing.runs import LENGTHS, P, stack, year
 
 TRAIN = (0, 1, 3)
@@ -62,11 +62,7 @@ SUITE: Suite[SelectorCase] = Suite()
 @SUITE.check("reports and the command line show these")
 def says_what_it_is(c: SelectorCase) -> None:
     cls = c.selector
-    expect(issubclass(cls, Selector), "a subclass of features.selectors.base.Selector", cls)
-    for name in ("key", "summary", "source"):
-        expect(
-            isinstance(getattr(cls, name, None), str) and getattr(cls, name), f"a text {name}", getattr(cls, name, None)
-        )
+    expect_described(cls, Selector, "key", "summary", "source")
     expect(cls.effort in EFFORTS, f"an effort of {EFFORTS}", cls.effort)
 
 
