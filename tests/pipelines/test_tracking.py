@@ -101,6 +101,15 @@ def test_an_experiment_follows_the_settings_and_keeps_the_note_of_a_user(store):
     assert runs.find_experiment(client, slash, "toy-renamed", "z").experiment_id == first
 
 
+def test_an_experiment_is_found_by_what_it_is_of_also_where_that_has_a_quote(store) -> None:
+    client = tracking.open_store(store)
+    ids = {t: runs.experiment_id(client, store, "toy-quoted", t, True) for t in ("z'", "z")}
+    renamed = replace(store, names=NamesPart(experiment="{machine} by {target}"))
+    for target, own in ids.items():
+        found = runs.find_experiment(client, renamed, "toy-quoted", target)
+        assert found is not None and found.experiment_id == own
+
+
 def test_a_run_says_who_made_it_with_which_program_and_in_which_process(logged, monkeypatch):
     settings, training_id, _ = logged
     tags = MlflowClient(settings.store_uri, registry_uri=settings.store_uri).get_run(training_id).data.tags
