@@ -89,10 +89,10 @@ def main(what: str) -> None:
 
     configure_environment()
     text = sys.stdin.readline()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if what == "check":
         sys.stdout.write(json.dumps(check(Fleet.from_json(text))) + "\n")
         return
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     job = json.loads(text)
     machine = FleetMachine.from_plain(job["machine"])
     outcome = run(machine, job["flow_run_id"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -21,7 +22,7 @@ from pipelines import fleet_state
 from pipelines.caller import Say
 from pipelines.fleet import Fleet
 from pipelines.folders import Folders
-from pipelines.scheduling import APART, Clock, Scheduler
+from pipelines.scheduling import Clock, Scheduler, started_apart
 
 
 def local_timezone() -> str:
@@ -38,12 +39,11 @@ def checked(fleet: Fleet, say: Say) -> tuple[Fleet, dict[str, Any]]:
         InputError: a line for every machine file, channel or family that cannot be used.
         WorkError: the process of the check fails.
     """
-    process = subprocess.Popen(
-        (*APART, "check"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
-    )  # fmt: skip
-    with ending(process.kill):
-        out, error = process.communicate(fleet.as_json() + "\n")
+    process = started_apart("check", fleet.as_json(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None
+    kept_open, process.stdin = process.stdin, None  # else `communicate` closes it, which ends the process
+    with ending(process.kill), contextlib.closing(kept_open):
+        out, error = process.communicate()
     if process.returncode:
         raise WorkError(f"the check of {fleet.source} failed: {(error.strip() or '?').splitlines()[-1]}")
     found = json.loads(out.splitlines()[-1])

@@ -31,6 +31,19 @@ APART = (sys.executable, "-m", "pipelines.apart")
 END_S = 2.5  # for a run to end after SIGTERM; an operator waits 5 s for all of it
 
 
+def started_apart(what: str, line: str, **streams: Any) -> subprocess.Popen[str]:
+    """The process of `pipelines.apart` that does `what` with a line of JSON.
+
+    Its standard input stays open: it ends when that closes, at the latest with this process.
+    """
+    process = subprocess.Popen((*APART, what), stdin=subprocess.PIPE, text=True, start_new_session=True, **streams)
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(line + "\n")
+        process.stdin.flush()
+    return process
+
+
 @dataclass(frozen=True)
 class Job:
     """A machine whose turn has come; `flow_run_id` where a server scheduled it."""
@@ -182,15 +195,8 @@ class Scheduler:
         result, log = (folder / f"{fleet_state.file_name(machine.name)}{suffix}" for suffix in (".result", ".log"))
         result.unlink(missing_ok=True)
         with log.open("w", encoding="utf-8") as out:
-            process = subprocess.Popen(
-                (*APART, "run"), stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True,
-                start_new_session=True,
-            )  # fmt: skip
-        assert process.stdin is not None
-        line = {"machine": machine.as_plain(), "flow_run_id": job.flow_run_id, "result": str(result)}
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(json.dumps(line) + "\n")
-            process.stdin.flush()  # it stays open: the run ends with this process
+            line = {"machine": machine.as_plain(), "flow_run_id": job.flow_run_id, "result": str(result)}
+            process = started_apart("run", json.dumps(line), stdout=out, stderr=subprocess.STDOUT)
         return Run(job, process, result, log, now)
 
     def _end(self, run: Run) -> None:

@@ -37,7 +37,7 @@ NAME, TARGET, BATCHES = "killed", "z", 7
 MODEL = f"{NAME}-{TARGET}"
 FAMILIES = ("zero", "mlr")
 WAIT_S = 600.0  # for a command on a busy computer
-ORPHANS_S = 60.0  # for workers, servers and the check of a fleet to end without their parent, on a busy computer
+ORPHANS_S = 15.0  # for workers, servers and the processes of a fleet to end without their parent, on a busy computer
 SAME = 1e-9  # relative difference of numbers that are the same
 
 

@@ -26,6 +26,7 @@ from tests.toys.small_year import write_machine
 ROOT = Path(__file__).parents[2]
 MONDAY = datetime(2026, 11, 30, 5, 0, tzinfo=UTC)
 WEEK = timedelta(days=7)
+APART = scheduling.APART  # of the program
 # A run that does what its machine's name says.
 TOY = """
 import json, os, signal, subprocess, sys, time
@@ -183,6 +184,21 @@ def _lives(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+@pytest.mark.parametrize("what", ["check", "run"])
+def test_a_process_of_a_fleet_ends_with_the_one_that_started_it(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    monkeypatch.setattr(scheduling, "APART", APART)
+    fleet = fleet_of("lathe")
+    job = {"machine": fleet.machines[0].as_plain(), "flow_run_id": None, "result": "/m/result"}
+    line = fleet.as_json() if what == "check" else json.dumps(job)
+    process = scheduling.started_apart(what, line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        assert process.stdin is not None
+        process.stdin.close()  # as the end of the process that started it does
+        assert process.wait(60) == 128 + signal.SIGTERM
+    finally:
+        process.kill()
 
 
 def test_turns_and_next_dates_are_kept(tmp_path: Path, said: list[str]) -> None:
