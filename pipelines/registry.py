@@ -41,7 +41,7 @@ from models.trust import Region, fit_siblings
 from models.updating import Updater, out_of_fold
 from pipelines import audit, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
-from pipelines.runs import close_interrupted, code_version, registered_models
+from pipelines.runs import close_interrupted, code_version, model_versions, registered_models, versions_by_model
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
@@ -141,7 +141,7 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
     with _locked(name, settings):
         close_interrupted(client)
         champion, fingerprint = _by_alias(client, name, CHAMPION), new.fingerprint
-        same = [v for v in versions_of(client, name) if v.tags.get("fingerprint") == fingerprint]
+        same = [v for v in model_versions(client, name) if v.tags.get("fingerprint") == fingerprint]
         begun = next((v for v in same if _is_unfinished(client, v, new.training_id)), None)
         done = [v for v in same if OUTCOME in v.tags]
         if begun is None and done and (champion is not None or force or not new.choice.trusted):
@@ -309,10 +309,12 @@ def status(settings: Settings) -> pd.DataFrame:
                "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
-        for model in registered_models(client):
+        models = list(registered_models(client))
+        versions = versions_by_model(client)  # read after the models: a champion is among them
+        for model in models:
             log = audit.read(model)
             ends = audit.latest_ends(log.reigns, log.champion)
-            for v in versions_of(client, model.name):
+            for v in versions[model.name]:
                 tags, until = v.tags, ends.get(int(v.version))
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))
                 rows.append({
@@ -352,7 +354,7 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     model = find_model(client, name)
     if which in model.aliases:
         return client.get_model_version_by_alias(name, which)
-    versions = {str(v.version): v for v in versions_of(client, name)}
+    versions = {str(v.version): v for v in model_versions(client, name)}
     if which == CHAMPION and versions:
         newest = next(iter(versions.values()))
         raise InputError(
@@ -427,12 +429,6 @@ def _crown(client: MlflowClient, name: str, version: str, why: str, training_id:
     )  # fmt: skip
     if CHALLENGER in client.get_registered_model(name).aliases:  # it lost to an older champion
         client.delete_registered_model_alias(name, CHALLENGER)
-
-
-def versions_of(client: MlflowClient, name: str) -> list[ModelVersion]:
-    quoted = name.replace("'", "''")
-    found = client.search_model_versions(f"name = '{quoted}'", max_results=10_000)
-    return sorted(found, key=lambda v: -int(v.version))
 
 
 def _by_alias(client: MlflowClient, name: str, alias: str) -> ModelVersion | None:

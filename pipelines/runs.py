@@ -13,6 +13,7 @@ import platform
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cache
@@ -23,7 +24,7 @@ from urllib.parse import quote
 import pandas as pd
 import psutil
 from mlflow.entities import Dataset, DatasetInput, Experiment, InputTag, Metric, Param, Run, RunStatus, RunTag
-from mlflow.entities.model_registry import RegisteredModel
+from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.tracking import MlflowClient
 from pydantic import BaseModel, ConfigDict
 
@@ -306,6 +307,25 @@ def registered_models(client: MlflowClient) -> Iterator[RegisteredModel]:
         yield from page
         if not (token := page.token):
             return
+
+
+def model_versions(client: MlflowClient, name: str | None = None) -> list[ModelVersion]:
+    """Every version in the registry, or those of one model, the newest of a model first."""
+    which = f"name = '{name}'" if name is not None and "'" not in name else None  # a filter cannot write a quote
+    found, token = [], None
+    while True:
+        page = client.search_model_versions(which, max_results=10_000, page_token=token)
+        found += [v for v in page if name in (None, v.name)]
+        if not (token := page.token):
+            return sorted(found, key=lambda v: -int(v.version))
+
+
+def versions_by_model(client: MlflowClient) -> dict[str, list[ModelVersion]]:
+    """Every version by the model's name, the newest first; in one query, where there are many models."""
+    found: dict[str, list[ModelVersion]] = defaultdict(list)
+    for v in model_versions(client):
+        found[v.name].append(v)
+    return found
 
 
 def _runs(client: MlflowClient, which: str, **tags: str | None) -> Iterator[Run]:

@@ -231,6 +231,7 @@ def _corrections(file: Path) -> dict[str, Any]:
 
 def _store_facts(home: Path) -> dict[str, Any]:
     from pipelines import audit, model_store, registry, settings, tracking
+    from pipelines.runs import model_versions
 
     configured = settings.load()
     client = tracking.open_store(configured)
@@ -248,7 +249,7 @@ def _store_facts(home: Path) -> dict[str, Any]:
     if MODEL not in models:
         return out | {"champion": None, "logged": None}
     log = audit.read(models[MODEL])
-    out["versions"] = {v.version: v.tags.get("outcome", "") for v in registry.versions_of(client, MODEL)}
+    out["versions"] = {v.version: v.tags.get("outcome", "") for v in model_versions(client, MODEL)}
     out |= {"champion": log.champion, "logged": log.reigns[-1].version if log.reigns else None}
     out["noted"] = [r.note for r in log.reigns if r.note]
     shown = registry.status(configured)

@@ -84,10 +84,10 @@ def overview(client: MlflowClient, logs: Sequence[Log]) -> pd.DataFrame:
     """Every model: model, machine, target, champion (version), since (UTC), action, who, why, versions, note."""
     import pandas as pd
 
-    from pipelines.registry import versions_of
+    from pipelines.runs import versions_by_model
 
     columns = ["model", "machine", "target", "champion", "since", "action", "who", "why", "versions", "note"]
-    rows = []
+    rows, versions = [], versions_by_model(client)
     for log in logs:
         reign = log.reigns[-1] if log.reigns and log.reigns[-1].version == log.champion else None
         note = log.reigns[-1].note if log.reigns else log.silence()
@@ -95,7 +95,7 @@ def overview(client: MlflowClient, logs: Sequence[Log]) -> pd.DataFrame:
         rows.append({
             "model": log.model, "machine": log.machine, "target": log.target, "champion": log.champion,
             "since": entry and entry.when, "action": entry.action if entry else "", "who": entry.who if entry else "",
-            "why": entry.why if entry else "", "versions": len(versions_of(client, log.model)), "note": note,
+            "why": entry.why if entry else "", "versions": len(versions[log.model]), "note": note,
         })  # fmt: skip
     return _typed(pd.DataFrame(rows, columns=columns))
 

@@ -101,6 +101,17 @@ def test_an_experiment_follows_the_settings_and_keeps_the_note_of_a_user(store):
     assert runs.find_experiment(client, slash, "toy-renamed", "z").experiment_id == first
 
 
+def test_versions_of_a_model_are_found_also_where_its_name_has_a_quote(store) -> None:
+    client = tracking.open_store(store)
+    for name in ("quoted-z'", "quoted-z"):
+        client.create_registered_model(name)
+        for _ in range(2):
+            client.create_model_version(name, "/somewhere")
+    assert [int(v.version) for v in runs.model_versions(client, "quoted-z'")] == [2, 1]
+    found = runs.versions_by_model(client)
+    assert [int(v.version) for v in found["quoted-z'"]] == [int(v.version) for v in found["quoted-z"]] == [2, 1]
+
+
 def test_an_experiment_is_found_by_what_it_is_of_also_where_that_has_a_quote(store) -> None:
     client = tracking.open_store(store)
     ids = {t: runs.experiment_id(client, store, "toy-quoted", t, True) for t in ("z'", "z")}
