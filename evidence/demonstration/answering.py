@@ -1,9 +1,9 @@
-"""The process that answers a demonstration: it confines itself, diagnoses what lies in its place, and writes there.
+"""The process that answers a demonstration: it confines itself, diagnoses its case, and writes the answer.
 
-Started by `evidence.demonstration.demonstrating` with its task as JSON on standard input. Its place holds `case`
+Started by `evidence.demonstration.demonstrating` with its task as JSON on standard input. Its folder holds `case`
 (machine file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
 Progress goes to standard output, a line of JSON each. Only the standard library and names of packages are imported
-before the walls stand.
+before the process is confined.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ OWN = ("__init__.py", "answering.py", "plain.py")
 
 
 def visible(place: Path, import_from: list[Path]) -> Allowed:
-    """What an answer to a proof may see, and the files of this process itself."""
+    """What an answering process of a proof may read, and the files of this process."""
     base, here = allowed(place, import_from), own_source()[0] / "evidence" / "demonstration"
     return replace(base, read=(*base.read, *(here / name for name in OWN)), listed=(*base.listed, here))
 
 
 def main() -> None:
-    """Answer; `status.json` states which protection held, and what went wrong."""
+    """Answer the case; `status.json` states which protection holds, and any error."""
     task = json.loads(sys.stdin.read())
     place = Path(task["place"])
     import_from = [Path(p) for p in task["import_from"]]
@@ -37,7 +37,7 @@ def main() -> None:
     sys.path[:0] = task["import_from"]
     try:
         (place / "answer" / DIAGNOSIS).write_text(_answer(place, task), encoding="utf-8")
-    except Exception as error:  # whatever it is, it is the answer
+    except Exception as error:  # any error is the answer
         message = " ".join(str(error).split())
         ours = type(error).__name__ in ("InputError", "WorkError")
         status["error"] = message if ours else f"{type(error).__name__}: {message}"

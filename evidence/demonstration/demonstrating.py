@@ -1,7 +1,7 @@
-"""The demonstration: conceal and seal, have it answered by a process that sees no answer, open, and judge.
+"""The demonstration: conceal an effect, seal it, diagnose it in an isolated process, open the seal, and score.
 
-The case's folder (machine file, recordings) is all that the answering process sees; both walls of
-`evidence.proof.sealing.isolation` stand around it. What is concealed is committed to beforehand by a salted SHA-256.
+The case's folder (machine file, recordings) is all that the answering process can read
+(`evidence.proof.sealing.isolation`). A salted SHA-256 commits to the concealed effect beforehand.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Answerer:
 
 @dataclass(frozen=True)
 class Seal:
-    """What was committed to before the diagnosis began: SHA-256 over salt ‖ answer, of the case, and when (UTC)."""
+    """The commitment made before the diagnosis begins: SHA-256 over salt ‖ answer, of the case, and when (UTC)."""
 
     digest: str
     case_digest: str
@@ -68,7 +68,7 @@ class Seal:
 class Judgement:
     """`outcome` as the page names it, in `reports.diagnosis.first_screen`.
 
-    `finding` is the one that counts for what was concealed, None where none does; `false` are claims that are not true.
+    `finding` is the finding that matches the concealed effect, None without a match; `false` are the false claims.
     """
 
     outcome: Outcome
@@ -77,7 +77,7 @@ class Judgement:
 
     @property
     def right(self) -> bool:
-        """Whether the answer is right as a whole: all of what was concealed, and nothing else."""
+        """Whether the answer is entirely right: everything concealed is found, and nothing else."""
         return self.outcome in RIGHT
 
 
@@ -103,18 +103,18 @@ def demonstrate(
     effect: str | None = None,
     by: Answerer | None = None,
 ) -> Demonstration:
-    """Conceal what the seed draws, seal it, have it diagnosed without the answer, open it, and write the page.
+    """Conceal what the seed draws, seal it, diagnose it without the key, open the seal, and write the page.
 
     An earlier demonstration in `out` is replaced.
 
     Args:
-        say: gets a line when the seal is on disk, when it was answered, and when it was opened.
+        say: receives a line when the seal is on disk, when the answer is there, and when the seal is opened.
         done: progress of the diagnosis, (step, n, of).
         effect: a key of `plants.sample.concealed.EFFECTS` or "nothing", instead of what the seed draws.
 
     Raises:
         InputError: a seed, effect or folder that cannot be used.
-        WorkError: the diagnosis failed, or its process did not start; what was concealed stays sealed.
+        WorkError: the diagnosis failed, or its process did not start; the effect stays sealed.
     """
     by = by or Answerer()
     case = conceal(seed, effect)
@@ -138,7 +138,8 @@ def demonstrate(
 
 
 def answered(case: Path, machine: Machine, by: Answerer, done: Done | None = None) -> tuple[Diagnosis, str]:
-    """The diagnosis of the case in a folder by a process that sees a copy of it and nothing else; which walls stood.
+    """The diagnosis of the case in a folder by a process that can read a copy of it and nothing else; with it the
+    protection that held.
 
     Raises:
         WorkError: the process did not start, failed, or did not end in time.
@@ -147,7 +148,7 @@ def answered(case: Path, machine: Machine, by: Answerer, done: Done | None = Non
         place = Path(scratch).resolve()
         if (seen := allowed().covers(place)) is not None:
             raise InputError(
-                f"TMPDIR {place}: lies in {seen}, which the answering process may see; give another TMPDIR"
+                f"TMPDIR {place}: lies in {seen}, which the answering process may read; give another TMPDIR"
             )
         lay_out(case, place)
         ended = _run(place, by, done)
@@ -159,7 +160,7 @@ def answered(case: Path, machine: Machine, by: Answerer, done: Done | None = Non
 
 
 def judged(diagnosis: Diagnosis, answer: Mapping[str, Any], machine: Machine) -> Judgement:
-    """The answer by the rules of the proof: the mechanism, at the place or one that touches it; all else is false."""
+    """Score by the rules of the proof: right is the mechanism at its place or an adjacent one; all else is false."""
     f = diagnosis.findings
     sensors = (machine.twin or {}).get("sensors", {})
     key = AnswerKey.from_json(
@@ -192,7 +193,7 @@ def judged(diagnosis: Diagnosis, answer: Mapping[str, Any], machine: Machine) ->
 def unsealed(
     answer: Mapping[str, Any], d: Diagnosis, judgement: Judgement, seal: Seal, seed: int, isolation: str
 ) -> Unsealed:
-    """The panel on top of the page: what was concealed, what was named, how it was sealed."""
+    """The panel on top of the page: concealed effect, named effect, seal."""
     first = judgement.finding or next(iter(d.findings.findings), None)
     return Unsealed(
         outcome=judgement.outcome,
@@ -208,7 +209,7 @@ def unsealed(
 
 
 def _sealed(case: Case, salt: str, out: Path) -> Seal:
-    """Commit to the answer; it is on disk when this returns, and the answer itself is not."""
+    """Commit to the key. The commitment is on disk when this returns, the key is not."""
     seal = Seal(salted_digest(salt, case.answer), folder_digest(out / CASE), now())
     how = "SHA-256 over salt, then the answer as JSON with sorted keys and no blanks; opened.json has both"
     plain = {"digest": seal.digest, "case": seal.case_digest, "sealed": seal.at, "how": how}
@@ -217,7 +218,7 @@ def _sealed(case: Case, salt: str, out: Path) -> Seal:
 
 
 def _emptied(out: Path) -> None:
-    """Make the folder, and take away what an earlier demonstration left there.
+    """Make the folder and remove the files of an earlier demonstration.
 
     Raises:
         InputError: it cannot be written, or holds a case of something else.
@@ -240,7 +241,7 @@ def _written(out: Path, d: Diagnosis, panel: Unsealed) -> dict[str, Path]:
 
 
 def _run(place: Path, by: Answerer, done: Done | None) -> str:
-    """Run the process to its end; why there may be no answer."""
+    """Run the process to its end; returns the reason if there is no answer."""
     task = {"place": str(place), "diagnose": by.diagnose, "import_from": by.import_from}
     command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
     with (place / "output").open("wb") as errors:
@@ -254,7 +255,7 @@ def _run(place: Path, by: Answerer, done: Done | None) -> str:
         try:
             with ending(process.kill):
                 assert process.stdin is not None and process.stdout is not None
-                with suppress(BrokenPipeError):  # it has ended already, and its output says why
+                with suppress(BrokenPipeError):  # it has ended; its output states the reason
                     process.stdin.write(json.dumps(task).encode())
                     process.stdin.close()
                 for line in process.stdout:
@@ -272,7 +273,7 @@ def _run(place: Path, by: Answerer, done: Done | None) -> str:
 
 
 def _relay(line: bytes, done: Done | None) -> None:
-    """Hand a line of progress on; whatever else is printed is no progress."""
+    """Forward a line of progress; other output is ignored."""
     try:
         step, n, of = json.loads(line)
     except (ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""A diagnosis as plain data, so that a confined process can hand it over: all that a page shows, in one JSON text."""
+"""A diagnosis as plain data that a confined process can return: all that a page shows, as one JSON text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from twin.schema import TwinPart
 def plain_text(d: Diagnosis) -> str:
     """The findings, the network before and after, the plan of the next run and every table; numbers to the last digit.
 
-    What only the machine file is written from (fitted values, intervals) stays behind.
+    Values that only the machine file needs (fitted values, intervals) are left out.
     """
     value = {
         "findings": d.findings.model_dump(mode="json", by_alias=True),

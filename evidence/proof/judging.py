@@ -1,4 +1,4 @@
-"""What scoring needs of each case once the key is open: the stored answer and the true model."""
+"""What scoring needs of each opened case: the stored answer and the true model."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 
 def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Examinee | None = None) -> Findings | None:
-    """Findings of the case with one more recording; None where the run cannot be done or the diagnosis fails.
+    """Findings with the proposed run among the recordings; None where the run is impossible or the diagnosis fails.
 
-    What the same source answered before is read from the folder `kept`. The answering process sees as little as before.
+    Earlier answers of the same source are read from the folder `kept`. The answering process is confined as before.
     """
     source = source_digest()
     if not (kept / RUN).exists() or read_json(kept / RUN)["source_digest"] != source:
@@ -42,7 +42,7 @@ def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Exam
             shutil.copytree(case, more)
             try:
                 _add(more, plan, key)
-            except InputError:  # a plan that this plant cannot do settles nothing
+            except InputError:  # a plan that this plant cannot run separates nothing
                 return None
             files = examine(more, by or Examinee(baselines=None), source)
         shutil.rmtree(kept, ignore_errors=True)
@@ -70,7 +70,7 @@ def _add(case: Path, plan: str, key: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Judged:
-    """One case: what was stored, and its true model or why there is none."""
+    """One case: the stored answer, and its true model or the reason why there is none."""
 
     stored: Stored
     truth: TrueModel | None
@@ -78,7 +78,7 @@ class Judged:
 
 
 def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | None = None) -> dict[str, Judged]:
-    """Every case that counts. True models take seconds each and are kept in PROOF/judged for the next opening.
+    """Every case that counts. True models take seconds each and are stored in PROOF/judged for the next opening.
 
     Raises:
         WorkError: the folder cannot be written.
@@ -105,9 +105,9 @@ def _judged(tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[tuple[st
 
 
 def judge(case: Path, answer: Path, kept: Path, again: Path, key: Mapping[str, Any], source: str) -> Judged:
-    """One case; its true model is read from the file `kept` where the same source worked it out.
+    """One case; its true model is read from the file `kept` if the same source computed it.
 
-    `again` is the folder that keeps what was found once the proposed run had been done.
+    `again` is the folder with the findings after the proposed run.
     """
     from evidence.proof.scoring.answer_key import read_stored
 
@@ -150,7 +150,7 @@ def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch
 
 
 def plain_json(value: Any) -> Any:
-    """As JSON has it: what is no number is null."""
+    """As in JSON: NaN becomes null."""
     if isinstance(value, dict):
         return {k: plain_json(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -174,6 +174,6 @@ def truth_from_json(plain: Mapping[str, Any] | None) -> TrueModel | None:
 
 
 def scoring_source() -> str:
-    """Digest of all that an answer is judged with."""
+    """Digest of the source that scores an answer."""
     root, _ = own_source()
     return files_digest(root, sorted(f for part in ("data", "twin") for f in (root / part).rglob("*.py")))

@@ -1,4 +1,4 @@
-"""`thermodrift prove`: seal a suite of concealed cases, have them answered apart, open and score them."""
+"""`thermodrift prove`: seal a suite of concealed cases, answer them in isolation, open and score them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from evidence.proof.spec import CENTRES, PLANT_KINDS, REAL, CaseSpec, PlantKind
 Which = Literal["development", "sealed"]
 SUITES: tuple[Which, ...] = get_args(Which)
 SECRET_BYTES = 32
-SEED_BITS = 63  # of a development suite that nobody gave a seed
+SEED_BITS = 63  # of a development suite without a given seed
 
 
 @dataclass(frozen=True)
 class ProofRequest:
-    """What to prove: `cases` of simulated plants, and every case that real recordings in `data` give.
+    """The requested proof: `cases` of simulated plants, and every case that the real recordings in `data` provide.
 
     `seed` None: a secret for a sealed suite, a drawn number that is reported for a development one.
     """
@@ -59,7 +59,7 @@ def drawn(request: ProofRequest) -> Suite:
 
 
 def specs_of(request: ProofRequest, seed: bytes | int) -> list[CaseSpec]:
-    """Cases of simulated plants first, then every case that the real recordings give.
+    """Cases of simulated plants first, then every case of the real recordings.
 
     Raises:
         InputError: real recordings requested and none there.
@@ -80,7 +80,7 @@ def specs_of(request: ProofRequest, seed: bytes | int) -> list[CaseSpec]:
 
 
 def make_case(spec: CaseSpec, folder: Path, data: Path | None = None) -> dict[str, Any]:
-    """Build a case into a folder; gives its answer."""
+    """Build a case in a folder; returns its key."""
     from evidence.proof.suite import build, write_built
 
     built = build(spec, data)
@@ -95,7 +95,7 @@ WRITTEN = ("outcomes", "terms", "missed", "claims", "goals", "compared", "leak",
 
 @dataclass(frozen=True)
 class ProofOutcome:
-    """An opened proof: the run as its page shows it, and the files that were written."""
+    """An opened proof: the run as its page shows it, and the written files."""
 
     run: ProofRun
     files: dict[str, Path] = field(default_factory=dict)
@@ -113,7 +113,7 @@ def seal_proof(request: ProofRequest, workers: int, done: Done | None = None) ->
 def run_proof(
     out: Path, workers: int, restart: bool = False, by: Examinee | None = None, done: Done | None = None
 ) -> RunOutcome:
-    """Have every case answered that has no answer yet.
+    """Answer every case that has no answer yet.
 
     Raises:
         InputError, WorkError: as `evidence.proof.sealing.running.run`.
@@ -128,7 +128,7 @@ def open_proof(
     """Check everything, reveal the key, score, and write tables and page.
 
     Args:
-        deals: how often answers are dealt anew for the leak test; 0 leaves it out.
+        deals: number of permutations in the leak test; 0 omits the test.
 
     Raises:
         InputError: not sealed, not run, incomplete, or not as it was recorded; WorkError: it cannot be written.
@@ -173,7 +173,7 @@ def prove(
     request: ProofRequest, workers: int, by: Examinee | None = None, deals: int = 100,
     say: Say = lambda text: None, done: Done | None = None,
 ) -> ProofOutcome:  # fmt: skip
-    """Seal, run and open; what was done already, by the folder's ledger, is not done again.
+    """Seal, run and open; steps that the ledger of the folder records as done are not repeated.
 
     Raises:
         InputError: the folder holds a proof of another number of cases or suite; the rest as of the three steps.

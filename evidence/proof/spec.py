@@ -39,7 +39,7 @@ class CaseSpec:
     input or effect withheld).
     """
 
-    name: str  # reveals nothing: case_0001 in an order drawn by lot
+    name: str  # reveals nothing: case_0001, in random order
     kind: Kind
     plant: PlantKind
     seed: int

@@ -1,4 +1,4 @@
-"""The tables of an opened proof: what its page shows and what is written next to it."""
+"""The tables of an opened proof, for its page and as files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OF_CASES = ("started", "answered", "interrupted", "void")  # steps of the ledger
 def tables_of(
     folder: ProofFolder, opened: Opened, judged: Mapping[str, Judged], leak: pd.DataFrame
 ) -> dict[str, pd.DataFrame]:
-    """Every table that the stored answers and the key give, by its name on the page."""
+    """Every table derived from stored answers and keys, by its name on the page."""
     keys = {name: opened.answers[name] for name in judged}
     stored = {name: j.stored for name, j in judged.items()}
     truths = {n: j.truth for n, j in judged.items() if j.truth is not None}
@@ -49,7 +49,7 @@ def tables_of(
 
 
 def proof_run(opened: Opened, judged: Mapping[str, Judged], tables: Mapping[str, pd.DataFrame]) -> ProofRun:
-    """All that the page of the proof is made from."""
+    """The input of the page of the proof."""
     c = opened.commitment
     runs = {name: j.stored.run for name, j in judged.items()}
     return ProofRun(

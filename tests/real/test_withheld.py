@@ -1,4 +1,4 @@
-"""Plant D: what is kept back of a machine file is gone from it, can be proposed, and has the size that is claimed."""
+"""Plant D: what is withheld from a machine file is gone from it, can be proposed, and has the size that is claimed."""
 
 from __future__ import annotations
 

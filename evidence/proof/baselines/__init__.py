@@ -1,4 +1,4 @@
-"""Baselines and ablations: plain methods, and the diagnosis with one of its rules taken out, on the same fits."""
+"""Baselines and ablations: standard methods, and the diagnosis with one rule removed, on the same fits."""
 
 from evidence.proof.baselines.evaluate import replies
 

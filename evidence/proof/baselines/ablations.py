@@ -1,8 +1,8 @@
-"""The diagnosis with one of its rules taken out, at the round in which it first decides about physics.
+"""The diagnosis with one rule removed, in the round that first decides about physics.
 
 Every ablation runs the code of the diagnosis with a changed `Policy`, on the fits and the refits of that round. A finer
-network that is accepted counts as no claim, as in a diagnosis, where it is a refinement; so an ablation is not blamed
-for what refinements would have caught.
+network that is accepted counts as no claim, as in a diagnosis, where it is a refinement; so that an ablation is not
+charged for what a refinement would find.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from diagnosis.search.refits import common_memory, compared, judged, optimised, 
 from diagnosis.search.search import Search
 from evidence.proof.baselines.base import MIN_ALIKE_SHARE, Claim, Reply, claimable, without_nuisances
 
-MAX_REFITS = 10  # of the round: what gains less would not come first by any other count
+MAX_REFITS = 10  # of the round: a smaller gain ranks first under no other count
 UNPROJECTED_REFITS = 4  # of a screen without projection, each of another mechanism
 
 
 @dataclass(frozen=True)
 class Stage:
-    """The first round that named no finer network, or the last; `findings` are of the whole diagnosis, if there are."""
+    """The first round that named no finer network, or the last; `findings` are those of the whole diagnosis."""
 
     done: Search
     findings: Findings | None = None
@@ -53,7 +53,7 @@ class Stage:
 
     @cached_property
     def refits(self) -> tuple[Tried, ...]:
-        """Its best full refits; one that was exchanged in a fit with later effects is refitted as it was here."""
+        """Its best full refits; one that a later fit exchanged is refitted in the form that it has here."""
         now, out = self.round.before, []
         for t in [t for t in self.round.tried if t.fitted is not None][:MAX_REFITS]:
             again = refit(now, t.scored) if self._exchanged(t) else t
@@ -63,14 +63,14 @@ class Stage:
         return tuple(out)
 
     def _exchanged(self, t: Tried) -> bool:
-        """Whether its fit holds more than what this round began with and itself."""
+        """Whether its fit contains more than the start of this round and itself."""
         assert t.fitted is not None
         before, after = self.round.before.part, t.fitted.part
         more = set(after.mechanisms) - set(before.mechanisms) - {t.candidate.name}
         return bool(more) or (t.candidate.part is not None and set(after.bodies) != set(before.bodies))
 
     def decided(self, policy: Policy, tried: Sequence[Tried] | None = None) -> Round:
-        """The round decided anew by a policy, on its own refits or on those given, which are judged by it."""
+        """The round decided by another policy, on its own refits or on those given, which the policy judges."""
         r, now = self.round, self.round.before
         if tried is None:
             tried = [replace(t, barred=False) for t in self.refits]
@@ -89,7 +89,7 @@ class Stage:
         return self.round.screen.columns(never_reported(proposed(now), now))
 
     def reply(self, done: Round, policy: Policy = POLICY) -> Reply:
-        """What a diagnosis would report of this round, were it the last."""
+        """What a diagnosis reports if this round is the last."""
         if not done.accepted or done.best is None or done.best.fitted is None:
             return Reply(verdict_of([], False, *self._residual(done.before), done.before.runs, policy))
         if not done.best.candidate.kind.is_physics:
@@ -104,21 +104,21 @@ class Stage:
         return Reply(verdict, (Claim(best, found.probability, alike),))
 
     def _residual(self, fitted: Fitted) -> tuple[float, float]:
-        """What a fit leaves, in units of what structure alone would: of filtered rows, and of rows as they are."""
+        """The residual of a fit in units of the structural null: of filtered rows, and of unfiltered rows."""
         left = left_out_rows(fitted)
         slow = slow_residual_ratio(rms_of(rms_table(left, left, fitted), fitted), fitted)
         return residual_ratio(replace(self.done, final=fitted)), slow
 
 
 def reference(stage: Stage) -> Reply:
-    """The full rules. What is in no list is reported where the diagnosis went no further than this round."""
+    """The full rules. An unlisted effect is reported where the diagnosis ends with this round."""
     if stage.findings is not None and stage.findings.verdict == "unlisted" and stage.alone:
         return Reply("unlisted", _unlisted(stage.findings))
     return stage.reply(_as_decided(stage))
 
 
 def no_projection(stage: Stage) -> Reply:
-    """Screened as if nothing had been recalibrated; the best of few mechanisms are refitted, the full rules judge."""
+    """Screened without projection of recalibrated parameters; the best mechanisms are refitted, full rules judge."""
     r = stage.round
     residuals = r.before.problem.residuals(r.before.x, r.before.state.nuisance)
     gain = without_nuisances(r.screen.evidence, residuals).scores().gain
@@ -141,17 +141,17 @@ def independent_noise(stage: Stage) -> Reply:
 
 
 def in_sample(stage: Stage) -> Reply:
-    """Gains on the recordings that were fitted; no batch is left out, in the structural null neither."""
+    """Gains on the fitted recordings; no batch is left out, nor in the structural null."""
     return stage.reply(stage.decided(replace(POLICY, leaves_batches_out=False)))
 
 
 def no_structural_null(stage: Stage) -> Reply:
-    """Nothing is held against what structure alone makes of it."""
+    """No candidate is compared with the structural null."""
     return stage.reply(stage.decided(replace(POLICY, uses_structural_null=False)))
 
 
 def no_floor_check(stage: Stage) -> Reply:
-    """What is left over does not count: a claim explains all, and no claim means that nothing is missing."""
+    """The residual is not judged: a claim explains everything, and no claim means that nothing is missing."""
     return stage.reply(_as_decided(stage), replace(POLICY, checks_residual=False))
 
 

@@ -16,12 +16,12 @@ from diagnosis.fitting.regression import Whitened
 from diagnosis.screening.evidence import Evidence
 from diagnosis.search.decision import Round
 
-MIN_ALIKE_SHARE = 0.1  # of the first explanation's probability: what is less likely is not of the reported set
+MIN_ALIKE_SHARE = 0.1  # of the first explanation's probability: less likely ones are not in the reported set
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One finding, its probability where the method has one, and what the method cannot tell from it."""
+    """One finding, its probability where the method has one, and the candidates that it cannot distinguish from it."""
 
     candidate: Candidate
     probability: float | None = None
@@ -37,7 +37,7 @@ class Reply:
 
     @classmethod
     def of(cls, claims: Sequence[Claim]) -> Reply:
-        """Whatever is claimed explains all; nothing claimed means nothing is missing."""
+        """A claim explains everything; no claim means that nothing is missing."""
         return cls("explained" if claims else "consistent", tuple(claims))
 
     def as_json(self, seconds: float) -> dict[str, Any]:
@@ -103,17 +103,16 @@ def claimable(done: Round) -> list[Scored]:
 
 
 def beyond_slack(done: Round) -> list[Scored]:
-    """Those of them that are not late or off-centre readings or lengths, which every lumped network shows without a
-    fault.
+    """Those that are no lag, off-centre reading or length, which every lumped network shows without a fault.
 
-    A diagnosis fits that slack with every candidate; a method without it would name nothing else.
+    A diagnosis fits these with every candidate; a method without them would name nothing else.
     """
     loose = slack([s.candidate for s in done.screen.scored], done.before)
     return [s for s in claimable(done) if s.candidate.name not in loose]
 
 
 def counted_in_full(evidence: Evidence) -> Evidence:
-    """The same evidence had every row noise of its own, none remembering another."""
+    """The same evidence with independent noise in every row."""
     memory = evidence.batches[0].memory
     white = np.ones(len(evidence.rows)) if memory is None else memory.white
     batches = tuple(_without_memory(b) for b in evidence.batches)
@@ -121,7 +120,7 @@ def counted_in_full(evidence: Evidence) -> Evidence:
 
 
 def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidence:
-    """The same columns had no parameter, start or offset been fitted; the targets are the fit's residuals."""
+    """The same columns without fitted parameters, starts and offsets; the targets are the residuals of the fit."""
     batches = []
     for b, residual in zip(evidence.batches, residuals, strict=True):
         bare = replace(b, jacobian=np.zeros((len(residual), 1)), mixing=b.mixing[:, :0], damping=b.damping[:0])

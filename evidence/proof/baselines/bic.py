@@ -18,13 +18,13 @@ from diagnosis.screening.evidence import Evidence
 from diagnosis.search.search import Search
 from evidence.proof.baselines.base import Claim, Reply, beyond_slack, counted_in_full
 
-LOOKED_AT = 40  # candidates of a step whose criterion is worked out, by what they take off at the weights before it
+LOOKED_AT = 40  # candidates of a step whose criterion is computed, by their reduction at the weights of the step before
 REWEIGHTING_ROUNDS = 5  # of reweighting the channels
-ALIKE = 2.0  # of the criterion: a difference not worth a mention (Raftery 1995)
+ALIKE = 2.0  # of the criterion: "not worth more than a bare mention" (Raftery 1995)
 
 
 def in_sample_bic(done: Search) -> Reply:
-    """All effects that lower the criterion, in the order in which they enter; alike is what lowers it as much."""
+    """All effects that lower the criterion, in the order of entry; those that lower it equally are alike."""
     news = beyond_slack(done.rounds[0])
     sums = _Sums.of(counted_in_full(done.rounds[0].screen.evidence), news)
     chosen: list[int] = []
@@ -48,7 +48,7 @@ class _Sums:
 
     gram: Array
     rows: Array  # (K,)
-    least: Array  # (K,) squares that the stated noise alone leaves
+    least: Array  # (K,) sum of squares of the stated noise alone
     low: Array
     high: Array
 
@@ -74,7 +74,7 @@ class _Sums:
         return float(self.rows[known] @ np.log(mean) + len(chosen) * np.log(self.rows.sum()))
 
     def promising(self, chosen: list[int]) -> list[int]:
-        """Candidates that take most off the weighted squares given those chosen."""
+        """Candidates that reduce the weighted squares most, given those chosen."""
         total = np.tensordot(self._weight(self._fit(chosen)[0]), self.gram, 1)
         own, to = total[:-1, :-1], total[:-1, -1]
         if chosen:
@@ -87,7 +87,7 @@ class _Sums:
         return [int(j) for j in np.argsort(-off, kind="stable")[:LOOKED_AT] if off[j] > 0]
 
     def _fit(self, chosen: list[int]) -> tuple[Array, Array]:
-        """Squares left (K,) and sizes with the channels weighted by what is left of them."""
+        """Residual squares (K,) and sizes, the channels weighted by their residuals."""
         square: Array = self.gram[:, -1, -1]
         size: Array = np.zeros(len(chosen))
         if not chosen:

@@ -36,7 +36,7 @@ ABLATIONS = Registry(
 
 @threadpool_limits.wrap(limits=1)
 def replies(done: Diagnosis | Search) -> dict[str, Any]:
-    """The reply of each to the same recordings, as `rivals.json` keeps it.
+    """The reply of each to the same recordings, as stored in `rivals.json`.
 
     Baselines start from the first fit, before anything was refined; ablations and the reference, the full rules, are of
     the round that first decided about physics. With a diagnosis, the reference can say that something is unlisted.

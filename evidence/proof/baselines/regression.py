@@ -1,4 +1,4 @@
-"""The candidate whose signature looks most like the residual of the recalibrated network."""
+"""The candidate whose signature correlates most with the residual of the recalibrated network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALIKE = 0.95  # of the largest correlation: as good an explanation
 def raw_correlation(done: Search) -> Reply:
     """Pearson's correlation over all rows and channels, of the sign that the candidate allows.
 
-    Claimed if it is significant for independent rows; what correlates nearly as much is reported as alike.
+    Claimed if significant for independent rows; candidates of nearly equal correlation are reported as alike.
     """
     rows = plain_rows(done.rounds[0])
     size = np.linalg.norm(rows.residual) * np.linalg.norm(rows.columns, axis=0)
@@ -40,7 +40,7 @@ def raw_correlation(done: Search) -> Reply:
 
 MOST = 200  # signatures, those that correlate most (sure independence screening, Fan and Lv 2008)
 PENALTIES, FOLDS = 30, 5
-SHARE = 0.3  # of the largest contribution: a lasso leaves small ones next to every strong one
+SHARE = 0.3  # of the largest contribution: a lasso keeps small coefficients next to every strong one
 
 
 def sparse_regression(done: Search) -> Reply:

@@ -33,7 +33,7 @@ def plant_style(plant: str) -> tuple[str, str]:
 
 
 def head(fig: Figure, title: str, plants: Sequence[str]) -> None:
-    """The title, and below it what of the figure is simulated."""
+    """The title, and below it which part of the figure is simulated."""
     high, wide = fig.get_figheight(), fig.get_figwidth()
     fig.text(0.1 / wide, 1 - 0.18 / high, title, fontsize=11, color=INK, fontweight="bold", va="center")
     said = origin(plants)
@@ -161,7 +161,7 @@ def reliability(table: pd.DataFrame, stated: Array, error: float, plants: Sequen
     below.set_xlabel("probability claimed, %", fontsize=8, labelpad=1)
     below.set_ylabel("answers", fontsize=8)
     below.locator_params(axis="y", nbins=3)
-    head(fig, "Are the probabilities honest?", plants)
+    head(fig, "Calibration of the probabilities", plants)
     return fig
 
 
@@ -201,7 +201,7 @@ def detection(table: pd.DataFrame, plants: Sequence[str]) -> Figure:
 
 
 def confusion(counts: pd.DataFrame, bounds: Sequence[int], title: str, plants: Sequence[str]) -> Figure:
-    """What was named (columns) for what was there (rows); shaded by the row's share, the same on both outlined.
+    """Named (columns) against concealed (rows); shaded by the row's share, the same on both outlined.
 
     Args:
         counts: rows and columns in the order to draw.
@@ -241,7 +241,7 @@ SHADE = "#f3ddc9"
 
 
 def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
-    """Left-out error of every case before and after the diagnosis, with the true model and the noise; sorted.
+    """Left-out error of every case before and after the diagnosis, with the true model and the noise level; sorted.
 
     Args:
         cases: a row a case with error_before, error_after, error_true and error_floor, in units of the noise.
@@ -265,7 +265,7 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
     ax.yaxis.set_minor_formatter(lambda v, _: "")
     ax.set_ylabel("left-out error, units of the noise", fontsize=8)
     ax.set_xlabel("visible cases, largest error first", fontsize=8, labelpad=2)
-    head(fig, "What the diagnosis repairs", plants)
+    head(fig, "Left-out error before and after the diagnosis", plants)
     lines = [("━", "with the true model", GREEN), ("━", "noise", MUTED)]
     keys(fig, [("●", "before", ORANGE), ("●", "after", BLUE), *lines], 0.4)
     return fig
@@ -334,7 +334,7 @@ def ratios(terms: pd.DataFrame, plants: Sequence[str]) -> Figure:
 
 
 def times(cases: pd.DataFrame, wanted_s: float, plants: Sequence[str]) -> Figure:
-    """Share of cases that took no longer, by plant, with the goal."""
+    """Empirical distribution of the time per case, by plant, with the goal."""
     fig = Figure(figsize=(HALF_IN, 5.6))
     ax = panel(fig, 0.75, 0.95, HALF_IN - 1.0, 4.1)
     ax.axvline(wanted_s, color=INK, lw=1, ls="--")
@@ -354,11 +354,11 @@ def times(cases: pd.DataFrame, wanted_s: float, plants: Sequence[str]) -> Figure
 
 
 def worst_case(series: pd.DataFrame, windows: pd.DataFrame | None, plant: str) -> Figure:
-    """Residual of one case's channel before and after, a panel a run; shaded where the concealed effect works.
+    """Residual of one case's channel before and after, a panel a run; shaded where the concealed effect acts.
 
     Args:
         series: batch, channel, unit, time_s, recorded, before, after of one case and channel.
-        windows: batch, start_s, end_s; without rows the effect works always, None: nothing is concealed.
+        windows: batch, start_s, end_s; without rows the effect always acts, None: nothing is concealed.
     """
     batches = list(dict.fromkeys(series["batch"]))
     fig = Figure(figsize=(WIDE_IN, 2.35))

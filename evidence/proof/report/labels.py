@@ -14,7 +14,7 @@ from reports.labels import NOTHING, number
 _PLANTS = {
     "elements": ("A", "finite elements", "SIMULATED"), "volumes": ("B", "finite volumes", "SIMULATED"),
     "grafted": ("C", "an effect grafted on real recordings", "partly SIMULATED"),
-    "withheld": ("D", "real recordings, something kept back", "real"),
+    "withheld": ("D", "real recordings, a part withheld", "real"),
     "lathe": ("E", "lathe", "SIMULATED"), "board": ("F", "laboratory board", "SIMULATED"),
     "horizontal": ("G", "horizontal machining centre", "SIMULATED"), "gantry": ("H", "gantry", "SIMULATED"),
     "bench": ("I", "spindle on a bench", "SIMULATED"), "battery": ("J", "battery", "SIMULATED"),
@@ -34,43 +34,43 @@ _METHODS = {
 }  # fmt: skip
 GROUPS = {"diagnosis": "Diagnosis", "baseline": "Baselines, same first fit", "ablation": "Ablations, first round only"}
 
-NOT_SEALED = "A development suite: its seed is known, so these figures show the work's state and prove nothing."
-PARTIAL = "Opened in part: some cases had no answer yet. These figures prove nothing."
+NOT_SEALED = "A development suite: its seed is known, so these figures show the state of the work and are no evidence."
+PARTIAL = "Opened in part: some cases have no answer yet. These figures are no evidence."
 
 METHOD = (
-    "Plants A and B, and E to J of other kinds of machines, share no code with the twin and use other numerics; what "
-    "they conceal, how much and where is drawn by lot from the suite's seed. Plants C and D, if there, are every case "
-    "that real recordings give.",
-    "Each answer key gets a salt; the hash of both and of the case's files goes into one list, and the hash of that "
-    "list, the root, is published before any case is answered.",
-    "Every case is answered in a process of its own that can read its machine file and its recordings and nothing "
-    "else. Its answer is written before any key is opened.",
-    "Opening checks every hash, then scores. A case that was run after the opening, or twice, is void: it is counted "
-    "above and left out.",
-    "A case counts as visible when the true effect, fitted, cuts a left-out error by a tenth or more, beyond what "
-    "structure alone gives. Detection, place, mechanism and amplitude are judged on visible cases.",
+    "Plants A and B, and E to J of other kinds of machines, share no code with the twin and use other numerics. The "
+    "concealed effect, its size and its place are drawn at random from the seed of the suite. Plants C and D comprise "
+    "every case that the real recordings provide.",
+    "Each answer key gets a salt. The hashes of salted keys and case files form a list, and the hash of that list, the "
+    "root, is published before any case is answered.",
+    "A separate process answers each case. It can read the machine file and the recordings of its case and nothing "
+    "else, and it writes its answer before any key is opened.",
+    "Opening verifies every hash, then scores. A case that was answered after the opening, or twice, is void: it is "
+    "counted above and not scored.",
+    "A case is visible if the true effect, fitted, reduces a left-out error by at least a tenth, beyond the structural "
+    "null. Detection, place, mechanism and amplitude are scored on visible cases.",
 )
 INFORMED = "truth known"
 GLOSSARY = (
-    ("interval", "90 %: Clopper and Pearson for shares, bootstrap over cases for medians and quantiles."),
+    ("interval", "90 %: Clopper–Pearson for shares, bootstrap over cases for medians and quantiles."),
     ("met", "The measured value itself reaches the goal; the interval states its uncertainty."),
-    (INFORMED, "The same measure for an answer that has all concealed effects in its model, refits it, and "
-     "claims what passes the bars of a claim. What it misses, these recordings do not give with such bars. Of the "
-     "calibration error: what probabilities show that are exactly right, in the mean over chance."),
-    ("detection limit", "The size at which an effect of this kind is just found on development plants."),
-    ("right answer", "Every visible effect is named with its place, and nothing false is claimed. Of a confounded pair "
-     "the reported set must hold the truth; an effect that is not in the library must be called so."),
+    (INFORMED, "The same measure for the true model: all concealed effects are in the model and refitted, and each is "
+     "claimed if it passes the thresholds of a claim. What it misses, these recordings do not support at these "
+     "thresholds. For the calibration error: the expected value for perfectly calibrated probabilities."),
+    ("detection limit", "The size at which an effect of this kind is just detected on development plants."),
+    ("right answer", "Every visible effect is named with its place, and no claim is false. Of a confounded pair the "
+     "reported set must contain the truth; an effect that the library lacks must be reported as unlisted."),
     ("decoy", "A fault of a recording or of a value in the file. Naming it is right; other claims are false."),
-    ("unlisted", "Concealed is an effect that no mechanism of the library describes; right is to say so."),
+    ("unlisted", "The concealed effect is described by no mechanism of the library; the right answer says so."),
     ("error", "Of left-out runs, in units of the noise: root of the mean over channels of (rms / noise)²."),
-    ("with the true model", "The twin given the concealed effects and fitted: what a perfect answer would reach."),
-    ("expected calibration error", "Mean distance of claimed probability and share right, weighted by cases. Right is "
-     "the mechanism of a concealed effect at its place or adjacent."),
+    ("with the true model", "The twin with the concealed effects, fitted: the error of a perfect answer."),
+    ("expected calibration error", "Mean distance between claimed probability and share of right answers, weighted by "
+     "cases. Right is the mechanism of a concealed effect at its place or adjacent."),
 )  # fmt: skip
 
 
 def meaning(term: str) -> str:
-    """Its entry in the glossary."""
+    """The entry of a term in the glossary."""
     return dict(GLOSSARY)[term]
 
 
@@ -96,7 +96,7 @@ def plant_origin(plant: str) -> str:
 
 
 def origin(plants: Sequence[str]) -> str:
-    """One word where all plants are alike, else each: ``A, B SIMULATED · D real``."""
+    """One word if all plants are alike, else each: ``A, B SIMULATED · D real``."""
     groups: dict[str, list[str]] = {}
     for p in plants:
         groups.setdefault(plant_origin(p), []).append(plant_letter(p))
@@ -114,13 +114,18 @@ def method_label(method: str) -> str:
     return _METHODS.get(method, method.replace("_", " "))
 
 
+def table_line(cells: Sequence[str]) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |"
+
+
 def key_label(key: str) -> str:
-    """A mechanism's, effect's or place's key as it is read."""
+    """The key of a mechanism, effect or place as readable text."""
     return key.replace("_", " ")
 
 
 def measured(value: float, goal: str, wanted: float) -> str:
-    """A measured value in the goal's unit: a share in per cent or points where the goal says so."""
+    """A measured value in the unit of the goal: a share in per cent or points where the goal has them."""
     if not math.isfinite(value):
         return NOTHING
     if "%" in goal or "point" in goal:

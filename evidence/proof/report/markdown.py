@@ -1,4 +1,4 @@
-"""The part of docs/proof.md that a sealed run writes: root, date, version, results by plant, shortfalls."""
+"""The parts of docs/proof.md that an opened proof writes: its result, and the table of all sealed proofs."""
 
 from __future__ import annotations
 
@@ -10,20 +10,27 @@ import pandas as pd
 from data.errors import InputError
 from data.files import write_atomic
 from evidence.proof.report import labels, shortfall
+from evidence.proof.report.labels import table_line
 from evidence.proof.report.page import headline
+from evidence.proof.report.runs import record_run, runs_markdown
 from evidence.proof.report.tables import Cell, ProofRun, goal_rows, shortfalls
 from reports.labels import NOTHING
 
 BEGIN, END = "<!-- result: written by thermodrift prove open --publish -->", "<!-- end of result -->"
 _BLOCK = re.compile(f"{re.escape(BEGIN)}.*?{re.escape(END)}", re.DOTALL)
+RUNS_BEGIN, RUNS_END = "<!-- runs: written by thermodrift prove open --publish from ", "<!-- end of runs -->"
+_RUNS = re.compile(rf"({re.escape(RUNS_BEGIN)}(\S+) -->).*?{re.escape(RUNS_END)}", re.DOTALL)
 NO_RUN = "No sealed proof has been run on this version yet, so there is no result to show."
 
 
 def publish_proof(path: Path, run: ProofRun | None) -> None:
-    """Put a run's result between the two markers of a Markdown file; nothing else of it changes.
+    """Put a run's result between the two markers of a Markdown file.
+
+    Where the file also has a block of runs, whose first line names their record relative to the file, the run is added
+    to the record and the block is written anew. Nothing else of the file changes.
 
     Raises:
-        InputError: the file cannot be read or written, has no pair of markers, or the run is of a development suite
+        InputError: a file cannot be read or written, has no pair of markers, or the run is of a development suite
             or opened in part.
     """
     if run is not None and (run.suite != "sealed" or run.partial):
@@ -33,13 +40,28 @@ def publish_proof(path: Path, run: ProofRun | None) -> None:
         text = path.read_text(encoding="utf-8")
         if len(_BLOCK.findall(text)) != 1:
             raise InputError(f"--publish {path}: expected one pair of lines {BEGIN} and {END}; put them where it goes")
-        write_atomic(path, _BLOCK.sub(lambda _: f"{BEGIN}\n\n{proof_markdown(run)}\n{END}", text))
+        text = _BLOCK.sub(lambda _: f"{BEGIN}\n\n{proof_markdown(run)}\n{END}", text)
+        record = record_of(path, text)
+        if run is not None and record is not None:
+            text = with_runs(text, record_run(record, run), " ".join(run.plants))
+        write_atomic(path, text)
     except OSError as error:
         raise InputError(f"--publish {path}: cannot be read or written ({error.strerror}); give another file") from None
 
 
+def record_of(path: Path, text: str) -> Path | None:
+    """The record of sealed proofs that a page names; None where it has no block of runs."""
+    block = _RUNS.search(text)
+    return None if block is None else path.parent / block[2]
+
+
+def with_runs(text: str, table: pd.DataFrame, plants: str) -> str:
+    """The page with its block of runs written from the record (`runs.runs_markdown`)."""
+    return _RUNS.sub(lambda m: f"{m[1]}\n\n{runs_markdown(table, plants)}\n{RUNS_END}", text)
+
+
 def proof_markdown(run: ProofRun | None) -> str:
-    """The block between the markers; without a run it states so."""
+    """The block between the markers; without a run a sentence says so."""
     if run is None:
         return NO_RUN + "\n"
     goals = run.table("goals")
@@ -57,7 +79,7 @@ def proof_markdown(run: ProofRun | None) -> str:
     lines += _table(goals, run)
     short = shortfalls(goals)
     missed = [*(f"- {said}" for said in short), *_by_plant(goals, run.plants)]
-    lines += ["", "Goals that are missed:", "", *missed] if missed else ["", "No goal is missed on any plant."]
+    lines += ["", "Missed goals:", "", *missed] if missed else ["", "No goal is missed on any plant."]
     lines += _shortfall(run)
     return "\n".join(lines) + "\n"
 
@@ -75,23 +97,31 @@ def _table(goals: pd.DataFrame, run: ProofRun) -> list[str]:
         labels.INFORMED,
         *heads,
     ]
-    out = [_line(cells), _line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
+    out = [table_line(cells), table_line(["---", *["---:"] * 4, "---", *["---:"] * (len(heads) + 1)])]
     for g in goal_rows(goals, plants):
         met = {"yes": "yes", "no": "**no**"}.get(g.whole.met, NOTHING)
         interval, n = g.whole.interval or NOTHING, g.whole.n or NOTHING
-        out.append(_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, [g.informed, *g.plants])]))
+        out.append(
+            table_line([g.measure, g.goal, g.whole.value, interval, n, met, *map(_plant, [g.informed, *g.plants])])
+        )
     return [*out, "", f"{labels.INFORMED.capitalize()}: {labels.meaning(labels.INFORMED)}"]
 
 
 def _shortfall(run: ProofRun) -> list[str]:
-    """Why goals are missed: reasons by plant, and false claims by mechanism."""
+    """Causes of missed goals: reasons by plant, and false claims by mechanism."""
     own = shortfall.tables(run, each=False)
     out = ["", " ".join(shortfall.sentences(run))] if own else []
     for table in own:
         heads = [f"{c.title} ({c.unit})" if c.unit else c.title for c in table.columns]
         rule = ["---:" if c.kind == "number" else "---" for c in table.columns]
-        out += ["", f"{table.caption}, {labels.origin(run.plants)}:", "", _line(heads), _line(rule)]
-        out += [_line([str(cell) for cell in row.cells]) for row in table.rows]
+        out += [
+            "",
+            f"{table.caption}, {labels.origin(run.plants)}:",
+            "",
+            table_line(heads),
+            table_line(rule),
+        ]
+        out += [table_line([str(cell) for cell in row.cells]) for row in table.rows]
     return out
 
 
@@ -101,15 +131,7 @@ def _plant(cell: Cell) -> str:
 
 
 def _by_plant(goals: pd.DataFrame, plants: tuple[str, ...]) -> list[str]:
-    """Goals that are met over all plants and missed on one."""
+    """Goals that all plants together meet and one plant misses."""
     whole = set(goals.loc[(goals["plant"] == "all") & goals["met"].eq(False), "measure"])
     rest = goals[~goals["measure"].isin(whole)]
     return [f"- plant {labels.plant_letter(p)} alone, {said}" for p in plants for said in shortfalls(rest, p)]
-
-
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |"
-
-
-def _stamp(utc: str) -> str:
-    return f"{pd.Timestamp(utc):%Y-%m-%d %H:%M} UTC" if utc else NOTHING

@@ -1,4 +1,4 @@
-"""The report of the proof: how the diagnosis did on recordings in which the effect is concealed, on one page."""
+"""The report of the proof: performance of the diagnosis on recordings with concealed effects, on one page."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _baselines(run: ProofRun) -> Part:
 
 
 def _confusion(run: ProofRun) -> Part:
-    own = Part("confusion", "Confusion", "What was taken for what")
+    own = Part("confusion", "Confusion", "Confusion matrices")
     shown = []
     for name, ordered, title in (
         ("confusion_mechanism", tables.mechanism_matrix, "Mechanism: concealed (rows) and named (columns)"),
@@ -92,7 +92,7 @@ def _confusion(run: ProofRun) -> Part:
             matrix, bounds = ordered(table)
             shown.append(_shown(run, figures.confusion(matrix, bounds, title, run.plants), title))
     if not shown:
-        return _absent(own, "No concealed effect was scored, so nothing can be confused.")
+        return _absent(own, "No concealed effect was scored.")
     notes = ("Counts of visible concealed effects, shaded by the row's share; right answers are outlined.",)
     return replace(own, wide=tuple(shown), notes=notes)
 
@@ -108,10 +108,10 @@ def _detection(run: ProofRun) -> Part:
 
 
 def _shortfall(run: ProofRun) -> Part:
-    own = Part("shortfall", "Shortfall", "What was missed, what was claimed wrongly, and why")
+    own = Part("shortfall", "Shortfall", "Missed effects and false claims")
     shown = shortfall.tables(run, each=True)
     if not shown:
-        return _absent(own, "No visible effect was missed and no claim was false, or none was scored.")
+        return _absent(own, "No visible effect was missed and no claim is false, or none was scored.")
     return replace(own, lead=" ".join(shortfall.sentences(run)), tables=tuple(shown))
 
 
@@ -121,7 +121,7 @@ def _improvement(run: ProofRun) -> Part:
     shown = _numeric(o, ["error_before", "error_after", "error_true", "error_floor"])
     shown = shown[shown["visible"].eq(True) & (shown["error_before"] > 0)]
     if shown.empty:
-        return _absent(own, "No visible case has its left-out errors in this run.")
+        return _absent(own, "No visible case has left-out errors in this run.")
     return replace(own, wide=(_shown(run, figures.improvement(shown, run.plants), own.title),))
 
 
@@ -130,7 +130,7 @@ def _amplitude(run: ProofRun) -> Part:
     terms = run.table("terms")
     table = tables.with_amplitude(terms) if len(terms) else terms
     if table.empty:
-        return _absent(own, "No visible effect was found with an amplitude in this run.")
+        return _absent(own, "No visible effect has an estimated amplitude in this run.")
     shown = [_shown(run, figures.ratios(table, run.plants), "Amplitude found by true, per effect")]
     sized = table[table["true_limits"].notna()]
     if len(sized):
@@ -140,7 +140,7 @@ def _amplitude(run: ProofRun) -> Part:
 
 
 def _reliability(run: ProofRun) -> Part:
-    own = Part("reliability", "Honesty, time", "Probabilities and time")
+    own = Part("reliability", "Calibration, time", "Calibration of probabilities, and time")
     table, timed = run.table("reliability"), _numeric(run.table("outcomes"), ["seconds"])
     shown, notes = [], []
     if len(table) and table["n"].sum() > 0:
@@ -180,7 +180,7 @@ def _worst(run: ProofRun) -> Part:
         what = f"{KIND_WORDS.get(kind, key_label(kind))}{': ' if kind and effects else ''}{effects}"
         what += f"; plant {plant_label(plant)}"
         shown.append(Worst(k, case, what, _sentence(str(r["why"])), plant_origin(plant) == "SIMULATED", drawn))
-    lead = "False alarms first, then wrong names by how sure the answer was, then what was overlooked."
+    lead = "False alarms first, then wrong names by their probability, then missed effects."
     return replace(own, lead=lead, worst=tuple(shown))
 
 
@@ -194,7 +194,7 @@ def _cases(run: ProofRun) -> Part:
     if without is not None:
         shown.append(without)
     for name, made, absent in (
-        ("ledger", tables.ledger, "The ledger was not given to this page."),
+        ("ledger", tables.ledger, "The ledger is not part of this page."),
         ("leak", lambda t: tables.leak(t, run.plants), "The leak test was not run."),
         ("convergence", tables.convergence, "The plants' convergence was not studied in this run."),
     ):
@@ -205,12 +205,12 @@ def _cases(run: ProofRun) -> Part:
             notes.append(absent)
     if run.isolation:
         protections = "; ".join(f"{protection}: {count(n, 'case')}" for protection, n in sorted(run.isolation.items()))
-        notes.insert(0, f"What kept the answering process from everything but its case: {protections}.")
+        notes.insert(0, f"Isolation of the answering process: {protections}.")
     return replace(own, tables=tuple(shown), notes=tuple(notes))
 
 
 def _sentence(why: str) -> str:
-    """Keys as they are read, and a capital."""
+    """Keys as readable text, capitalised."""
     said = key_label(why).replace("+", " + ")
     return said[:1].upper() + said[1:]
 
@@ -239,7 +239,7 @@ _MOST_MISSED = 4
 
 @dataclass(frozen=True)
 class ProofPage:
-    """Everything that the template shows."""
+    """The content of the template."""
 
     title: str
     headline: str
@@ -272,7 +272,7 @@ def write_proof_report(folder: Path, run: ProofRun) -> Path:
 
 
 def proof_page(run: ProofRun) -> ProofPage:
-    """Collect the page. A table that is absent leaves a sentence in its section's place."""
+    """Collect the page. A section without its table shows a sentence instead."""
     goals = run.table("goals")
     sealed = run.suite == "sealed"
     return ProofPage(
@@ -298,18 +298,18 @@ def headline(run: ProofRun) -> str:
     met, missed, _ = counted(run.table("goals"))
     cases = count(len(run.table("outcomes")), "sealed case" if run.suite == "sealed" else "development case")
     if not met + missed:
-        return f"No goal could be judged on {cases}."
+        return f"No goal could be evaluated on {cases}."
     share = "Every goal" if not missed else "No goal" if not met else f"{met} of {met + missed} goals"
     return f"{share} met on {cases}."
 
 
 def lead(goals: pd.DataFrame) -> str:
-    """What was missed, the first by name; then what could not be measured."""
+    """The missed goals, the first ones by name; then the goals without a case."""
     _, missed, unknown = counted(goals)
     more = [f"{missed - _MOST_MISSED} more, in the table"] if missed > _MOST_MISSED else []
     parts = [f"Missed: {'; '.join([*shortfalls(goals)[:_MOST_MISSED], *more])}."] if missed else []
     if unknown:
-        parts.append(f"{count(unknown, 'goal')} had no case to be judged on.")
+        parts.append(f"Without a case: {count(unknown, 'goal')}.")
     return " ".join(parts)
 
 
@@ -330,7 +330,3 @@ def _facts(run: ProofRun) -> list[tuple[str, str]]:
         ("Opened", labels.stamp(run.opened)),
         ("thermodrift", run.version),
     ]
-
-
-def _stamp(utc: str) -> str:
-    return f"{pd.Timestamp(utc):%Y-%m-%d %H:%M} UTC" if utc else ""

@@ -1,4 +1,4 @@
-"""The shortfall of a proof: what was missed and claimed falsely, and whether data or search limit it."""
+"""The shortfall of a proof: missed effects and false claims, and whether data or search limit them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reports.layout import Column, Row, Table
 
 
 def sentences(run: ProofRun) -> list[str]:
-    """A sentence on visible effects, one on those that were missed, one on claims; those that the tables give."""
+    """A sentence each on visible effects, missed effects and claims, as far as the tables give them."""
     terms, missed, claims = run.table("terms"), run.table("missed"), run.table("claims")
     said = []
     seen = visible_physics(terms)
@@ -25,22 +25,22 @@ def sentences(run: ProofRun) -> list[str]:
         stated = seen[seen["bar_nats"].notna()]
         enough = int((stated["gain_nats"] > stated["bar_nats"]).sum())
         said.append(
-            f"Of {count(len(stated), 'visible effect')} that the true model states, {enough} gain what a claim takes "
-            f"once all that is true is in the model."
+            f"Of {count(len(stated), 'visible effect')} that the true model contains, {enough} gain more than the "
+            f"threshold of a claim."
         )
     if len(missed):
         recordings = int(missed["reason"].isin(OF_RECORDINGS).sum())
         said.append(
-            f"{len(missed)} of {count(len(seen), 'visible effect')} have no claim; in {recordings} of them the "
-            f"recordings do not favour the truth, in {len(missed) - recordings} the search fell short."
+            f"{len(missed)} of {count(len(seen), 'visible effect')} have no claim: {recordings} are limited by the "
+            f"data, {len(missed) - recordings} by the search."
         )
     if len(claims):
-        said.append(f"{int((~claims['true'].astype(bool)).sum())} of {count(len(claims), 'claim')} are not so.")
+        said.append(f"{int((~claims['true'].astype(bool)).sum())} of {count(len(claims), 'claim')} are false.")
     return said
 
 
 def tables(run: ProofRun, each: bool) -> list[Table]:
-    """Those that say anything, without or with `each` missed effect."""
+    """The tables that have rows, without or with `each` missed effect."""
     missed, claims, out = run.table("missed"), run.table("claims"), []
     if len(missed):
         out.append(reasons(missed, run.plants))
@@ -52,22 +52,22 @@ def tables(run: ProofRun, each: bool) -> list[Table]:
 
 
 def reasons(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """Why visible effects were not named, counted by plant, and whether they are limited by the data or the search."""
+    """Reasons why visible effects are not named, by plant, and whether data or search limit them."""
     rows = []
     for reason in REASONS:
         own = missed[missed["reason"] == reason]
         limited_by = "data" if reason in OF_RECORDINGS else "search"
         rows.append(Row.of(reason, limited_by, *_by_plant(own, plants), f"{len(own)}"))
-    columns = (Column("why", kind="wide"), Column("limited by"), *_plants("", plants), Column("all", kind="number"))
+    columns = (Column("reason", kind="wide"), Column("limited by"), *_plants("", plants), Column("all", kind="number"))
     notes = (
-        "Gains are of the batches left out, in nats; the effect's own with all else that is true in the model. Data: "
-        "these recordings, read by networks as coarse as the machine file's.",
+        "Gains are those on left-out batches, in nats, with all other concealed effects in the model. Data: these "
+        "recordings with networks as coarse as that of the machine file.",
     )
-    return Table("Visible effects that no claim names", columns, tuple(rows), simulated(plants), notes=notes)
+    return Table("Visible effects without a claim", columns, tuple(rows), simulated(plants), notes=notes)
 
 
 def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """Each of them: what it gains, what a claim takes, what was reported instead and what that gains."""
+    """Each missed effect: its gain, the threshold of a claim, the explanation reported instead and its gain."""
     order = missed.assign(rank=missed["reason"].map(REASONS.index))
     rows = []
     for r in order.sort_values(["rank", "case"], ascending=[False, True]).to_dict("records"):
@@ -77,15 +77,15 @@ def missed_effects(missed: pd.DataFrame, plants: Sequence[str]) -> Table:
         gain, bar, other = (_nats(r[c]) for c in ("gain_nats", "bar_nats", "told_gain_nats"))
         rows.append(Row.of(str(r["case"]), plant_letter(str(r["plant"])), what, gain, bar, named, other))
     columns = (
-        Column("case"), Column("plant"), Column("effect", kind="wide"), Column("gains", "nats", "number"),
-        Column("a claim takes", "nats", "number"), Column("reported instead", kind="wide"),
-        Column("that gains", "nats", "number"),
+        Column("case"), Column("plant"), Column("effect", kind="wide"), Column("gain", "nats", "number"),
+        Column("threshold", "nats", "number"), Column("reported instead", kind="wide"),
+        Column("its gain", "nats", "number"),
     )  # fmt: skip
-    return Table("Each of them", columns, tuple(rows), simulated(plants))
+    return Table("Each visible effect without a claim", columns, tuple(rows), simulated(plants))
 
 
 def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """By mechanism, the worst first: how often it was claimed and was not so, and how sure the false claims were."""
+    """By mechanism, the worst first: claims, false claims and the probability of the false claims."""
     false = claims[~claims["true"].astype(bool)]
     rows = []
     for mechanism, n in sorted(false["mechanism"].value_counts().items(), key=lambda one: (-one[1], str(one[0]))):
@@ -96,10 +96,10 @@ def false_claims(claims: pd.DataFrame, plants: Sequence[str]) -> Table:
         rows.append(Row.of(key_label(str(mechanism)), f"{every}", *_by_plant(own, plants), f"{n}", f"{nothing}", sure))
     columns = (
         Column("mechanism", kind="wide"), Column("claims", kind="number"), *_plants("false, ", plants),
-        Column("false", kind="number"), Column("nothing was missing", kind="number"),
-        Column("median probability of the false", kind="number"),
+        Column("false", kind="number"), Column("nothing missing", kind="number"),
+        Column("median probability of false claims", kind="number"),
     )  # fmt: skip
-    return Table("Claims that are not so", columns, tuple(rows), simulated(plants))
+    return Table("False claims", columns, tuple(rows), simulated(plants))
 
 
 def _plants(said: str, plants: Sequence[str]) -> list[Column]:

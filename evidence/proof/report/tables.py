@@ -1,4 +1,4 @@
-"""An opened proof as data of its page: the tables that it reads and shows, the extracts that it draws, its goals."""
+"""An opened proof as data of its page: its tables, the extracts for its figures, its goals."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ class ProofRun:
     """A proof that has been opened.
 
     Args:
-        root: hexadecimal, what was published before the run.
-        suite: a development suite has a known seed, a sealed one nobody's.
-        cases: as many as were sealed; `outcomes` holds those that count.
+        root: hexadecimal, published before the run.
+        suite: the seed of a development suite is known, that of a sealed one secret.
+        cases: number of sealed cases; `outcomes` holds those that count.
         sealed, opened: UTC, to the second.
         version: of thermodrift.
-        source_digest: of the source that answered.
+        source_digest: digest of the source that answered.
         partial: opened before every case had an answer.
         isolation: protection of the answering process -> cases that ran under it.
-        void: case -> why it does not count.
-        failed: case -> the one line of its error; it counts, as a wrong answer.
+        void: case -> reason why it does not count.
+        failed: case -> its error in one line; it counts as a wrong answer.
         tables: by the keys of `TABLES`.
 
     Raises:
@@ -113,11 +113,11 @@ _RARE = 0.05
 
 
 def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """How many cases of each kind stand on each plant, and how many answers were wholly right."""
+    """Number of cases of each kind on each plant, and of entirely right answers."""
     columns = [Column("what is concealed"), *(Column(plant_letter(p), plant_origin(p), "number", p) for p in plants),
                Column("all", kind="number"), Column("visible", kind="number")]  # fmt: skip
     judged = "right" in outcomes.columns and outcomes["right"].notna().any()
-    columns += [Column("wholly right", kind="number")] if judged else []
+    columns += [Column("entirely right", kind="number")] if judged else []
     rows = []
     kinds = [k for k in KIND_WORDS if (outcomes["kind"] == k).any()]
     for kind in [*kinds, *sorted(set(outcomes["kind"]) - set(kinds)), ""]:
@@ -133,7 +133,7 @@ def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
 
 
 def ledger(table: pd.DataFrame) -> Table:
-    """What happened when, as the chained ledger holds it."""
+    """The steps of the chained ledger with their times."""
     rows = [Row.of(_time(str(r["time"])), str(r["step"]), str(r["words"])) for r in table.to_dict("records")]
     columns = (Column("UTC"), Column("step"), Column("what", kind="wide"))
     notes = ("Every line of the ledger holds the hash of the line before it.",)
@@ -141,7 +141,7 @@ def ledger(table: pd.DataFrame) -> Table:
 
 
 def uncounted(run: ProofRun) -> Table | None:
-    """Cases that are void or failed, and why; None where there is none."""
+    """Void and failed cases with the reason; None if there are none."""
     rows = [Row.of(case, "void, left out", why) for case, why in sorted(run.void.items())]
     rows += [Row.of(case, "failed, counts as wrong", why) for case, why in sorted(run.failed.items())]
     if not rows:
@@ -151,7 +151,7 @@ def uncounted(run: ProofRun) -> Table | None:
 
 
 def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
-    """What a classifier makes of names, sizes and inputs alone; 0.5 is chance."""
+    """Performance of a classifier on names, sizes and inputs alone; 0.5 is chance."""
     rows = [
         Row.of(
             key_label(str(r["question"])),
@@ -166,20 +166,20 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
     columns = (
         Column("what the classifier predicts", kind="wide"), Column("area under its curve", kind="number"),
         Column("90 %", kind="number"), Column("by chance", kind="number"),
-        Column("chance does as well", kind="number"), Column("cases", kind="number"),
+        Column("p (permutations)", kind="number"), Column("cases", kind="number"),
     )  # fmt: skip
     low = int((table["p"] < _RARE).sum())
     notes = (
-        "It sees names, sizes, row counts, gaps and inputs, no temperature and no displacement. By chance: what it "
-        "reaches when the answers are dealt anew.",
-        f"Chance does as well in fewer than {percent(_RARE)} of the deals for {low} of {len(table)} questions; "
-        f"chance alone would give about {_RARE * len(table):.1f}.",
+        "Its features are names, sizes, row counts, gaps and inputs, no temperatures and displacements. By chance: its "
+        "area after permutation of the answers.",
+        f"Fewer than {percent(_RARE)} of the permutations do as well for {low} of {len(table)} questions; chance alone "
+        f"gives about {_RARE * len(table):.1f}.",
     )
     return Table("Leak test", columns, tuple(rows), simulated(plants), notes=notes)
 
 
 def convergence(table: pd.DataFrame) -> Table:
-    """Errors of the plants' own numerics from the coarsest to the finest, with the observed orders; a row a study."""
+    """Numerical errors of the plants from coarse to fine, with observed orders; a row per study."""
     rows = []
     for (plant, quantity, refined), own in table.groupby(["plant", "quantity", "refined"], sort=False):
         unit = str(own["unit"].iloc[0])
@@ -190,8 +190,8 @@ def convergence(table: pd.DataFrame) -> Table:
         rows.append(Row.of(plant_label(str(plant)), name, str(refined), f"{sizes} {unit}", errors, orders or NOTHING))
     columns = (Column("plant"), Column("quantity", kind="wide"), Column("refined"), Column("size", kind="number"),
                Column("error", kind="number"), Column("observed orders", kind="number"))  # fmt: skip
-    notes = ("An error is against a closed form or the finest of the study; the orders say how fast it falls.",)
-    return Table("Do the plants' own numerics converge?", columns, tuple(rows), True, notes=notes)
+    notes = ("An error is against a closed form or the finest of the study; the order is its rate of convergence.",)
+    return Table("Numerical convergence of the plants", columns, tuple(rows), True, notes=notes)
 
 
 def _range(low: object, high: object, digits: int) -> str:
@@ -248,8 +248,9 @@ def with_amplitude(terms: pd.DataFrame) -> pd.DataFrame:
 
 
 def mechanism_matrix(counts: pd.DataFrame) -> tuple[pd.DataFrame, list[int]]:
-    """Square at the front: what was there (rows) and named (columns), ordered by the registry's groups; then what was
-    only named, `unlisted` and `nothing`. With it the rows after which a group ends."""
+    """Concealed (rows) against named (columns), ordered by the groups of the registry; then the columns that are only
+    named, `unlisted` and `nothing`. With it the rows after which a group ends.
+    """
     names = _by_group(set(counts["true"]) | set(counts["named"]))
     wide = _wide(counts)
     rows = [n for n in names if n in wide.index]
@@ -261,7 +262,7 @@ def mechanism_matrix(counts: pd.DataFrame) -> tuple[pd.DataFrame, list[int]]:
 
 
 def place_matrix(counts: pd.DataFrame) -> tuple[pd.DataFrame, list[int]]:
-    """The same for places, by name; the rarest stand together as `other`."""
+    """The same for places, by name; the rarest are merged as `other`."""
     total = pd.concat([counts.groupby("true")["count"].sum(), counts.groupby("named")["count"].sum()])
     often = (
         total.groupby(level=0).sum().drop(NOTHING_NAMED, errors="ignore").sort_values(ascending=False, kind="stable")
@@ -276,8 +277,9 @@ def place_matrix(counts: pd.DataFrame) -> tuple[pd.DataFrame, list[int]]:
 
 
 def worst_channel(series: pd.DataFrame) -> pd.DataFrame:
-    """Of one case's series the channel whose residual after the diagnosis is largest in noise (of its differences),
-    in the runs where it is worst, in their order."""
+    """The channel of one case whose residual after the diagnosis is largest relative to its noise (of differences), in
+    its worst runs, in their order.
+    """
     left = series.assign(after_left=(series["recorded"] - series["after"]).astype(float))
     by_channel = left.groupby("channel", sort=False)["after_left"]
     size = by_channel.agg(_rms) / by_channel.agg(_roughness)
@@ -292,7 +294,7 @@ def _rms(residual: pd.Series) -> float:
 
 
 def _roughness(residual: pd.Series) -> float:
-    """Median step from row to row: what noise leaves, whatever the unit; 1 where the recording never moves."""
+    """Median absolute difference from row to row, a robust measure of noise; 1 where the recording is constant."""
     steps = np.abs(np.diff(residual.to_numpy(float)))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     return float(np.median(steps)) if len(steps) else 1.0
@@ -312,7 +314,7 @@ def _by_group(names: set[str]) -> list[str]:
 
 
 def _group(name: str) -> str:
-    """The file that a mechanism stands in."""
+    """The module of a mechanism."""
     from twin.mechanisms import MECHANISMS
 
     if name in MECHANISMS:
@@ -330,7 +332,7 @@ _WIDTH = 100.0
 
 @dataclass(frozen=True)
 class Bar:
-    """Positions in 0..100 of a goal's picture: interval, value, and where the goal stands."""
+    """Positions in 0..100 of the picture of a goal: interval, value, and goal."""
 
     low: float
     high: float
@@ -354,7 +356,7 @@ _NONE = Cell(NOTHING, "", "", "")
 
 @dataclass(frozen=True)
 class GoalRow:
-    """One goal: over all plants, what an answer would reach that knows the truth, and a cell for each plant."""
+    """One goal: a cell over all plants, one for the true model, and one for each plant."""
 
     measure: str
     goal: str
@@ -390,9 +392,9 @@ def counted(goals: pd.DataFrame) -> tuple[int, int, int]:
 
 
 def shortfalls(goals: pd.DataFrame, plant: str = "all") -> list[str]:
-    """``detection, visible: 95.5 %, wanted ≥ 97 %`` for every goal that was missed."""
+    """``detection, visible: 95.5 %, goal ≥ 97 %`` for every goal that was missed."""
     missed = goals[(goals["plant"] == plant) & goals["met"].eq(False)]
-    return [f"{r['measure']}: {_value(r)}, wanted {r['goal']}" for r in missed.to_dict("records")]
+    return [f"{r['measure']}: {_value(r)}, goal {r['goal']}" for r in missed.to_dict("records")]
 
 
 def _cell(r: Mapping[Any, Any] | None, picture: bool) -> Cell:

@@ -1,4 +1,4 @@
-"""The answer key of a case, as the vault keeps it, read once and checked."""
+"""The answer key of a case as stored in the vault, parsed and checked."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ class Spot:
 
 @dataclass(frozen=True)
 class TrueTerm:
-    """One thing that the recordings hold and the machine file does not. `mechanism` None: no listed one.
+    """One effect that the recordings contain and the machine file lacks. `mechanism` None: no listed one.
 
     `also` are places that mean the same, `neighbours` bodies that touch it, `parameters` values in the mechanism's own
     names and units, `active` the windows (batch, start s, end s), `partners` what these recordings cannot distinguish
-    from it. `form` states what no list has: a parameter of `free_flux` or `free_shift` and the channels that drive it.
+    from it. `form` states an unlisted effect: a parameter of `free_flux` or `free_shift` and the channels that drive
+    it.
     """
 
     effect: str
@@ -54,7 +55,7 @@ class TrueTerm:
 
 @dataclass(frozen=True)
 class AnswerKey:
-    """All of a case that was concealed."""
+    """Everything concealed in a case."""
 
     case: str
     kind: str
@@ -66,7 +67,7 @@ class AnswerKey:
 
     @classmethod
     def from_json(cls, raw: Mapping[str, Any]) -> AnswerKey:
-        """From what the vault's JSON gives.
+        """From the JSON of the vault.
 
         Raises:
             InputError: another schema, or a key that is missing.
@@ -90,7 +91,7 @@ class AnswerKey:
 
     @property
     def physics(self) -> tuple[TrueTerm, ...]:
-        """The terms that are no decoys."""
+        """The terms that are not decoys."""
         return tuple(t for t in self.terms if not t.decoy)
 
 
@@ -139,7 +140,7 @@ class Stored:
 
     @property
     def seconds(self) -> float | None:
-        """Wall time of the diagnosis; of one that did not end, the time that it was given."""
+        """Wall time of the diagnosis; its time limit if it did not end."""
         seconds = self.run.get("seconds")
         if seconds is None and self.failed and self.run.get("started") and self.run.get("ended"):
             return (pd.Timestamp(self.run["ended"]) - pd.Timestamp(self.run["started"])).total_seconds()

@@ -1,4 +1,4 @@
-"""Every goal with what was measured, its 90 % interval and whether it is met: over all cases and by plant."""
+"""Every goal with the measured value, its 90 % interval and whether it is met: over all cases and by plant."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RELIABILITY_COLUMNS = ("low", "high", "n", "claimed", "right", "low90", "high90"
 
 
 def reliability(outcomes: pd.DataFrame) -> tuple[pd.DataFrame, float]:
-    """Bins of the first finding's probability against its being right, and the expected calibration error.
+    """Bins of the probability of the first finding against the share of right ones, and the expected calibration error.
 
     Right: the mechanism of a true term, at its place or adjacent. An answer without a finding states no probability
     and is left out. Bins hold equal numbers of cases; the error is the mean over cases of the bins' |stated − right|
@@ -41,7 +41,7 @@ def stated_and_right(outcomes: pd.DataFrame) -> tuple[NDArray[np.float64], NDArr
 
 
 def calibration_error(pairs: NDArray[np.float64]) -> float:
-    """Of pairs (n, 2) of what was stated and whether it was right."""
+    """Of pairs (n, 2): stated probability, and 1 if right, else 0."""
     if not len(pairs):
         return float("nan")
     gaps = [len(own) * abs(float(np.mean(pairs[own, 0] - pairs[own, 1]))) for own in _bins(pairs[:, 0])]
@@ -49,9 +49,9 @@ def calibration_error(pairs: NDArray[np.float64]) -> float:
 
 
 def error_by_chance(stated: NDArray[np.float64], seed: int = 0) -> float:
-    """The calibration error that these probabilities (n,) show in the mean where every one of them is exactly right.
+    """Expected value of the calibration error of these probabilities (n,) if they are perfectly calibrated.
 
-    Ten bins of a dozen cases scatter about the truth: the error is never 0 (Bröcker and Smith 2007).
+    Finite bins scatter about the truth, so that the error is above 0 (Bröcker and Smith 2007).
     """
     if not len(stated):
         return float("nan")
@@ -68,14 +68,15 @@ GOAL_COLUMNS: Mapping[str, str] = {
     "low90": "Float64", "high90": "Float64", "n": "Int64", "met": "boolean", "informed": "Float64",
     "informed_n": "Int64", "plant": "string",
 }  # fmt: skip
-CALIBRATED = 0.05
-AHEAD = 0.15  # of the best baseline, in share of right answers
+CALIBRATION = Wanted("probabilities: expected calibration error", 0.05, "lower", unit="")
+LEAD = Wanted("right answers: lead over the best baseline", 0.15, "higher")  # in share of right answers
+WANTED: tuple[Wanted, ...] = (*GOALS, CALIBRATION, LEAD)
 
 
 def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFrame | None = None) -> pd.DataFrame:
     """Columns `GOAL_COLUMNS`, plant "all" first, then "unseen", kinds of machines that the diagnosis was not developed
     on, if there are any, then every plant. Shares with exact intervals, the rest by a bootstrap over cases.
-    `informed` is what an answer would reach that knows the truth (`goals.Goal`).
+    `informed` is the value of the true model (`goals.Goal`).
 
     `compared` (`evidence.proof.baselines.compared`) adds the lead over the best baseline, for all cases together.
     """
@@ -103,8 +104,7 @@ def _measured(outcomes: pd.DataFrame, terms: pd.DataFrame) -> Iterator[dict[str,
     low, high = (
         of_groups(list(pairs[:, None]), lambda g: calibration_error(np.vstack(g))) if len(pairs) else (None,) * 2
     )
-    wanted = Wanted("probabilities: expected calibration error", CALIBRATED, "lower", unit="")
-    row = _row_of(wanted, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
+    row = _row_of(CALIBRATION, calibration_error(pairs) if len(pairs) else None, low, high, len(pairs))
     yield row | {"informed": error_by_chance(pairs[:, 0]) if len(pairs) else None, "informed_n": len(pairs)}
 
 
@@ -120,13 +120,12 @@ def _row(goal: Goal, values: pd.Series) -> dict[str, Any]:
 
 def _lead(compared: pd.DataFrame) -> dict[str, Any]:
     """Over the baseline with the most right answers."""
-    wanted = Wanted("right answers: lead over the best baseline", AHEAD, "higher")
     baselines = compared[(compared["group"] == "baseline") & compared["lead"].notna()]
     if baselines.empty:
-        return _row_of(wanted, None, None, None, 0)
+        return _row_of(LEAD, None, None, None, 0)
     best = baselines.sort_values(["lead", "method"]).iloc[0]
     lead, low, high = (float(best[c]) for c in ("lead", "lead_low90", "lead_high90"))
-    return _row_of(wanted, lead, low, high, int(best["n"]))
+    return _row_of(LEAD, lead, low, high, int(best["n"]))
 
 
 def _row_of(wanted: Wanted, value: float | None, low: float | None, high: float | None, n: int) -> dict[str, Any]:

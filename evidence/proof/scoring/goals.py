@@ -1,4 +1,4 @@
-"""The goals of the proof, stated before any case is drawn, and the intervals of what is measured.
+"""The goals of the proof, fixed before any case is drawn, and the intervals of the measured values.
 
 Each entry of `GOALS` names a measure, the cases over which it is taken, and the value wanted. Shares have exact
 binomial intervals, other statistics bootstrap intervals over whole cases.
@@ -45,7 +45,7 @@ def bootstrap(values: pd.Series, statistic: Statistic, seed: int = 0) -> tuple[f
 def of_groups(
     groups: Sequence[NDArray[np.float64]], statistic: Callable[[Sequence[NDArray[np.float64]]], float], seed: int = 0
 ) -> tuple[float, float]:
-    """The same of any statistic of groups that are drawn whole."""
+    """The same for a statistic of groups that are resampled as a whole."""
     if not groups:
         raise ValueError("bootstrap: no values")
     if len(groups) == 1:
@@ -92,8 +92,8 @@ class Wanted:
 class Goal(Wanted):
     """One goal. `of` gives the values from outcomes and terms, indexed by case; `statistic` None: a share of yes or no.
 
-    `informed` gives the same values for an answer whose refitted model holds all true terms and that claims those that
-    pass the bars of a claim: what it misses, these recordings cannot give under such bars. None: not defined.
+    `informed` gives the same values for the true model, which contains all concealed effects and claims those that pass
+    the thresholds of a claim: what it misses, the recordings do not support. None: not defined.
     """
 
     of: Select
@@ -151,7 +151,7 @@ def _claims_of_two(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
 
 
 def _sized(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
-    """Visible physics that was found and whose amplitude both sides state."""
+    """Visible physics that is found, with an amplitude in key and finding."""
     rows = visible_physics(terms)
     return _both_stated(rows[rows["found"].fillna(False).astype(bool)])
 
@@ -178,14 +178,14 @@ def _covered(sizes: Sizes) -> Select:
 
 
 def _claimable(terms: pd.DataFrame) -> pd.DataFrame:
-    """Visible physics that a candidate states, and whether the true model's gain passes the bars: `passes`."""
+    """Visible physics with a candidate; `passes`: whether its gain in the true model passes the thresholds."""
     rows = visible_physics(terms)
     rows = rows[rows["gain_nats"].notna() & rows["bar_nats"].notna()]
     return rows.assign(passes=(rows["gain_nats"] > rows["bar_nats"]).astype(bool))
 
 
 def _informed(*kinds: str) -> Select:
-    """By case of these kinds (none named: all) with a visible effect that a candidate states, whether one passes."""
+    """By case of these kinds (none named: all) with a visible effect that a candidate describes: whether one passes."""
 
     def select(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
         rows = _claimable(terms)
@@ -204,7 +204,7 @@ def _informed_all(kind: str) -> Select:
 
 
 def _informed_sizes(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.DataFrame:
-    """Those that pass, with the amplitudes that the true model fits in place of those found."""
+    """Those that pass, with the amplitudes of the true model in place of those found."""
     rows = _claimable(terms).drop(columns=["amplitude_found", "low90", "high90"])
     rows = rows.rename(columns=lambda c: {"informed_amplitude": "amplitude_found"}.get(c, c.removeprefix("informed_")))
     return _both_stated(rows[rows["passes"]])
@@ -214,7 +214,7 @@ def _falsely_flagged(outcomes: pd.DataFrame, terms: pd.DataFrame) -> pd.Series:
     return _known(outcomes[outcomes["kind"] != "unlisted"], "flagged_unlisted")
 
 
-ONE = ("one", "invisible")  # of one listed effect each; which of them can be seen, the true model decides
+ONE = ("one", "invisible")  # of one listed effect each; the true model decides which are visible
 
 
 def _one(column: str) -> Select:

@@ -1,7 +1,7 @@
-"""Which finding is which true term, and which claims are false.
+"""Assignment of findings to true terms, and the false claims.
 
-A finding is a term's when the mechanism is the same (`names`) and the place is the true one or adjacent. One finding
-claims one term: a second name for the same thing is a false claim. Under the verdict "undecidable" a finding claims
+A finding matches a term if the mechanism is the same (`names`) and the place is the true one or adjacent. One finding
+matches one term: a second name for the same effect is a false claim. Under the verdict "undecidable" a finding claims
 its whole reported set; in confounded cases a partner is as true as the term. Alternatives and faults are claims too.
 """
 
@@ -19,7 +19,7 @@ from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from twin.mechanisms import MECHANISMS
 
 UNLISTED = "unlisted"
-FREE = ("free_flux", "free_shift")  # the regressions that stand in for physics of no listed mechanism
+FREE = ("free_flux", "free_shift")  # the regressions that describe physics of no listed mechanism
 SAME = (
     frozenset({"guide_friction", "nut_friction", "screw_bearing"}),  # heat in proportion to the feed
     frozenset({"jacket_chiller", "coolant_jacket"}),  # a fluid at a set temperature that takes heat from a body
@@ -35,21 +35,21 @@ def counted_as(mechanism: str | None) -> str:
 
 
 def means(named: str | None, term: TrueTerm) -> bool:
-    """Whether a reported name means the term's mechanism."""
+    """Whether a reported name means the mechanism of the term."""
     pair = {counted_as(named), counted_as(term.mechanism)}
     groups = SAME + (SAME_IF_SWITCHED if term.driver else ())
     return len(pair) == 1 or any(pair <= group for group in groups)
 
 
 def exact(named: Spot, term: TrueTerm) -> bool:
-    """The term's own place or one of `also`. A link is the same whichever end its name begins with."""
+    """The place of the term or one of `also`. The two ends of a link may be named in either order."""
     return any(same_place(named, place) for place in (term.where, *term.also))
 
 
 def near(named: Spot, term: TrueTerm, body_of: Mapping[str, str]) -> bool:
     """Exact, or adjacent: a touching body, a link that ends at the true place, an end of the true link.
 
-    A sensor stands for its body (`body_of`). Error channels and other sensors' faults have no neighbours.
+    A sensor represents its body (`body_of`). Error channels and faults of other sensors have no neighbours.
     """
     if exact(named, term):
         return True
@@ -79,7 +79,7 @@ def _ends(spot: Spot, body_of: Mapping[str, str]) -> set[str]:
 
 
 def reported_set(finding: Finding) -> list[tuple[str, Spot]]:
-    """Mechanism and place of all that the finding reports, itself first."""
+    """Mechanism and place of every explanation that the finding reports, its own first."""
     least = MIN_ALIKE_SHARE * finding.probability
     own = [(finding.mechanism, Spot(finding.where.kind, finding.where.name))]
     others = [(a.mechanism, Spot(a.where.kind, a.where.name)) for a in finding.alternatives if a.probability >= least]
@@ -88,9 +88,11 @@ def reported_set(finding: Finding) -> list[tuple[str, Spot]]:
 
 @dataclass(frozen=True)
 class Matches:
-    """Findings numbered best first; `of_term` the number that claims a term, or None; `false` those of no term.
+    """Findings numbered best first; `of_term` the number of the finding that matches a term, or None; `false` those
+    that match none.
 
-    `instead` is, for a term that none claims, the finding that took its place: at its place, else the next remaining.
+    `instead` is, for a term without a match, the finding reported in its stead: the one at its place, else the next
+    one.
     """
 
     findings: tuple[Finding, ...]
@@ -148,7 +150,7 @@ def _ties(finding: Finding, key: AnswerKey, body_of: Mapping[str, str]) -> bool:
     return any(names_term(m, place, t, body_of) for m, place in reported_set(finding) for t in key.terms)
 
 
-RATED_RPM = 6000.0  # at which what follows the speed is compared
+RATED_RPM = 6000.0  # at which effects of the speed are compared
 Values = Mapping[str, float]
 Sized = tuple[float | None, float | None, float | None]  # a value, and low and high of its 90 % interval
 Reported = Mapping[str, tuple[float | None, tuple[float | None, float | None] | None]]  # by parameter the same
@@ -180,13 +182,13 @@ PRODUCTS: Mapping[str, Callable[[Values], float]] = {
     "rotating_convection": _convection,
     "speed_shift": _shift_um,
     "motor_loss": _motor_W,
-    "draught": lambda p: p["factor"] * p["drop"],  # K: what a surface at room temperature loses, per W/K
+    "draught": lambda p: p["factor"] * p["drop"],  # K: loss of a surface at room temperature, per W/K
     "stratification": lambda p: p["gradient"] * p.get("height", 1.0),
 }
 
 
 def amplitude(mechanism: str, values: Values) -> float | None:
-    """The one number; None where these values do not give it. Of several amplitudes one that is not stated is off."""
+    """The amplitude as one number; None where these values do not give it. Of several amplitudes a missing one is 0."""
     if mechanism not in MECHANISMS:
         return None
     off = dict(MECHANISMS[mechanism].off or {})
@@ -200,21 +202,21 @@ def amplitude(mechanism: str, values: Values) -> float | None:
 
 
 def true_amplitude(term: TrueTerm) -> float | None:
-    """Of the key's own values."""
+    """The amplitude of the key."""
     values = {name: value for name, (value, _) in (term.parameters or {}).items()}
     return amplitude(term.mechanism, values) if term.mechanism else None
 
 
 def found_amplitude(finding: Finding, scale_of: TrueTerm) -> Sized:
-    """`sized` of a finding."""
+    """The amplitude of a finding."""
     reported = {name: (p.value, p.interval90) for name, p in finding.parameters.items()}
     return sized(finding.mechanism, reported, scale_of)
 
 
 def sized(mechanism: str, parameters: Reported, scale_of: TrueTerm) -> Sized:
-    """Value, low and high of the 90 % interval, in what the key states; the interval None where none is stated.
+    """Value, low and high of the 90 % interval, in the quantity of the key; the interval is None if none is stated.
 
-    Of the key only what sets the scale is taken (a rated speed), never a size. A product's interval is that of its
+    From the key only the scale is taken (a rated speed), never a size. A product's interval is that of its
     first amplitude, the other values held; several amplitudes have none.
     """
     given = {name: v for name, (v, _) in (scale_of.parameters or {}).items()}
@@ -284,7 +286,7 @@ JOINING = {"and", "times", "with", "x"}
 
 
 def flagged(findings: Findings) -> bool:
-    """Whether the verdict or a finding states that something is in no list."""
+    """Whether the verdict or a finding reports an unlisted effect."""
     return findings.verdict == "unlisted" or any(counted_as(f.mechanism) == UNLISTED for f in findings.findings)
 
 

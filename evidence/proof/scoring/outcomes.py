@@ -1,6 +1,6 @@
-"""Outcomes: one row a case and one row a true term, from the key, what was stored, and the true models.
+"""Outcomes: one row per case and one row per true term, from the keys, the stored answers, and the true models.
 
-Cells that do not apply are empty. A diagnosis that failed has found nothing, and is right about nothing.
+Cells that do not apply are empty. A failed diagnosis counts as wrong without findings.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def error_level(rms: Mapping[str, float | None], noise: Mapping[str, float | Non
 
 
 def closed(before: float | None, after: float | None, true: float | None) -> float | None:
-    """Share of the way from the baseline to the true model; at most 1, None where the true model is no better."""
+    """Error reduction in units of the true model's; at most 1, None where the true model is no better."""
     if before is None or after is None or true is None or before <= true:
         return None
     return min(1.0, 1.0 - (after - true) / (before - true))
@@ -94,7 +94,7 @@ def outcomes(
 
 
 def visible_physics(terms: pd.DataFrame) -> pd.DataFrame:
-    """Of true terms (columns `TERMS`) those that can be seen and are physics, no decoys."""
+    """The true terms (columns `TERMS`) that are visible and physics, without decoys."""
     return terms[terms["visible"].fillna(False).astype(bool) & ~terms["decoy"].astype(bool)]
 
 
@@ -152,7 +152,7 @@ def outcome(
 
 
 def _first(key: AnswerKey, stored: Stored, first: Finding | None) -> dict[str, Any]:
-    """The first finding, compared with the term that it comes nearest to."""
+    """The first finding, compared with the term that it matches best."""
     if first is None:
         lost = dict.fromkeys(("first_right", "in_set", "place_exact", "place_near"), False)
         return lost if key.physics else {}
@@ -170,7 +170,7 @@ def _first(key: AnswerKey, stored: Stored, first: Finding | None) -> dict[str, A
 
 
 def _matched(key: AnswerKey, stored: Stored, found: Matches) -> dict[str, Any]:
-    """When and how much, of the first term of the key that was found."""
+    """Time windows and amplitude of the first term of the key that is found."""
     for term, n in zip(key.terms, found.of_term, strict=True):
         if n is None or term.decoy:
             continue
@@ -214,9 +214,9 @@ def _holds(findings: Findings, key: AnswerKey, stored: Stored) -> bool:
 
 
 def _settled(key: AnswerKey, stored: Stored, findings: Findings) -> bool | None:
-    """Whether the proposed run left the truth alone in the reported set; no run was needed where it stood alone.
+    """Whether the reported set contains the truth alone after the proposed run; no run is needed if it does before.
 
-    What is one law under several names counts as one: no run could distinguish them.
+    Names of the same law count as one: no run can distinguish them.
     """
     if not any(_tied(f, key) for f in findings.findings):
         return None
@@ -229,7 +229,7 @@ def _settled(key: AnswerKey, stored: Stored, findings: Findings) -> bool | None:
 
 
 def _tied(finding: Finding, key: AnswerKey) -> bool:
-    """Whether its reported set holds more than one thing."""
+    """Whether its reported set contains several explanations."""
 
     def name(mechanism: str) -> str:
         return next((str(t.mechanism) for t in key.physics if means(mechanism, t)), mechanism)
@@ -238,10 +238,10 @@ def _tied(finding: Finding, key: AnswerKey) -> bool:
 
 
 def _right(key: AnswerKey, out: Mapping[str, Any], seen: list[dict[str, Any]], found: Matches) -> bool:
-    """The whole answer: every visible term by its mechanism at its place, and no false claim.
+    """Whether the answer is entirely right: every visible term by its mechanism at its place, and no false claim.
 
-    Confounded: the reported set holds the truth. Unlisted: it states so, at the place or adjacent. What cannot be seen,
-    or is no physics, need not be reported.
+    Confounded: the reported set contains the truth. Unlisted: reported as such, at the place or adjacent. Invisible
+    effects and decoys need not be reported.
     """
     if out["false_claims"]:
         return False

@@ -48,14 +48,14 @@ def by(outcomes: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def confusion(terms: pd.DataFrame, what: Literal["mechanism", "place"]) -> pd.DataFrame:
-    """Of visible physics: what was `true`, what was `named` in its stead ("nothing" too) and how often, `count`."""
+    """Of visible physics: the `true` name, the `named` one (or "nothing") and their `count`."""
     rows = visible_physics(terms)
     table = pd.DataFrame({"true": rows[what].astype(str), "named": rows[f"named_{what}"].astype(str)})
     return table.value_counts(sort=False).rename("count").reset_index()
 
 
 def worst(outcomes: pd.DataFrame, most: int = 10) -> pd.DataFrame:
-    """So many cases that are not right, the worst first: columns of the outcomes and `why`, one sentence."""
+    """The worst wrong cases, the worst first: columns of the outcomes and `why`, one sentence."""
     wrong = outcomes[~outcomes["right"].fillna(False).astype(bool)].copy()
     wrong["why"] = [_why(row) for _, row in wrong.iterrows()]
     wrong["rank"] = [_badness(row) for _, row in wrong.iterrows()]
@@ -64,7 +64,7 @@ def worst(outcomes: pd.DataFrame, most: int = 10) -> pd.DataFrame:
 
 
 def _badness(row: pd.Series) -> float:
-    """A false alarm where nothing is missing first, then false names by how sure, then what was overlooked."""
+    """False alarms first, then false names by their probability, then missed effects."""
     if row["failed"]:
         return 5.0
     false = _number(row["false_claims"]) > 0
@@ -80,30 +80,30 @@ def _why(row: pd.Series) -> str:
     if row["failed"]:
         return f"{what}: the diagnosis failed."
     false = int(_number(row["false_claims"]))
-    sure = f", {100 * _number(row['probability']):.0f} % sure" if pd.notna(row["probability"]) else ""
+    sure = f", probability {100 * _number(row['probability']):.0f} %" if pd.notna(row["probability"]) else ""
     if row["kind"] in ("nothing", "decoy") and false:
-        return f"No physics was missing, yet {_claims(false)}{sure}."
+        return f"No physics is missing; {_claims(false)}{sure}."
     if _true(row["visible"]) and not _true(row["detected"]):
-        return f"{what} was visible and overlooked."
+        return f"{what} was visible and is missed."
     if false and row["kind"] != "unlisted" and _true(row["flagged_unlisted"]) and not _true(row["first_right"]):
         there = ", at the right place" if _true(row["place_exact"]) else ""
-        return f"{what} is listed and was reported as in no list{there}."
+        return f"{what} is listed and is reported as unlisted{there}."
     if false and not _true(row["first_right"]):
-        held = "; the truth was in the reported set" if _true(row["in_set"]) else ""
-        return f"{what} was taken for something else{sure}{held}."
+        held = "; the truth is in the reported set" if _true(row["in_set"]) else ""
+        return f"{what} is named as something else{sure}{held}."
     if false:
-        return f"{what} was named, and in addition {_claims(false)}."
+        return f"{what} is named, with {_claims(false)}."
     if row["kind"] == "unlisted" and not _true(row["flagged_unlisted"]):
-        return f"{what} is in no list, and the answer does not say so."
+        return f"{what} is unlisted, and the answer does not say so."
     if _true(row["first_right"]) and not _true(row["place_exact"]):
-        return f"{what} was named{' at a neighbouring place' if _true(row['place_near']) else ' at another place'}."
+        return f"{what} is named{' at a neighbouring place' if _true(row['place_near']) else ' at another place'}."
     if _number(row["visible_terms"]) > 1 and not _true(row["all_named"]):
-        return f"{what}: not all of {int(_number(row['visible_terms']))} visible effects were named."
-    return f"{what}: the answer does not say what is missing (verdict {row['verdict']})."
+        return f"{what}: not all of {int(_number(row['visible_terms']))} visible effects are named."
+    return f"{what}: the answer does not name the effect (verdict {row['verdict']})."
 
 
 def _claims(n: int) -> str:
-    return "one thing was claimed that is not so" if n == 1 else f"{n} things were claimed that are not so"
+    return "one false claim" if n == 1 else f"{n} false claims"
 
 
 def _number(value: object) -> float:
@@ -187,7 +187,7 @@ def as_findings(reply: Mapping[str, Any], like: Findings) -> Findings:
 
 
 def _answered(known: Mapping[str, Stored], method: str) -> dict[str, Stored]:
-    """What was stored, with this method's reply in place of the diagnosis'; without one it has failed."""
+    """The stored answer with the reply of this method in place of the diagnosis; without a reply it has failed."""
     out = {}
     for name, own in known.items():
         given = own.replies or {}
@@ -222,11 +222,11 @@ def _lead(better: pd.DataFrame, other: pd.DataFrame) -> dict[str, float]:
     return {"lead": float(gap.mean()), "lead_low90": low, "lead_high90": high}
 
 
-LITTLE = "the effect itself gains less than a claim takes"
-ALIKE = "what was reported instead gains as much as the effect"
-PREFERRED = "something that gains less was reported instead"
-SILENT = "the effect gains enough, and nothing was reported"
-OF_RECORDINGS = (LITTLE, ALIKE)  # the others are the search's
+LITTLE = "the effect gains less than the threshold of a claim"
+ALIKE = "another explanation that gains as much was reported"
+PREFERRED = "another explanation that gains less was reported"
+SILENT = "the effect gains more than the threshold, nothing was reported"
+OF_RECORDINGS = (LITTLE, ALIKE)  # the others are limited by the search
 REASONS = (*OF_RECORDINGS, PREFERRED, SILENT)
 
 MISSED: Mapping[str, str] = {

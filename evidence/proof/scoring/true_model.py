@@ -1,8 +1,8 @@
-"""The twin with the true terms in it, refitted: what a perfect answer would reach, and which terms can be seen at all.
+"""The true model, the twin with the concealed terms, refitted: errors of a perfect answer, and visibility of each term.
 
 A term is visible when, with the others in, it cuts the left-out error of some channel by a tenth and gains more on the
 left-out batches than structure alone does (99 % quantile of the structural null, without a diagnosis' own margin).
-What no candidate states is compared with the same case redrawn without it.
+A term that no candidate describes is compared with the same case simulated without it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, alone, proposed, screen
 from diagnosis.search.acceptance import least_gain
 from diagnosis.search.null import Null, null_with, structural_null
-from diagnosis.search.refits import improved
+from diagnosis.search.refits import better_and_worse
 from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from evidence.proof.scoring.matching import Sized, counted_as, exact, sized
 from twin.calibration.identifiability import Interval, intervals90
@@ -46,23 +46,23 @@ from twin.schema import TwinPart, twin_part
 def true_candidates(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) -> list[Scored]:
     """The candidates at the term's place with its mechanism, best first in the screen.
 
-    The key does not state by which channel the twin would drive it, or which other bodies it would involve.
+    The key does not state the driver channel of the twin, or the other bodies involved.
     """
     own = [s for s in seen.scored if _is(term, s.candidate)]
     own = [s for s in own if s.candidate.where.name == term.where.name] or own
     if own:
         return sorted(own, key=lambda s: -s.gain)
-    unseen = next((c for c in every if _is(term, c)), None)  # what cannot be switched off has no signature
+    unseen = next((c for c in every if _is(term, c)), None)  # a term that cannot be switched off has no signature
     return [] if unseen is None else [Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)]
 
 
 def open_shape(term: TrueTerm, s: Scored) -> bool:
-    """Whether it has a shape that the key does not state: the screen saw it at one value of that alone."""
+    """Whether it has a shape parameter that the key does not state and that the screen evaluates at one value only."""
     return not set(s.candidate.shape) <= set(term.parameters or {})
 
 
 def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
-    """The law of a heat that no list has, as the key states it; None where it states none or a driver is not recorded.
+    """The law of an unlisted heat as the key states it; None if it states none or a driver is not recorded.
 
     `true_candidates` finds it among the candidates.
     """
@@ -75,8 +75,9 @@ def of_no_list(term: TrueTerm, fit: Fitted) -> Candidate | None:
 
 
 def each_its_own(terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]) -> list[Scored | None]:
-    """By term the first of its choices, none twice: of what two terms want, each has first what is driven as its key
-    says. A cabinet's heat and a pump's at one body are two candidates of one mechanism."""
+    """By term its first choice, none twice; candidates driven as the key states have priority. The heats of a cabinet
+    and of a pump at one body are two candidates of one mechanism.
+    """
     wanted = Counter(own[0].candidate.name for own in choices if own)
     out: list[Scored | None] = []
     for term, own in zip(terms, choices, strict=True):
@@ -90,8 +91,9 @@ def each_its_own(terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]])
 def begun_at_truth(
     term: TrueTerm, s: Scored, now: Fitted, share: float = 1.0
 ) -> tuple[Mapping[str, Value], Mapping[str, float]]:
-    """`start_values` of a refit, with the key's values to begin with, amplitudes at this share of them; priors are
-    what a diagnosis would have."""
+    """`start_values` of a refit that begins at the values of the key, amplitudes at this share of them; priors are
+    those of a diagnosis.
+    """
     c = s.candidate
     if c.mechanism not in MECHANISMS or c.change is not None:
         return start_values(s, now)
@@ -111,7 +113,7 @@ def begun_at_truth(
 def with_terms(
     part: TwinPart, terms: Sequence[TrueTerm], found: Sequence[Scored], now: Fitted, share: float = 1.0
 ) -> tuple[TwinPart, dict[str, float]]:
-    """The twin part with these candidates in it, and where a refit begins; `share` as in `begun_at_truth`.
+    """The twin part with these candidates, and the start of a refit; `share` as in `begun_at_truth`.
 
     Raises:
         ValueError: two of them take the same name.
@@ -139,18 +141,18 @@ def _said(number: float, unit: str) -> str | float:
     return float(f"{number:.6g}") if unit == "1" else f"{number:.6g} {unit}"
 
 
-CUT = 0.1  # of a channel's left-out error: less is not worth a name
+CUT = 0.1  # of a channel's left-out error: a smaller reduction is not visible
 Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
 
 
 @dataclass(frozen=True)
 class TrueModel:
-    """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term
-    of `gain_nats`, `threshold_nats` and `bar_nats`, what a diagnosis requires of a gain before it claims it; nan where
-    nothing could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval
-    as a diagnosis would state them (`amplitude.sized`).
+    """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term of
+    `gain_nats`, `threshold_nats` and `bar_nats`, the gain that a diagnosis requires for a claim; nan where nothing
+    could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval as a
+    diagnosis states them (`amplitude.sized`).
 
-    `visible` None: not known, as no candidate states the term and the case could not be redrawn.
+    `visible` None: unknown, since no candidate describes the term and the case cannot be redrawn.
     """
 
     error_before: float
@@ -167,7 +169,7 @@ class TrueModel:
 def true_model(
     machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any], redraw: Redraw | None = None, seed: int = 0
 ) -> TrueModel:
-    """The true model of a case whose key is open.
+    """The true model of an opened case.
 
     Args:
         answer: the key as the vault's JSON gives it.
@@ -194,7 +196,7 @@ def true_model(
         for k, t in enumerate(key.terms)
     ]
     others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
-    best = full if stated and not others else others[0] if others else fit  # an unlisted effect stands alone
+    best = full if stated and not others else others[0] if others else fit  # an unlisted effect is the only one
     numbers = zip(*((j.gain, j.threshold, j.bar, j.visible, j.size) for j in judged), strict=True)
     return TrueModel(level, _level(best), 1.0, *numbers)
 
@@ -225,8 +227,8 @@ def _null(fit: Fitted, seed: int) -> Null:
 def best_candidates(
     fit: Fitted, terms: Sequence[TrueTerm], choices: Sequence[Sequence[Scored]]
 ) -> tuple[list[Scored | None], Fitted | None]:
-    """By term the candidate that states it best, by the screen, or by refits where that saw one shape of many; and the
-    fit with all of them.
+    """By term the candidate that describes it best, by the screen, or by refits where its shape is unknown; and the fit
+    with all of them.
     """
     found = each_its_own(terms, choices)
     several = [k for k, own in enumerate(choices) if len(own) > 1 and open_shape(terms[k], own[0])]
@@ -242,10 +244,10 @@ def best_candidates(
 
 
 def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]) -> Fitted | None:
-    """The fit with the terms that are stated in it at its optimum; None where it cannot be simulated.
+    """The fit with the stated terms at its optimum; None where it cannot be simulated.
 
-    As a diagnosis does, it begins with less where all of it cannot: heat that feeds itself runs away in a network whose
-    values are off.
+    As in a diagnosis, it begins with a smaller amplitude where the full one cannot be simulated: heat with positive
+    feedback diverges in a network with wrong values.
     """
     own = [(t, s) for t, s in zip(terms, found, strict=True) if s is not None]
     for share in (1.0, *POLICY.start_amplitude_shares):
@@ -263,13 +265,13 @@ def _judged(
     fit: Fitted, full: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int,
     stated: Sequence[int], seed: int,
 ) -> _Judged:  # fmt: skip
-    """One term with the others in: the better of two fits without it is what it must beat."""
+    """One term with the others in the model, compared with the better of two fits without it."""
     others = [k for k in stated if k != which]
     own = [(terms[k], s) for k in others if (s := found[k]) is not None]
     part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
     try:
         back = refitted(full, part)
-        # where the first fit stands at its optimum, a second one only shows whether it had stopped short
+        # the second fit shows whether the first one stopped short of its optimum
         without = [settle(back)] if others else [settle(back, steps=4, tolerance=0.05, rounds=2), fit]
     except (InputError, WorkError):
         return _Judged()
@@ -279,19 +281,19 @@ def _judged(
     s = found[which]
     assert s is not None
     nulls = null_with(without[best], full, s.candidate, seed)
-    if nulls is None:  # a value that is doubted, labels that are swapped
+    if nulls is None:  # an uncertain value, swapped labels
         nulls = _null(without[best], seed), _score(full, memory)
     structure = nulls[0].threshold(nulls[1], name=s.candidate.name, margin=1.0)
     out = _beyond(without[best], full, memory, structure)
-    better = improved(alone(without[best], memory), alone(full, memory))
-    least = least_gain(Tried(s, out.gain, better, s.candidate.name, 0.0, full), len(full.batches))
+    better, worse = better_and_worse(alone(without[best], memory), alone(full, memory))
+    least = least_gain(Tried(s, out.gain, better, s.candidate.name, 0.0, full, worse=worse))
     size = _size(full, s, terms[which], nulls[0].scatter(s.candidate.name, nulls[1]))
     return replace(out, bar=max(least, POLICY.null_margin * structure), size=size)
 
 
 @lru_cache(maxsize=1)
 def _known(full: Fitted) -> dict[str, Interval]:
-    """The intervals of a fit's parameters, by name; the last fit's are kept, since each of its terms needs them."""
+    """Intervals of the parameters of a fit, by name; those of the last fit are cached, as each term needs them."""
     state = replace(full.state, noise=full.noise)
     return {
         i.name: i
@@ -300,7 +302,7 @@ def _known(full: Fitted) -> dict[str, Interval]:
 
 
 def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
-    """The term's amplitude in the true model, stated as a diagnosis states it."""
+    """The amplitude of the term in the true model, stated as in a diagnosis."""
     stated, _ = reported_parameters(full, s.candidate, _known(full), scatter)
     parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in stated.items()}
     return sized(s.candidate.mechanism, parameters, term)

@@ -1,1 +1,1 @@
-"""Sealing a proof, running it apart from its answers, and opening it: who saw what, and when, can be checked later."""
+"""Sealing a proof, running it in isolation from its keys, and opening it, with a record that can be verified later."""

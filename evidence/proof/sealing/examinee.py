@@ -1,8 +1,8 @@
-"""The process that answers one case: it confines itself, then diagnoses what lies in its place, and writes there.
+"""The process that answers one case: it confines itself, diagnoses its case, and writes the answer.
 
-Started by `evidence.proof.sealing.running` with its task as JSON on standard input. Its place holds `case` (machine
-file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read.
-Only the standard library and names of packages are imported before the walls stand.
+Started by `evidence.proof.sealing.running` with its task as JSON on standard input. Its folder holds `case` (machine
+file and recordings), `answer`, which it fills, and `witness`, a file that it must not be able to read. Only the
+standard library and names of packages are imported before the process is confined.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PLAN, SERIES = "next_run.yml", "series.csv"
 
 
 def main() -> None:
-    """Answer the case; `status.json` states how far it came, under which protection, and what went wrong."""
+    """Answer the case; `status.json` states the last step, the protection, and any error."""
     task = json.loads(sys.stdin.read())
     place = Path(task["place"])
     import_from = [Path(p) for p in task["import_from"]]
@@ -41,12 +41,12 @@ def main() -> None:
         if baselines is not None:
             _write(place, REPLIES, _json(baselines(diagnosis)))
         _report(place, status | {"stage": "done"})
-    except Exception as error:  # whatever it is, it is the answer to this case
+    except Exception as error:  # any error is the answer to this case
         _report(place, status | {"error": _one_line(error)})
 
 
 def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
-    """Machine and batches of a case as `thermodrift diagnose` reads them: into a lake, here an own one, and checked.
+    """Machine and batches of a case as `thermodrift diagnose` reads them: into a lake of its own, and checked.
 
     Raises:
         InputError: a machine file or recordings that cannot be used.
@@ -67,7 +67,7 @@ def read_case(case: Path, lake: Path) -> tuple[Any, list[Any]]:
 
 
 def _write_diagnosis(place: Path, diagnosis: Any) -> None:
-    """The findings, the next run's plan if there is one, and the series that a picture of the case would show."""
+    """The findings, the plan of the next run if any, and the series for a figure of the case."""
     from diagnosis.findings.schema import as_json
 
     _write(place, FINDINGS, as_json(diagnosis.findings))
@@ -90,7 +90,7 @@ def _json(value: Any) -> str:
 
 
 def _write(place: Path, name: str, text: str) -> None:
-    """Whole or not at all."""
+    """Atomic."""
     scratch = place / "answer" / f"{name}.part"
     scratch.write_text(text, encoding="utf-8")
     scratch.replace(place / "answer" / name)

@@ -1,4 +1,4 @@
-"""The folder of a proof: where everything in it lies, and only one who works on it at a time."""
+"""The folder of a proof: its layout, and a lock that admits one process at a time."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def files_digest(root: Path, files: Iterable[Path]) -> str:
 
 
 def source_digest() -> str:
-    """SHA-256 over the source that an answering process may read of this package: all that can change an answer."""
+    """SHA-256 over the source that an answering process may read: everything that can change an answer."""
     root, parts = own_source()
     files = {f for p in parts for f in ([p] if p.is_file() else p.rglob("*"))}
     return files_digest(root, sorted(f for f in files if f.is_file() and f.suffix != ".pyc"))
@@ -75,7 +75,7 @@ class Entry:
     own: str = field(default="")
 
     def plain(self) -> dict[str, Any]:
-        """As it is hashed."""
+        """The hashed form."""
         return {"at": self.at, "step": self.step, "details": dict(self.details), "before": self.before}
 
     @property
@@ -85,10 +85,10 @@ class Entry:
 
 
 class Ledger:
-    """The lines of a file, checked when it is opened, and the only way to add to them.
+    """The lines of a file, verified when it is opened; lines can only be appended.
 
     Raises:
-        InputError: a line that is not as it was written.
+        InputError: a line that was changed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -138,7 +138,7 @@ def _read(path: Path) -> list[Entry]:
         if entry is None or entry.before != before or entry.own != digest_of(entry.plain()):
             raise InputError(
                 f"ledger {path} line {number}: is not as it was written, the chain of hashes breaks there; "
-                "this proof is worth nothing any more, seal a new one"
+                "this proof is void, seal a new one"
             )
         entries.append(entry)
     return entries
@@ -154,7 +154,7 @@ def _entry(text: bytes) -> Entry | None:
 
 @dataclass(frozen=True)
 class ProofFolder:
-    """PROOF: an answering process gets one of `cases`; `vault` holds the keys, `answers` what was answered."""
+    """PROOF: an answering process gets one of `cases`; `vault` holds the keys, `answers` the answers."""
 
     path: Path
 
@@ -198,14 +198,14 @@ class ProofFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Nobody else works on this proof meanwhile.
+        """Lock the proof against other processes.
 
         Raises:
-            InputError: somebody does, or an answering process could see into the folder.
+            InputError: another process holds the lock, or an answering process could read the folder.
             WorkError: it cannot be written.
         """
         if (seen := allowed().covers(self.path)) is not None:
-            raise InputError(f"{self.path}: lies in {seen}, which answering processes may see; give another folder")
+            raise InputError(f"{self.path}: lies in {seen}, which answering processes may read; give another folder")
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             with FileLock(self.path / ".lock", timeout=0):
@@ -229,7 +229,7 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Plain data into a file of the proof, in one step."""
+    """Plain data into a file of the proof, atomically."""
     write_atomic(path, json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n")
 
 
@@ -241,7 +241,7 @@ TWICE = "it was answered twice"
 class State:
     """`answered`: digest of each case's answer since the last restart; `void`: why a case does not count.
 
-    `begun`: cases that a process was started for and that were not finished. `source`: digest of the source that
+    `begun`: cases with a started and unfinished process. `source`: digest of the source that
     answers, as it was sealed or, after a restart, begun anew; `ran`: whether a run has begun.
     """
 

@@ -1,9 +1,9 @@
-"""A confined process: it reads the interpreter, the libraries, the diagnosis' source and one place, and nothing else.
+"""Isolation of a process: it can read the interpreter, the libraries, the source of the diagnosis and one folder only.
 
-Two walls. Landlock (Linux 5.13; Salaün, "Landlock: unprivileged access control", kernel documentation) binds the
-process in the kernel, root and native code as well, and cannot be lifted. Python's audit hook stands everywhere; it
-stops Python code and states what was refused, but native code could pass it.
-Only the standard library is imported here: the walls stand before anything else is loaded.
+Two layers. Landlock (Linux 5.13; Salaün, "Landlock: unprivileged access control", kernel documentation) confines the
+process in the kernel, including root and native code, and cannot be lifted. Python's audit hook works on every system;
+it stops Python code and reports refusals, but native code can bypass it. Only the standard library is imported here,
+since isolation precedes every other import.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SYSTEM = (
     "/usr/share/zoneinfo", "/dev/null", "/dev/zero", "/dev/urandom", "/dev/random", "/proc/self", "/proc/cpuinfo",
     "/proc/meminfo", "/sys/devices/system/cpu",
 )  # fmt: skip
-# What an answering process may read below the root: not plants/, which draws cases, nor what judges them.
+# Folders that an answering process may read below the root: not plants/, which draws cases, nor the scoring.
 READABLE = (
     "data", "twin", "diagnosis", "evidence/__init__.py", "evidence/proof/__init__.py", "evidence/proof/baselines",
     "evidence/proof/sealing/__init__.py", "evidence/proof/sealing/examinee.py", "evidence/proof/sealing/isolation.py",
@@ -48,7 +48,7 @@ class Allowed:
     write: tuple[Path, ...] = ()
 
     def covers(self, path: Path) -> Path | None:
-        """The folder through which a path could be seen, None where it cannot."""
+        """The readable folder that contains a path, None if there is none."""
         path = path.resolve()
         return next((p for p in (*self.read, *self.listed, *self.write) if path.is_relative_to(p)), None)
 
@@ -60,7 +60,7 @@ def own_source() -> tuple[Path, tuple[Path, ...]]:
 
 
 def allowed(place: Path | None = None, import_from: Iterable[Path] = ()) -> Allowed:
-    """What an answering process may see; `place` is its own, with the folders `case` to read and `answer` to write."""
+    """What an answering process may read; `place` is its own folder, with `case` to read and `answer` to write."""
     root, source = own_source()
     own = () if place is None else (place / "case",)
     libraries = {sysconfig.get_path(k) for k in ("stdlib", "platstdlib", "purelib", "platlib")}
@@ -71,9 +71,9 @@ def allowed(place: Path | None = None, import_from: Iterable[Path] = ()) -> Allo
 
 
 def confine(to: Allowed, witness: Path) -> str:
-    """Put up both walls around this process, for good.
+    """Isolate this process with both layers, irrevocably.
 
-    `witness` is a readable file outside: whether the kernel refuses it is tried, not assumed.
+    `witness` is a readable file outside, which verifies that the kernel refuses access.
     Returns which protection holds: "landlock and audit hook" or "audit hook".
     """
     landlocked = _landlock(to)
@@ -83,7 +83,7 @@ def confine(to: Allowed, witness: Path) -> str:
 
 
 def audit_hook(to: Allowed) -> Any:
-    """Refuses what the walls forbid by PermissionError; an audit hook cannot be removed."""
+    """Raises PermissionError for forbidden access; an audit hook cannot be removed."""
     read = tuple(str(p) for p in (*to.read, *to.write))
     listed = (*read, *(str(p) for p in to.listed))
     write = tuple(str(p) for p in to.write)
@@ -110,7 +110,7 @@ def audit_hook(to: Allowed) -> Any:
             return
         for path in args[: 2 if event.startswith(CHANGES) else 1]:  # a renaming has two paths
             if not inside(path, roots):
-                raise PermissionError(13, f"{event}: outside of what the answering process may see", str(path))
+                raise PermissionError(13, f"{event}: outside of what the answering process may read", str(path))
 
     return hook
 
@@ -125,7 +125,7 @@ class _Beneath(ctypes.Structure):
 
 
 def _landlock(to: Allowed) -> bool:
-    """Restrict this thread and all that it starts; False where the kernel has no Landlock."""
+    """Restrict this thread and its children; False where the kernel has no Landlock."""
     try:
         libc = ctypes.CDLL(None, use_errno=True)
         version = int(libc.syscall(CREATE_RULESET, None, ctypes.c_size_t(0), VERSION))

@@ -1,9 +1,9 @@
-"""The leak test: whether a classifier that sees no temperature and no error can predict what a case conceals.
+"""The leak test: whether a classifier without temperatures and errors can predict the concealed effect of a case.
 
 Two learners of different kinds, shrunk linear discriminants (Ledoit and Wolf 2004) and extremely randomised trees
 (Geurts, Ernst and Wehenkel 2006), answer for cases left out; their mean is judged by the area under the ROC curve.
-Chance is what the same learners reach after the answers were dealt anew (Ojala and Garriga 2010, test 1), within each
-plant, since plants may be distinguishable.
+Chance is the performance of the same learners after permutation of the answers (Ojala and Garriga 2010, test 1), within
+each plant, since plants may be distinguishable.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from threadpoolctl import threadpool_limits
 
 from evidence.proof.spec import SIMULATED
 
-RARE = 0.03  # of the cases; a word of the machine file that is present or absent in fewer carries no information
+RARE = 0.03  # of the cases; a word of the machine file present or absent in fewer is no feature
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?$", re.IGNORECASE)
 
 
 def leak_features(cases: Sequence[Path]) -> pd.DataFrame:
-    """A row a case folder, a column a feature; nothing of what sensors and probes show. Unknown values are nan."""
+    """A row per case folder, a column per feature; no readings of sensors and probes. Unknown values are nan."""
     texts = [(folder / "machine.yml").read_text(encoding="utf-8") for folder in cases]
     described = [_described(text, folder / "recordings") for text, folder in zip(texts, cases, strict=True)]
     words = pd.DataFrame([_words(text) for text in texts]).notna()
@@ -49,7 +49,7 @@ def _described(text: str, recordings: Path) -> dict[str, float]:
 
 
 def _machine(text: str, tree: Mapping[str, Any], roles: Sequence[str]) -> dict[str, float]:
-    """Sizes of the file and of its parts, and how its numbers look."""
+    """Sizes of the file and of its parts, and statistics of its numbers."""
     twin = tree.get("twin") or {}
     name = str(tree["machine"])
     out: dict[str, float] = {
@@ -72,7 +72,7 @@ def _machine(text: str, tree: Mapping[str, Any], roles: Sequence[str]) -> dict[s
 
 
 def _words(text: str) -> dict[str, bool]:
-    """Every key and every word of the file that is no number."""
+    """Every key and every non-numeric word of the file."""
     return {word: True for word in re.findall(r"[A-Za-z_][\w-]*", text) if len(word) > 1}
 
 
@@ -87,7 +87,7 @@ def _numbers(tree: Any, key: str = "") -> list[tuple[str, float]]:
 
 
 def _recordings(folder: Path, role: Mapping[str, str]) -> dict[str, float]:
-    """Rows, holes, clocks, drivers and surroundings of the recordings: means over them, and how they scatter."""
+    """Rows, gaps, clocks, drivers and surroundings of the recordings: means and standard deviations over them."""
     rows = pd.DataFrame([_recording(path, role) for path in sorted(folder.iterdir())])
     out = {f"{c}, mean": _mean(rows[c].dropna()) for c in rows} | {f"{c}, sd": _sd(rows[c].dropna()) for c in rows}
     return out | {"recordings": float(len(rows))}
@@ -133,13 +133,13 @@ def _sd(values: Any) -> float:
     return float(np.std(values)) if len(values) else float("nan")
 
 
-PLANTS = SIMULATED  # real recordings are public, and are no secret
+PLANTS = SIMULATED  # real recordings are public
 SOUND = ("nothing", "decoy")
 FOLDS = 5
 LEAST = 2 * FOLDS  # cases of a class
 RESAMPLED = 500
 TREES = 20
-ENOUGH = 10  # deals as good as the truth: more of them would not change the verdict (Besag and Clifford 1991)
+ENOUGH = 10  # permutations as good as the truth at which the test stops (Besag and Clifford 1991)
 COLUMNS = ("question", "auc", "low90", "high90", "chance", "p", "n")
 Possible = Callable[[str, Mapping[str, Any]], bool]
 Features = NDArray[np.float64]
@@ -148,7 +148,7 @@ Labels = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Question:
-    """Features (n, F), classes (n,) from 0, and the group (n,) within which classes could be dealt anew."""
+    """Features (n, F), classes (n,) from 0, and the group (n,) within which classes can be permuted."""
 
     label: str
     features: Features
@@ -165,7 +165,7 @@ def leak_table(
     seed: int = 0,
     done: Callable[[str, int, int], None] | None = None,
 ) -> pd.DataFrame:
-    """Columns `COLUMNS`: area under the curve with a bootstrap interval, chance, and the share of deals as good.
+    """Columns `COLUMNS`: area under the curve with a bootstrap interval, chance, and the share of permutations as good.
 
     Questions: is physics missing, of which kind is the case, and which effect is it among those that the case's
     machine could have. A question with too few cases is left out.
@@ -201,7 +201,7 @@ def kind_questions(features: Features, keys: Sequence[Mapping[str, Any]]) -> lis
     common = kinds.isin([k for k, n in kinds.value_counts().items() if n >= LEAST]).to_numpy()
     classes = pd.factorize(kinds[common], sort=True)[0]
     out = [Question("is physics missing", features, missing, plant)]
-    if classes.max(initial=0) > 1:  # of two it would be the same question again
+    if classes.max(initial=0) > 1:  # with two kinds it is the same question
         out.append(Question("kind of the case", features[common], classes, plant[common]))
     return [q for q in out if np.bincount(q.classes, minlength=2).min() >= LEAST]
 
@@ -209,7 +209,7 @@ def kind_questions(features: Features, keys: Sequence[Mapping[str, Any]]) -> lis
 def effect_questions(
     features: Features, keys: Sequence[Mapping[str, Any]], possible: Possible | None
 ) -> list[Question]:
-    """For each effect: cases that have it against those that could have it and have another."""
+    """For each effect: cases with it against those that could have it and have another one."""
     single = [k for k, key in enumerate(keys) if key["kind"] == "one"]
     effect = {k: str(keys[k]["terms"][0]["effect"]) for k in single}
     out = []
@@ -242,7 +242,7 @@ def _row(
 
 
 def predicted(features: Features, classes: Labels) -> Features:
-    """Probability of each class (n, C) by learners that have not seen the case."""
+    """Probability of each class (n, C) by learners trained without the case."""
     linear = make_pipeline(StandardScaler(), LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"))
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=3, class_weight="balanced", random_state=0)
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
@@ -266,7 +266,7 @@ def _dealt(classes: Labels, group: Labels, rng: np.random.Generator) -> Labels:
 
 
 def _interval(classes: Labels, probability: Features, rng: np.random.Generator) -> tuple[float, float]:
-    """90 %, cases of each class drawn anew."""
+    """90 % bootstrap interval, cases resampled within each class."""
     members = [np.flatnonzero(classes == c) for c in range(probability.shape[1])]
     areas = []
     for _ in range(RESAMPLED):

@@ -1,4 +1,4 @@
-"""Opening: everything is checked against what was sealed and recorded, and only then the answers are shown."""
+"""Opening: everything is verified against seal and ledger before the keys are revealed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOST = "an answer is there that no run recorded"
 
 @dataclass(frozen=True)
 class Opened:
-    """A proof whose key is known: `answers` of all cases, `void` those that do not count and why."""
+    """An opened proof: `answers` are the keys of all cases, `void` the cases that do not count with the reason."""
 
     commitment: Mapping[str, Any]
     answers: Mapping[str, Mapping[str, Any]]
@@ -44,9 +44,9 @@ class Opened:
 
 
 def unseal(folder: ProofFolder, partial: bool = False) -> Opened:
-    """Check the whole proof and reveal it; `opened.json` lets anybody check it again.
+    """Verify the proof and reveal the keys; `opened.json` allows anyone to verify it again.
 
-    A proof may be opened again, with the same result: answers that come after the first opening are void.
+    A proof may be opened again with the same result: answers after the first opening are void.
 
     Args:
         partial: cases without an answer become void instead of preventing the opening.
@@ -120,7 +120,7 @@ def _suite_seed(folder: ProofFolder, commitment: Mapping[str, Any]) -> dict[str,
 
 
 def _kept(folder: ProofFolder, name: str, keys: tuple[str, ...]) -> tuple[Path, Mapping[str, Any]]:
-    """From the vault; of a proof that was opened and handed on without it, from `opened.json`."""
+    """From the vault, or from `opened.json` of an opened proof without a vault."""
     path = folder.vault / f"{name}.json"
     if path.exists() or not folder.opened.exists():
         return path, read_json(path)

@@ -1,4 +1,4 @@
-"""The run: every case answered once, each by a process of its own, under one and the same source."""
+"""The run: every case is answered once, each by its own process, all by the same source."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class Examinee:
 def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) -> dict[str, bytes]:
     """The answer to the case in a folder as files by name; `run.json` is always among them.
 
-    The process sees a copy of the folder in an empty place, an empty environment, and nothing that names the proof.
+    The process sees a copy of the folder in an empty directory, an empty environment, and no name of the proof.
 
     Args:
         source: digest of the source, for `run.json`.
-        stop: set once no answer is wanted any more.
+        stop: set when no further answer is needed.
 
     Raises:
-        WorkError: the process could not be started or shut in, or was stopped; nothing was answered.
+        WorkError: the process could not be started or isolated, or was stopped; there is no answer.
     """
     started = now()
     with tempfile.TemporaryDirectory(prefix="thermodrift-") as scratch:
@@ -82,16 +82,16 @@ def examine(case: Path, by: Examinee, source: str, stop: Event | None = None) ->
 
 
 def lay_out(case: Path, place: Path) -> None:
-    """What an answering process finds in its place: a copy of the case, a folder to fill, what it must not read."""
+    """The folder of an answering process: a copy of the case, a folder for the answer, a file that it must not read."""
     shutil.copytree(case, place / "case")
     for path in (place / "case").rglob("*"):
-        os.utime(path, (0, 0))  # the time at which a case was built is no part of it
+        os.utime(path, (0, 0))  # the build time of a case is no information
     (place / "answer").mkdir()
     (place / "witness").write_text("not to be read\n", encoding="utf-8")
 
 
 def _watched(place: Path, by: Examinee, stop: Event) -> str | None:
-    """Wait for the process; the reason why it was ended, if it was."""
+    """Wait for the process; returns the reason if it was stopped."""
     task = {"place": str(place), "diagnose": by.diagnose, "baselines": by.baselines, "import_from": by.import_from}
     command = [sys.executable, "-I", "-B", "-c", BEGIN, str(own_source()[0])]
     with (place / "output").open("wb") as output:
@@ -126,13 +126,13 @@ def environment(place: Path) -> Mapping[str, str]:
 
 
 def status_of(place: Path) -> dict[str, Any]:
-    """What the process states of itself; empty where it has not begun."""
+    """The status of the process; empty before it begins."""
     file = place / "answer" / STATUS
     return dict(json.loads(file.read_bytes())) if file.exists() else {}
 
 
 def last_line(place: Path, again: str = "the case again") -> str:
-    """The last that the process printed."""
+    """The last output of the process."""
     lines = (place / "output").read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else f"it ended without a message; run {again}"
 
@@ -143,7 +143,7 @@ Answered = Callable[[str, dict[str, bytes]], None]
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How many cases there are, how many were answered before and by this run, begun anew, and void."""
+    """Numbers of cases: all, answered before and by this run, restarted, and void."""
 
     cases: int
     before: int
@@ -155,10 +155,10 @@ class RunOutcome:
 def run(
     folder: ProofFolder, by: Examinee, workers: int = 1, restart: bool = False, done: Done | None = None
 ) -> RunOutcome:
-    """Answer every case that has no answer yet; what is there is kept, what was interrupted starts again.
+    """Answer every case that has no answer yet; answers are kept, interrupted cases start again.
 
     Args:
-        restart: drop all answers of another source and begin anew; the ledger says so.
+        restart: drop all answers of another source and start again; the ledger records it.
 
     Raises:
         InputError: not sealed, opened already, another source than the earlier answers', a changed case.
@@ -218,7 +218,7 @@ def _in_parallel(cases: list[str], answer: Answerer, answered: Answered, workers
 
 
 def _resumed(folder: ProofFolder, ledger: Ledger, state: State, source: str, restart: bool) -> State:
-    """Note what happened since the last run, and drop what may not stay."""
+    """Record the events since the last run, and drop answers that may not stay."""
     if state.source != source:
         if not restart:
             raise InputError(
@@ -262,7 +262,7 @@ def _check_source(folder: ProofFolder, source: str) -> None:
 
 
 def _store(target: Path, files: dict[str, bytes]) -> str:
-    """All files of an answer in one step; gives their digest."""
+    """Store all files of an answer atomically; returns their digest."""
     scratch = target.with_name(f".{uuid4().hex}.part")
     scratch.mkdir()
     for name, content in files.items():

@@ -1,4 +1,4 @@
-"""Sealing: cases without their answers, answers in a vault, and what is published before any case is answered."""
+"""Sealing: cases without keys, keys in a vault, and the root to publish before any case is answered."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Done = Callable[[str, int, int], None]
 
 
 class Spec(Protocol):
-    """A case to be made; the name reveals nothing about it."""
+    """The specification of a case; its name reveals nothing about it."""
 
     @property
     def name(self) -> str: ...
 
 
 Make = Callable[[Any, Path], dict[str, Any]]
-"""Builds a spec, writes machine file and recordings into the folder and gives the answer."""
+"""Builds a case: writes machine file and recordings into the folder and returns the key."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def seal(folder: ProofFolder, suite: Suite, make: Make, workers: int = 1, done: 
 
 
 def _clean(folder: ProofFolder) -> None:
-    """What a broken seal left goes; anything else in the folder is not ours to remove."""
+    """Files of an interrupted seal are removed; other files are not."""
     left = {folder.cases, folder.vault, folder.answers}
     strange = sorted(p.name for p in folder.path.iterdir() if p not in left and p.name != ".lock")
     if strange:
@@ -110,8 +110,8 @@ def _made(specs: Sequence[Spec], make: Make, cases: Path, workers: int) -> Itera
 
 
 def _lock_away(path: Path, value: Any) -> None:
-    """For the owner's eyes alone, before it holds anything."""
-    canonical(value)  # what could not be hashed again must not be sealed
+    """Readable by the owner only, from its creation on."""
+    canonical(value)  # only data that can be hashed again are sealed
     path.touch(mode=0o600)
     write_json(path, value)
     path.chmod(0o600)

@@ -1,4 +1,4 @@
-"""From a specification to what a diagnosis sees of the case, and to the answer key that it does not see."""
+"""From a specification to the visible part of a case and its answer key."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def batches_of(built: Built) -> list[Batch]:
 def real_suite(
     seed: bytes | int, data: Path, which: Which, plants: Sequence[PlantKind] = REAL, first: int = 1
 ) -> list[CaseSpec]:
-    """Every case whose recordings lie in the folder `data`, in an order drawn by lot, named from number `first` on.
+    """Every case whose recordings lie in the folder `data`, in random order, named from number `first` on.
 
     A grafted case and its reference, the same runs without the graft, have one seed; the case names its reference.
 
@@ -98,11 +98,11 @@ def _cases(plant: str) -> Any:
     return import_module(f"plants.{plant}")
 
 
-# Heat that grows with itself, and more exchange with a little air than a plant's explicit part is stable at: drawn
-# weaker until the machine survives.
+# Heat with positive feedback, and exchange with a small air volume beyond the stability limit of the explicit part,
+# are drawn weaker until the simulation is stable.
 RUNS_AWAY, WEAKER = ("preload_feedback", "rotating_convection"), 0.7
 HOTTEST_DEGC = 90.0
-TIMES = 20  # then the machine is as hot without it
+TIMES = 20  # the machine is as hot without it
 
 
 def build(spec: CaseSpec, data: Path | None = None) -> Built:
@@ -133,10 +133,10 @@ def _drawn(spec: CaseSpec) -> Case:
 
 
 def _seized(case: Case) -> bool:
-    """Whether a bearing ran so hot that no machine would have gone on."""
+    """Whether a bearing exceeds the temperature at which a machine stops."""
     for batch in case.batches:
         degC = np.stack([batch.values(c) for c in batch.names("temperature")])
-        gone = bool(np.isnan(degC[:, -1]).all())  # an absent sensor shows nothing either, but never all of them
+        gone = bool(np.isnan(degC[:, -1]).all())  # an absent sensor has no values, but never all sensors
         if gone or np.nanmax(degC, initial=-np.inf) > HOTTEST_DEGC:
             return True
     return False
@@ -173,7 +173,7 @@ def answer_of(spec: CaseSpec, case: Case) -> dict[str, Any]:
 
 
 def _idle(machine: Machine, terms: list[dict[str, Any]]) -> list[str]:
-    """Drivers that neither the machine file nor anything left out of it depends on."""
+    """Drivers on which neither the machine file nor a concealed effect depends."""
     stated = [part.get("drivers") or () for part in (machine.twin or {}).get("mechanisms", {}).values()]
     used = {name for drivers in stated for name in _channels(drivers)}
     return [name for name in machine.names("driver") if name not in used | {t["driver"] for t in terms}]

@@ -21,7 +21,7 @@ FAULTS = (
     "sensor_lag", "sensor_drift", "sensor_bonding", "sensor_offset", "sensor_swap", "time_skew", "wrong_capacity",
     "wrong_link", "wrong_heat",
 )  # fmt: skip
-AMBIGUOUS = ("belt_loss", "natural_convection")  # recordings of any machine may not tell another law from these
+AMBIGUOUS = ("belt_loss", "natural_convection")  # laws that other laws can imitate in recordings of any machine
 SIGMA = (1.5, 25.0)
 """Least and largest sigma of an effect: the rms of what it changes before any recalibration, in units of the noise."""
 INVISIBLE_SIGMA = (0.1, 0.6)
@@ -40,7 +40,7 @@ def could_have(effect: str, plant: str) -> bool:
 
 
 def kind_case(name: str, kind: Kind, plant: PlantKind, seed: int, which: Any) -> CaseSpec:
-    """The case of a seed: what no case of it says first, the same for every kind of case, then what it lacks.
+    """The case of a seed: first the setting, the same for every kind of case, then the concealed effects.
 
     Sizes are sigmas. A machine without a law that others imitate has one effect where the suite wants a confounded one.
     """
@@ -72,7 +72,7 @@ def kind_case(name: str, kind: Kind, plant: PlantKind, seed: int, which: Any) ->
 
 
 def sigma(rng: np.random.Generator, span: tuple[float, float]) -> float:
-    """Even by logarithm."""
+    """Log-uniform."""
     low, high = np.log(span)
     return float(f"{np.exp(rng.uniform(low, high)):.4g}")
 
@@ -82,7 +82,7 @@ def _some(lot: np.random.Generator, among: Sequence[str], number: int) -> list[s
 
 
 def drawn_kind(spec: CaseSpec) -> Case:
-    """The case of a specification, under a name that tells nothing.
+    """The case of a specification, under a neutral name.
 
     Raises:
         InputError: as `plants.kinds.draw_kind_case`.
@@ -98,7 +98,7 @@ def drawn_kind(spec: CaseSpec) -> Case:
 
 
 def renamed(machine: Machine, name: str) -> Machine:
-    """The machine under another name: the one that a plant gives holds its seed."""
+    """The machine under another name, since the name from a plant contains its seed."""
     return machine.model_copy(update={"machine": name})
 
 

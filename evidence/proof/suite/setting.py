@@ -1,4 +1,4 @@
-"""What a case is like before anyone decides what it lacks: recorder, shop, engineer; the same for every kind."""
+"""The setting of a case before its concealed effects are drawn: recorder, shop, engineer; the same for every kind."""
 
 from __future__ import annotations
 

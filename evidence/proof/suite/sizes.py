@@ -1,4 +1,4 @@
-"""How strong an effect is: drawn by logarithm around its detection limit, from below to ten times."""
+"""Sizes of effects: log-uniform around the detection limit, from below to ten times."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ SHARE: Mapping[Kind, tuple[float, float]] = MappingProxyType({
 """From and to, in units of the size at the detection limit."""
 ALL_OR_NOTHING = ("sensor_swap",)
 MOST = 10.0
-"""No larger: beyond it, no effect is one that a machine could have."""
+"""Upper limits; larger effects do not occur in machines."""
 BOUNDS: Mapping[str, float] = MappingProxyType(
     {
         "time_skew": 1.8,  # a clock's error stays within what is simulated
-        "preload_feedback": 4.0,  # beyond it a bearing heats without an end
+        "preload_feedback": 4.0,  # beyond it a bearing diverges thermally
         "wrong_parameter": 3.0,  # a joint that is off by a factor of 64
     }
 )
@@ -48,7 +48,7 @@ def most(effect: str) -> float:
 
 
 def size(effect: str, plant: str, kind: Kind, rng: np.random.Generator) -> float:
-    """A size for a case of this kind; where ten times the limit is more than there is, even up to that."""
+    """A size for a case of this kind; uniform up to the largest one where ten times the limit exceeds it."""
     low, high = (share * limit(effect, plant) for share in SHARE[kind])
     high = min(high, most(effect))
     drawn = np.exp(rng.uniform(np.log(min(low, high / 3.0)), np.log(high)))

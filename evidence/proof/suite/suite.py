@@ -1,4 +1,4 @@
-"""Suites: cases of a fixed mix in an order drawn by lot, each from a seed that only the suite's secret gives."""
+"""Suites: cases of a fixed mix in random order, each from a seed derived from the secret of the suite."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Which = Literal["development", "sealed"]
 
 
 def number(seed: bytes | int, which: str, what: str) -> int:
-    """256 bits for one purpose that nobody can derive without the whole seed; development and sealed share none."""
+    """256 bits for one purpose that cannot be derived without the seed; development and sealed share none."""
     root = seed if isinstance(seed, bytes) else str(seed).encode()
     message = b"\0".join([b"thermodrift proof", which.encode(), what.encode(), root])
     return int.from_bytes(hashlib.sha256(message).digest(), "big")
@@ -78,7 +78,7 @@ def decoys(options: Mapping[str, Any]) -> list[str]:
 
 
 def unlisted(options: Mapping[str, Any]) -> list[str]:
-    """What no list of mechanisms has, sorted."""
+    """Unlisted effects, sorted."""
     return sorted(key for key in UNLISTED if possible(key, options))
 
 
@@ -142,11 +142,11 @@ def alternatives_of(effect: str, options: Mapping[str, Any]) -> list[str]:
 
 
 def ambiguous(options: Mapping[str, Any]) -> set[str]:
-    """Effects that these options make alike to another."""
+    """Effects that these options make indistinguishable from another one."""
     return {effect for pair in PAIRS.values() if pair.holds(options) for effect in pair.truths}
 
 
-HABITUAL = 0.2  # share of the cases that have what makes a pair alike, whatever they lack
+HABITUAL = 0.2  # share of the cases with a habit that makes a pair alike, whatever they conceal
 SECRET_BYTES = 16
 
 
@@ -171,7 +171,7 @@ def suite(seed: bytes | int, cases: int, which: Which, plants: Sequence[PlantKin
 
 
 def case(name: str, kind: Kind, plant: PlantKind, seed: int, which: Which) -> CaseSpec:
-    """The case of a seed: first the setting, the same for every kind, then by lot what it lacks."""
+    """The case of a seed: first the setting, the same for every kind, then the concealed effects at random."""
     if plant in KIND_PLANTS:
         return kind_case(name, kind, plant, seed, which)
     lot = stream(seed, "lot")
@@ -199,7 +199,7 @@ def case(name: str, kind: Kind, plant: PlantKind, seed: int, which: Which) -> Ca
 
 
 def small_suite() -> list[CaseSpec]:
-    """Six short development cases that never change: nothing, a decoy, one on either plant, two, an unlisted one."""
+    """Six short fixed development cases: nothing, a decoy, one effect on either plant, two, an unlisted one."""
     wanted: tuple[tuple[Kind, PlantKind, dict[str, float], dict[str, float]], ...] = (
         ("nothing", "volumes", {}, {}),
         ("decoy", "volumes", {}, {"sensor_drift": 1.5}),
@@ -217,7 +217,7 @@ def small_suite() -> list[CaseSpec]:
 
 
 def _habitual(kind: Kind) -> float:
-    """Chance of a habit that keeps its share the same with and without physics left out."""
+    """Probability of a habit that keeps its share equal with and without a concealed effect."""
     if kind not in LACKING:
         return HABITUAL
     whole, forced = sum(MIX[k] for k in LACKING), MIX["confounded"]

@@ -92,7 +92,7 @@ def test_the_drawing_of_cases_is_no_part_of_what_is_seen() -> None:
 
 def test_a_proof_does_not_lie_where_it_is_seen() -> None:
     inside = own_source()[0] / "twin" / "some_proof"
-    with pytest.raises(InputError, match=r"some_proof: lies in .*, which answering processes may see; give another"):
+    with pytest.raises(InputError, match=r"some_proof: lies in .*, which answering processes may read; give another"):
         sealed(inside)
     assert not inside.exists()
 

@@ -59,7 +59,7 @@ def test_a_line_that_was_tampered_with_is_named(path: Path, change: object, line
         Ledger(path)
     assert str(error.value) == (
         f"ledger {path} line {line}: is not as it was written, the chain of hashes breaks there; "
-        "this proof is worth nothing any more, seal a new one"
+        "this proof is void, seal a new one"
     )
 
 

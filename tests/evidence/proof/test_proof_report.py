@@ -44,12 +44,12 @@ SILENT = {
     "terms": "No concealed effect has a known detection limit in this run.",
     "goals": "The goals were not scored in this run.",
     "reliability": "No finding stated a probability in this run.",
-    "missed": "No visible effect was missed and no claim was false, or none was scored.",
+    "missed": "No visible effect was missed and no claim is false, or none was scored.",
     "worst": "Every answer was right, or none was judged.",
     "leak": "The leak test was not run.",
     "convergence": "convergence was not studied in this run.",
-    "ledger": "The ledger was not given to this page.",
-    "outcomes": "No visible case has its left-out errors in this run.",
+    "ledger": "The ledger is not part of this page.",
+    "outcomes": "No visible case has left-out errors in this run.",
 }
 
 
@@ -125,7 +125,7 @@ def test_an_absent_table_leaves_a_sentence_in_its_place(run: ProofRun, absent: s
 def test_a_table_without_rows_is_an_absent_one(run: ProofRun) -> None:
     empty = {name: pd.DataFrame(columns=list(columns)) for name, columns in TABLES.items()}
     page = proof_page(replace(run, tables=empty))
-    assert page.headline == "No goal could be judged on 0 sealed cases." and page.plants == ()
+    assert page.headline == "No goal could be evaluated on 0 sealed cases." and page.plants == ()
     assert not [p for part in page.parts for p in (*part.wide, *part.half)]
 
 
@@ -170,13 +170,15 @@ def test_what_was_missed_and_claimed_falsely_is_listed_with_what_limits_it(run: 
     assert len(missed) and (~claims["true"].astype(bool)).any()
     plain = re.sub(r"<[^>]*>", " ", text)
     false = int((~claims["true"].astype(bool)).sum())
-    assert f"{false} of {len(claims)} claims are not so." in plain
+    assert f"{false} of {len(claims)} claims are false." in plain
     terms = run.table("terms")
     seen = terms[terms["visible"].eq(True) & ~terms["decoy"].astype(bool)]
     enough = int((seen["gain_nats"] > seen["bar_nats"]).sum())
-    assert f"Of {len(seen)} visible effects that the true model states, {enough} gain what a claim takes" in plain
+    assert (
+        f"Of {len(seen)} visible effects that the true model contains, {enough} gain more than the threshold" in plain
+    )
     little = int((missed["reason"] == LITTLE).sum())
-    assert f"{len(missed)} of {len(seen)} visible effects have no claim; in {little} of them the recordings do" in plain
+    assert f"{len(missed)} of {len(seen)} visible effects have no claim: {little} are limited by the data" in plain
     table = shortfall.reasons(missed, ("elements", "volumes"))
     assert [row.cells[1] for row in table.rows] == ["data", "data", "search", "search"]
     assert table.rows[0].cells[0] == LITTLE and table.rows[0].cells[-1] == f"{little}"
@@ -191,7 +193,7 @@ def _goal(**changed: object) -> dict[str, object]:
     return row | changed
 
 
-def test_a_goal_is_told_with_interval_count_and_plants() -> None:
+def test_a_goal_is_shown_with_interval_count_and_plants() -> None:
     goals = pd.DataFrame([_goal(), _goal(plant="volumes", value=0.98, met=True, n=90)])
     (row,) = goal_rows(goals, ("elements", "volumes"))
     assert (row.measure, row.goal, row.whole.value) == ("detection", "≥ 97 %", "95.5 %")
@@ -201,7 +203,7 @@ def test_a_goal_is_told_with_interval_count_and_plants() -> None:
     assert [(c.value, c.met, c.n) for c in row.plants] == [("–", "", ""), ("98.0 %", "yes", "90")]
     bar = row.whole.bar
     assert bar is not None and (bar.wanted, bar.value) == (75.0, 62.5)  # the axis runs from 0.97 − 3 · 0.03 to 1
-    assert shortfalls(goals) == ["detection: 95.5 %, wanted ≥ 97 %"] and shortfalls(goals, "volumes") == []
+    assert shortfalls(goals) == ["detection: 95.5 %, goal ≥ 97 %"] and shortfalls(goals, "volumes") == []
 
 
 def test_a_goal_that_no_case_speaks_for_is_neither_met_nor_missed(run: ProofRun) -> None:
@@ -211,14 +213,14 @@ def test_a_goal_that_no_case_speaks_for_is_neither_met_nor_missed(run: ProofRun)
     assert goal_rows(goals, ())[0].whole.value == "–" and goal_rows(goals, ())[0].whole.bar is None
     told = replace(run, tables={"goals": goals, "outcomes": run.table("outcomes")})
     assert headline(told) == "Every goal met on 60 sealed cases."
-    assert proof_page(replace(told, tables={"goals": goals})).lead == "1 goal had no case to be judged on."
+    assert proof_page(replace(told, tables={"goals": goals})).lead == "Without a case: 1 goal."
 
 
 def test_many_missed_goals_are_counted_and_the_first_told() -> None:
     goals = pd.DataFrame([_goal(measure=f"m{k}", met=k == 0) for k in range(8)])
     run = toy_proof(5, tables={"goals": goals})
     said = proof_page(run).lead
-    assert said.startswith("Missed: m1: 95.5 %, wanted ≥ 97 %; m2: ") and said.endswith("; 3 more, in the table.")
+    assert said.startswith("Missed: m1: 95.5 %, goal ≥ 97 %; m2: ") and said.endswith("; 3 more, in the table.")
 
 
 def test_a_convergence_study_is_one_row_with_its_orders(run: ProofRun) -> None:

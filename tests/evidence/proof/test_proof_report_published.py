@@ -38,7 +38,7 @@ def test_the_block_names_root_dates_version_results_and_shortfalls(run: ProofRun
     assert "- Cases: 31 sealed, 30 count, 1 void, 1 failed (counted as wrong)\n" in text
     row = next(line for line in text.splitlines() if line.startswith("| detection, visible"))
     assert row.startswith("| detection, visible | ≥ 97 % | 95.5 % | 93.6 to 97.4 % | 120 | **no** | 99.4 % (n 120) |")
-    assert "- detection, visible: 95.5 %, wanted ≥ 97 %\n" in text
+    assert "- detection, visible: 95.5 %, goal ≥ 97 %\n" in text
     assert "A, finite elements (SIMULATED) | B, finite volumes (SIMULATED) |" in text
 
 
@@ -46,7 +46,7 @@ def test_a_plant_that_alone_misses_a_goal_is_named(run: ProofRun) -> None:
     goals = run.table("goals")
     goals = goals[goals["measure"] == "place exact"].assign(met=[True, False, True], value=[0.93, 0.90, 0.96])
     text = proof_markdown(replace(run, tables=dict(run.tables) | {"goals": goals}))
-    assert "Goals that are missed:\n\n- plant A alone, place exact: 90.0 %, wanted ≥ 92 %\n" in text
+    assert "Missed goals:\n\n- plant A alone, place exact: 90.0 %, goal ≥ 92 %\n" in text
     met = proof_markdown(replace(run, tables=dict(run.tables) | {"goals": goals.assign(met=True)}))
     assert "No goal is missed on any plant." in met
 
@@ -59,9 +59,9 @@ def test_the_block_says_what_was_missed_and_claimed_falsely_and_why() -> None:
     row = next(line for line in text.splitlines() if line.startswith(f"| {SILENT} "))
     by_plant = [int((silent["plant"] == p).sum()) for p in ("elements", "volumes")]
     assert row == f"| {SILENT} | search | {by_plant[0]} | {by_plant[1]} | {len(silent)} |"
-    assert "Claims that are not so, SIMULATED:\n" in text
+    assert "False claims, SIMULATED:\n" in text
     quiet = proof_markdown(replace(run, tables={k: v for k, v in run.tables.items() if k not in ("missed", "claims")}))
-    assert "Claims that are not so" not in quiet and "limited by" not in quiet
+    assert "False claims" not in quiet and "limited by" not in quiet
 
 
 def test_publishing_changes_the_block_alone_and_again_gives_the_same(page: Path, run: ProofRun) -> None:

@@ -74,7 +74,7 @@ def test_the_reported_set_holds_what_is_a_tenth_as_likely() -> None:
     assert (case["first_right"], case["in_set"], case["set_size"], case["false_claims"]) == (False, True, 2, 1)
 
 
-def test_what_is_overlooked_is_wrong_in_every_way() -> None:
+def test_what_is_missed_is_wrong_in_every_way() -> None:
     case, (own,) = scored(answer("one", term()), stored("consistent"), truth(True))
     for column in ("detected", "first_right", "in_set", "place_exact", "place_near", "all_named", "right"):
         assert case[column] is False, column

@@ -22,7 +22,7 @@ HEATS_W = (100.0, 105.0, 110.0, 120.0, 150.0, 90.0, 100.0, 100.0)  # of 100; int
 
 
 def examined() -> tuple[pd.DataFrame, pd.DataFrame]:
-    """One effect: eight right answers, one overlooked, one false name; nothing: nine quiet answers, one false alarm."""
+    """One effect: eight right answers, one missed, one false name; nothing: nine quiet answers, one false alarm."""
     keys, given, true = {}, {}, {}
     for k in range(20):
         name = f"case_{k:04d}"
@@ -171,7 +171,7 @@ def test_the_worst_come_first_with_a_reason() -> None:
 def test_a_listed_effect_that_is_called_unlisted_is_reported_so() -> None:
     own = stored("unlisted", finding("free_flux", parameters={}))
     cases, _ = outcomes({"case_0001": answer("one", term())}, {"case_0001": own}, {"case_0001": truth(True)})
-    why = "cabinet_heat in plant volumes is listed and was reported as in no list, at the right place."
+    why = "cabinet_heat in plant volumes is listed and is reported as unlisted, at the right place."
     assert worst(cases)["why"].tolist() == [why]
 
 
