@@ -1,1 +1,1 @@
-"""Development plants: simulated machines of their own numerics, to try a diagnosis on; nothing here uses the twin."""
+"""Plants: simulated machines with independent numerics for testing a diagnosis; nothing here uses the twin."""

@@ -1,8 +1,8 @@
-"""Do the plants' own numerics converge? One machine on finer grids and at finer steps; a slab with a known solution.
+"""Convergence studies of the plants: one machine on finer grids and at finer steps, and a slab with a known solution.
 
-Each study gives a table with `COLUMNS`, a row a run: error against the finest run (or the known solution), the unit in
-the quantity's name, and the observed order, that of the changes from one refinement to the next,
-log2(|u - u/2| / |u/2 - u/4|) (Roache 1998), NA before there are two. Grids and steps halve.
+Each study returns a table with `COLUMNS`, a row per run: error against the finest run (or the known solution), the unit
+in the quantity's name, and the observed order, that of the changes from one refinement to the next, log2(|u - u/2| /
+|u/2 - u/4|) (Roache 1998), NA for the first rows. Grids and steps halve.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from plants.volumes.structure import Volumes
 
 COLUMNS = ("plant", "quantity", "refined", "size", "unit", "error", "order")
 ROW_S, WARM_UP_H = 300.0, 0.25
-VOLUMES_H, VOLUMES_STEP_S = 2.0, 60.0  # the step of the grids, the same for all, so that it drops out of their changes
+VOLUMES_H, VOLUMES_STEP_S = 2.0, 60.0  # the time step of all grids, so that it cancels in their differences
 ELEMENTS_H, ELEMENTS_STEP_S = 1.5, 100.0
 BIOT, FOURIER, START_K = 2.0, 0.4, 10.0  # of the slab: h L / k, k t / (ρ c L²), before it cools
 
@@ -130,7 +130,7 @@ def carried(plain: Drawn, finer: Drawn) -> sparse.csr_matrix:
 
 
 def moved_um(drawn: Drawn, plain: Drawn) -> Array:
-    """Every channel by the plain machine's rise when each heat source alone has warmed it for good."""
+    """Every channel at the steady-state rise of the plain machine for each heat source alone."""
     s, p = drawn.structure, plain.structure
     heat = np.stack([source.share * 100.0 for source in _elements_plant(plain, 0).sources.values()], axis=1)
     rise = sparse.linalg.spsolve(p.losses(), heat)
@@ -190,7 +190,7 @@ def _rows(
     plant: str, quantity: str, refined: tuple[str, str], sizes: Sequence[float], errors: Sequence[float],
     falling: Sequence[float],
 ) -> list[Row]:  # fmt: skip
-    """`refined` is what is refined and the unit of its size; the order is how fast `falling` falls from row to row."""
+    """`refined` names the refined quantity and the unit of its size; the order is the rate of decrease of `falling`."""
     orders = [np.nan, *(float(np.log2(a / b)) for a, b in pairwise(falling))]
     what, unit = refined
     table = zip(sizes, errors, orders, strict=True)

@@ -84,7 +84,7 @@ def _parted(s: Structure, one: Part, other: Part, share: float) -> Array:
 
 
 def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
-    """One in most bodies, at a cell away from the body's middle and from its joints."""
+    """A sensor in most bodies, at a cell away from the middle of the body and from its joints."""
     rng = stream(seed, "sensors")
     joined = s.joined()
     out = []
@@ -101,7 +101,7 @@ def _sensors(s: Structure, seed: int) -> tuple[Sensor, ...]:
 
 
 def ordinary(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
-    """Nothing of the kind."""
+    """No habit."""
     return list(runs)
 
 
@@ -117,7 +117,7 @@ def one_speed(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
 
 
 def long_runs(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
-    """The spindle is switched on once and runs on to the end of the shift, from a machine at rest."""
+    """The spindle starts once from a machine at rest and runs to the end of the shift."""
     out = []
     for run in runs:
         fastest = max((b.value for b in run.speed), default=0.0)
@@ -126,7 +126,7 @@ def long_runs(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
 
 
 def walls_as_room(runs: Sequence[Run], rated_rpm: float) -> list[Run]:
-    """Walls inside a bigger hall: as warm as the room, all day."""
+    """Walls inside a larger hall: at room temperature all day."""
     return [replace(run, wall_K=0.0, wall_swing=1.0, wall_late_h=0.0) for run in runs]
 
 

@@ -1,4 +1,4 @@
-"""Physics that is never an answer: the machine file states it as a constant or by a simple law."""
+"""Physics that is never concealed: the machine file states it as a constant or by a simple law."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Stated:
 
 
 class Everyday(Effect):
-    """Works as an effect does, at size 1."""
+    """Acts like an effect of size 1."""
 
     @classmethod
     def fits(cls, plant: Plant) -> bool:
-        """Whether this plant has it."""
+        """Whether this plant includes it."""
         return True
 
     def stated(self) -> Stated | None:

@@ -162,7 +162,7 @@ def _stated(stated: Stated, pen: _Pen) -> dict[str, Any]:
 
 
 def _error(plant: Plant, channel: str, pen: _Pen, withheld: set[str]) -> dict[str, Any]:
-    """What is withheld is not even guessed: the file is that of a machine without it."""
+    """Withheld features are left out: the file describes a machine without them."""
     chain, tilts = [], []
     for growth in plant.growths:
         if growth.channel != channel or growth.name in withheld:

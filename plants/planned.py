@@ -32,7 +32,7 @@ DURATIONS = {"hours": ("h", 3600.0), "minutes": ("min", 60.0), "seconds": ("s", 
 AIR = ("room", "wall")
 RESTED_H = 24.0
 RIPPLE_K = 0.2  # of a hall that is kept at a temperature
-MORNING, EVENING = pd.Timedelta(hours=7), pd.Timedelta(hours=21)  # when a shop begins, and when it goes home
+MORNING, EVENING = pd.Timedelta(hours=7), pd.Timedelta(hours=21)  # begin and end of work in a shop
 
 _VALUE = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _BEFORE = re.compile(r"^#\s*Begin after (.+?)\.\s*$", re.MULTILINE)

@@ -36,10 +36,10 @@ Windows = Literal["always"] | list[list[str | float]]  # [batch id, start s, end
 
 
 def windows(effect: Effect, runs: Sequence[Run], step_s: float, course: Course) -> Windows:
-    """Stretches in which the effect works, on the rows of the recordings, or "always".
+    """Time intervals in which the effect acts, on the rows of the recordings, or "always".
 
-    What a driver or a gate switches works while that is on. Another one that moves heat works while that is more than
-    a tenth of its largest. Faults, chains and constants always do.
+    A switched effect acts while its driver or gate is on. Another effect on heat acts while its heat exceeds a tenth of
+    the largest value. Faults, chains and constants always act.
     """
     rows_s = np.arange(0.0, runs[0].hours * 3600.0 + 1.0, step_s)
     shown = moments(runs, rows_s, rows_s)
@@ -151,7 +151,7 @@ def _features(
 
 
 def with_amounts(plant: Plant, effects: list[Effect]) -> Plant:
-    """The plant with withheld features as strong as their effects say."""
+    """The plant with withheld features of the strength of their effects."""
 
     def amount(feature: str) -> float:
         return prod(effect.amount(feature) for effect in effects)
@@ -240,7 +240,7 @@ def write_case(case: Case, folder: Path, key_folder: Path | None = None) -> tupl
     """Writes `machine.yml` and `recordings/*.csv` below `folder`, `truth.json` into `key_folder`.
 
     Returns the machine file, the recordings' folder and the key. `key_folder` is by default next to `folder`, with
-    `_key` added to its name; it must not lie inside, where whoever answers could find it.
+    `_key` added to its name; it must not lie inside, where the answering process could read it.
 
     Raises:
         InputError: the key would lie in the case's folder, or a folder cannot be written.

@@ -27,7 +27,7 @@ Window = list[Any]  # batch, start s, end s
 
 @dataclass(frozen=True)
 class RealCase:
-    """Machine file and batches are all that a diagnosis sees; `answer` is plain data."""
+    """Machine file and batches are the visible part of a case; `answer` is plain data."""
 
     machine: Machine
     batches: list[Batch]
@@ -115,7 +115,7 @@ CLOCK = "%Y%m%d_%H%M"
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the recordings of a machine lie below the data folder and what a case takes of them.
+    """The folder of the recordings of a machine below the data folder, and the selection for a case.
 
     A case has rows every `rows_s` and `runs` runs (None: all). `unusable`: runs whose stop no driver records. `known`
     is added to the machine file, by dotted path below `twin`; a * stands for every part of that name's place.

@@ -25,7 +25,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Run:
-    """One batch as it is meant to go. Room: mean, day's swing with its warmest hour, ripple and drift.
+    """The schedule of one batch. Room: mean, day's swing with its warmest hour, ripple and drift.
 
     `idle` are recorded switches that drive nothing, by channel.
     """

@@ -1,5 +1,5 @@
-"""The plant at work, and its recordings: losses and effects drive the cells through all runs of a case at once;
-lag, offset, drift, clock, noise and rounding turn their course into the rows of a recorder.
+"""The plant at work, and its recordings: losses and effects drive the cells through all runs of a case at once; lag,
+offset, drift, clock, noise and rounding give the rows of a recorder.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What a plant's castings are to everything else, however they are cut: nodes, bodies, capacities, losses.
+"""The common interface of plants for any discretisation: nodes, bodies, capacities, losses.
 
-Plants by finite volumes (`volumes`) and by finite elements (`elements`) both stand behind this.
+Finite volumes (`volumes`) and finite elements (`elements`) implement it.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A temperature channel: its node, how late and how wrong it shows it."""
+    """A temperature channel: its node, lag and error."""
 
     channel: str
     body: str
@@ -231,7 +231,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a kind of plant draws of a machine: its castings, cut up, and what their rises do to the tool."""
+    """The draw of a kind of plant: discretised castings, and the influence of their rises on the tool."""
 
     structure: Structure
     growths: tuple[Growth, ...]

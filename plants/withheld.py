@@ -1,6 +1,6 @@
-"""Plant D: real recordings whose machine file withholds an input or an effect that it is known to need.
+"""Plant D: real recordings without an input or an effect that the machine file is known to need.
 
-Each case takes parts out of a machine's file or replaces them, and states the terms that a diagnosis should give back.
+Each case removes or replaces parts of a machine file, and states the terms that a diagnosis should find.
 Sizes of board and cell are those that the full file calibrates; those of the lathe are what its file states, which was
 fitted to its runs. Of the spindle test the speed is withheld, the only cause of its heat; it has no twin part, so that
 the network is drafted.
@@ -41,7 +41,7 @@ class Withheld:
     kind: str = "one"
 
     def hidden_from(self, machine: Machine, batches: list[Batch]) -> tuple[Machine, list[Batch]]:
-        """Machine file and runs without what is withheld."""
+        """Machine file and runs without the withheld part."""
         part = copy.deepcopy(machine.twin) if self.twin else None
         for path in self.without:
             *keys, last = path.split(".")
@@ -143,7 +143,7 @@ def _charge(twin: Mapping[str, Any], batches: list[Batch]) -> Term:
 
 
 def _radiation(twin: Mapping[str, Any], batches: list[Batch]) -> Term:
-    """Where the file has a linear exchange only."""
+    """For a file with a linear exchange only."""
     return Term(
         "radiation", "radiation", ("node", "can"), neighbours=["core"],
         parameters={"area": (CELL["mechanisms.loss.area"], "m**2"), "emissivity": (0.9, "1")},

@@ -1,4 +1,4 @@
-"""The effects by key. A new one: a class in its group's file and a line here."""
+"""The effects by key. To add one: a class in the file of its group and a line here."""
 
 from data.registry import Registry
 

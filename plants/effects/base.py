@@ -1,4 +1,4 @@
-"""What an effect of a plant is: physics, or a fault of a recording, that the machine file does not state.
+"""The interface of an effect of a plant: physics, or a fault of a recording, that the machine file does not state.
 
 To add one: a class in the file of its group and a line in `plants/effects/__init__.py`; override what it changes.
 """
@@ -19,10 +19,10 @@ from plants.structure import Plant, Sensor
 
 @dataclass(frozen=True)
 class Answer:
-    """What a diagnosis should say: mechanism (None: no listed one), place, values with units.
+    """The right answer: mechanism (None: unlisted), place, values with units.
 
-    `also` are places that mean the same; `parameters` is the equation's, in the mechanism's own names. `form` states
-    what no list has: the parameter of `free_flux` or `free_shift`, the channel of its level and of the other driver.
+    `also` are places that mean the same; `parameters` is the equation's, in the mechanism's own names. `form` describes
+    an unlisted effect: the parameter of `free_flux` or `free_shift`, the channel of its level and of the other driver.
     """
 
     mechanism: str | None
@@ -35,7 +35,7 @@ class Answer:
 
 
 class Effect:
-    """An effect in a plant, `size` 1 about as strong as engineers meet it, 0 nothing at all."""
+    """An effect in a plant; `size` 1 is about the strength met in practice, 0 no effect."""
 
     key: ClassVar[str]
     has: ClassVar[frozenset[str]] = frozenset()  # features that the plant must have for it
@@ -54,14 +54,14 @@ class Effect:
         raise NotImplementedError
 
     def active(self, now: Now) -> NDArray[np.bool_]:
-        """Whether it can work at all, (B,): its driver runs, its gate is open; always, where nothing switches it."""
+        """Whether it is active, (B,): its driver runs, its gate is open; always, if nothing switches it."""
         return np.ones(len(now.room_degC), bool) if self.driver is None else now.driver(self.driver) != 0
 
     def add_heat_W(self, heat_W: Array, cells_degC: Array, now: Now) -> None:
         """Adds to the heat into the cells in place; both (N, B)."""
 
     def friction(self, source: str, cells_degC: Array, now: Now) -> Array | float:
-        """What a source's heat is multiplied by, (B,)."""
+        """Factor of the heat of a source, (B,)."""
         return 1.0
 
     def displaced_um(self, speed_rpm: Array) -> Mapping[str, Array]:
@@ -73,11 +73,11 @@ class Effect:
         return sensors
 
     def ahead_s(self) -> Mapping[str, float]:
-        """By how much the clock of a channel runs ahead."""
+        """Advance of the clock of a channel, s."""
         return {}
 
     def amount(self, feature: str) -> float:
-        """What a withheld feature of the plant is multiplied by."""
+        """Factor of a withheld feature of the plant."""
         return self.size if feature == self.withholds else 1.0
 
     def misread(self) -> Mapping[str, float]:

@@ -1,4 +1,4 @@
-"""Effects on the heat balance: floor, cabinet, guides, sun, bearings, surfaces, air; three of no listed mechanism."""
+"""Effects on the heat balance: floor, cabinet, guides, sun, bearings, surfaces, air; three unlisted ones."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Sun(_Steady):
 
 
 class UnlistedWarmSpeed(_Steady):
-    """Not in any list: heat into the head's rear by speed times the head's excess over 20 degC."""
+    """Unlisted: heat into the rear of the head by speed times the head's excess over 20 degC."""
 
     key = "unlisted_warm_speed"
     driver = "spindle_rpm"
@@ -138,7 +138,7 @@ class UnlistedWarmSpeed(_Steady):
 
 
 class UnlistedCoolantSpeed(PumpHeat):
-    """Not in any list: heat into the column's back while coolant flows, by the speed squared."""
+    """Unlisted: heat into the back of the column while coolant flows, by the speed squared."""
 
     key = "unlisted_coolant_speed"
     watts = 180.0
@@ -155,7 +155,7 @@ class UnlistedCoolantSpeed(PumpHeat):
 
 
 class UnlistedFeedSpeed(_Steady):
-    """Not in any list: heat into the bed while the table moves under a turning spindle, by feed times speed."""
+    """Unlisted: heat into the bed while the table moves under a turning spindle, by feed times speed."""
 
     key = "unlisted_feed_speed"
     has = frozenset({"feed"})

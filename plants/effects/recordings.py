@@ -1,4 +1,4 @@
-"""What only the recording shows: a shift of the shaft by speed, faults of sensors and clocks, a wrong value."""
+"""Effects on recordings alone: a shift of the shaft by speed, faults of sensors and clocks, a wrong value."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _OneSensor(Effect):
 
 
 class SensorDrift(_OneSensor):
-    """A sensor whose error grows evenly in every run."""
+    """A sensor with a linear drift in every run."""
 
     key = "sensor_drift"
 
@@ -69,7 +69,7 @@ class SensorLag(_OneSensor):
 
 
 class SensorSwap(Effect):
-    """Two sensors under each other's name, whole; any size but 0 means it."""
+    """Two sensors with exchanged names; any size but 0 enables it."""
 
     key = "sensor_swap"
 
@@ -90,7 +90,7 @@ class SensorSwap(Effect):
 
 
 class TimeSkew(Effect):
-    """The probe's computer has a clock of its own: all error channels are early or late together."""
+    """The clock of the probes is off: all error channels are early or late together."""
 
     key = "time_skew"
 
@@ -105,7 +105,7 @@ class TimeSkew(Effect):
 
 
 class WrongParameter(Effect):
-    """Nothing is missing, but one joint of the machine file is wrong far beyond its spread."""
+    """No physics is missing; one joint of the machine file is wrong far beyond its prior spread."""
 
     key = "wrong_parameter"
 

@@ -1,6 +1,6 @@
 """Thermoelastic displacement of the whole machine: quadratic hexahedra, castings tied by stiff patches, soft feet.
 
-Linear in the rise, so one adjoint solve an error channel gives what every node's kelvin adds to it (duality as in
+Linear in the rise, so one adjoint solve an error channel gives the influence of every node's rise on it (duality as in
 Becker and Rannacher 2001). Small strains, isotropic, Duhamel and Neumann's law (Boley and Weiner 1960, chapter 1).
 """
 
@@ -22,7 +22,7 @@ from plants.structure import MATERIALS, Cells
 YOUNG_PA: Mapping[str, float] = {"steel": 210e9, "cast_iron": 120e9}
 POISSON: Mapping[str, float] = {"steel": 0.29, "cast_iron": 0.26}
 BOLTED_N_PER_M3 = 3e11  # stiffness of a joint by area, Ito (2008) gives 1e11 to 1e12
-FEET_N_PER_M3 = (5e8, 5e8, 5e10)  # they carry, and let the bed grow sideways
+FEET_N_PER_M3 = (5e8, 5e8, 5e10)  # vertical support, free lateral growth of the bed
 
 
 @dataclass(frozen=True)

@@ -129,12 +129,12 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a seed decides."""
+    """Random choices of a seed."""
 
     size: float
     mass: dict[str, float]  # of each casting as a factor
     head_at: float
-    aside_m: dict[str, float]  # of motor and table from the middle plane: no machine is its own mirror image
+    aside_m: dict[str, float]  # of motor and table from the middle plane: no machine is symmetric
     screw: bool
     saddle: bool
     mandrel: bool

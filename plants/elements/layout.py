@@ -1,4 +1,4 @@
-"""Plant A: a machine of finite elements and what every node's rise does to its tool."""
+"""Plant A: a machine of finite elements and the influence of every node's rise on its tool."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ FRONT, BACK = "column_front", "column_back"
 def growths(s: Elements, weights_um_per_K: Mapping[str, Array], features: frozenset[str]) -> tuple[Growth, ...]:
     """All pieces together are the whole displacement, but for what the plant's features leave out.
 
-    What answers to the column's front being warmer than its back at the same height is its bending. "growth" is the
-    shaft along z, "mandrel" the mandrel.
+    The response to a temperature difference between front and back of the column at the same height is its bending.
+    "growth" is the shaft along z, "mandrel" the mandrel.
     """
     out: list[Growth] = []
     for channel, whole in weights_um_per_K.items():
@@ -63,7 +63,7 @@ def _lumped(s: Elements, bends_um_per_K: Array) -> float:
 
 
 def _by_the_motor(s: Elements, bow_um_per_K: Array, rear: str) -> float:
-    """The bow a kelvin between motor and head when the motor's heat alone has warmed the machine for good."""
+    """The sideways bow per kelvin between motor and head in the steady state of the motor's heat alone."""
     heat = np.zeros(s.size)
     s.bodies["motor"].add(heat, 1.0)
     rise = splu(s.losses()).solve(heat)

@@ -1,4 +1,4 @@
-"""What a graft is: a known effect superposed on real recordings; the room, speeds and all else in them are real.
+"""The interface of a graft: a known effect superposed on real recordings; everything else in them is real.
 
 To add one: a class in the file of its group and a line in `GRAFTS`.
 """
@@ -53,7 +53,7 @@ def room_degC(twin: Mapping[str, Any], batch: Batch) -> Array:
     return np.asarray(batch.values(room["channel"]) + offset_K)
 
 
-FINE_K = 0.1  # a sensor of coarser steps shows no graft
+FINE_K = 0.1  # a coarser sensor does not resolve a graft
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Setting:
 
 
 class Graft:
-    """An effect in real recordings; `size` 1 is about as strong as engineers meet it."""
+    """An effect in real recordings; `size` 1 is about the strength met in practice."""
 
     key: ClassVar[str]
 
@@ -95,11 +95,11 @@ class Graft:
         raise NotImplementedError
 
     def shown(self, number: int, batch: Batch) -> Mapping[str, Array]:
-        """Channels of the run of this number anew, each (rows,), before the instrument rounds them."""
+        """Changed channels of the run of this number, each (rows,), before the instrument rounds them."""
         raise NotImplementedError
 
     def mapping(self) -> dict[str, str]:
-        """Which part of the simulated response went on which real channel."""
+        """Part of the simulated response added to each real channel."""
         return {}
 
 

@@ -1,7 +1,7 @@
 """The cases of plant C by name: a real machine and the effects superposed on its recordings; none: the reference.
 
-What real physics the machine's file misses is not known. So a case is read together with its reference, the same runs
-of the same seed without a graft: what is found there too was not grafted.
+The real physics that the machine file lacks is unknown. Therefore a case has a reference, the same runs of the same
+seed without a graft: a finding that occurs there too is not the graft.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from plants.options import stream
 from plants.real import ORIGINS, RealCase, Term, answer, recorded, there, thinned
 
 SIZES = (0.5, 5.0)  # log-uniform between
-FINE_S = 60.0  # grafts go on rows as fine as the recordings are
+FINE_S = 60.0  # grafts use the finest rows of the recordings
 DESCRIBED = "Real recordings on which a simulated response may be superposed."
 
 
@@ -67,7 +67,7 @@ def build(name: str, data: Path, seed: int) -> RealCase:
     """A case; the seed draws runs, hours, the frame, the place and the size.
 
     The answer has two keys more than others: `reference`, the case of the same seed to subtract (None: this is one),
-    and `graft`, where the response went and how much it added at most to each channel.
+    and `graft`, the channels of the response and its largest value in each.
 
     Raises:
         InputError: an unknown name, no recordings in `data`; one line.

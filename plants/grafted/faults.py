@@ -1,4 +1,4 @@
-"""Faults grafted on real readings, exactly: a sensor that drifts, lags, is loose or swapped, a clock, a shift."""
+"""Faults applied to real readings: a sensor that drifts, lags, is loose or swapped, a clock, a shift."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class OneSensor(Graft):
 
 
 class SensorDrift(OneSensor):
-    """An error that grows evenly in every run."""
+    """A linear drift in every run."""
 
     key = "sensor_drift"
     words = "a sensor drifts"
@@ -104,7 +104,7 @@ class SensorBonding(OneSensor):
 
 
 class SensorSwap(Graft):
-    """Two sensors of different bodies under each other's name; any size but 0 means it."""
+    """Two sensors of different bodies with exchanged names; any size but 0 enables it."""
 
     key = "sensor_swap"
 

@@ -1,8 +1,9 @@
-"""The real machine's frame as the grafted heat finds it: its file's bodies cut into cells, with values of their own.
+"""The structure of the real machine for a grafted heat: the bodies of its file cut into cells, with values of their
+own.
 
-A file's network is lumped; a response computed with the very same network would be no test. So every body is a bar
-of cells with a gradient inside, joined, heated and sensed at cells of its own, and no conductance or capacity is
-quite the file's.
+A file's network is lumped; a response of the same network would be no test. So every body is a bar of cells with a
+gradient inside, joined, heated and sensed at cells of its own, and every conductance and capacity differs from the
+file.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ class Push:
     spread: bool = False
 
     def times(self, factor: float) -> Push:
-        """The same of another strength."""
+        """The same with another strength."""
         return Push(
             {b: factor * d for b, d in self.drive_W.items()},
             {b: factor * m for b, m in self.more_W_per_K.items()},

@@ -1,4 +1,4 @@
-"""Heats grafted on real runs: what is nearly linear, at bodies that no bearing heats."""
+"""Heats grafted on real runs: nearly linear effects, at bodies without bearing heat."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Heat(Graft):
 
     @cached_property
     def amplitude(self) -> float:
-        """So strong that the body's sensors gain what the size requests, to first order."""
+        """The amplitude whose response at the sensors of the body has the requested size, to first order."""
         rise = self._unit_rise
         own = [s.bonding * rise[:, s.cell] for s in self.frame.placements.values() if s.body == self.body]
         inside = np.arange(len(rise))[:, None] < np.array([b.n_rows for b in self.setting.batches])
@@ -199,7 +199,7 @@ class BeltLoss(Heat):
 
 
 class UnlistedWarmSpeed(Heat):
-    """Not in any list: heat by the speed times the room's excess over 20 degC."""
+    """Unlisted: heat by the speed times the room's excess over 20 degC."""
 
     key = "unlisted_warm_speed"
     mechanism = None

@@ -1,4 +1,4 @@
-"""A case of a kind: plant, runs, recordings, machine file and answer key, its effects as strong as is wanted."""
+"""A case of a kind: plant, runs, recordings, machine file and answer key, with effects of requested strength."""
 
 from __future__ import annotations
 
@@ -52,18 +52,18 @@ NEARLY_ALWAYS = 0.95
 
 
 def effects_of(kind: str) -> tuple[str, ...]:
-    """Keys of the effects of a kind that a mechanism of the library is the answer to."""
+    """Keys of the effects of a kind that a mechanism of the library describes."""
     return tuple(KINDS[kind].listed)
 
 
 def unlisted_of(kind: str) -> tuple[str, ...]:
-    """Keys of those that no listed mechanism explains."""
+    """Keys of the unlisted effects."""
     return tuple(KINDS[kind].unlisted)
 
 
 @dataclass(frozen=True)
 class KindPosed:
-    """A plant of a kind with its effects as strong as they are; `plant` is `full` less what they bring themselves.
+    """A plant of a kind with its effects; `plant` is `full` less what they bring themselves.
 
     `decoys` are small faults that are at work in every variant; `idle` are recorded switches that drive nothing.
     """
@@ -86,10 +86,10 @@ def draw_kind_case(
 ) -> Case:
     """A case; the same arguments give the same one, to the last digit.
 
-    `effects` gives the sigma wanted of each effect: the rms of what it changes in the channel that it changes most, in
-    units of that channel's noise, before any recalibration. The key states the sigma that it has: some effects have a
-    least or a largest size. `decoys` adds what is no effect: idle switches, an offset within its prior, a drift below
-    the noise, a conductance that is misread within its prior, early rows, holes, lost samples.
+    `effects` gives the requested sigma of each effect: the rms of what it changes in the channel that it changes most,
+    in units of that channel's noise, before any recalibration. The key states the actual sigma, since some effects have
+    a least or a largest size. `decoys` adds small faults that are no effect: idle switches, an offset within its prior,
+    a drift below the noise, a conductance that is misread within its prior, early rows, holes, lost samples.
 
     Raises:
         InputError: an unknown kind or effect, a seed below 0, a sigma that is not above 0, fewer than 2 runs; one line.
@@ -110,7 +110,7 @@ def draw_kind_case(
 def posed(
     seed: int, kind: str, wanted: Mapping[str, float], *, decoys: bool = False, runs: int | None = None
 ) -> KindPosed:
-    """What `draw_kind_case` simulates, with the sizes that give the sigmas wanted.
+    """What `draw_kind_case` simulates, with the sizes of the requested sigmas.
 
     Raises:
         InputError: as `draw_kind_case`.
@@ -153,9 +153,9 @@ def made(key: str, item: Item, plant: KindPlant, seed: int) -> Effect:
 def fitted_sizes(
     plant: KindPlant, runs: Sequence[KindRun], effects: Sequence[Effect], wanted: Sequence[float]
 ) -> tuple[float, ...]:
-    """Sizes at which each effect alone has the sigma wanted.
+    """Sizes at which each effect alone has the requested sigma.
 
-    Two or three trials in coarse steps, each followed by a guess by proportion or by a power law.
+    Two or three trials with coarse steps, each followed by a linear or power-law extrapolation.
     """
     if not effects:
         return ()
@@ -188,7 +188,7 @@ def _sigmas(plant: KindPlant, runs: Sequence[KindRun], effects: Sequence[Effect]
 
 
 def _change(trials: Sequence[tuple[Array, Array]], wanted: Array) -> Array:
-    """By what the last sizes are to be multiplied: in proportion, or by the power law through two trials."""
+    """Factors of the last sizes: linear, or by the power law through two trials."""
     size, sigma = trials[-1]
     power = np.ones(len(size))
     if len(trials) > 1:

@@ -1,4 +1,4 @@
-"""Pieces that several kinds draw alike: settings, drivers, heats of bearings, motors, axes; what a kind is."""
+"""Parts that several kinds share: settings, drivers, heats of bearings, motors, axes; the interface of a kind."""
 
 from __future__ import annotations
 

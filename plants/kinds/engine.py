@@ -1,7 +1,7 @@
 """A small thermal engine: boxes and rings cut into cells, contacts, films to air, and an L-stable Rosenbrock method.
 
-Everything about a solid is drawn by the kinds; this file only conducts. Temperatures are (N cells, C columns): all runs
-of a case, in all its variants, are integrated together.
+The kinds draw every property of a solid; this module solves the conduction problem. Temperatures are (N cells, C
+columns): all runs of a case, in all its variants, are integrated together.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Solid:
         return {a: (c, self.film_W_per_K[a][c, None], self.exponent[c, None] / 2.0) for a, c in of.items()}
 
     def film_heat_W(self, cells_degC: Array, air_degC: Mapping[str, Array]) -> Array:
-        """What the films bring beyond ``-G T``: the air's part, and their growth with the difference; (N, C).
+        """Heat of the films beyond ``-G T``: the term of the air, and the growth of the coefficient; (N, C).
 
         h = h0 [(dT² + m²) / (6² + m²)]^(p / 2): the coefficient that is stated holds 6 K above the air; m is what the
         hall's own draughts do at no difference.

@@ -126,7 +126,7 @@ def _mechanism(stated: Stated, pen: Pen) -> dict[str, Any]:
 
 
 def _error(plant: KindPlant, full: KindPlant, channel: str, seed: int) -> dict[str, Any]:
-    """Chains of gains; what is withheld is not even guessed."""
+    """Chains of gains; withheld ones are left out."""
     chain, tilts = [], []
     unit = f"{plant.error_unit}/K"
     for name, growth in plant.growths.items():

@@ -67,7 +67,7 @@ def _in_a_hall(text: str) -> str:
     try:
         given = parse_plain(text, "run plan")
     except InputError:
-        return text  # the reader says what is wrong
+        return text  # the reader reports the error
     if not isinstance(given, dict) or not isinstance(given.get("surroundings"), dict):
         return text
     given["surroundings"] = {k: v for k, v in given["surroundings"].items() if k != "inlet"}

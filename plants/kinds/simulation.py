@@ -1,4 +1,4 @@
-"""Runs of a plant in several variants at once, what its channels show of each, and the rows of the recorder."""
+"""Runs of a plant in several variants at once, the readings of its channels, and the rows of the recorder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def simulated(
 ) -> Course:  # fmt: skip
     """All runs with every row of `sizes` (V, effects), from `before_h` before their starts to beyond their ends.
 
-    `step_s` divides the rows' step. What the effects of `watching` look at is kept too.
+    `step_s` divides the rows' step. Quantities that the effects in `watching` request are kept too.
     """
     s, set_up = plant.solid, plant.setting
     before_s = 3600.0 * (set_up.before_h if before_h is None else before_h)
@@ -159,14 +159,14 @@ def shown(
 
 
 def seen_by(effect: Effect, course: Course, temps_degC: Mapping[str, Array], own: Mapping[str, Array]) -> Seen:
-    """What an effect sees of a variant; `own` is what was watched there."""
+    """The view of a variant for an effect; `own` holds its watched quantities."""
     watched = {name: own[f"{effect.key} {name}"] for name in effect.watch}
     zero = int(np.argmin(np.abs(course.time_s)))
     return Seen(course.time_s, dict(temps_degC), watched, course.air_degC, course.drive, zero)
 
 
 def prepared(plant: KindPlant, runs: Sequence[KindRun], effects: Sequence[Effect], wanted: Sequence[float]) -> None:
-    """Lets effects that need it see the plant as it runs without any."""
+    """Passes the plant without effects to those that need it."""
     if not any(e.needs_clean for e in effects):
         return
     course = simulated(plant, runs, [], np.zeros((1, 0)), coarse_s(plant), watching=effects)

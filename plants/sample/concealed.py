@@ -1,4 +1,4 @@
-"""The sample machine with one effect more than its file: for a demonstration of the diagnosis on simulated runs.
+"""The sample machine with one effect that its file lacks, for a demonstration of the diagnosis on simulated runs.
 
 Every effect has a law of its own here; none is the twin's. A foundation and a cabinet store heat, the spindle's shift
 saturates, the sun crosses a window, a loose sensor lags twice.
@@ -42,7 +42,7 @@ ERRORS = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Moment:
-    """What the runs are like: start temperature, floor (B,), degC; clock (S, B), h, of every step."""
+    """Conditions of the runs: start temperature, floor (B,), degC; clock (S, B), h, of every step."""
 
     room_degC: Array
     floor_degC: Array
@@ -70,7 +70,7 @@ class Concealed:
         return machine
 
     def forget(self, twin: dict[str, Any]) -> None:
-        """Take what the sample machine's file says of it out of the file's twin part, in place."""
+        """Remove the effect from the twin part of the sample machine's file, in place."""
 
     def start_degC(self, now: Moment) -> Mapping[str, Array]:
         """Start of the bodies that the effect adds, each (B,)."""
@@ -141,7 +141,7 @@ class Cabinet(Concealed):
 
 
 class MotorLosses(Concealed):
-    """The file knows nothing of the motor's losses; here they are one power of the speed on top of idling."""
+    """The file lacks the losses of the motor; here they are a power of the speed in addition to idling losses."""
 
     key, place = "motor_loss", "motor"
     POWER = 1.6
@@ -166,7 +166,7 @@ class MotorLosses(Concealed):
 
 
 class Bending(Concealed):
-    """The file's error chains do not know that the column bends; the bending itself is the sample machine's."""
+    """The error chains of the file lack the bending of the column, which is that of the sample machine."""
 
     key, kind, place, also = "column_bending", "error", "y", ("z",)
 
@@ -220,7 +220,7 @@ class LooseSensor(Concealed):
 
 
 class Swapped(Concealed):
-    """Two sensors under each other's name."""
+    """Two sensors with exchanged names."""
 
     key, kind = "sensor_swap", "sensor"
     PAIRS = (("rear", "motor"), ("head_front", "column_front"), ("front", "head_rear"))
@@ -282,7 +282,7 @@ class Case:
 
 
 def drawn(seed: int) -> str:
-    """What a seed conceals: a key of `EFFECTS`, or "nothing" in one of seven."""
+    """The concealed effect of a seed: a key of `EFFECTS`, or "nothing" for one seed in seven."""
     rng = np.random.default_rng([seed, 71])
     return "nothing" if rng.random() < NOTHING_SHARE else str(rng.choice(list(EFFECTS)))
 
@@ -302,13 +302,13 @@ def conceal(seed: int, effect: str | None = None, runs: int = RUNS) -> Case:
         raise InputError(f"demonstration: effect: got {effect!r}, expected one of {', '.join(EFFECTS)} or nothing")
     key, rng = effect or drawn(seed), np.random.default_rng([seed, 73])
     chosen = None if key == "nothing" else EFFECTS[key](rng)
-    # a bearing that rubs now more and now less would be a second effect
+    # friction that varies between runs would be a second effect
     plans = [replace(p, friction=1.0) for p in plan_year(seed, runs)]
     return Case(chosen, _machine_file(chosen), _recordings(chosen or Concealed(rng), plans, seed))
 
 
 def write_case(case: Case, folder: Path) -> tuple[Path, Path]:
-    """Write `machine.yml` and `recordings/*.csv` below `folder`, and nothing of the answer; returns both paths.
+    """Write `machine.yml` and `recordings/*.csv` below `folder`, without the answer; returns both paths.
 
     Raises:
         InputError: the folder cannot be written.
@@ -386,7 +386,7 @@ def _simulated(
 
 
 def _csv(plan: Plan, temperatures: Mapping[str, Array], speed_rpm: Array, errors: Mapping[str, Array]) -> str:
-    """One row a minute; what the instrument rounds is rounded, and a negative zero is none."""
+    """One row per minute, rounded as by the instrument; a negative zero becomes zero."""
 
     def stepped(values: Array, step: float, digits: int) -> list[str]:
         return [f"{v:.{digits}f}" for v in np.rint(values / step) * step + 0.0]

@@ -1,6 +1,6 @@
 """Runs of a simulated machine as a measuring system would have recorded them, with the scatter of a real year.
 
-Every number that is drawn is drawn whatever its range, so a scatter that is narrowed changes nothing else.
+Every random number is drawn even if its range is empty, so that a smaller scatter changes nothing else.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Axis recordings of the sample lathe: errors at 12 positions of X and Z while spindle and feed warm the machine.
 
-Each run stands cold, is swept once, then runs at one spindle speed and one feed and is swept again and again, in most
-runs also while it cools down. A sweep takes a reading every 10 s, X first, then Z. Between sweeps temperatures, speed,
-feed and the spindle's own errors are logged every minute.
+Each run begins cold with one sweep, then runs at one spindle speed and one feed with repeated sweeps, in most runs also
+during cooling. A sweep takes a reading every 10 s, X first, then Z. Between sweeps temperatures, speed, feed and the
+spindle's own errors are logged every minute.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LOG_S = 60.0
 LASER_STEP_UM = 0.1
 START_DEGC = (10.0, 30.0)
 SCATTER = Scatter(start_K=(-1.5, 2.5))  # a lathe's bed is smaller than a machining centre's and follows the shop sooner
-STROKE = 12.0  # the greater, the less the strokes that warm the axes differ from run to run
+STROKE = 12.0  # the greater, the smaller the variation of strokes between runs
 FIRST_DAY, DAYS = datetime(2025, 3, 3, 7, 0), 180
 
 # The offsets belong to the machine and do not follow the seed.
@@ -106,7 +106,7 @@ def _drive(rng: np.random.Generator) -> Drive:
 
 @dataclass(frozen=True)
 class AxisTruth:
-    """What happened, before any instrument: the longest run sets S.
+    """Simulated quantities before any instrument; the longest run sets S.
 
     body_degC (S + 1, B, N), room_degC, speed_rpm and feed_mm_per_min (S + 1, B); a speed is that of the step that ends.
     """

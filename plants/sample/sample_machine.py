@@ -93,7 +93,7 @@ _BENDING: Mapping[str, Any] = _TWIN["errors"]["z"]["tilts"][0]
 COLUMN_HEIGHT_M, COLUMN_DEPTH_M, HEAD_REACH_M = (_number(_BENDING[k], "m") for k in ("height", "depth", "lever"))
 SPEED_SHIFT_UM = _parameter("speed_shift", "shift", "um")  # at 6000 rpm, proportional to n²
 
-# What the file does not hold: the twin has expansions and rated speed in its mechanisms, and lumps the head's bow into
+# Not in the file: the twin has expansions and rated speed in its mechanisms, and lumps the head's bow into
 # one rounded gain. The motor is flanged to one side of the head; its heat crosses the head's width.
 STEEL_UM_PER_M_K, IRON_UM_PER_M_K = 11.5, 10.8
 RATED_RPM = 6000.0
@@ -156,7 +156,7 @@ def displacement_um(rise_K: Array, speed_rpm: Array) -> dict[str, Array]:
 
 
 def machine(auxiliaries_W: float = AUXILIARIES_W) -> ThermalMachine:
-    """The sample machine as data; its error is linear in the rises, so a unit rise of each node tells all of it."""
+    """The sample machine as data; its error is linear in the rises, so that unit rises of the nodes determine it."""
     unit = displacement_um(np.eye(len(NODES)), np.zeros(len(NODES)))
     return ThermalMachine(
         capacity_J_per_K=CAPACITY_J_PER_K,

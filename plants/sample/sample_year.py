@@ -156,7 +156,7 @@ def _working_day(day: int, taken: set[date]) -> date:
 
 @dataclass(frozen=True)
 class Truth:
-    """What happened in the batches, before any instrument: the longest batch sets S.
+    """Simulated quantities before any instrument; the longest batch sets S.
 
     node_degC (S + 1, B, 14), room_degC and speed_rpm (S + 1, B), error_um per channel (S + 1, B).
     """
@@ -185,7 +185,7 @@ def run_plans(plans: Sequence[Plan]) -> Truth:
 
 
 def sensor_degC(true_degC: Array, air_degC: Array, bonding: float) -> Array:
-    """What a surface sensor shows, without its offset, along axis 0 at 10-s steps.
+    """Reading of a surface sensor without its offset, along axis 0 at 10-s steps.
 
     It sees ``T_a + eta (T_s - T_a)`` through a first-order lag of 60 s and starts settled.
     """

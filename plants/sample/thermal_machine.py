@@ -29,7 +29,7 @@ LOAD_Z, LOAD_Y = 0.001, 0.33
 class BearingSet:
     """`count` equal angular-contact bearings in one housing; half of their heat goes into the body `shaft`.
 
-    `gain` multiplies their friction: this machine's against the catalogue's.
+    `gain` multiplies their friction: the ratio to the catalogue value.
     """
 
     housing: str
@@ -52,8 +52,8 @@ class SpeedHeat:
 class ThermalMachine:
     """One machine. Conductances in W/K, capacities in J/K; `always_W` is heat that never stops.
 
-    `um_per_K` says for each error channel what a rise of each body moves, `speed_shift_um` what speed alone moves, at
-    rated speed and proportional to n² (no temperature shows it). The body named `shaft` takes half the bearings' heat.
+    `um_per_K` is the displacement of each error channel per kelvin of each body, `speed_shift_um` that of the speed
+    alone, at rated speed and proportional to n². The body named `shaft` takes half the bearings' heat.
     """
 
     capacity_J_per_K: Mapping[str, float]
@@ -130,7 +130,7 @@ class ThermalMachine:
         return heat
 
     def driven_heat_W(self, speed_rpm: Array) -> Array:
-        """The part of the heat that no temperature changes, (..., N), W, at speeds (...,)."""
+        """The part of the heat that is independent of temperature, (..., N), W, at speeds (...,)."""
         x = speed_rpm / self.rated_rpm
         heat = np.zeros((*speed_rpm.shape, len(self.bodies)))
         for body, watts in self.always_W.items():

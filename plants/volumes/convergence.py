@@ -1,4 +1,4 @@
-"""Do the finite volumes converge? A machine with everyday physics and an effect, on finer grids and at finer steps."""
+"""Convergence study of the finite volumes: a machine with everyday physics and an effect, on finer grids and steps."""
 
 from __future__ import annotations
 

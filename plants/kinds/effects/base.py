@@ -1,4 +1,4 @@
-"""What an effect of a kind is: physics, or a fault of a recording, that the machine file does not state.
+"""The interface of an effect of a kind: physics, or a fault of a recording, that the machine file does not state.
 
 Its strength is a size of 0 or more: 0 is nothing, 1 a usual one. Sizes reach the heat balance as one number a column
 (C,), since several variants of a case are integrated at once, and everything else as a number.
@@ -22,9 +22,9 @@ Places = tuple[str | dict[str, str], ...]
 
 @dataclass(frozen=True)
 class Seen:
-    """One variant of a case as it went: time_s (M,) from the runs' starts, everything else (M, B).
+    """One simulated variant of a case: time_s (M,) from the runs' starts, everything else (M, B).
 
-    `temps_degC` are the sensors' readings, `watched` what the effect itself asked for.
+    `temps_degC` are the sensors' readings, `watched` the quantities that the effect requests.
     """
 
     time_s: Array
@@ -58,7 +58,9 @@ class Effect:
     words: str = ""
     form: tuple[str, ...] = ()
     driver: str | None = None  # the channel that switches it
-    same_as: tuple[tuple[str, str, str], ...] = ()  # mechanism, kind, name that these recordings may not tell from it
+    same_as: tuple[
+        tuple[str, str, str], ...
+    ] = ()  # mechanism, kind, name that the recordings may not distinguish from it
     least: float = 0.0  # size
     largest: float = 1e3
     withholds: frozenset[str] = frozenset()  # sources and growths of the plant that the file leaves out
@@ -75,17 +77,17 @@ class Effect:
         """Draws what is free of this effect."""
 
     def prepare(self, seen: Seen, wanted_K: float) -> None:
-        """Settles what depends on how the machine runs without it, where `wanted_K` is to be seen of it."""
+        """Sets quantities that depend on the machine without the effect, for a visible response of `wanted_K`."""
 
     def values(self, size: float) -> dict[str, tuple[float, str]]:
-        """Values in the mechanism's own names and units, as near as its own formula has them."""
+        """Values in the names and units of the mechanism, approximated where the formulas differ."""
         return {}
 
     def heat_W(self, out: Array, cells_degC: Array, now: Now, size: Array) -> None:
         """Adds heat into the cells (N, C) in place."""
 
     def factor(self, source: str, cells_degC: Array, now: Now, size: Array) -> Array | None:
-        """What a source's heat is multiplied by, (C,)."""
+        """Factor of the heat of a source, (C,)."""
         return None
 
     def slowness(self, cells_degC: Array, size: Array) -> Array | None:
@@ -101,11 +103,11 @@ class Effect:
         return {}
 
     def ahead_s(self, size: float) -> Mapping[str, float]:
-        """By how much the clock of a channel runs ahead."""
+        """Advance of the clock of a channel, s."""
         return {}
 
     def active(self, now: Now) -> Mask:
-        """Whether it can work at a moment, (C,): its driver runs, its gate is open."""
+        """Whether it is active at a moment, (C,): its driver runs, its gate is open."""
         anything = next(iter(now.air_degC.values()))
         if self.driver is None:
             return np.ones(anything.shape, bool)

@@ -87,7 +87,7 @@ class Radiates(_Surface):
 
 
 class Rises(_Surface):
-    """Air that rises along a warm face: more by a power of the difference that is no textbook's."""
+    """Air that rises along a warm face: with a power of the difference other than that of textbooks."""
 
     mechanism = "natural_convection"
     words = "natural convection"
@@ -132,7 +132,7 @@ class Windy(_Surface):
 
 
 class Gate(Effect):
-    """A gate that opens at the same time of every run: colder air at all faces, its edges as fast as a hall's air."""
+    """A gate that opens at the same time of every run: colder air at all faces, with the time constant of a hall."""
 
     mechanism = "draught"
     words = "a gate opens for a while"
@@ -272,7 +272,7 @@ class Clamped(Effect):
 
 
 class WrongLink(Clamped):
-    """Nothing is missing, but one joint conducts far better than the file says."""
+    """No physics is missing; one joint conducts far better than the file states."""
 
     mechanism = "wrong_parameter"
     words = "a joint is stated wrong"

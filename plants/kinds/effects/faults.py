@@ -1,4 +1,4 @@
-"""What only the recording shows: displacements the file lacks, faults of sensors and of clocks."""
+"""Effects on recordings alone: displacements that the file lacks, faults of sensors and of clocks."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class TestBar(Effect):
 
 
 class Reverses(Effect):
-    """Of no listed law: an error that follows the direction in which an axis moved last."""
+    """Unlisted: an error that follows the direction in which an axis moved last."""
 
     mechanism = None
     kind = "error"
@@ -184,7 +184,7 @@ class Offset(_Sensor):
 
 
 class Swapped(_Sensor):
-    """Two sensors of different bodies under each other's name; any size but 0 means it."""
+    """Two sensors of different bodies with exchanged names; any size but 0 enables it."""
 
     mechanism = "sensor_swap"
     words = "two sensors are exchanged"
@@ -196,7 +196,7 @@ class Swapped(_Sensor):
         self.partner = self.place
 
     def prepare(self, seen: Seen, wanted_K: float) -> None:
-        """The two whose readings differ about as much as is wanted."""
+        """The pair whose readings differ by about the requested amount."""
         of = {n: v[seen.zero :] for n, v in seen.temps_degC.items()}
         pairs = [(a, b) for a, b in combinations(of, 2) if self.body_of[a] != self.body_of[b]]
         away = [abs(np.log(max(float(np.sqrt(((of[a] - of[b]) ** 2).mean())), 1e-9) / wanted_K)) for a, b in pairs]

@@ -1,4 +1,4 @@
-"""Heats that the machine file lacks: cabinet, pump, sun, guides, windage, withheld losses; and of no listed law."""
+"""Heats that the machine file lacks: cabinet, pump, sun, guides, windage, withheld losses, and unlisted ones."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ class Withheld(Effect):
 
 
 class Product(Heat):
-    """Of no listed law: a driver times the body's excess over a temperature, saturating far above it."""
+    """Unlisted: a driver times the body's excess over a temperature, saturating far above it."""
 
     mechanism = None
 
@@ -183,7 +183,7 @@ class Product(Heat):
 
 
 class Cross(Heat):
-    """Of no listed law: the product of two drivers."""
+    """Unlisted: the product of two drivers."""
 
     mechanism = None
 
@@ -209,7 +209,7 @@ class Cross(Heat):
 
 
 class Plateau(Effect):
-    """Of no listed law: a body that takes up a latent heat about one temperature, as a grease or wax that melts."""
+    """Unlisted: a body that takes up a latent heat about one temperature, as a grease or wax that melts."""
 
     mechanism = None
     largest = 12.0
@@ -236,7 +236,7 @@ class Plateau(Effect):
 
 
 class WrongCapacity(Effect):
-    """Nothing is missing, but one body holds more heat than the file says, far beyond its prior."""
+    """No physics is missing; the capacity of one body exceeds that of the file, far beyond its prior."""
 
     mechanism = "wrong_parameter"
     words = "a heat capacity is stated wrong"
@@ -255,7 +255,7 @@ class WrongCapacity(Effect):
 
 
 class WrongHeat(Effect):
-    """Nothing is missing, but one heat of the file is larger than it says, far beyond its prior."""
+    """No physics is missing; one heat is larger than in the file, far beyond its prior."""
 
     mechanism = "wrong_parameter"
     words = "a heat is stated wrong"
