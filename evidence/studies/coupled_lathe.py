@@ -131,7 +131,7 @@ class CoupledLathe(Study):
         "Our lathe moves more than the source's ({before_x} against 18.6 µm in X, {before_z} against 24.3 µm in Z); "
         "its sensors explain more of it ({after_x} against 7.4 µm left, {after_z} against 10.5 µm). A fit on all nine "
         "runs leaves little less ({after_fit_x} and {after_fit_z} µm), so the number of runs does not make the "
-        "difference: the simulated lathe has only the scatter that it was given.",
+        "difference: the simulated lathe has only the specified scatter.",
         "A sensor of spindle or headstock is chosen for the offset in {on_spindle_x} % (X) and {on_spindle_z} % (Z) of "
         "the folds, one of the axis' own drive for the slope in {on_axis_x} % and {on_axis_z} %.",
     )
@@ -184,7 +184,7 @@ class CoupledLathe(Study):
                 ((f"axis_eta_{c}", f"spindle_eta_{c}"),), 1 - AXIS_ETA[c] / SPINDLE_ETA[c],
                 why=f"Eta in {c.upper()}: spindle {{spindle_eta_{c}}} %, axis {{axis_eta_{c}}} %. A straight line "
                 f"through each sweep's own readings leaves {{straight_rmse_{c}}} µm of the axis' {{axis_rmse_{c}}} µm "
-                "RMSE; the rest is the slope that few sensors miss.",
+                "RMSE; the rest is the part of the slope that few sensors do not explain.",
             )
             for c in ("x", "z")
         ),

@@ -66,7 +66,7 @@ class GreyDistributedLag(Study):
         "0.1 °C, Z to 1 µm every 5 min; runs of 6 h at 2000, 4000 and 6000 rpm, started at 6, 14, 22 and 30 °C (±1 K)"
     )
     assumed: ClassVar[tuple[str, ...]] = (
-        "Neither machine nor figures of the source are known to us: the claim that is tried is that piecewise "
+        "Machine and figures of the source are unknown; the tested claim is that piecewise "
         "weighting by start temperature adapts the model to season and time of day.",
         "Bands have their borders at 10, 18 and 26 °C. Tested are new runs at the bands' own temperatures, at their "
         "borders (between) and at 1 and 35 °C (outside), each at three speeds.",

@@ -69,10 +69,10 @@ def _evidence(c: str) -> tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...
         *((m, f"RMSE below that of {METHODS[m]}", ((combined, f"{m}_rmse_{c}"),)) for m in ALONE),
         (
             "early",
-            "RMSE below that of each alone where they too are taught on rows 16–55 only",
+            "RMSE below that of each alone where they too are trained on rows 16–55 only",
             tuple((combined, f"{m}_early_rmse_{c}") for m in ALONE),
         ),
-        ("wide", "a corrector taught on all 50 rows leaves less", ((f"combined_wide_rmse_{c}", combined),)),
+        ("wide", "a corrector trained on all 50 rows leaves less", ((f"combined_wide_rmse_{c}", combined),)),
         ("linear", "a corrector with a linear part leaves less", ((f"combined_linear_rmse_{c}", combined),)),
         (
             "ahead",
@@ -94,23 +94,23 @@ class GreyLSSVM(Study):
         "0.1 °C, Y and Z to 1 µm; 4000 rpm for 4.5 h from a cold start, 136 rows of 2 min"
     )
     assumed: ClassVar[tuple[str, ...]] = (
-        "Rows 16–55 teach the grey models, 56–65 the corrector, 66–116 test; each method alone learns from all of "
-        "16–65, or, as evidence, from 16–55.",
+        "Rows 16–55 train the grey models, 56–65 the corrector, 66–116 are the test; each method alone learns from "
+        "all of 16–65, or, as evidence, from 16–55.",
         "Inputs are temperature rises. Kernels are RBF as published, with a linear part for comparison.",
-        "The whitening response that the source prints knows no measured error behind its first row: the study must "
-        "have run free. Both are shown: free-running, and one step ahead as evidence of what that would be worth.",
+        "The published whitening response uses no measured error after its first row, so the study ran free. Both are "
+        "shown: free-running, and one step ahead as evidence of the difference.",
         "The grey models run free by their difference equation, whose response is exact for rising inputs.",
         "Development coefficients are kept at 2 or below; directions of the sums weaker than 1e-4 are dropped, which "
         "keeps driving coefficients small.",
         "The BP net alone is 5–5–1, tanh, one start, with weight decay.",
     )
     remarks: ClassVar[tuple[str, ...]] = (
-        "The test rows lie behind the warm-up: Z moves by {moved_z} µm in them and Y by {moved_y} µm, and every method "
-        "goes on from the first two hours. Our development coefficients are as high as the published ones, so a grey "
-        "model forgets within a row: it is close to a regression on the rises.",
+        "The test rows follow the warm-up: Z moves by {moved_z} µm in them and Y by {moved_y} µm, and every method "
+        "extrapolates from the first two hours. Our development coefficients are as high as the published ones, so a "
+        "grey model has a memory of less than a row: it is close to a regression on the rises.",
         "One step ahead does not help a grey model: measured sums and modelled sums drift apart (RMSE in Z "
-        "{combined_one_step_rmse_z} against {combined_rmse_z} µm free-running). To repeat the error measured 2 min "
-        "before has {last_value_rmse_z} µm without any model.",
+        "{combined_one_step_rmse_z} against {combined_rmse_z} µm free-running). Repeating the error measured 2 min "
+        "before gives {last_value_rmse_z} µm without any model.",
     )
     figures: ClassVar[tuple[Figure, ...]] = (
         *(
@@ -139,7 +139,7 @@ class GreyLSSVM(Study):
                     for m in ALONE
                 ),
                 why=f"{name} in {c.upper()}: combined {{combined_{measure}_{c}}}, GM {{gm_{measure}_{c}}}, LS-SVM "
-                f"{{lssvm_{measure}_{c}}}, BP {{bp_{measure}_{c}}}. Taught on rows 16–55 alone, as the grey models "
+                f"{{lssvm_{measure}_{c}}}, BP {{bp_{measure}_{c}}}. Trained on rows 16–55 alone, as the grey models "
                 f"are, they have {{gm_early_{measure}_{c}}}, {{lssvm_early_{measure}_{c}}} and "
                 f"{{bp_early_{measure}_{c}}}. The corrector's ten rows move by {{seen_{c}}} µm, the test by "
                 f"{{moved_{c}}} µm; one of all 50 rows gives {{combined_wide_{measure}_{c}}}.",

@@ -52,8 +52,9 @@ class MainFactor(Study):
         "0.1 °C, X and Z of the spindle to 1 µm every 2 min; 2000 rpm for 3.5 h, stop 1 h, 3.5 h, on five days"
     )
     assumed: ClassVar[tuple[str, ...]] = (
-        "The number of sensors that was found to suffice is not known to us: 1 to 16 are tried, four stand for few.",
-        "The source judged on the recorded run itself; here the nets also predict four other days they never saw.",
+        "The number of sensors that was found to suffice is unknown: 1 to 16 are evaluated, four represent few.",
+        "The source judged on the recorded run itself; here the nets also predict four other days outside the "
+        "training.",
         "Sensitivities are the mean of 20 starts, so the choice is steadier than that of the one net of the source.",
         "Nets that predict: p–5–1, tanh, one start, Levenberg–Marquardt with weight decay, the same for all choices.",
         "No loss means: S at most 5 % above that with all 16 sensors.",

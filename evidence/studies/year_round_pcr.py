@@ -109,7 +109,7 @@ class YearRoundPCR(Study):
         "The heat of the feed at 1500 mm/min is left out: the simulated axes stand.",
     )
     remarks: ClassVar[tuple[str, ...]] = (
-        "Our models miss by more than was printed, {pca4_pcr_S_mean} µm where Z moves by {z_range} µm. They learn from "
+        "Our errors exceed the published ones, {pca4_pcr_S_mean} µm where Z moves by {z_range} µm. They learn from "
         "one speed and predict three: on batches of their own speed they have {same_speed_S_mean} µm, without room "
         "drift and with settled starts {settled_same_speed_S_mean} µm. How far Z moved in the source is not known.",
     )
@@ -165,13 +165,13 @@ class YearRoundPCR(Study):
             "bp_predicts_worst", "the BP net predicts worst",
             tuple((f"{m}_S_mean", "fcgc2_bp_S_mean") for m in ("fcgc2_mlr", "fcgc2_ridge", "pca4_pcr")),
             why="The net has the greatest mean, {fcgc2_bp_S_mean} µm, and is the least robust, {fcgc2_bp_S_std} µm, "
-            "but not in every year. Held back by weight decay, the mean of three starts has {fcgc2_calm_bp_S_mean} µm.",
+            "but not in every year. With weight decay, the mean of three starts has {fcgc2_calm_bp_S_mean} µm.",
         ),
         Ordering(
             "more_points_less_accurate", "with more than 2 points accuracy falls",
             (("pca2_pcr_S_mean", "pca10_pcr_S_mean"),),
-            why="PCA elimination is blind to the error. Only {pca2_spindle} % of its models keep a point at spindle or "
-            "head among two, {fcgc2_spindle} % of FCGC's do. From 4 to 10 "
+            why="PCA elimination does not use the error. Only {pca2_spindle} % of its models keep a point at spindle "
+            "or head among two, {fcgc2_spindle} % of FCGC's do. From 4 to 10 "
             "points accuracy goes from {pca4_pcr_S_mean} to {pca10_pcr_S_mean} µm.",
         ),
         Ordering(
@@ -204,7 +204,7 @@ class YearRoundPCR(Study):
             (("fcgc2_mlr_S_mean", "fcgc2_bp_S_mean"),), evidence_for="bp_predicts_worst",
         ),
         Ordering(
-            "held_back_better", "held back by weight decay, the mean of three starts predicts better than the net",
+            "held_back_better", "with weight decay, the mean of three starts predicts better than the net",
             (("fcgc2_calm_bp_S_mean", "fcgc2_bp_S_mean"),), evidence_for="bp_predicts_worst",
         ),
         Ordering(
@@ -212,8 +212,8 @@ class YearRoundPCR(Study):
             (("pca4_pcr_S_mean", "pca10_pcr_S_mean"),), evidence_for="more_points_less_accurate",
         ),
         Ordering(
-            "two_points_miss_the_spindle", "PCA elimination, blind to the error, keeps spindle and head less often "
-            "than FCGC", (("pca2_spindle", "fcgc2_spindle"),), evidence_for="more_points_less_accurate",
+            "two_points_miss_the_spindle", "PCA elimination, which does not use the error, keeps spindle and head less "
+            "often than FCGC", (("pca2_spindle", "fcgc2_spindle"),), evidence_for="more_points_less_accurate",
         ),
     )  # fmt: skip
 
