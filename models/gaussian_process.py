@@ -75,7 +75,7 @@ class GaussianProcess(Family):
 
     Covariances over the p inputs u, each divided by a fixed scale per unit (10 K, …): the line u·u'/p, the curve
     `exp(−|u − u'|²/(2 p length²))`, one length for all inputs. The batch's own part is what makes the stated interval
-    honest: rows of one batch are not independent, and a new batch brings an own part that nobody has seen. u is
+    valid: rows of one batch are not independent, and a new batch brings an own part that nobody has seen. u is
     relative to the batch's start, where it is 0 (`as_published`: the inputs as they are, a common constant and the
     whole curve).
 

@@ -30,10 +30,10 @@ class GMDL(Family):
     temperatures are not known.
 
     `banded`: "lag" bands the distributed lag behind one grey model of all batches; "both" bands both layers. The grey
-    model learns from each batch's `recent_rows` most recent rows (None: all), the distributed lag from honest outputs:
-    those for a training batch come from grey models of the other batches, with one or two batches those for a quarter
-    from models that were not shown its errors (`models.solvers.grey_models`). `lags` and `lag_min` belong to the
-    distributed lag.
+    model learns from each batch's `recent_rows` most recent rows (None: all), the distributed lag from out-of-sample
+    outputs: those for a training batch come from grey models of the other batches, with one or two batches those for a
+    quarter from models that were not shown its errors (`models.solvers.grey_models`). `lags` and `lag_min` belong to
+    the distributed lag.
 
     Source: study of a grey model and distributed lags, weighted by start temperature; Deng 1989; Almon 1965.
     """

@@ -25,7 +25,7 @@ class GMLSSVM(Family):
 
     A grey model of length L learns from the L most recent usable rows of every training batch. `lengths` count rows, as
     published (2-min samples), or minutes with `lengths_in` "min"; none is shorter than the model has unknowns. The
-    LS-SVM (RBF and linear, at most `max_rows` rows, evenly) learns from outputs that are honest: those for a training
+    LS-SVM (RBF and linear, at most `max_rows` rows, evenly) learns from out-of-sample outputs: those for a training
     batch come from grey models of the other training batches, with one or two batches those for a quarter from models
     that were not shown its errors (`models.solvers.grey_models`). γ and σ by exact leave-batch-out of this second layer
     on a grid (`tuning` "closed_form") or by "particle_swarm" as published.

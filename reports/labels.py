@@ -94,7 +94,7 @@ def percent(share: float) -> str:
 
 
 def p_label(p: float) -> str:
-    """A p-value with honest digits."""
+    """A p-value with its significant digits."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
 
 

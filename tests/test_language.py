@@ -24,6 +24,17 @@ INSTEAD: Mapping[str, str] = {  # regular expression, in lower case -> preferred
     r"robustly|seamless(ly)?|powerful|cutting.edge|state.of.the.art|blazing(ly)?": "the measured property",
     r"previously|used to be": "the present state; history belongs in the changelog",
     r"and so on|etc\.": "the whole list, or what the members share",
+    r"told|beside": "reported, stated; next to",
+    r"owes?|owed|debts?": "limited by; shortfall",
+    r"honest(ly|y)?": "calibrated, out-of-sample, valid",
+    r"mates|voices|sceptics?": "the term of the field",
+    r"by lot|dealt anew": "at random; permuted",
+    r"kept back|keeps back|shut in": "withheld; isolated",
+    r"blind to": "independent of, does not use",
+    r"under each other's names?": "exchanged, swapped",
+    r"(is|are|was|were) not so": "is false",
+    r"overlook(s|ed)?": "missed, not detected",
+    r"in no list|not known to us": "unlisted; unknown",
 }
 WORDS = {re.compile(rf"\b(?:{pattern})(?!\w)", re.IGNORECASE): instead for pattern, instead in INSTEAD.items()}
 PAGES = [*(ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md")), *sorted((ROOT / "docs").rglob("*.md"))]

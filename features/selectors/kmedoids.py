@@ -20,8 +20,9 @@ class KMedoids(Selector):
     """Partition around medoids: n inputs of least total distance 1 − |corr| from every input to its nearest one.
 
     Exact up to `most_inputs` inputs, where all sets are tried; beyond, PAM: build greedily, then swap while any swap of
-    a medoid against another input helps. Blind to the error but for sets of equal total distance (of a cluster of two
-    either may be the medoid): there the larger sum of |corr| with the error decides, then the order of the inputs.
+    a medoid against another input helps. Independent of the error except for sets of equal total distance (of a cluster
+    of two either may be the medoid): there the larger sum of |corr| with the error decides, then the order of the
+    inputs.
 
     Source: L. Kaufman and P. Rousseeuw (1990), Finding Groups in Data, ch. 2.
     """

@@ -19,7 +19,7 @@ class PcaElimination(Selector):
     """Drop the input of largest |loading| in the eigenvector of the smallest eigenvalue; repeat on the rest.
 
     That component is the tightest linear relation among the inputs, so its largest member is the one the
-    others replace best. Blind to the error. Where the smallest eigenvalue is shared (a sensor with two twins),
+    others replace best. Independent of the error. Where the smallest eigenvalue is shared (a sensor with two twins),
     the eigenvector is arbitrary and the length of the loadings in the shared space decides. Of equal loadings
     the later input goes, so the last two inputs are always decided by their order.
     """

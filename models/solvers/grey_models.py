@@ -1,4 +1,5 @@
-"""Grey models as the first layer of a corrected model: honest outputs for training, and the published one-batch form.
+"""Grey models as the first layer of a corrected model: out-of-sample outputs for training, and the published one-batch
+form.
 
 The one-batch functions work on arrays, rows numbered from 0: early rows train, later ones correct, the rest test. The
 study of a THM6380 machining centre (136 rows of 2 min) fitted GM(1,6) of the 25, 30, 35 and 40 rows that end with row
@@ -26,7 +27,7 @@ _STEP_S = 120.0  # nominal step of a sequence; its length does not enter the res
 
 @dataclass(frozen=True)
 class GreyLayer:
-    """The G grey models of one training set, and their honest outputs on it, µm (n, G), NaN on other rows."""
+    """The G grey models of one training set, and their out-of-sample outputs on it, µm (n, G), NaN on other rows."""
 
     models: list[GM1N]
     outputs_um: Array

@@ -91,13 +91,13 @@ def certainty_table(
 def verdict(mean: float, spread: float, n_batches: int, season: float = math.nan) -> str:
     """A verdict on a mean share inside the 90 % interval, with its spread over batches.
 
-    Within five per cent of nine tenths it is honest; beyond that "perhaps", unless the mean lies further off than
+    Within five per cent of nine tenths it is calibrated; beyond that "perhaps", unless the mean lies further off than
     chance would put it (one-sided 95 % of a mean over batches). `season`: the share where whole seasons are left out.
     """
     if not math.isfinite(mean):
         return NOTHING
     if abs(mean - _MEANT) <= _TOLERATED:
-        return "honest, but too sure of a new season" if season < _MEANT - _TOLERATED else "honest"
+        return "calibrated, but too sure of a new season" if season < _MEANT - _TOLERATED else "calibrated"
     label = "too sure" if mean < _MEANT else "too careful"
     if math.isfinite(spread) and abs(mean - _MEANT) > _BEYOND_CHANCE * spread / math.sqrt(n_batches):
         return label

@@ -40,8 +40,8 @@ def text_of(result: GridResult, folder: Path, suffix: str = "md", cell: str = ""
 @pytest.mark.parametrize(
     ("mean", "spread", "n", "words"),
     [
-        (0.90, 0.25, 30, "honest"),
-        (0.851, 0.01, 30, "honest"),
+        (0.90, 0.25, 30, "calibrated"),
+        (0.851, 0.01, 30, "calibrated"),
         (0.80, 0.10, 30, "too sure"),
         (0.80, 0.40, 30, "perhaps too sure"),
         (0.99, 0.02, 30, "too careful"),
@@ -55,8 +55,8 @@ def test_the_verdict_in_plain_words(mean: float, spread: float, n: int, words: s
 
 
 def test_a_new_season_is_asked_too() -> None:
-    assert verdict(0.9, 0.2, 30, 0.78) == "honest, but too sure of a new season"
-    assert verdict(0.9, 0.2, 30, 0.94) == "honest"
+    assert verdict(0.9, 0.2, 30, 0.78) == "calibrated, but too sure of a new season"
+    assert verdict(0.9, 0.2, 30, 0.94) == "calibrated"
 
 
 def test_the_share_inside_is_that_of_fits_done_one_by_one(
@@ -95,7 +95,7 @@ def test_the_page_shows_it_for_families_that_tell_and_marks_the_promoted(result:
     )
     assert {f.removesuffix(" (champion)") for f in column(rows, "family")} == {"gaussian process"}
     assert sum("(champion)" in f for f in column(rows, "family")) == 1
-    every = ("honest", "honest, but too sure of a new season", "too sure", "too careful")
+    every = ("calibrated", "calibrated, but too sure of a new season", "too sure", "too careful")
     assert {words.removeprefix("perhaps ") for words in column(rows, "it is")} <= set(every)
     assert "z: how sure the models say they are" in text_of(result, tmp_path, "html")
 

@@ -175,7 +175,7 @@ def _scanned(seen: Numeric, kept: Numeric, before: Numeric, now: Numeric) -> Num
 
 
 class SensorSwap(Mechanism):
-    """Two sensors under each other's name: place, lag, bonding and offset go together."""
+    """Two sensors with exchanged names: place, lag, bonding and offset go together."""
 
     key = "sensor_swap"
     summary = "two sensors exchanged"

@@ -30,7 +30,7 @@ SAME_IF_SWITCHED = (
 
 
 def counted_as(mechanism: str | None) -> str:
-    """The mechanism's own name; None, and what stands for it, is what no list has."""
+    """The name of a mechanism; `UNLISTED` for None and for the regressions that describe unlisted physics."""
     return UNLISTED if mechanism is None or mechanism in FREE else mechanism
 
 

@@ -26,7 +26,7 @@ def main() -> None:
     task = json.loads(sys.stdin.read())
     place = Path(task["place"])
     import_from = [Path(p) for p in task["import_from"]]
-    status: dict[str, Any] = {"stage": "shut in", "isolation": confine(allowed(place, import_from), place / "witness")}
+    status: dict[str, Any] = {"stage": "isolated", "isolation": confine(allowed(place, import_from), place / "witness")}
     sys.path[:0] = task["import_from"]
     diagnose = _function(task["diagnose"])
     baselines = _function(task["baselines"]) if task["baselines"] else None
