@@ -183,6 +183,7 @@ def lamp_of(done: Diagnosis, rel: float) -> None:
     assert first.parameters["heat"].value == pytest.approx(100.0, rel=rel)
 
 
+@pytest.mark.slow
 def test_a_fifth_of_the_samples_missing() -> None:
     def holes(values: np.ndarray, k: int) -> np.ndarray:
         gone = np.random.default_rng(k).random(len(values)) < 0.2
@@ -197,10 +198,12 @@ def test_a_fifth_of_the_samples_missing() -> None:
     lamp_of(diagnose(two_bodies(), given), 0.1)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_shows_half_kelvins() -> None:
     lamp_of(diagnose(two_bodies(), changed("t_shaft", lambda v, k: np.round(2 * v) / 2)), 0.1)
 
 
+@pytest.mark.slow
 def test_a_channel_that_was_not_always_recorded() -> None:
     done = diagnose(two_bodies(), changed("t_head", lambda v, k: np.full(len(v), np.nan) if k % 2 else v))
     lamp_of(done, 0.1)

@@ -17,7 +17,7 @@ from tests.diagnosis.small_cases import consistent, fitted, four_bodies, runs
 PAIRS = [("t_spindle", "t_head"), ("t_head", "t_bed")]
 
 
-@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("pair", [PAIRS[0], pytest.param(PAIRS[1], marks=pytest.mark.slow)])
 def test_the_pair_that_was_exchanged_comes_first(pair: tuple[str, str]) -> None:
     known = four_bodies()
     given = runs(known, {"swap": {"law": "sensor_swap", "acts_on": list(pair)}})
@@ -31,6 +31,7 @@ def test_the_pair_that_was_exchanged_comes_first(pair: tuple[str, str]) -> None:
     np.testing.assert_allclose(done.fitted.noise.factor, right.noise.factor, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_so_it_does_where_readings_are_missing() -> None:
     """One sensor was away for a run, the other misses every seventh row: what both have tells enough."""
     known = four_bodies()
@@ -47,6 +48,7 @@ def test_so_it_does_where_readings_are_missing() -> None:
     assert first.part is not None and first.part.acts_on == ("t_spindle", "t_bed")
 
 
+@pytest.mark.slow
 def test_labels_come_before_physics() -> None:
     known = four_bodies()
     now = fitted(known, runs(known, {"swap": {"law": "sensor_swap", "acts_on": ["t_spindle", "t_head"]}}))

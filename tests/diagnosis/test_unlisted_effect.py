@@ -64,6 +64,7 @@ def test_law_is_recovered(concealed: dict[str, Any], place: str, true: dict[str,
     assert out.name == f"unlisted_{place}" and max(out.fitted.noise.factor) < 1.3
 
 
+@pytest.mark.slow
 def test_its_usual_size_is_told() -> None:
     """Of a heat that is switched its watts while it runs, of a displacement what it adds to its error."""
     heat, moved = found(case(flux("bed", linear="40 W"))), found(case(shift("z", linear="8 um")))

@@ -26,7 +26,15 @@ def drawn(rng: np.random.Generator, n: int, power: float) -> pd.DataFrame:
     return left_out(S_um, disagreement_um=apart_um, distance=np.zeros(n))
 
 
-@pytest.mark.parametrize(("n", "power"), [(4, 0.25), (16, 0.0), (16, 0.7), (60, 0.7)])
+@pytest.mark.parametrize(
+    ("n", "power"),
+    [
+        (4, 0.25),
+        (16, 0.0),
+        pytest.param(16, 0.7, marks=pytest.mark.slow),
+        pytest.param(60, 0.7, marks=pytest.mark.slow),
+    ],
+)
 def test_nine_new_runs_in_ten_stay_below_the_bound(n: int, power: float) -> None:
     rng = np.random.default_rng(n)
     covered = []

@@ -180,6 +180,7 @@ def beside_speed(
     return out
 
 
+@pytest.mark.slow
 def test_the_withheld_speed_is_found_as_heat_that_follows_it() -> None:
     located, speed = spindle_without_its_speed()
     heat = next(f for f in located.found if f.kind == "heat")

@@ -66,6 +66,7 @@ def test_spindle_fl_states_the_noise_that_the_file_does_not() -> None:
     assert all(s.noise is not None for s in drafted("spindle_fl", 5).part.sensors.values())
 
 
+@pytest.mark.slow
 def test_lathe_drafted_lies_between_nothing_and_the_twin_that_was_written_for_it() -> None:
     found = drafted("lathe_gv1203", 4)
     machine, batches = recorded("lathe_gv1203")

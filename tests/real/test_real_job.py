@@ -55,6 +55,7 @@ def score_um(outcome: Any, target: str, family: str) -> tuple[float, float]:
     return row["S_mean_um"], row["S_std_um"]
 
 
+@pytest.mark.slow
 def test_every_row_of_the_lathe_is_accounted_for(lathe: Any) -> None:
     report = lathe.ingested
     assert len(report.batches) == 32 and not report.quarantined
@@ -62,6 +63,7 @@ def test_every_row_of_the_lathe_is_accounted_for(lathe: Any) -> None:
     assert report.rows_in == report.rows_stored + report.rows_dropped == rows
 
 
+@pytest.mark.slow
 def test_the_lathes_faults_are_kept_from_training(lathe: Any, home: Path) -> None:
     result = lathe.results["disp_z"]
     assert list(result.excluded["channel"]) == ["PT10"]
@@ -77,6 +79,7 @@ def test_the_lathes_faults_are_kept_from_training(lathe: Any, home: Path) -> Non
     assert np.isfinite(stored.values("disp_z")).mean() > 0.99  # the lake keeps what was recorded
 
 
+@pytest.mark.slow
 def test_the_lathe_is_learned(lathe: Any) -> None:
     """Without data checks ridge leaves 6.3 ± 5.4 µm in Z and no model 14.0 ± 7.8 µm (plain scripts)."""
     zero, ridge = score_um(lathe, "disp_z", "zero"), score_um(lathe, "disp_z", "ridge")
@@ -87,6 +90,7 @@ def test_the_lathe_is_learned(lathe: Any) -> None:
     assert not lathe.simulated and lathe.report.exists()
 
 
+@pytest.mark.slow
 def test_the_lathes_champion_predicts_a_raw_file(lathe: Any) -> None:
     from pipelines import settings
     from pipelines.commands.predict import predict_file

@@ -16,6 +16,7 @@ def S_um(name: str, target: str, protocol: str, families: tuple[str, ...]) -> di
     return {family: rows.set_index("batch_id")["S_um"] for family, rows in scores.groupby("family")}
 
 
+@pytest.mark.slow
 def test_the_lathes_summer() -> None:
     """Ridge leaves 3.8 µm in Z and 9.2 in X; 21 August drifts by 87 µm in X, which nothing recorded explains."""
     z = S_um("lathe_gv1203", "disp_z", "leave-batch-out", ("ridge", "lag_dictionary"))
@@ -27,7 +28,7 @@ def test_the_lathes_summer() -> None:
     assert explained.mean() < 3.6 and explained.std() < 2.0
 
 
-@pytest.mark.parametrize("probe", ["ch1", "ch2", "ch3", "ch4", "ch5"])
+@pytest.mark.parametrize("probe", ["ch1", *(pytest.param(f"ch{k}", marks=pytest.mark.slow) for k in range(2, 6))])
 def test_the_spindle_at_a_speed_that_it_was_not_trained_at(probe: str) -> None:
     """Six runs: on ch3 and ch5 ridge is better by less than a tenth."""
     got = S_um("spindle_fl", probe, "leave-speed-out", ("zero", "ridge", "lag_dictionary"))

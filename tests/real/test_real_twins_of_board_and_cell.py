@@ -89,6 +89,7 @@ def test_the_board_needs_its_shared_supply() -> None:
     assert shared_K < 1.1 and apart_K > 1.35 * shared_K
 
 
+@pytest.mark.slow
 def test_every_discharge_is_predicted_by_the_other_three() -> None:
     """4C by 1C to 3C among them: beyond every current, heat and temperature that was fitted."""
     table = left_out(*cell())

@@ -244,7 +244,7 @@ def test_hostile_names_stay_text(toy_batches: Maker, tmp_path: Path) -> None:
     assert figure_pngs(both["z"])
 
 
-@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize("simulated", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_simulated_is_said_everywhere_or_nowhere(simulated: bool, toy_batches: Maker, tmp_path: Path) -> None:
     page = training(results(toy_batches, simulated=simulated)["x"])
     for text in (html_of([page], tmp_path), markdown_of([page], tmp_path)):

@@ -110,6 +110,7 @@ def test_what_goes_wrong_is_one_line(tmp_path: Path) -> None:
         assert set(files) == {RUN} and (run["error"], run["rivals_error"]) == (error, None)
 
 
+@pytest.mark.slow
 def test_findings_outlive_rivals_that_fail(tmp_path: Path) -> None:
     by = Examinee("toy_examinee:quick", "toy_examinee:no_rivals", import_from=(HERE,))
     files = examine(case_of(tmp_path / "case", []), by, "ab")
@@ -118,6 +119,7 @@ def test_findings_outlive_rivals_that_fail(tmp_path: Path) -> None:
     assert (run["error"], run["rivals_error"]) == (None, "rivals: nothing to compare with")
 
 
+@pytest.mark.slow
 def test_a_process_that_cannot_begin_answers_nothing(tmp_path: Path) -> None:
     by = Examinee("toy_examinee:absent", None, import_from=(HERE,))
     with pytest.raises(WorkError, match=r"the answering process did not start: .*has no attribute 'absent'$"):

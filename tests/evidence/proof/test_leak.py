@@ -73,6 +73,7 @@ def test_a_planted_leak_is_noticed(tmp_path: Path) -> None:
     assert effect["n"] == 22
 
 
+@pytest.mark.slow
 def test_cases_by_lot_score_at_chance(tmp_path: Path) -> None:
     row = table_of(tmp_path, extra_rows=False, deals=1).loc["is physics missing"]
     assert row["low90"] < 0.5 and 0.2 < row["auc"] < 0.8
@@ -109,6 +110,7 @@ def test_the_area_is_that_under_the_curve(kinds: int) -> None:
     assert area_under_curve(classes, told) == pytest.approx(np.mean(areas))
 
 
+@pytest.mark.slow
 def test_features_tell_nothing_of_temperatures_and_errors(tmp_path: Path) -> None:
     """A built case and the same one without its effect: whatever differs is not among the features."""
     spec = next(s for s in small_suite() if s.kind == "one" and s.plant == "volumes")
