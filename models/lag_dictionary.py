@@ -191,15 +191,15 @@ class _Pooling:
         if len(rest) < _FEWEST_BATCHES:
             usual = self._process(_USUAL_SETTING, prior, ())
             weights = np.array([float(s == _USUAL_SETTING) for s in _SETTINGS])
-            return _Pooled(self._gains(usual, without), weights, (), self._fitted_spread_um2(usual))
+            return _Pooled(usual.gains(self._place(without)), weights, (), self._fitted_spread_um2(usual))
         mistrusted = self._mistrusted(prior, rest, without)
         voters = rest[~np.isin(ids[rest], mistrusted)]
         processes = [self._process(setting, prior, mistrusted) for setting in _SETTINGS]
-        left_um = np.array([self._left_um(process, without) for process in processes])
+        left_um = np.array([process.left_um(self._place(without)) for process in processes])
         S_mean_um = np.maximum([self._S_um(left)[voters].mean() for left in left_um], np.finfo(float).tiny)
         weights = (S_mean_um.min() / S_mean_um) ** _SHARPNESS
         weights /= weights.sum()
-        coef_um = weights @ np.array([self._gains(process, without) for process in processes])
+        coef_um = weights @ np.array([process.gains(self._place(without)) for process in processes])
         widened = (stats.t.ppf(0.95, len(voters) - 1) / SIDE_OF_90) ** 2
         spread_um2 = widened * self._spread_um2(np.tensordot(weights, left_um, 1), rest)
         return _Pooled(coef_um, weights, mistrusted, spread_um2)
@@ -219,16 +219,10 @@ class _Pooling:
 
     def _S_um_with(self, prior: Array, odd: list[int], without: int | None) -> Array:
         mistrusted = tuple(sorted(int(k) for k in self.windows.ids[odd]))
-        return self._S_um(self._left_um(self._process(_USUAL_SETTING, prior, mistrusted), without))
+        return self._S_um(self._process(_USUAL_SETTING, prior, mistrusted).left_um(self._place(without)))
 
-    def _gains(self, process: BatchProcess, without: int | None) -> Array:
-        return process.gains if without is None else process.gains_without[self._place(without)]
-
-    def _left_um(self, process: BatchProcess, without: int | None) -> Array:
-        return process.alone_um if without is None else process.pairs_um[self._place(without)]
-
-    def _place(self, batch: int) -> int:
-        return int(np.searchsorted(self.windows.ids, batch))
+    def _place(self, batch: int | None) -> int | None:
+        return None if batch is None else int(np.searchsorted(self.windows.ids, batch))
 
     def _S_um(self, left_um: Array) -> Array:
         return np.asarray(np.sqrt((left_um**2).sum(axis=1) / np.maximum(self.windows.counts - 1, 1)))
@@ -243,5 +237,5 @@ class _Pooling:
 
     def _fitted_spread_um2(self, process: BatchProcess) -> Array:
         """One or two batches leave no other to try: what the fit leaves on its own windows, and as much an hour."""
-        left_um = self.windows.y_um - self.windows.x @ process.gains
+        left_um = self.windows.y_um - self.windows.x @ process.gains()
         return np.full(2, np.mean(left_um**2))

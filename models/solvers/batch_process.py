@@ -10,19 +10,21 @@ residual of a block b that is left out is H_bb⁻¹ (H y)_b (Rasmussen and Willi
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from data.arrays import Array
+from data.arrays import Array, Mask
 from features.design import Design
 
 _WINDOW_S = 600.0
 _MOST_WINDOWS = 1200
+_INVERSE = 5.0  # cost of an inverse of N rows over N³, in units of a solved system of m columns over m³
 _MISTRUST = 100.0  # drift variance of a batch that the others do not explain, relative to theirs
 
 
@@ -75,6 +77,34 @@ class Windows:
     def counts(self) -> NDArray[np.int64]:
         return np.diff(self.borders)
 
+    @cached_property
+    def padded(self) -> tuple[Array, Array]:
+        """x (B, q, m) and y_um (B, q) batch by batch, 0 behind a batch's end."""
+        place = np.arange(len(self.batch)) - np.repeat(self.borders[:-1], self.counts)
+        at = np.repeat(np.arange(len(self.ids)), self.counts), place
+        x = np.zeros((len(self.ids), int(self.counts.max(initial=0)), self.x.shape[1]))
+        y_um = np.zeros(x.shape[:2])
+        x[at], y_um[at] = self.x, self.y_um
+        return x, y_um
+
+    @cached_property
+    def _whitened(self) -> dict[float, tuple[Array, Array]]:
+        return {}
+
+    def whitened_sums(self, steady: float) -> tuple[Array, Array]:
+        """xᵀ D⁻¹ x (B, m, m) and xᵀ D⁻¹ y (B, m) of every batch, D its own block of `drift`."""
+        if steady not in self._whitened:
+            m = self.x.shape[1]
+            xx, xy = np.empty((len(self.ids), m, m)), np.empty((len(self.ids), m))
+            for i, (a, n) in enumerate(zip(self.borders, self.counts, strict=False)):
+                rows = slice(a, a + n)
+                own = Windows(self.x[rows], self.y_um[rows], self.time_h[rows], self.batch[rows])
+                factor = np.linalg.cholesky(own.drift(steady))
+                table = solve_triangular(factor, np.column_stack([own.x, own.y_um]), lower=True)
+                xx[i], xy[i] = table[:, :m].T @ table[:, :m], table[:, :m].T @ table[:, m]
+            self._whitened[steady] = xx, xy
+        return self._whitened[steady]
+
     def drift(self, steady: float) -> Array:
         """Covariance (N, N) of what no column explains, block by block, in units of a random walk's after an hour.
 
@@ -85,36 +115,156 @@ class Windows:
         return np.where(same, walk + steady, 0.0) + steady * np.eye(len(self.y_um))
 
 
-@dataclass(frozen=True)
-class BatchProcess:
-    """Predictions of the process for B batches left out.
+class BatchProcess(ABC):
+    """Predictions of the process from all batches, or with one or two of its B batches left out.
 
-    gains (m,), µm per unit of each column; gains_without (B, m), without one batch; alone_um (B, q) residuals of every
-    batch, left out alone, 0 behind its end; pairs_um (B, B, q), at k, i those of batch i where k and i are left out.
+    A batch that is left out is given by its place in `windows.ids`. Results are kept, so that folds share them.
     """
-
-    gains: Array
-    gains_without: Array
-    alone_um: Array
-    pairs_um: Array
 
     @classmethod
     def of(cls, windows: Windows, variance: Array, steady: float = 1.0, mistrusted: Sequence[int] = ()) -> BatchProcess:
-        """Pool all batches, for prior variances (m,) in units of the drift's.
+        """Pool all batches, for prior variances (m,) in units of the drift's; columns of variance 0 take no part.
 
-        `mistrusted` names batches whose drift variance is let grow hundredfold: they have little weight.
+        `mistrusted` names batches whose drift variance is let grow hundredfold: they have little weight. Of two ways
+        to the same result the cheaper one is taken: a system per pair of batches (B² m³), or one inverse of all
+        windows (N³).
         """
-        w = windows
-        wide = np.where(np.isin(w.batch, list(mistrusted)), _MISTRUST, 1.0)
-        covariance = (w.x * variance) @ w.x.T + w.drift(steady) * wide[:, None]
+        wide = np.where(np.isin(windows.ids, list(mistrusted)), _MISTRUST, 1.0)
+        pairs = len(windows.ids) ** 2 * float(np.count_nonzero(variance)) ** 3
+        way = ByColumns if pairs < _INVERSE * float(len(windows.y_um)) ** 3 else ByRows
+        return way(windows, variance, steady, wide)
+
+    @abstractmethod
+    def gains(self, without: int | None = None) -> Array:
+        """(m,), µm per unit of each column, from all batches or from all but one."""
+
+    @abstractmethod
+    def left_um(self, without: int | None = None) -> Array:
+        """Residuals (B, q) of every batch when it is left out, alone or with `without`; 0 behind its end.
+
+        Those of `without` itself are 0.
+        """
+
+
+@dataclass(frozen=True)
+class ByColumns(BatchProcess):
+    """Posterior of the gains from sums over the batches that are left in.
+
+    With the rows of a batch whitened by its drift, and columns over their prior spread, the gains of a set of batches
+    are (I + Σ xᵀx)⁻¹ Σ xᵀy. The sums are added up anew for every set: subtracting a batch would cancel digits.
+    """
+
+    windows: Windows
+    variance: Array
+    steady: float
+    wide: Array  # (B,) drift variance of each batch
+
+    def gains(self, without: int | None = None) -> Array:
+        out = np.zeros(len(self.variance))
+        everything = np.ones((1, len(self.wide)), bool)
+        out[self._active] = self._solved(everything)[0] if without is None else self._gains_without[without]
+        return out
+
+    def left_um(self, without: int | None = None) -> Array:
+        if without is None:
+            x, y_um = self._padded
+            return y_um - (x @ self._gains_without[:, :, None])[:, :, 0]
+        self._leave_out(without)
+        return self._pairs_um[without]
+
+    @cached_property
+    def _active(self) -> NDArray[np.int64]:
+        return np.flatnonzero(self.variance)
+
+    @cached_property
+    def _padded(self) -> tuple[Array, Array]:
+        x, y_um = self.windows.padded
+        return x[:, :, self._active], y_um
+
+    @cached_property
+    def _sums(self) -> tuple[Array, Array]:
+        """xᵀx (B, a²) and xᵀy (B, a) of every batch."""
+        xx, xy = self.windows.whitened_sums(self.steady)
+        spread = np.sqrt(self.variance[self._active])
+        scale = (spread[:, None] * spread) / self.wide[:, None, None]
+        xx = xx[:, self._active[:, None], self._active] * scale
+        return xx.reshape(len(xx), -1), xy[:, self._active] * (spread / self.wide[:, None])
+
+    def _solved(self, masks: Mask) -> Array:
+        """Gains (S, a) from the batches of each set, masks (S, B)."""
+        (xx, xy), take, a = self._sums, masks.astype(float), len(self._active)
+        matrix = (take @ xx).reshape(-1, a, a)
+        matrix[:, range(a), range(a)] += 1.0
+        solved = np.linalg.solve(matrix, (take @ xy)[:, :, None])[:, :, 0]
+        return np.asarray(solved * np.sqrt(self.variance[self._active]))
+
+    @cached_property
+    def _gains_without(self) -> Array:
+        return self._solved(~np.eye(len(self.wide), dtype=bool))
+
+    @cached_property
+    def _pairs_um(self) -> Array:
+        return np.zeros((len(self.wide), *self.windows.padded[1].shape))
+
+    @cached_property
+    def _left(self) -> set[int]:
+        return set()
+
+    def _leave_out(self, k: int) -> None:
+        """Fill the residuals of the pairs of k that no other batch has filled: the gains of a pair serve both."""
+        if k in self._left:
+            return
+        others = np.array([i for i in range(len(self.wide)) if i != k and i not in self._left], np.int64)
+        self._left.add(k)
+        masks = np.ones((len(others), len(self.wide)), bool)
+        masks[:, k] = masks[range(len(others)), others] = False
+        gains, (x, y_um) = self._solved(masks), self._padded
+        self._pairs_um[k, others] = y_um[others] - (x[others] @ gains[:, :, None])[:, :, 0]
+        self._pairs_um[others, k] = y_um[k] - gains @ x[k].T
+
+
+@dataclass(frozen=True)
+class ByRows(BatchProcess):
+    """The inverse covariance of all windows, whose blocks give what is left out."""
+
+    windows: Windows
+    variance: Array
+    steady: float
+    wide: Array  # (B,) drift variance of each batch
+
+    def gains(self, without: int | None = None) -> Array:
+        w, (inverse, weights) = self.windows, self._inverse
+        whole = self.variance * (w.x.T @ weights)
+        if without is None:
+            return whole
+        a, n = w.borders[without], w.counts[without]
+        return np.asarray(whole - self.variance * (w.x.T @ (inverse[:, a : a + n] @ self._alone_um[without, :n])))
+
+    def left_um(self, without: int | None = None) -> Array:
+        return self._alone_um if without is None else self._pairs_um[without]
+
+    @cached_property
+    def _inverse(self) -> tuple[Array, Array]:
+        """Inverse covariance (N, N), and the weights (N,) of the windows."""
+        w = self.windows
+        drift = w.drift(self.steady) * np.repeat(self.wide, w.counts)[:, None]
+        covariance = (w.x * self.variance) @ w.x.T + drift
         inverse = cho_solve(cho_factor(covariance, lower=True), np.eye(len(covariance)))
-        weights = inverse @ w.y_um
-        inverse_blocks, weight_blocks = _blocks(w, inverse, weights)
-        alone_um = _solved(inverse_blocks[range(len(w.ids)), range(len(w.ids))], weight_blocks)
-        gains = variance * (w.x.T @ weights)
-        spans = list(zip(w.borders[:-1], w.counts, strict=True))
-        pulled = [w.x.T @ (inverse[:, a : a + n] @ alone_um[i, :n]) for i, (a, n) in enumerate(spans)]
-        return cls(gains, gains - variance * np.array(pulled), alone_um, _pairs(inverse_blocks, weight_blocks))
+        return inverse, inverse @ w.y_um
+
+    @cached_property
+    def _parts(self) -> tuple[Array, Array]:
+        return _blocks(self.windows, *self._inverse)
+
+    @cached_property
+    def _alone_um(self) -> Array:
+        inverse, weights = self._parts
+        every = range(len(weights))
+        return _solved(inverse[every, every], weights)
+
+    @cached_property
+    def _pairs_um(self) -> Array:
+        return _pairs(*self._parts)
 
 
 def _blocks(w: Windows, inverse: Array, weights: Array) -> tuple[Array, Array]:

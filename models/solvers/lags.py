@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from features.rises import first_finite, first_order_lag
+from features.rises import first_finite
 from models.linear import Pool, Task, Tuned
 from models.program import Builder
 from models.solvers.batches import bridged, steps_s
@@ -143,15 +143,16 @@ def _driver_values(design: Design) -> Array:
 def _inputs(design: Design) -> list[_Column]:
     held = bridged(design, design.x)
     source = {c: i for i, c in enumerate(_scaled_inputs(design))}
+    lagged = _lagged_by_batch(design, held, at_rest=False)
     return [
         _Column(
             f"{name} after {lag_min:g} min",
-            _lagged_by_batch(design, held[:, c], lag_min, at_rest=False),
+            values[:, c],
             _FULL_SCALE_K if c in source else 1.0,
             source.get(c, -1),
             reach=PROMPT if lag_min <= _PROMPT_MIN else UNDRIVEN,
         )
-        for lag_min in _LAGS_MIN
+        for lag_min, values in zip(_LAGS_MIN, lagged, strict=True)
         for c, name in enumerate(design.inputs)
     ]
 
@@ -159,13 +160,14 @@ def _inputs(design: Design) -> list[_Column]:
 def _drivers(design: Design) -> list[_Column]:
     held = bridged(design, _driver_values(design))
     first = len(_scaled_inputs(design))
+    powers = [(d, power) for d, unit in enumerate(design.driver_units) for power in _powers(unit)]
+    loads = np.abs(held)[:, [d for d, _ in powers]] ** np.array([float(power) for _, power in powers])
+    lagged = _lagged_by_batch(design, loads, at_rest=True)
     out = []
-    for d, (name, unit) in enumerate(zip(design.driver_names, design.driver_units, strict=True)):
-        for power in _powers(unit):
-            for lag_min in _LAGS_MIN:
-                values = _lagged_by_batch(design, np.abs(held[:, d]) ** power, lag_min, at_rest=True)
-                label = f"{name}^{power}" if power > 1 else name
-                out.append(_Column(f"{label} after {lag_min:g} min", values, _FULL_SCALE_K, first + d, power, DRIVEN))
+    for c, (d, power) in enumerate(powers):
+        label = f"{design.driver_names[d]}^{power}" if power > 1 else design.driver_names[d]
+        for lag_min, values in zip(_LAGS_MIN, lagged, strict=True):
+            out.append(_Column(f"{label} after {lag_min:g} min", values[:, c], _FULL_SCALE_K, first + d, power, DRIVEN))
     return out
 
 
@@ -194,9 +196,19 @@ def _starts(design: Design) -> list[_Column]:
     return out
 
 
-def _lagged_by_batch(design: Design, values: Array, lag_min: float, *, at_rest: bool) -> Array:
-    start = 0.0 if at_rest else None
-    return _by_batch(design, lambda rows: first_order_lag(values[rows], 60.0 * lag_min, _step_s(design, rows), start))
+def _lagged_by_batch(design: Design, values: Array, *, at_rest: bool) -> list[Array]:
+    """Values (n, c) behind a first-order lag of each time constant; before a batch they are 0 or its first ones."""
+    out = [np.empty(values.shape) for _ in _LAGS_MIN]
+    for k in range(design.n_batches):
+        own = values[design.rows(k)]
+        step_s = _step_s(design, design.rows(k))
+        for lagged, lag_min in zip(out, _LAGS_MIN, strict=True):
+            if len(own) and not (lag_min and step_s):
+                lagged[design.rows(k)] = own
+            elif len(own):
+                before = np.zeros(own.shape[1]) if at_rest else own[0]
+                lagged[design.rows(k)] = _lagged(own, before, 60.0 * lag_min / step_s)
+    return out
 
 
 def _gone(design: Design, gone_min: float) -> Array:

@@ -13,7 +13,7 @@ from features.rises import first_order_lag
 from models.lag_dictionary import LagDictionary
 from models.metrics import residual_std_um
 from models.ridge import Ridge
-from models.solvers.batch_process import BatchProcess, Windows
+from models.solvers.batch_process import BatchProcess, ByColumns, ByRows, Windows
 from models.solvers.lags import Columns
 
 STEP_S, N = 300.0, 72
@@ -69,30 +69,47 @@ def conditional_mean_um(w: Windows, variance, steady: float, seen, asked):
     return covariance[np.ix_(q, s)] @ np.linalg.solve(covariance[np.ix_(s, s)], w.y_um[s])
 
 
+@pytest.mark.parametrize("way", [ByColumns, ByRows])
 @pytest.mark.parametrize("steady", [1.0, 100.0])
-def test_leaving_batches_out_in_closed_form_is_fitting_without_them(windows, steady) -> None:
+def test_leaving_batches_out_in_closed_form_is_fitting_without_them(windows, steady, way) -> None:
     w, variance = windows
-    got = BatchProcess.of(w, variance, steady)
+    got = way(w, variance, steady, np.ones(5))
     y = w.y_um[w.batch == 2]
     alone = y - conditional_mean_um(w, variance, steady, [0, 1, 3, 4], [2])
-    np.testing.assert_allclose(got.alone_um[2, : len(y)], alone, atol=1e-6)
+    np.testing.assert_allclose(got.left_um()[2, : len(y)], alone, atol=1e-6)
     pair = y - conditional_mean_um(w, variance, steady, [0, 1, 3], [2])
-    np.testing.assert_allclose(got.pairs_um[4, 2, : len(y)], pair, atol=1e-6)
-    np.testing.assert_allclose(y - w.x[w.batch == 2] @ got.gains_without[2], alone, atol=1e-6)
+    np.testing.assert_allclose(got.left_um(4)[2, : len(y)], pair, atol=1e-6)
+    np.testing.assert_allclose(y - w.x[w.batch == 2] @ got.gains(2), alone, atol=1e-6)
+
+
+def test_both_ways_agree_with_a_mistrusted_batch_and_columns_of_no_variance(windows) -> None:
+    w, variance = windows
+    some, wide = np.where(np.arange(len(variance)) % 3 == 0, 0.0, variance), np.array([1.0, 100.0, 1.0, 1.0, 1.0])
+    by_columns, by_rows = (way(w, some, 1.0, wide) for way in (ByColumns, ByRows))
+    for without in (None, 1, 3):
+        np.testing.assert_allclose(by_columns.left_um(without), by_rows.left_um(without), atol=1e-6)
+        np.testing.assert_allclose(w.x @ by_columns.gains(without), w.x @ by_rows.gains(without), atol=1e-6)
+
+
+def test_the_way_follows_the_number_of_batches_and_columns(windows) -> None:
+    w, variance = windows
+    assert isinstance(BatchProcess.of(w, variance), ByColumns)
+    wider = replace(w, x=np.tile(w.x, 8))
+    assert isinstance(BatchProcess.of(wider, np.tile(variance, 8)), ByRows)
 
 
 def test_gains_are_generalised_least_squares_with_a_prior(windows) -> None:
     w, variance = windows
     precision = np.linalg.inv(w.drift(1.0))
     want = np.linalg.solve(w.x.T @ precision @ w.x + np.diag(1 / variance), w.x.T @ precision @ w.y_um)
-    np.testing.assert_allclose(w.x @ BatchProcess.of(w, variance).gains, w.x @ want, atol=1e-6)
+    np.testing.assert_allclose(w.x @ BatchProcess.of(w, variance).gains(), w.x @ want, atol=1e-6)
 
 
 def test_a_mistrusted_batch_hardly_pulls(windows) -> None:
     w, variance = windows
     bent = replace(w, y_um=w.y_um + np.where(w.batch == 1, 20.0 * w.time_h, 0.0))
-    honest = BatchProcess.of(w, variance).gains_without[1]
-    pulled = [w.x @ (BatchProcess.of(bent, variance, 1.0, who).gains - honest) for who in ((), (1,))]
+    honest = BatchProcess.of(w, variance).gains(1)
+    pulled = [w.x @ (BatchProcess.of(bent, variance, 1.0, who).gains() - honest) for who in ((), (1,))]
     assert np.std(pulled[1]) < 0.1 * np.std(pulled[0])
 
 
