@@ -38,7 +38,7 @@ class Everyday(Effect):
         return True
 
     def stated(self) -> Stated | None:
-        """What the machine file states of it in addition to the constants of links and exposures."""
+        """Entries of the machine file in addition to the constants of links and exposures."""
         return None
 
 
@@ -77,7 +77,7 @@ class Films(Everyday):
             heat_W[self.air] -= exchanged.sum(axis=0)
 
     def beyond_K(self, cells_degC: Array, air_degC: Array) -> Array:
-        """(N, B): what the constant coefficient must be given on top, as kelvins of it."""
+        """(N, B): addition to the constant coefficient, as kelvins of it."""
         lead_K = air_degC - cells_degC
         rising = rising_factor(lead_K, self.exponent, self.stated_K, self.moving_K)
         glowing = radiation_factor(cells_degC, air_degC)

@@ -1,4 +1,4 @@
-"""The machine file that an engineer would have written of a plant: lumped, a little wrong, without the effect."""
+"""The machine file that an engineer would write of a plant: lumped, with inexact values, without the effect."""
 
 from __future__ import annotations
 

@@ -121,7 +121,8 @@ def draw(
 
 
 def posed(seed: int, sizes: Mapping[str, float], plant: str = "volumes", **given: Any) -> Posed:
-    """What `draw` simulates: the plant of a kind with effects of these sizes, its runs and its machine file.
+    """The input of the simulation of `draw`: the plant of a kind with effects of these sizes, its runs and its machine
+    file.
 
     Raises:
         InputError: as `draw`.

@@ -1,4 +1,4 @@
-"""A case of real recordings: what a diagnosis sees, and its answer key."""
+"""A case of real recordings: its visible part and its answer key."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class Structure(ABC):
         """``C dT/dt = -L T + heat`` from `start_degC` (N, B): temperatures (steps + 1, N, B)."""
 
     def share_of(self, body: str) -> Array:
-        """How much of every node belongs to a body, 0 to 1, (N,)."""
+        """Share of every node that belongs to a body, 0 to 1, (N,)."""
         part, out = self.bodies[body], np.zeros(self.size)
         out[part.cells] = part.weights * part.capacity_J_per_K / self.capacity_J_per_K[part.cells]
         return out
@@ -173,7 +173,7 @@ def exposures_W_per_K(s: Structure) -> dict[tuple[str, str], float]:
 
 
 def gains_um_per_K(s: Structure, weights_um_per_K: Array) -> dict[str, float]:
-    """What each body's mean rise adds to an error; what no drawing would show, below `LEAST_UM_PER_K`, left out."""
+    """Contribution of the mean rise of each body to an error, µm/K, without those below `LEAST_UM_PER_K`."""
     sums = {body: float(s.share_of(body) @ weights_um_per_K) for body in s.bodies}
     return {body: total for body, total in sums.items() if abs(total) > LEAST_UM_PER_K}
 

@@ -1,9 +1,9 @@
 """Plant D: real recordings without an input or an effect that the machine file is known to need.
 
-Each case removes or replaces parts of a machine file, and states the terms that a diagnosis should find.
-Sizes of board and cell are those that the full file calibrates; those of the lathe are what its file states, which was
-fitted to its runs. Of the spindle test the speed is withheld, the only cause of its heat; it has no twin part, so that
-the network is drafted.
+Each case removes or replaces parts of a machine file, and states the terms that a diagnosis should find. Sizes of board
+and cell are those that the full file calibrates; those of the lathe are the values of its file, which is fitted to its
+runs. Of the spindle test the speed is withheld, the only cause of its heat; it has no twin part, so that the network is
+drafted.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def judge_all(folder: ProofFolder, opened: Opened, workers: int, done: Done | No
 
 
 def _judged(tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[tuple[str, Judged]]:
-    """Names and what `judge` gives, as they come."""
+    """Names and results of `judge`, in the order of completion."""
     with Processes(workers) as pool:
         yield from ((tasks[k][0].name, judged) for k, judged in pool.completed(judge, tasks))
 

@@ -30,7 +30,7 @@ from models.metrics import residual_std_um
 
 @dataclass(frozen=True)
 class Figure:
-    """One number of a study, per seed: what it is, its unit, and what the source printed (None: nothing)."""
+    """One number of a study, per seed: label, unit, and the published value (None: not published)."""
 
     key: str
     label: str
@@ -144,7 +144,7 @@ class StudyResult:
         return text.format_map(means)
 
     def orderings(self) -> pd.DataFrame:
-        """One row per ordering, evidence behind what it explains.
+        """One row per ordering, evidence after the ordering that it explains.
 
         Columns: ordering, words, evidence_for, why (with the means), held (seeds), seeds, share, low and high (95 % by
         Clopper and Pearson 1934), verdict (`holds` where low > ½, `fails` where high < ½, else `undecided`),
@@ -190,7 +190,7 @@ Job = tuple[type[Study], int]
 def run_studies(
     keys: Sequence[str], seeds: int, workers: int = 1, progress: Callable[[str, int, int], None] | None = None
 ) -> dict[str, StudyResult]:
-    """Every study on seeds 0 … `seeds` − 1. `progress` is called with what was done, how many of how many.
+    """Every study on seeds 0 … `seeds` − 1. `progress` is called with a label, the number done and the total.
 
     Raises:
         InputError: an unknown study, or fewer than 2 seeds (a spread needs two).

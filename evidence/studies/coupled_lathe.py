@@ -42,7 +42,7 @@ def machine_runs(seed: int) -> list[Batch]:
 
 
 def _described() -> Machine:
-    """What the columns of the simulated recordings mean."""
+    """Meaning of the columns of the simulated recordings."""
     channels: dict[str, dict[str, object]] = {s: {"role": "temperature", "unit": "degC"} for s in SENSOR_OFFSET_K}
     channels[ROOM]["role"] = "ambient"
     channels["spindle_rpm"] = {"role": "driver", "unit": "rpm"}
@@ -79,7 +79,7 @@ class Sweeps:
 
     @property
     def axis_um(self) -> Array:
-        """What the axis adds to the spindle, (R, 12)."""
+        """Contribution of the axis in addition to the spindle, (R, 12)."""
         return self.coupled_um - self.spindle_um[:, None]
 
     @property

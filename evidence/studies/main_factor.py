@@ -1,4 +1,4 @@
-"""The main-factor study: how few of a lathe's 16 sensors a BP net needs, chosen by its own weights."""
+"""The main-factor study: the number of a lathe's 16 sensors that a BP net needs, chosen by its weights."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def _S_um(design: Design, family: Family, inputs: Inputs) -> Array:
 
 
 def _starts(found: Sensitivity) -> dict[str, float]:
-    """How far single starts of the nets agree with their mean."""
+    """Agreement of single starts of the nets with their mean."""
     everything = np.ones(len(found.columns), bool)
     best = ranking(found.mean, everything)[:FEW]
     shared = [len(set(ranking(s, everything)[:FEW].tolist()) & set(best.tolist())) / len(best) for s in found.of_start]

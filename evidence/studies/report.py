@@ -30,7 +30,7 @@ _LABEL_CHARACTERS = 46
 
 @dataclass(frozen=True)
 class Strip:
-    """One figure of a study over its seeds: values (S,), unit, what was printed (NaN: nothing)."""
+    """One figure of a study over its seeds: values (S,), unit, the published value (NaN: none)."""
 
     label: str
     values: Array
@@ -114,7 +114,7 @@ Record = dict[Any, Any]
 
 @dataclass(frozen=True)
 class Claim:
-    """One published ordering: what came out, why, and its picture as a data: address."""
+    """One published ordering: result, explanation, and its picture as a data: address."""
 
     title: str
     verdict: str

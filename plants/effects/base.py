@@ -47,10 +47,10 @@ class Effect:
         self.drawn(plant, size, rng)
 
     def drawn(self, plant: Plant, size: float, rng: np.random.Generator) -> None:
-        """Draws what is free of this effect; a subclass sets its attributes here."""
+        """Draws the free attributes of this effect; a subclass sets them here."""
 
     def answer(self) -> Answer:
-        """Where and what it is."""
+        """The answer: mechanism, place and values."""
         raise NotImplementedError
 
     def active(self, now: Now) -> NDArray[np.bool_]:
@@ -69,7 +69,7 @@ class Effect:
         return {}
 
     def sensed(self, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
-        """The sensors as they are with the fault."""
+        """The sensors with the fault."""
         return sensors
 
     def ahead_s(self) -> Mapping[str, float]:

@@ -93,7 +93,7 @@ def _rails(a: Assembly) -> list[Piece]:
 
 
 def expose(a: Assembly, rng: np.random.Generator, spread: float = 1.0) -> None:
-    """Convection, W/m²/K: what faces the work is inside the enclosure; motor, rear and back are outside."""
+    """Convection, W/m²/K: faces towards the work are inside the enclosure; motor, rear and back are outside."""
     h = {name: float(rng.uniform(*wider((4.5, 8.0), spread))) for name in (b.name for b in a.boxes)}
     inside = ("shaft", "front", "table", "screw", "saddle", "mandrel")
     for box in a.boxes:

@@ -55,7 +55,7 @@ def odd(s: Elements, casting: str, weights_um_per_K: Array, axis: int) -> Array:
 
 
 def _lumped(s: Elements, bends_um_per_K: Array) -> float:
-    """What an even gradient through the column's depth gives for each kelvin between the means of its halves."""
+    """Response to a uniform gradient through the depth of the column, per kelvin between the means of its halves."""
     mesh = s.meshes["column"]
     gradient = np.zeros(s.size)
     gradient[s.cells["column"]] = mesh.points_m[:, 1]

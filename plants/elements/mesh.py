@@ -142,7 +142,7 @@ class Slabs:
     sign: Array
 
     def within(self, pieces: Sequence[Piece]) -> Slabs:
-        """What of them lies in the pieces; where a piece counts negative, it is taken away."""
+        """Their intersection with the pieces; negative pieces are subtracted."""
         parts = []
         for sign, under, over in pieces:
             low, high = np.maximum(self.low_m, under), np.minimum(self.high_m, over)
@@ -156,7 +156,7 @@ class Slabs:
         return Slabs(low, high, self.sign)
 
     def cut(self, lines_m: Sequence[Array]) -> Slabs:
-        """What of them lies within a grid, cut at its planes: functions of that grid are smooth on each."""
+        """Their intersection with a grid, cut at its planes: functions of that grid are smooth on each."""
         out = self
         for axis, line in enumerate(lines_m):
             n = len(line) - 1

@@ -88,7 +88,7 @@ class Graft:
         self.drawn(setting, size, rng)
 
     def drawn(self, setting: Setting, size: float, rng: np.random.Generator) -> None:
-        """Draws what is free of this effect; a subclass sets its attributes here."""
+        """Draws the free attributes of this effect; a subclass sets them here."""
 
     def term(self) -> Term:
         """Its term in the answer key."""

@@ -29,7 +29,7 @@ DESCRIBED = "Real recordings on which a simulated response may be superposed."
 
 @dataclass(frozen=True)
 class Grafted:
-    """What is grafted on which machine: heats first, faults of sensors last."""
+    """Grafts by machine: heats first, faults of sensors last."""
 
     machine: str
     grafts: tuple[str, ...]

@@ -129,7 +129,7 @@ BEFORE_S = 10 * 3600.0
 
 @dataclass(frozen=True)
 class Push:
-    """What an effect does to each body over K steps of B runs, (K, B): watts, and W/K that its own rise loses more.
+    """Action of an effect on each body over K steps of B runs, (K, B): watts, and additional losses of its rise in W/K.
 
     `spread` False: into the one cell where the body is heated; True: evenly over its surface.
     """
@@ -201,7 +201,7 @@ def response(frame: Frame, push: Push, clock: Clockwork) -> Array:
 
 
 def on_channels(frame: Frame, rise_K: Array) -> dict[str, Array]:
-    """What the rise adds to every sensor and error channel, (rows, B); errors count from the runs' starts."""
+    """Contribution of the rise to every sensor and error channel, (rows, B); errors are relative to the starts."""
     out = {c: placement.bonding * rise_K[:, placement.cell] for c, placement in frame.placements.items()}
     for channel, gains in frame.gains_um_per_K.items():
         moved = sum(

@@ -39,7 +39,7 @@ class Heat(Graft):
         self.frame: Frame = draw_frame(setting.twin, stream(setting.seed, "frame"))
 
     def unit_push(self) -> Push:
-        """What an amplitude of 1 does."""
+        """The action of an amplitude of 1."""
         raise NotImplementedError
 
     def shape(self) -> dict[str, tuple[float, str]]:
@@ -267,7 +267,7 @@ class Draught(Heat):
 
 
 def surface_degC(setting: Setting, body: str, batch: Batch) -> Array:
-    """What the run's sensors show of a body, the mean of those that have values, (rows,)."""
+    """Mean reading of the sensors of a body in a run, over those with values, (rows,)."""
     shown = [batch.values(c) for c, s in setting.twin["sensors"].items() if s["at"] == body]
     known = [v for v in shown if np.isfinite(v).mean() > 0.5]
     return np.asarray(np.mean([np.where(np.isfinite(v), v, np.nanmean(v)) for v in known], axis=0))

@@ -101,7 +101,7 @@ def _current(top_A: float) -> Driver:
 
 
 def _sources(dice: Dice, solid: Solid, bodies: Mapping[str, Cells], number: int, top_A: float) -> dict[str, Source]:
-    """Loss by the current's square and a little by its size; all cells are in series, each with its own resistance."""
+    """Loss by the square of the current, with a small linear term; cells in series, each with its resistance."""
     out: dict[str, Source] = {}
     common = dice.span(0.8, 6.0)
     for k in range(1, number + 1):

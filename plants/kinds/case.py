@@ -86,7 +86,7 @@ def draw_kind_case(
 ) -> Case:
     """A case; the same arguments give the same one, to the last digit.
 
-    `effects` gives the requested sigma of each effect: the rms of what it changes in the channel that it changes most,
+    `effects` gives the requested sigma of each effect: the rms of its change of the channel that it affects most,
     in units of that channel's noise, before any recalibration. The key states the actual sigma, since some effects have
     a least or a largest size. `decoys` adds small faults that are no effect: idle switches, an offset within its prior,
     a drift below the noise, a conductance that is misread within its prior, early rows, holes, lost samples.
@@ -110,7 +110,7 @@ def draw_kind_case(
 def posed(
     seed: int, kind: str, wanted: Mapping[str, float], *, decoys: bool = False, runs: int | None = None
 ) -> KindPosed:
-    """What `draw_kind_case` simulates, with the sizes of the requested sigmas.
+    """The simulated variant of `draw_kind_case`, with the sizes of the requested sigmas.
 
     Raises:
         InputError: as `draw_kind_case`.

@@ -36,7 +36,7 @@ class Kind:
 
 
 def setting(dice: Dice, effects: frozenset[str], **own: Any) -> Setting:
-    """How machines in shops are recorded; a kind overrules what is its own.
+    """Default settings of recordings in shops; a kind overrides its own.
 
     A file that states lags or offsets of its sensors lacks neither: a case of such a fault has another file.
     """

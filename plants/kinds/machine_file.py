@@ -1,4 +1,4 @@
-"""The machine file that an engineer would write of a plant of any kind: lumped, a little wrong, without the effects."""
+"""The machine file that an engineer would write of a plant of any kind: lumped, inexact, without the effects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def machine_file(
     plant: KindPlant, full: KindPlant, name: str, seed: int, idle: Sequence[str] = (),
     misread: Mapping[str, float] = NOTHING,
 ) -> Machine:  # fmt: skip
-    """The machine of a case with its twin part. `plant` is what is left of `full` once the effects withhold theirs.
+    """The machine of a case with its twin part. `plant` is `full` without the withheld features of the effects.
 
     The values of what both have are the same whatever the effects are: they are drawn for the full plant. `misread`
     multiplies the conductances of links.

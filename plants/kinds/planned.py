@@ -63,7 +63,7 @@ def execute(
 
 
 def _in_a_hall(text: str) -> str:
-    """The plan without surroundings that are none of a hall, such as a coolant's inlet: these stay as they are."""
+    """The plan without surroundings other than those of a hall, such as the inlet of a coolant, which are unchanged."""
     try:
         given = parse_plain(text, "run plan")
     except InputError:

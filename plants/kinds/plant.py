@@ -1,4 +1,4 @@
-"""What a kind draws: a solid with the bodies that a person names, heats, error terms, sensors, drivers, and a setting.
+"""The draw of a kind: a solid with named bodies, heats, error terms, sensors, drivers, and a setting.
 
 Also the lumped values that a drawing of the plant would give: links, exposures and gains of its bodies.
 """
@@ -97,7 +97,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Setting:
-    """How a case is recorded and how well its engineer knows the machine; K, s, h, µm.
+    """Recording of a case and accuracy of its machine file; K, s, h, µm.
 
     `noise_K` and `step_K` (0: unrounded) are of temperatures, `noise_um` and `step_um` of errors. `file_error` is the
     sd of the logarithm of what the file's values are off by. Lags and offsets that the file does not state are small.
@@ -239,6 +239,6 @@ def exposures_W_per_K(plant: KindPlant) -> dict[tuple[str, str], float]:
 
 
 def gains_um_per_K(plant: KindPlant, growth: Growth) -> dict[str, float]:
-    """What each body's mean rise adds to an error."""
+    """Contribution of the mean rise of each body to an error, µm/K."""
     sums = {body: float(growth.weights_um_per_K[cells].sum()) for body, cells in plant.bodies.items()}
     return {body: total for body, total in sums.items() if abs(total) > 0.02}

@@ -25,7 +25,7 @@ GAP_ROWS = 3.0  # a longer hole stays a hole
 
 @dataclass(frozen=True)
 class Course:
-    """V variants of B runs: time_s (M,); what was watched, by name, (M, V, B); air and drivers (M, B)."""
+    """V variants of B runs: time_s (M,); watched quantities by name, (M, V, B); air and drivers (M, B)."""
 
     runs: Sequence[KindRun]
     time_s: Array
@@ -258,7 +258,7 @@ def noise_of(plant: KindPlant, channel: str) -> float:
 
 
 def without(plant: KindPlant, effects: Sequence[Effect]) -> KindPlant:
-    """The plant less what its effects withhold and bring themselves."""
+    """The plant without the features that its effects withhold or replace."""
     gone = {name for e in effects for name in e.withholds}
     sources = {k: v for k, v in plant.sources.items() if k not in gone}
     growths = {k: v for k, v in plant.growths.items() if k not in gone}

@@ -85,7 +85,7 @@ class Concealed:
         return {}
 
     def read(self, shown_degC: dict[str, Array]) -> dict[str, Array]:
-        """What the sensors show, (S + 1, B) by channel, as the recorder gets it."""
+        """Readings of the sensors, (S + 1, B) by channel, before the recorder."""
         return shown_degC
 
 
@@ -270,7 +270,7 @@ class Case:
 
     @property
     def answer(self) -> dict[str, Any]:
-        """What is concealed, as plain data: effect, words, and `terms` with mechanism, place and values."""
+        """The concealed effect as plain data: effect, words, and `terms` with mechanism, place and values."""
         e = self.effect
         if e is None:
             return {"simulated": True, "effect": None, "words": "nothing", "terms": []}

@@ -38,7 +38,7 @@ ROOM = "room"
 
 @dataclass(frozen=True)
 class Scatter:
-    """How runs differ: room drift over 6 h, ripple, start of the slow castings against the room, friction ±.
+    """Scatter of runs: room drift over 6 h, ripple, start of the slow castings against the room, friction ±.
 
     A start is ``least + span · Beta(a, a)``, a per part of `START_OFFSET_SHAPE`.
     """

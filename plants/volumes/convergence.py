@@ -30,7 +30,7 @@ def study(
     seed: int = 4, effect: str = "natural_convection",
     grids: Sequence[int] = (1, 2, 4), steps_s: Sequence[float] = (60.0, 30.0, 15.0),
 ) -> pd.DataFrame:  # fmt: skip
-    """Errors against one halving more than the finest of each, and the orders observed: `COLUMNS`, a row a run.
+    """Errors against one halving more than the finest of each, and the orders observed: `COLUMNS`, a row per run.
 
     Grids cut every cell 1, 2, 4, … times along both axes, `size` is the number of cells; `steps_s` halve. `error` is
     the root mean square over all rows, sensors and two runs, in the unit of the quantity's name. The order is that of

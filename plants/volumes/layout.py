@@ -14,7 +14,7 @@ from plants.volumes.structure import Assembly, Plate, Volumes
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the drawing decides and the rest of the plant must know, lengths in m."""
+    """Dimensions of the drawing that the rest of the plant needs, in m."""
 
     structure: Volumes
     head_at: float  # height of the head's middle as a share of the column's
@@ -110,7 +110,7 @@ def _join(a: Assembly, g: dict[str, float], head_at: float) -> None:
 
 
 def _expose(a: Assembly, rng: np.random.Generator, spread: float) -> None:
-    """Convection, W/m²/K: what faces the work is inside the enclosure, motor, rear and back are outside."""
+    """Convection, W/m²/K: faces towards the work are inside the enclosure; motor, rear and back are outside."""
     h = {name: float(rng.uniform(*wider((4.5, 8.0), spread))) for name in a.castings}
     inside = ("shaft", "front", "table", "screw", "saddle", "mandrel")
     for name in a.castings:

@@ -244,7 +244,7 @@ def improvement(cases: pd.DataFrame, plants: Sequence[str]) -> Figure:
     """Left-out error of every case before and after the diagnosis, with the true model and the noise level; sorted.
 
     Args:
-        cases: a row a case with error_before, error_after, error_true and error_floor, in units of the noise.
+        cases: a row per case with error_before, error_after, error_true and error_floor, in units of the noise.
     """
     fig = Figure(figsize=(WIDE_IN, 4.3))
     ax = panel(fig, 0.75, 0.75, WIDE_IN - 0.95, 3.0)

@@ -27,7 +27,7 @@ def publish_proof(path: Path, run: ProofRun | None) -> None:
     """Put a run's result between the two markers of a Markdown file.
 
     Where the file also has a block of runs, whose first line names their record relative to the file, the run is added
-    to the record and the block is written anew. Nothing else of the file changes.
+    to the record and the block is rewritten. Nothing else of the file changes.
 
     Raises:
         InputError: a file cannot be read or written, has no pair of markers, or the run is of a development suite

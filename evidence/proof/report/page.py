@@ -185,7 +185,7 @@ def _worst(run: ProofRun) -> Part:
 
 
 def _cases(run: ProofRun) -> Part:
-    own = Part("how", "How it was done", "How it was done")
+    own = Part("how", "Procedure", "Procedure")
     shown: list[Table] = []
     notes: list[str] = []
     if len(run.table("outcomes")):

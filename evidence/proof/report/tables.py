@@ -114,7 +114,7 @@ _RARE = 0.05
 
 def cases(outcomes: pd.DataFrame, plants: Sequence[str]) -> Table:
     """Number of cases of each kind on each plant, and of entirely right answers."""
-    columns = [Column("what is concealed"), *(Column(plant_letter(p), plant_origin(p), "number", p) for p in plants),
+    columns = [Column("concealed"), *(Column(plant_letter(p), plant_origin(p), "number", p) for p in plants),
                Column("all", kind="number"), Column("visible", kind="number")]  # fmt: skip
     judged = "right" in outcomes.columns and outcomes["right"].notna().any()
     columns += [Column("entirely right", kind="number")] if judged else []
@@ -164,7 +164,7 @@ def leak(table: pd.DataFrame, plants: Sequence[str]) -> Table:
         for r in table.to_dict("records")
     ]
     columns = (
-        Column("what the classifier predicts", kind="wide"), Column("area under its curve", kind="number"),
+        Column("predicted quantity", kind="wide"), Column("area under its curve", kind="number"),
         Column("90 %", kind="number"), Column("by chance", kind="number"),
         Column("p (permutations)", kind="number"), Column("cases", kind="number"),
     )  # fmt: skip

@@ -93,7 +93,7 @@ class Goal(Wanted):
     """One goal. `of` gives the values from outcomes and terms, indexed by case; `statistic` None: a share of yes or no.
 
     `informed` gives the same values for the true model, which contains all concealed effects and claims those that pass
-    the thresholds of a claim: what it misses, the recordings do not support. None: not defined.
+    the thresholds of a claim: effects that it misses are not supported by the recordings. None: not defined.
     """
 
     of: Select

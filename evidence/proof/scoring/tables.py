@@ -164,7 +164,7 @@ def compared(
 
 
 def as_findings(reply: Mapping[str, Any], like: Findings) -> Findings:
-    """A reply as a diagnosis would have written it; what it cannot distinguish is equally probable.
+    """A reply in the form of a diagnosis; indistinguishable candidates are equally probable.
 
     Raises:
         InputError: a reply that lacks something.

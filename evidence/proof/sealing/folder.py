@@ -46,7 +46,7 @@ def folder_digest(folder: Path) -> str:
 
 
 def files_digest(root: Path, files: Iterable[Path]) -> str:
-    """SHA-256 over files by their path below `root`; every part with its length, so that no two lists are alike."""
+    """SHA-256 over files by their path below `root`; every part with its length, so that the encoding is unambiguous."""
     digest = hashlib.sha256()
     for file in files:
         for part in (file.relative_to(root).as_posix().encode(), file.read_bytes()):
@@ -242,7 +242,7 @@ class State:
     """`answered`: digest of each case's answer since the last restart; `void`: why a case does not count.
 
     `begun`: cases with a started and unfinished process. `source`: digest of the source that
-    answers, as it was sealed or, after a restart, begun anew; `ran`: whether a run has begun.
+    answers, as sealed or as restarted; `ran`: whether a run has begun.
     """
 
     root: str

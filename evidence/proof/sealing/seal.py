@@ -41,7 +41,7 @@ Make = Callable[[Any, Path], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Suite:
-    """What is sealed: its name, the specs, and the secret they were drawn from (a known number for development)."""
+    """The input of a seal: name, specs, and the secret that they are drawn from (a known number for development)."""
 
     name: str
     specs: Sequence[Spec]
@@ -52,7 +52,7 @@ class Suite:
 def seal(folder: ProofFolder, suite: Suite, make: Make, workers: int = 1, done: Done | None = None) -> str:
     """Build and seal a suite; returns the root, which commits to every case and answer and can be published.
 
-    A seal that was interrupted is begun anew. `make` is a function of a module where there are several `workers`.
+    An interrupted seal starts again. `make` is a function of a module where there are several `workers`.
 
     Raises:
         InputError: the folder holds a sealed proof, or something else; no case; a name twice.
@@ -102,7 +102,7 @@ def _clean(folder: ProofFolder) -> None:
 
 
 def _made(specs: Sequence[Spec], make: Make, cases: Path, workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Name and answer of every case once it is written, as they come."""
+    """Name and key of every written case, in the order of completion."""
     for spec in specs:
         (cases / spec.name).mkdir()
     with Processes(workers) as pool:

@@ -110,7 +110,7 @@ class Bench:
         return size
 
     def _times(self, rows: Sequence[Array]) -> float:
-        """How many times these rows can be seen; the largest of `SIZES` where none of them can."""
+        """The multiple of these rows at the limit; the largest of `SIZES` if none is visible."""
         batches = tuple(replace(b, columns=b.of(r)[:, None]) for b, r in zip(self.evidence.batches, rows, strict=True))
         evidence = replace(self.evidence, batches=batches, low=np.full(1, -np.inf), high=np.full(1, np.inf))
         targets = [b.target[:, None] + b.columns * SIZES for b in batches]
@@ -126,7 +126,7 @@ class Bench:
         return posed(self.seed, {}, self.plant, **self.options).plant
 
     def _doubt(self, effect: str, size: float) -> float:
-        """How many prior sd a value of the file is off, as far as the recordings say so."""
+        """Deviation of a value of the file in prior sd, as estimated from the recordings."""
         drawn = EFFECTS[effect](self._plant(), size, stream(self.seed, f"effect {effect}"))
         ((path, factor),) = drawn.misread().items()
         unknowns = self.fitted.problem.unknowns
@@ -148,7 +148,7 @@ def measured(plant: str, seeds: Sequence[int], effects: Sequence[str]) -> Iterat
 
 
 def renewed(table: Mapping[str, Any], plant: str, found: Sequence[tuple[str, int, float]]) -> dict[str, Any]:
-    """The table with these effects of a plant measured anew."""
+    """The table with new measurements of these effects of a plant."""
     by_effect: dict[str, list[float]] = {}
     for effect, _, size in found:
         by_effect.setdefault(effect, []).append(size)

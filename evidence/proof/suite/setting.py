@@ -23,7 +23,7 @@ ALWAYS_STEP_S = 30.0  # the solver's
 
 @dataclass(frozen=True)
 class Ranges:
-    """From and to of what is drawn evenly, or the values to choose from."""
+    """Limits of uniform draws, or the values to choose from."""
 
     batches: tuple[int, int]
     hours: tuple[float, ...]

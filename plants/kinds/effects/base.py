@@ -49,7 +49,7 @@ def lagged(values: Array, step_s: float, lag_s: float) -> Array:
 
 
 class Effect:
-    """A subclass says in `drawn` what is free of it, and overrides what it changes."""
+    """A subclass draws its free attributes in `drawn` and overrides the methods of its action."""
 
     mechanism: str | None
     kind: str = "node"
@@ -74,7 +74,7 @@ class Effect:
         self.drawn(plant, dice, **options)
 
     def drawn(self, plant: KindPlant, dice: Dice) -> None:
-        """Draws what is free of this effect."""
+        """Draws the free attributes of this effect."""
 
     def prepare(self, seen: Seen, wanted_K: float) -> None:
         """Sets quantities that depend on the machine without the effect, for a visible response of `wanted_K`."""

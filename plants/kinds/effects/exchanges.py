@@ -34,7 +34,7 @@ class _Surface(Effect):
         self.more(plant, dice, **options)
 
     def more(self, plant: KindPlant, dice: Dice) -> None:
-        """Draws what is its own."""
+        """Draws its own attributes."""
 
     def limit(self, W_per_K: float) -> None:
         """No larger a size than the solver's longest step allows an exchange that it does not know beforehand."""
@@ -302,7 +302,7 @@ class _Friction(Effect):
         self.more(dice)
 
     def more(self, dice: Dice) -> None:
-        """Draws what is its own."""
+        """Draws its own attributes."""
 
 
 class Thins(_Friction):

@@ -108,7 +108,7 @@ class _Sensor(Effect):
         self.more(plant, dice)
 
     def more(self, plant: KindPlant, dice: Dice) -> None:
-        """Draws what is its own."""
+        """Draws its own attributes."""
 
 
 class Late(_Sensor):

@@ -26,7 +26,7 @@ class Heat(Effect):
         self.shaped(plant, dice)
 
     def shaped(self, plant: KindPlant, dice: Dice) -> None:
-        """Draws what its shape needs."""
+        """Draws the attributes of its shape."""
 
     def level(self, cells_degC: Array, now: Now) -> Array:
         """Of the full power, (C,)."""
