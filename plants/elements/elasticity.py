@@ -81,7 +81,7 @@ class Elasticity:
         return np.stack([at @ u for at in self.fields[casting].at(points_m, self.size)], axis=1)
 
     def weights_um_per_K(self, one: tuple[str, Array], other: tuple[str, Array]) -> Array:
-        """Displacement of point `one` from `other` (casting, (3,)) along x, y, z per kelvin of each node: (3, nodes)."""
+        """Displacement of point `one` from `other` (casting, (3,)) along x, y, z per kelvin of a node: (3, nodes)."""
         out = []
         for plus, minus in zip(*(self.fields[n].at(p[None], self.size) for n, p in (one, other)), strict=True):
             adjoint = self.solve(np.asarray((plus - minus).todense()).ravel())

@@ -46,7 +46,7 @@ def folder_digest(folder: Path) -> str:
 
 
 def files_digest(root: Path, files: Iterable[Path]) -> str:
-    """SHA-256 over files by their path below `root`; every part with its length, so that the encoding is unambiguous."""
+    """SHA-256 over files by their path below `root`; each part with its length, so that the encoding is unambiguous."""
     digest = hashlib.sha256()
     for file in files:
         for part in (file.relative_to(root).as_posix().encode(), file.read_bytes()):
