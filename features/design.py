@@ -166,7 +166,7 @@ class Design:
         parent = self._parent
         if self.about_start:
             return self
-        if parent is not None and _same(parent._starts, self._starts):
+        if parent is not None and (parent._complete or _same(parent._starts, self._starts)):
             return parent.started.subset(self.inputs)
         x = np.full(self.x.shape, np.nan)
         for k, start in enumerate(self._starts):
@@ -195,6 +195,11 @@ class Design:
     @cached_property
     def _finite(self) -> NDArray[np.bool_]:
         return np.isfinite(self.x)
+
+    @cached_property
+    def _complete(self) -> bool:
+        """Whether no input is missing in any row: every batch's start is then that of every subset."""
+        return bool(self._finite.all())
 
     @cached_property
     def _holed(self) -> list[bool]:

@@ -50,19 +50,28 @@ def left_out_spread(
     """
     a, b = np.full(len(masks), np.nan), np.full(len(masks), np.nan)
     many = np.flatnonzero(masks.sum(axis=1) >= _ENOUGH_BATCHES)
-    if not len(many):
-        return a, b
-    error = _left_out_um(design, masks[many], scaled, path, chosen[many])
-    for f, column in zip(many, error.T, strict=True):
-        judged = np.isfinite(column)
-        a[f], b[f] = _fitted(column[judged] ** 2, square[judged])
+    if len(many):
+        rows = _judged_rows(design)
+        error = _left_out_um(design, rows, masks[many], scaled, path, chosen[many])
+        a[many], b[many] = _fitted(error**2, square[np.concatenate(rows)])
     return a, b
 
 
+def _judged_rows(design: Design) -> list[NDArray[np.int64]]:
+    """Usable rows of every batch, at most 120 each: neighbours are redundant, and a fold must not cost rows."""
+    every = [np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k] for k in range(design.n_batches)]
+    return [rows[:: -(-len(rows) // _MOST_ROWS) or 1] for rows in every]
+
+
 def _left_out_um(
-    design: Design, masks: Mask, scaled: bool, path: Callable[[Pool], Array], chosen: NDArray[np.int64]
+    design: Design,
+    rows: Sequence[NDArray[np.int64]],
+    masks: Mask,
+    scaled: bool,
+    path: Callable[[Pool], Array],
+    chosen: NDArray[np.int64],
 ) -> Array:
-    """Residuals (n, F) of each set's batches, each left out; NaN on other rows."""
+    """Residuals (F, m) at the m `rows` of all batches, each left out of its set; NaN where a set lacks the batch."""
     moments = design.moments
     blocks = Blocks.of(moments)
     outer, left, sets, which = inner_sets(masks)
@@ -75,32 +84,45 @@ def _left_out_um(
         coef[here] = path(pool)[at, :, chosen[outer[here]]]
         mean_x, mean_y = pool.mean_x[at] + moments.shift_x, pool.mean_y[at] + moments.shift_y
         constant[here] = mean_y - np.einsum("vj,vj->v", mean_x, coef[here])
-    out = np.full((len(design.y_um), len(masks)), np.nan)
-    for k in range(design.n_batches):
-        here = np.flatnonzero(left == k)
-        rows = np.flatnonzero(design.usable[design.rows(k)]) + design.offsets[k]
-        rows = rows[:: -(-len(rows) // _MOST_ROWS) or 1]  # neighbours are redundant, and a fold must not cost rows
-        out[rows[:, None], outer[here]] = design.y_um[rows, None] - design.x[rows] @ coef[here].T - constant[here]
+    order = np.argsort(left, kind="stable")
+    outer, coef, constant = outer[order], coef[order], constant[order]
+    sets_of = np.searchsorted(left[order], np.arange(len(rows) + 1))
+    border, every = np.cumsum([0, *map(len, rows)]), np.concatenate(rows)
+    x, y_um = design.x[every], design.y_um[every]
+    out = np.full((len(masks), len(every)), np.nan)
+    for k in range(len(rows)):
+        some, own = slice(sets_of[k], sets_of[k + 1]), slice(border[k], border[k + 1])
+        out[outer[some], own] = y_um[own] - (coef[some] @ x[own].T + constant[some, None])
     return out
 
 
-def _fitted(squared: Array, grows: Array) -> tuple[float, float]:
-    """Least squares a + b · grows, b ≥ 0 and a above its least share, in the size that holds nine tenths of them."""
-    n, q, qq = float(len(squared)), grows.sum(), grows @ grows
-    s, sq = squared.sum(), grows @ squared
-    determinant = n * qq - q * q
-    a, b = ((qq * s - q * sq) / determinant, (n * sq - q * s) / determinant) if determinant > 0 else (s / n, 0.0)
-    least = _LEAST_SHARE * s / n
-    if b <= 0:
-        a, b = s / n, 0.0
-    elif a < least:
-        a, b = least, max(sq - least * q, 0.0) / qq
-    if s == 0:
-        return 0.0, 0.0
-    with np.errstate(over="ignore"):  # residuals of rounding alone
-        ratio = squared / (a + b * grows)
-    size = max(float(ratio.mean()), float(np.quantile(ratio, 0.9)) / SIDE_OF_90**2)
-    return float(a * size), float(b * size)
+def _fitted(squared: Array, grows: Array) -> tuple[Array, Array]:
+    """Least squares a + b · grows (m,) of each set's squared residuals (F, m), NaN left out; (F,) each.
+
+    b ≥ 0, a above its least share, in the size that holds nine tenths of them.
+    """
+    known = np.isfinite(squared)
+    filled, take = np.where(known, squared, 0.0), known.astype(float)
+    n, q, qq = take.sum(axis=1), take @ grows, take @ grows**2
+    s, sq = filled.sum(axis=1), filled @ grows
+    mean, determinant = s / n, n * qq - q * q
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # flat inputs, or residuals of rounding alone
+        a, b = (qq * s - q * sq) / determinant, (n * sq - q * s) / determinant
+        flat, low = ~(determinant > 0) | ~(b > 0), a < _LEAST_SHARE * mean
+        a, b = np.where(low, _LEAST_SHARE * mean, a), np.where(low, np.maximum(sq - _LEAST_SHARE * mean * q, 0) / qq, b)
+        a, b = np.where(flat, mean, a), np.where(flat, 0.0, b)
+        ratio = squared / (a[:, None] + b[:, None] * grows)
+        size = np.maximum(np.where(known, ratio, 0.0).sum(axis=1) / n, _quantile90(ratio, n) / SIDE_OF_90**2)
+        return np.where(s == 0, 0.0, a * size), np.where(s == 0, 0.0, b * size)
+
+
+def _quantile90(values: Array, count: Array) -> Array:
+    """Linear 90 % quantile (F,) of the `count` (F,) numbers of each row; NaN elsewhere."""
+    ranked = np.sort(values, axis=1)  # NaN comes last
+    place = 0.9 * (count - 1.0)
+    low, every = place.astype(int), np.arange(len(values))
+    high = np.minimum(low + 1, count.astype(int) - 1)
+    return np.asarray(ranked[every, low] + (place - low) * (ranked[every, high] - ranked[every, low]))
 
 
 EPS = float(np.finfo(float).eps)
