@@ -180,9 +180,10 @@ def _shortcuts(fitted: Fitted, body: str, channel: str, where: Where, leaves: fl
 def _nearest(fitted: Fitted, body: str) -> list[str]:
     """The body's neighbours, the best conducting first."""
     links, whole = fitted.part.links, pieces_of(fitted.part)
+    here = whole.get(body, body)
 
     def conductance(other: str) -> float:
-        pair = {body, other}
+        pair = {here, other}
         return max(_conductance(fitted, k) for k in links if {whole.get(n, n) for n in ends_of(links[k])} == pair)
 
     return sorted(linked(fitted.part, body), key=lambda other: -conductance(other))

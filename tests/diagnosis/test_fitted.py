@@ -10,7 +10,7 @@ import pytest
 
 from data.arrays import Array
 from diagnosis.candidates.alternatives import coarse_candidates
-from diagnosis.contracts import Fitted
+from diagnosis.contracts import Fitted, with_parts
 from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, pieces_of, refitted, settle
 from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent, fitted, four_bodies, runs
 from twin.calibration.estimate import CalibrationOptions, LeftOut, leave_batch_out
@@ -103,6 +103,17 @@ def test_pieces_of_bodies_are_known_by_name() -> None:
     found = [pieces_of(c.applied(now.part)) for c in every]
     assert {"t_head_near": "head"} in found and {"t_head_far": "head"} in found
     assert pieces_of(now.part) == {}
+
+
+def test_a_piece_with_a_sensor_of_another_body_can_be_refined() -> None:
+    known = four_bodies()
+    now = fitted(known, runs(known, count=4))
+    piece = next(c for c in coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0])) if c.name == "coarse_network_t_head")
+    part = piece.applied(now.part)
+    moved = part.sensors["t_bed"].model_copy(update={"at": "t_head_near"})
+    finer = refitted(now, with_parts(part, {"sensors.t_bed": moved}), steps=0)
+    again = coarse_candidates(finer, np.array([1.0, 1.0, 100.0, 1.0]))
+    assert again and all(c.applied(finer.part) for c in again)
 
 
 def test_left_out_batches_are_predicted_as_by_fits_without_them() -> None:
