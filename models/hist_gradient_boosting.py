@@ -42,6 +42,7 @@ class HistGradientBoosting(Family):
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """Raises InputError: fewer than 4 usable rows."""
+        from sklearn import config_context
         from sklearn.ensemble import HistGradientBoostingRegressor
 
         rows = training_rows(self.key, design, train, self.max_rows, _ROWS)
@@ -49,7 +50,9 @@ class HistGradientBoosting(Family):
         boosted = HistGradientBoostingRegressor(
             max_iter=self.n_trees, learning_rate=self.rate, max_leaf_nodes=self.leaves, min_samples_leaf=leaf,
             early_stopping=False, random_state=self.seed,
-        ).fit(design.x[rows], design.y_um[rows])  # fmt: skip
+        )  # fmt: skip
+        with config_context(assume_finite=True, skip_parameter_validation=True):
+            boosted.fit(design.x[rows], design.y_um[rows])
         # scikit-learn keeps the grown trees private; a test holds the walk below to its own prediction.
         nodes = [grown.nodes for (grown,) in boosted._predictors]
         parts = []

@@ -46,6 +46,7 @@ class RandomForest(Family):
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """Raises InputError: fewer than 4 usable rows."""
+        from sklearn import config_context
         from sklearn.tree import DecisionTreeRegressor
 
         rows = training_rows(self.key, design, train, self.max_rows, _ROWS)
@@ -60,7 +61,8 @@ class RandomForest(Family):
         for t, weight in enumerate(drawn[:, block]):
             tree = DecisionTreeRegressor(min_samples_leaf=self.leaf, max_features=share, random_state=self.seed + t)
             held = np.repeat(np.arange(len(y)), weight)
-            grown = tree.fit(single[held], y[held], check_input=False).tree_
+            with config_context(assume_finite=True, skip_parameter_validation=True):
+                grown = tree.fit(single[held], y[held], check_input=False).tree_
             value = grown.value[:, 0, 0]
             parts.append((grown.feature, grown.threshold, grown.children_left, grown.children_right, value))
         trees = Trees.joined(parts)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data.arrays import Array
+from data.arrays import Array, Mask
 from data.errors import InputError
 from features.design import Design
 from models.base import inner_groups
@@ -19,6 +18,8 @@ from models.solvers.kernels import KernelExpansion, Rows, evenly, kernel, unit_s
 _LEAST_ROWS_PER_BATCH = 3
 _GROUPS = 3  # that the training batches are left out in, when the setting is chosen
 _STEPS_CHOICE, _STEPS_FIT = 2_000, 2_000_000  # of libsvm: a setting that needs more is judged as it stands then
+
+_EPSILON_SVR, _CACHE_MB = 3, 200  # libsvm's number of this kind, and the estimator's cache
 
 
 class SVR(KernelExpansion):
@@ -70,9 +71,9 @@ class SVR(KernelExpansion):
         mean_um, spread_um = float(y_um.mean()), float(y_um.std()) or 1.0
         found = _fitted(kernel(u, u, sigma, False), (y_um - mean_um) / spread_um, cost, epsilon, _STEPS_FIT)
         fitted = {
-            "support": u[found.support_],
-            "alpha": spread_um * found.dual_coef_[0],
-            "bias": mean_um + spread_um * float(found.intercept_[0]),
+            "support": u[found.support],
+            "alpha": spread_um * found.alpha,
+            "bias": mean_um + spread_um * found.bias,
             "sigma": sigma,
             "C": cost / len(rows),
             "epsilon": epsilon,
@@ -90,34 +91,59 @@ class SVR(KernelExpansion):
         """σ, cost, ε and their left-out RMS in µm."""
         u, y_um = design.x[rows] / scale, design.y_um[rows]
         group = inner_groups(design.group[rows]) % _GROUPS
-        kernels = {sigma: kernel(u, u, sigma, False) for sigma in self.sigmas}
+        left = [group == g for g in np.unique(group)]
+        parts = {sigma: [_Left.of(kernel(u, u, sigma, False), y_um, g) for g in left] for sigma in self.sigmas}
 
         def score(sigma: float, cost: float, epsilon: float) -> tuple[float, float, float, float]:
-            rms = [_left_out_rms(kernels[sigma], y_um, group == g, cost, epsilon) for g in np.unique(group)]
-            return float(np.mean(rms)), sigma, cost, epsilon
+            return float(np.mean([part.rms_um(cost, epsilon) for part in parts[sigma]])), sigma, cost, epsilon
 
         best = min(score(sigma, cost, self.epsilons[0]) for sigma in self.sigmas for cost in self.costs)
         best = min([best, *(score(best[1], best[2], epsilon) for epsilon in self.epsilons[1:])])
         return best[1], best[2], best[3], best[0]
 
 
-def _left_out_rms(omega: Array, y_um: Array, left: NDArray[np.bool_], cost: float, epsilon: float) -> float:
-    inside, outside = np.flatnonzero(~left), np.flatnonzero(left)
-    if not len(inside):
-        return float(np.sqrt(np.mean(y_um**2)))
-    mean_um, spread_um = y_um[inside].mean(), y_um[inside].std() or 1.0
-    found = _fitted(omega[np.ix_(inside, inside)], (y_um[inside] - mean_um) / spread_um, cost, epsilon, _STEPS_CHOICE)
-    support = inside[found.support_]
-    predicted = mean_um + spread_um * (omega[np.ix_(outside, support)] @ found.dual_coef_[0] + found.intercept_[0])
-    return float(np.sqrt(np.mean((y_um[outside] - predicted) ** 2)))
+@dataclass(frozen=True)
+class _Left:
+    """One group of rows left out: kernel among the rows inside and of those outside with them, and their errors."""
+
+    inside: Array
+    outside: Array
+    y_um: Array
+    left_um: Array
+
+    @classmethod
+    def of(cls, omega: Array, y_um: Array, left: Mask) -> Self:
+        return cls(omega[np.ix_(~left, ~left)], omega[np.ix_(left, ~left)], y_um[~left], y_um[left])
+
+    def rms_um(self, cost: float, epsilon: float) -> float:
+        if not len(self.y_um):
+            return float(np.sqrt(np.mean(self.left_um**2)))
+        mean_um, spread_um = self.y_um.mean(), self.y_um.std() or 1.0
+        found = _fitted(self.inside, (self.y_um - mean_um) / spread_um, cost, epsilon, _STEPS_CHOICE)
+        predicted = mean_um + spread_um * (self.outside[:, found.support] @ found.alpha + found.bias)
+        return float(np.sqrt(np.mean((self.left_um - predicted) ** 2)))
 
 
-def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> Any:
-    """libsvm's solution for the kernel matrix; a scaled error y, C = cost/n."""
-    from sklearn import config_context  # here alone: a trained model predicts without it
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.svm import SVR as LibSVR
+@dataclass(frozen=True)
+class _Found:
+    """Support rows, their weights, and the bias."""
 
-    with warnings.catch_warnings(), config_context(assume_finite=True, skip_parameter_validation=True):
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return LibSVR(kernel="precomputed", C=cost / len(y), epsilon=epsilon, max_iter=steps).fit(omega, y)
+    support: Rows
+    alpha: Array
+    bias: float
+
+
+def _fitted(omega: Array, y: Array, cost: float, epsilon: float, steps: int) -> _Found:
+    """libsvm's solution for the kernel matrix; a scaled error y, C = cost/n.
+
+    scikit-learn keeps this function private; its estimator takes more time to check its arguments than to solve a
+    problem of this size. A test holds the result to the estimator's.
+    """
+    from sklearn.svm import _libsvm  # here alone: a trained model predicts without it
+
+    _libsvm.set_verbosity_wrap(0)  # it prints otherwise
+    support, _, _, alpha, bias, *_ = _libsvm.fit(
+        np.ascontiguousarray(omega), y, svm_type=_EPSILON_SVR, kernel="precomputed", C=cost / len(y), epsilon=epsilon,
+        max_iter=steps, cache_size=_CACHE_MB,
+    )  # fmt: skip
+    return _Found(support.astype(np.int64), alpha[0], float(bias[0]))

@@ -37,6 +37,19 @@ def test_predicts_as_scikit_learn_with_its_own_rbf_does():
     assert abs(len(model.fitted["alpha"]) - len(other.support_)) <= 2
 
 
+def test_the_solver_called_directly_gives_what_scikit_learns_estimator_gives(capfd):
+    design = make_design()
+    model = SVR(**ONE).as_published().fit_design(design, [0, 1, 2, 3])
+    assert capfd.readouterr().out == ""
+    rows = design.group < 4
+    u, y = design.x[rows] / 10.0, design.y_um[rows]
+    omega = np.exp(-0.25 * ((u[:, None] - u[None]) ** 2).sum(axis=2))
+    other = LibSVR(kernel="precomputed", C=2e3 / len(y), epsilon=0.05).fit(omega, (y - y.mean()) / y.std())
+    np.testing.assert_allclose(model.fitted["support"], u[other.support_])
+    np.testing.assert_allclose(model.fitted["alpha"], y.std() * other.dual_coef_[0], rtol=1e-6)
+    assert model.fitted["bias"] == pytest.approx(y.mean() + y.std() * other.intercept_[0])
+
+
 def test_the_solution_meets_the_conditions_of_its_optimum():
     design = make_design(1)
     model = SVR(**ONE).as_published().fit_design(design, range(5))
