@@ -41,7 +41,7 @@ def toy_diagnosis(verdict: str) -> Diagnosis:
     tables = _tables(verdict)
     rms = _whole(tables["rms"])
     findings = Findings.from_json(_findings(verdict, rms))
-    words = ("The bed was split into two cells: its sensor sits off-centre.",)
+    words: tuple[str, ...] = ("The bed was split into two cells: its sensor sits off-centre.",)
     if verdict == "undecidable":
         words += ("Fewer than 4 batches: no probability above 80 % is stated.",)
     return Diagnosis(machine, findings, before, part, True, False, words, tables)
@@ -149,7 +149,7 @@ def _tables(verdict: str) -> dict[str, pd.DataFrame]:
     return {k: v if isinstance(v, pd.DataFrame) else _frame(k, v) for k, v in rows.items()}
 
 
-def _frame(name: str, rows: list[tuple[Any, ...]]) -> pd.DataFrame:
+def _frame(name: str, rows: Any) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS[name]))
 
 

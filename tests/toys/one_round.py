@@ -26,8 +26,8 @@ def write_fleet(path: Path, machine: Path, recordings: Path) -> Path:
 
 def main() -> None:
     from pipelines.fleet import load_fleet
+    from pipelines.fleet_service import local_timezone, serve_fleet
     from pipelines.home import home
-    from pipelines.scheduling import local_timezone, serve_fleet
 
     serve_fleet(load_fleet(Path(sys.argv[1]), local_timezone()), home(), lambda text: print(text, flush=True), rounds=1)
 
