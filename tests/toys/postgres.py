@@ -37,7 +37,8 @@ class Server:
 
     def sql(self, database: str, statement: str) -> str:
         """What a statement gives, as plain text."""
-        command = [str(self.psql), "-h", "127.0.0.1", "-p", str(self.port), "-U", USER, "-d", database, "-qAtc", statement]
+        where = ["-h", "127.0.0.1", "-p", str(self.port), "-U", USER, "-d", database]
+        command = [str(self.psql), *where, "-qAtc", statement]
         done = subprocess.run(
             command, capture_output=True, text=True, check=True, env={**os.environ, "PGPASSWORD": PASSWORD}
         )
