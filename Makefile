@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 FREEZE := $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's/+cpu$$//' | sort -f
 
-.PHONY: run test lint docs prove bench clean lock
+.PHONY: run test lint docs gallery prove bench clean lock
 
 run: $(READY)  ## the main job on the built-in sample year, then a sealed demonstration of the diagnosis
 	$(BIN)/thermodrift simulate --sample-year --out var/sample_year
@@ -25,14 +25,14 @@ docs: .venv/.docs-ready  ## the site in var/site, which opens from disk; a broke
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "open var/site/index.html"
 
+gallery: $(READY)  ## runs every script of docs/gallery and renews its picture; about four minutes
+	OMP_NUM_THREADS=1 $(BIN)/python -m docs.gallery
+
 prove: $(READY)  ## the diagnosis examined on 60 concealed cases that nobody has seen; about half an hour on two cores
 	$(BIN)/thermodrift prove --cases 60 --suite development --out var/proof/$$(date -u +%Y%m%d-%H%M%S)
 
-bench: $(READY)
-	$(BIN)/python -m benchmarks.grid
-	$(BIN)/python -m benchmarks.grid_growth
-	$(BIN)/python benchmarks/ingest.py
-	$(BIN)/python -m benchmarks.twin
+bench: $(READY)  ## one table of all performance figures; `python -m benchmarks --quick` takes small sizes
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 	$(BIN)/python -m benchmarks.calibration
 	$(BIN)/python -m benchmarks.twin_families
 	$(BIN)/python -m benchmarks.diagnosis

@@ -29,7 +29,10 @@ NOTE = "*Made from the code at build time.*"
 
 def pages() -> dict[str, str]:
     """Path below docs/ → Markdown, of every generated page."""
+    from docs import gallery
+
     made = {
+        **gallery.pages(),
         "reference/machine_file.md": machine_file_page(),
         "reference/mechanisms.md": mechanisms_page(),
         "reference/selectors_families.md": selectors_and_families_page(),

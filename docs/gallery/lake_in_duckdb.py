@@ -1,0 +1,42 @@
+"""What do a year's recordings say, asked in SQL?
+
+The lake is plain Parquet, one file a run: DuckDB reads all of it without thermodrift. One query gives the rise of the
+spindle's front bearing and the error of z after five hours for every speed.
+"""
+
+import tempfile
+from pathlib import Path
+
+import duckdb
+
+import thermodrift as td
+from docs.gallery.drawing import COLD, GOLD, WARM, picture
+from plants.sample.sample_year import write_sample_year
+
+MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
+QUERY = """
+select batch, max(spindle_rpm) as rpm,
+       arg_max(front, time_s) - arg_min(front, time_s) as rise_K,
+       arg_max(z, time_s) - arg_min(z, time_s) as error_um
+from '{lake}/*/*/*.parquet' where time_s <= 5 * 3600
+group by batch order by batch
+"""
+
+with tempfile.TemporaryDirectory() as folder:
+    write_sample_year(Path(folder) / "year", seed=0)
+    lake = td.Lake(Path(folder) / "lake")
+    report = td.ingest(Path(folder) / "year", MACHINE, lake)
+    table = duckdb.sql(QUERY.format(lake=Path(folder) / "lake")).df()
+
+assert len(table) == 30 == sum(row.status == "new" for row in report.rows)
+mean = table[table["rpm"].isin([2000, 4000, 6000])].groupby("rpm").mean(numeric_only=True)
+print(mean.round(1).to_string())
+assert mean["error_um"].is_monotonic_increasing and mean["rise_K"].is_monotonic_increasing
+assert abs(mean.loc[6000, "error_um"] - 90) < 10 and abs(mean.loc[6000, "rise_K"] - 20) < 2
+
+labels = {"xlabel": "rise of the front bearing after 5 h, K", "ylabel": "error of z after 5 h, µm"}
+with picture(__file__, "Thirty runs of a year, one query", **labels) as ax:
+    for rpm, color in ((2000, COLD), (4000, GOLD), (6000, WARM)):
+        of = table[table["rpm"] == rpm]
+        label = f"{rpm}/min" if rpm < 6000 else "6000/min, alone or at times"
+        ax.plot(of["rise_K"], of["error_um"], "o", color=color, label=label)

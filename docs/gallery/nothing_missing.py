@@ -1,0 +1,47 @@
+"""Simulation and recordings agree: how large an effect may still hide?
+
+The machine file is right, and the diagnosis says so: the error of left-out runs is the noise. For every effect of the
+library it states how large it would have had to be to be seen; here those that are heats, next to the heaters' 1 W.
+"""
+
+import tempfile
+from pathlib import Path
+
+import thermodrift as td
+from docs.gallery.drawing import COLD, picture
+
+BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
+PLAN = """
+step: 10 s
+stages:
+  - {{minutes: 7, heater1: {0}}}
+  - {{minutes: 6, heater2: {1}}}
+  - {{minutes: 6, heater1: {1}}}
+  - {{minutes: 6, heater1: 0, heater2: 0}}
+surroundings: {{room: {2} degC}}
+"""
+POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
+
+with tempfile.TemporaryDirectory() as folder:
+    recorded = []
+    for k, powers in enumerate(POWERS):
+        plan = Path(folder) / f"run{k}.yml"
+        plan.write_text(PLAN.format(*powers))
+        recorded.append(td.simulate(BOARD, plan, noise=True, seed=k).batch)
+findings = td.diagnose(BOARD, recorded).findings
+
+assert findings.verdict == "consistent" and not findings.findings
+rms = findings.fit.left_out_rms
+for channel, noise in rms.noise_floor.items():
+    assert 0.8 * noise < rms.before[channel] < 1.2 * noise
+heats = [d for d in findings.detection_limits if d.unit == "W" and d.limit]
+heats = sorted(heats, key=lambda d: d.limit)
+assert len(heats) >= 4 and heats[0].limit < 0.01 < 1.0  # W; a hundredth of a heater at full power is seen
+print(findings.statement.split(". An effect")[0])
+
+labels = [f"{d.mechanism.replace('_', ' ')}, {d.where.name}" for d in heats]
+title = "The least heat that these runs would have shown"
+with picture(__file__, title, xlabel="limit, mW (a heater at full power: 1000 mW)") as ax:
+    ax.barh(labels, [1000 * d.limit for d in heats], color=COLD)
+    ax.set_xscale("log")
+    ax.invert_yaxis()
