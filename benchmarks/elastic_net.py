@@ -10,13 +10,11 @@ that neither pays for the rows. Results agree to 1e-6; run with OMP_NUM_THREADS=
 from __future__ import annotations
 
 import argparse
-import statistics
-import time
-from collections.abc import Callable
 
 import numpy as np
 from sklearn.linear_model import enet_path, lars_path_gram
 
+from benchmarks.table import Row, markdown, median_s
 from data.arrays import Array
 from features.selectors.elastic_net_path import active_inputs
 from models.solvers.penalised import sparse_coefficients
@@ -74,14 +72,17 @@ def descent(xx: Array, xy: Array, tol: float) -> Array:
     return out
 
 
-def median_s(work: Callable[[], object], repeats: int) -> float:
-    """Wall seconds."""
-    took = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - start)
-    return statistics.median(took)
+def rows(repeats: int) -> list[Row]:
+    """Rows of the table: selection, and the fit at scikit-learn's own tolerance and at an exact one."""
+    xx, xy = problems(HALVES)
+    a, b = (median_s(f, repeats) for f in (lambda: active_inputs(xx, xy, LEVELS), lambda: lars_active(xx, xy)))
+    out = [Row(f"elastic net, selection, {HALVES} halves", a, "scikit-learn, lars_path_gram", b)]
+    xx, xy = problems(FOLDS, 1)
+    a = median_s(lambda: ours(xx, xy), repeats)
+    for tol in (1e-4, 1e-12):
+        b = median_s(lambda tol=tol: descent(xx, xy, tol), repeats)  # type: ignore[misc]
+        out.append(Row(f"elastic net, fit, {FOLDS} folds", a, f"scikit-learn, enet_path, tol {tol:g}", b))
+    return out
 
 
 def main() -> None:
@@ -91,16 +92,11 @@ def main() -> None:
     xx, xy = problems(HALVES)
     own, theirs = active_inputs(xx, xy, LEVELS), lars_active(xx, xy)
     print(f"selection: {np.mean(own == (np.abs(theirs) > 1e-9)):.4%} of the active inputs agree")
-    a, b = (median_s(f, repeats) for f in (lambda: active_inputs(xx, xy, LEVELS), lambda: lars_active(xx, xy)))
-    print(f"selection, {HALVES} halves: own {1e3 * a:.1f} ms, lars_path_gram {1e3 * b:.1f} ms, ratio {b / a:.1f}")
     xx, xy = problems(FOLDS, 1)
     found = ours(xx, xy)
-    a = median_s(lambda: ours(xx, xy), repeats)
     for tol in (1e-4, 1e-12):
-        b = median_s(lambda tol=tol: descent(xx, xy, tol), repeats)  # type: ignore[misc]
-        apart = np.abs(found - descent(xx, xy, tol)).max()
-        print(f"fit, {FOLDS} folds, tol {tol:g}: own {1e3 * a:.1f} ms, enet_path {1e3 * b:.1f} ms, ratio {b / a:.1f}, "
-              f"largest difference {apart:.1e}")  # fmt: skip
+        print(f"fit, tol {tol:g}: largest difference {np.abs(found - descent(xx, xy, tol)).max():.1e}")
+    print(markdown(rows(repeats)))
 
 
 if __name__ == "__main__":

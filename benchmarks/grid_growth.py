@@ -17,6 +17,7 @@ from dataclasses import fields
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from benchmarks.table import exponent
 from features.design import Design
 from models import FAMILIES
 from models.judging import FamilyScores
@@ -59,9 +60,22 @@ def folds_of(batches: int) -> list[Fold]:
 
 def seconds_per_fold(design: Design, family: str, **options: int) -> float:
     folds = folds_of(design.n_batches)
-    start = time.perf_counter()
+    start = time.process_time()
     FamilyScores.run(design, FAMILIES[family](**options), folds, [(design, list(range(len(folds))))])
-    return (time.perf_counter() - start) / len(folds)
+    return (time.process_time() - start) / len(folds)
+
+
+def exponents(family: str, largest: int, repeats: int = 1) -> str:
+    """Growth of the cost of a fold with rows, sensors and batches, up to a multiple of the first size of each."""
+    if family not in CLOSED or largest < 2:
+        return ""
+    seconds_per_fold(recordings(5, 3, 50), family)  # imports are not what is measured
+    found = []
+    for what, values in GROWTH.items():
+        sizes = [v for v in values if v <= max(largest * values[0], values[1])]
+        took = [min(seconds_per_fold(recordings(**{**BASE, what: v}), family) for _ in range(repeats)) for v in sizes]
+        found.append(f"{what} {exponent(sizes, took):.1f}")
+    return ", ".join(found)
 
 
 def grown(what: str, value: int) -> None:

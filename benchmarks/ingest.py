@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shutil
 import statistics
@@ -26,6 +27,12 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
+if __name__ == "__main__":  # also without -m: the rows of the table need the package
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from benchmarks.table import Row
+
+TARGET, TARGET_MB = 1.0, 180  # of pyarrow alone's speed, and memory
 STEP_S = 0.1
 RUN_S, STOP_S = 1800.0, 600.0
 TEMPERATURES = 16
@@ -72,15 +79,31 @@ def write_recording(path: Path, size_bytes: float) -> int:
     return rows
 
 
+def clocks() -> tuple[float, float]:
+    """Wall and CPU seconds."""
+    return time.perf_counter(), time.process_time()
+
+
+def since(began: tuple[float, float]) -> dict[str, float]:
+    wall_s, cpu_s = clocks()
+    return {"s": wall_s - began[0], "cpu_s": cpu_s - began[1]}
+
+
+def peak_MB() -> float:
+    """Largest resident memory of this program; getrusage would count that of the program which started it too."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+
+
 def with_ingest(csv: Path, out: Path, step_s: float = STEP_S) -> dict[str, float]:
     from data.ingest import ingest
     from data.lake import Lake
     from data.machine import parse_machine
 
     machine = parse_machine(MACHINE.replace("STEP", str(step_s)), "benchmark")
-    began = time.perf_counter()
+    began = clocks()
     report = ingest([csv], machine, Lake(out))
-    return {"s": time.perf_counter() - began, "rows": report.rows_stored, "batches": len(report.batches)}
+    return {**since(began), "rows": report.rows_stored, "batches": len(report.batches)}
 
 
 def with_ingest_1s(csv: Path, out: Path) -> dict[str, float]:
@@ -90,20 +113,20 @@ def with_ingest_1s(csv: Path, out: Path) -> dict[str, float]:
 def with_pyarrow(csv: Path, out: Path) -> dict[str, float]:
     out.mkdir()
     rows = 0
-    began = time.perf_counter()
+    began = clocks()
     with pc.open_csv(csv) as reader, pq.ParquetWriter(out / "all.parquet", reader.schema) as writer:
         for block in reader:
             writer.write_batch(block)
             rows += block.num_rows
-    return {"s": time.perf_counter() - began, "rows": rows, "batches": 1}
+    return {**since(began), "rows": rows, "batches": 1}
 
 
 def with_pyarrow_in_memory(csv: Path, out: Path) -> dict[str, float]:
     out.mkdir()
-    began = time.perf_counter()
+    began = clocks()
     table = pc.read_csv(csv)
     pq.write_table(table, out / "all.parquet")
-    return {"s": time.perf_counter() - began, "rows": table.num_rows, "batches": 1}
+    return {**since(began), "rows": table.num_rows, "batches": 1}
 
 
 PLAIN = {"pyarrow alone": with_pyarrow, "pyarrow in memory": with_pyarrow_in_memory}
@@ -113,13 +136,44 @@ WAYS = PLAIN | OURS
 
 def one(way: str, csv: str, out: str, threads: str) -> None:
     """In a child process: run one way and tell its time and peak memory."""
-    import resource
-
     pa.set_cpu_count(int(threads))
     result = WAYS[way](Path(csv), Path(out))
-    result["peak_MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    result["peak_MB"] = peak_MB()
     result["disk_MB"] = sum({p.stat().st_ino: p.stat().st_size for p in Path(out).rglob("*.parquet")}.values()) / 1e6
     sys.stdout.write(json.dumps(result))
+
+
+def measured(gb: float, rounds: int, threads: int) -> tuple[dict[str, list[dict[str, float]]], float, int]:
+    """Results of every way, round by round; MB and rows of the CSV."""
+    results: dict[str, list[dict[str, float]]] = {way: [] for way in WAYS}
+    with tempfile.TemporaryDirectory() as folder:
+        csv = Path(folder) / "recording.csv"
+        n_rows = write_recording(csv, gb * 1e9)
+        size_MB = csv.stat().st_size / 1e6
+        for k in range(rounds):
+            for way in WAYS:
+                out = f"{folder}/{k} {way}"
+                child = [sys.executable, __file__, "--one", way, str(csv), out, str(threads)]
+                done = subprocess.run(child, check=True, capture_output=True, text=True)
+                results[way].append(json.loads(done.stdout))
+                shutil.rmtree(out)
+    return results, size_MB, n_rows
+
+
+def rows(gb: float, rounds: int, threads: int = 1) -> list[Row]:
+    """Rows of the table, CPU seconds of the children; the target is of speed and of memory."""
+    results, size_MB, _ = measured(gb, rounds, threads)
+    cpu = {way: statistics.median(r["cpu_s"] for r in runs) for way, runs in results.items()}
+    peak = {way: statistics.median(r["peak_MB"] for r in runs) for way, runs in results.items()}
+    out = []
+    for way in OURS:
+        enough = f"≤ {TARGET_MB} MB", peak[way] <= TARGET_MB
+        for plain in PLAIN:
+            what, reference = f"{way}, {size_MB:.0f} MB of CSV", f"{plain}, {peak[plain]:.0f} MB of memory"
+            target = TARGET if plain == "pyarrow alone" else math.nan
+            note = f"{peak[way]:.0f} MB of memory"
+            out.append(Row(what, cpu[way], reference, cpu[plain], target, limit=enough, note=note))
+    return out
 
 
 def main() -> None:
@@ -128,30 +182,19 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads of pyarrow's pool, for all ways")
     args = parser.parse_args()
-    results: dict[str, list[dict[str, float]]] = {way: [] for way in WAYS}
-    with tempfile.TemporaryDirectory() as folder:
-        csv = Path(folder) / "recording.csv"
-        rows = write_recording(csv, args.gb * 1e9)
-        size_MB = csv.stat().st_size / 1e6
-        batch_MB = ROWS_A_BLOCK * (TEMPERATURES + 5) * 8 / 1e6
-        print(
-            f"{size_MB:.0f} MB of CSV, {rows} rows, {TEMPERATURES + 4} channels; one batch {batch_MB:.0f} MB in memory;"
-            f" pyarrow uses {args.threads} threads, on {os.cpu_count()} cores"
-        )
-        for k in range(args.rounds):
-            for way in WAYS:
-                out = f"{folder}/{k} {way}"
-                child = [sys.executable, __file__, "--one", way, str(csv), out, str(args.threads)]
-                done = subprocess.run(child, check=True, capture_output=True, text=True)
-                results[way].append(json.loads(done.stdout))
-                shutil.rmtree(out)
-    print(f"{'':18}{'median s':>10}{'MB/s':>8}{'peak MB':>9}{'rows':>10}{'batches':>9}{'Parquet MB':>12}")
+    results, size_MB, n_rows = measured(args.gb, args.rounds, args.threads)
+    batch_MB = ROWS_A_BLOCK * (TEMPERATURES + 5) * 8 / 1e6
+    print(
+        f"{size_MB:.0f} MB of CSV, {n_rows} rows, {TEMPERATURES + 4} channels; one batch {batch_MB:.0f} MB in memory;"
+        f" pyarrow uses {args.threads} threads, on {os.cpu_count()} cores"
+    )
+    print(f"{'':18}{'median s':>10}{'MB/s':>8}{'CPU s':>8}{'peak MB':>9}{'rows':>10}{'batches':>9}{'Parquet MB':>12}")
     for way, runs in results.items():
-        s = statistics.median(r["s"] for r in runs)
-        peak = statistics.median(r["peak_MB"] for r in runs)
+        s, cpu, peak = (statistics.median(r[name] for r in runs) for name in ("s", "cpu_s", "peak_MB"))
         last = runs[-1]
         print(
-            f"{way:18}{s:10.2f}{size_MB / s:8.0f}{peak:9.0f}{last['rows']:10}{last['batches']:9}{last['disk_MB']:12.1f}"
+            f"{way:18}{s:10.2f}{size_MB / s:8.0f}{cpu:8.2f}{peak:9.0f}{last['rows']:10}{last['batches']:9}"
+            f"{last['disk_MB']:12.1f}"
         )
     for way in OURS:
         for plain in PLAIN:

@@ -20,7 +20,11 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVR
 
 from data.arrays import Array
+from features.design import Design
 from models import FAMILIES
+from models.base import inner_groups
+from models.solvers.kernels import Rows, evenly, unit_scale
+from models.solvers.trees import training_rows
 
 PENALTIES = np.logspace(-6, 3, 25)
 
@@ -107,3 +111,53 @@ PLAIN: dict[str, Callable[[int], BaseEstimator]] = {
 }
 ROWS = {"lssvm": 480, "svr": 480, "gaussian_process": 300, "bp": 600}  # that these learn from, as in the grid
 CHEAP = tuple(f for f in PLAIN if f in FAMILIES and FAMILIES[f].closed_form)
+
+
+def _boosted(design: Design, train: Sequence[int], test: int) -> Array:
+    own = FAMILIES["hist_gradient_boosting"]().options()
+    rows = training_rows("hist_gradient_boosting", design, train, own["max_rows"], 720)
+    model = HistGradientBoostingRegressor(
+        max_iter=own["n_trees"], learning_rate=own["rate"], max_leaf_nodes=own["leaves"], min_samples_leaf=own["leaf"],
+        early_stopping=False, random_state=own["seed"],
+    )  # fmt: skip
+    return np.asarray(model.fit(design.x[rows], design.y_um[rows]).predict(design.x[design.rows(test)]))
+
+
+def _forest(design: Design, train: Sequence[int], test: int) -> Array:
+    own = FAMILIES["random_forest"]().options()
+    rows = training_rows("random_forest", design, train, own["max_rows"], 480)
+    model = RandomForestRegressor(own["n_trees"], min_samples_leaf=own["leaf"], max_features=1 / 3, random_state=0)
+    return np.asarray(model.fit(design.x[rows], design.y_um[rows]).predict(design.x[design.rows(test)]))
+
+
+def _support_vectors(design: Design, train: Sequence[int], test: int) -> Array:
+    """The settings that the family tries, each by a fit of its own with scikit-learn's kernel."""
+    own, scale, p = FAMILIES["svr"]().options(), unit_scale(design), len(design.inputs)
+    few, many = (evenly(design, train, max(3, n // len(train))) for n in (own["max_rows"] // 2, own["max_rows"]))
+    group = inner_groups(design.group[few]) % 3
+
+    def fitted(rows: Rows, sigma: float, cost: float, epsilon: float, steps: int) -> tuple[SVR, float, float]:
+        u, y = design.x[rows] / scale, design.y_um[rows]
+        model = SVR(gamma=1 / (2 * p * sigma**2), C=cost / len(y), epsilon=epsilon, max_iter=steps)
+        return model.fit(u, (y - y.mean()) / y.std()), y.mean(), y.std()
+
+    def score(sigma: float, cost: float, epsilon: float) -> tuple[float, float, float, float]:
+        rms = []
+        for g in np.unique(group):
+            model, mean, spread = fitted(few[group != g], sigma, cost, epsilon, 2_000)
+            left = few[group == g]
+            away = design.y_um[left] - mean - spread * model.predict(design.x[left] / scale)
+            rms.append(np.sqrt(np.mean(away**2)))
+        return float(np.mean(rms)), sigma, cost, epsilon
+
+    best = min(score(s, c, own["epsilons"][0]) for s in own["sigmas"] for c in own["costs"])
+    best = min([best, *(score(best[1], best[2], e) for e in own["epsilons"][1:])])
+    model, mean, spread = fitted(many, *best[1:], 2_000_000)
+    return np.asarray(mean + spread * model.predict(design.x[design.rows(test)] / scale))
+
+
+SAME: dict[str, Callable[[Design, Sequence[int], int], Array]] = {
+    "svr": _support_vectors,
+    "random_forest": _forest,
+    "hist_gradient_boosting": _boosted,
+}
