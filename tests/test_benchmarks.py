@@ -2,6 +2,8 @@
 
 import math
 
+import pytest
+
 from benchmarks.__main__ import Sizes, table_rows
 from benchmarks.table import HEAD, Row, exponent, markdown, seconds
 
@@ -25,6 +27,7 @@ def test_an_exponent_is_the_slope_of_the_logarithms() -> None:
     assert math.isclose(exponent([10, 20, 40], [3 * n**1.5 for n in (10, 20, 40)]), 1.5)
 
 
+@pytest.mark.slow
 def test_the_table_has_every_part_and_a_value_in_every_row() -> None:
     rows = table_rows(TINY)
     lines = markdown(rows).splitlines()
