@@ -20,12 +20,11 @@ surroundings: {{room: {2} degC}}
 """
 POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
 TRUE = {"capacity: {value: 2.5 J/K": "capacity: {value: 3.2 J/K", "value: 12 mW/K": "value: 9 mW/K",
-        "value: 3 mW/K": "value: 5 mW/K", "value: 20 s": "value: 15 s"}  # fmt: skip
+        "value: 3 mW/K": "value: 5 mW/K"}  # fmt: skip
 
 with tempfile.TemporaryDirectory() as folder:
     text = BOARD.read_text()
     for stated, true in TRUE.items():
-        assert stated in text
         text = text.replace(stated, true)
     truth, recorded = Path(folder) / "truth.yml", []
     truth.write_text(text)
@@ -39,21 +38,23 @@ SHOWN = {  # prior value, its spread in the logarithm, true value, unit
     "bodies.heater1.capacity": (2.5, 0.4, 3.2, "J/K"),
     "exposures.heater1-room.conductance": (0.012, 0.4, 0.009, "W/K"),
     "links.heater1-heater2.conductance": (0.003, 0.7, 0.005, "W/K"),
-    "sensors.temperature1.lag": (20, 0.3, 15, "s"),
 }
 intervals = {i.name: i for i in found.intervals90}
 for name, (_, spread, true, unit) in SHOWN.items():
     i = intervals[name]
     print(f"{name:<36} {i.value:.3g} {unit} (90 %: {i.low:.3g} to {i.high:.3g}), true {true:g}")
     assert i.low * 0.97 < true < i.high * 1.03
-    assert np.log(i.high / i.low) < 0.75 * 2 * 1.645 * spread  # the prior is much wider
+    assert np.log(i.high / i.low) < 0.3 * 2 * 1.645 * spread  # the prior is much wider
 
-labels = {"xlabel": "value relative to the true one", "xscale": "log"}
-with picture(__file__, "Prior and calibrated 90 % intervals", **labels) as ax:
+with picture(
+    __file__, "Prior and calibrated 90 % intervals", xlabel="value relative to the true one", xscale="log"
+) as ax:
     for row, (name, (prior, spread, true, _)) in enumerate(SHOWN.items()):
         i = intervals[name]
         ax.plot(prior * np.exp([-1.645 * spread, 1.645 * spread]) / true, [row, row], color=GREY, lw=8, alpha=0.6)
         ax.plot([i.low / true, i.high / true], [row, row], color=WARM, lw=4)
     ax.axvline(1.0, color=COLD, lw=1)
     ax.set_yticks(range(len(SHOWN)), [name.replace(".", "\n") for name in SHOWN])
+    ax.minorticks_off()
+    ax.set_ylim(-0.5, 2.5)
     ax.set_xticks([0.2, 0.5, 1, 2, 4], ["0.2", "0.5", "1", "2", "4"])

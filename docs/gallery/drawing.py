@@ -23,7 +23,7 @@ from PIL import Image
 from docs.pictures import COLD, INK, STYLE, WARM
 
 __all__ = ["COLD", "GOLD", "GREEN", "GREY", "INK", "PALE", "WARM", "picture", "pictures"]
-GREEN, GOLD, GREY, PALE = "#00897b", "#f9a825", "#90a4ae", "#eceff1"
+GREEN, GOLD, GREY, PALE = "#00897b", "#f9a825", "#90a4ae", "#dfe6ea"
 _SIZE_IN, _DPI = (7.0, 4.2), 140  # 980 pixels: on a phone, 360 pixels wide, the text keeps 8 pixels
 
 
@@ -44,7 +44,7 @@ def picture(script: str, title: str, **labels: Any) -> Iterator[Axes]:
 @contextmanager
 def pictures(script: str, title: str, rows: int, columns: int, **given: Any) -> Iterator[list[Axes]]:
     """The same for several axes, row by row; `given` are keywords of `pyplot.subplots`."""
-    with plt.rc_context({**STYLE, "font.size": 11, "axes.titlesize": 11.5}):
+    with plt.rc_context({**STYLE, "font.size": 11, "axes.axisbelow": True}):
         figure, axes = plt.subplots(rows, columns, figsize=_SIZE_IN, layout="constrained", squeeze=False, **given)
         try:
             yield list(axes.flat)
@@ -55,7 +55,7 @@ def pictures(script: str, title: str, rows: int, columns: int, **given: Any) -> 
 
 
 def _save(figure: Figure, path: Path) -> None:
-    figure.text(0.995, 0.005, "simulated", ha="right", va="bottom", size=8, color="#78909c")
+    figure.text(0.995, 0.985, "simulated", ha="right", va="top", size=8, color="#78909c")
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=_DPI, metadata={"Software": None})  # the same bytes at each run
     Image.open(drawn).convert("RGB").quantize(64).save(path, optimize=True)  # a third of the size

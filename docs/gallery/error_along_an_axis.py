@@ -31,8 +31,8 @@ assert left_um.std() < 0.3 * read_um[read].std()
 sweeps = np.split(np.flatnonzero(read), np.flatnonzero(np.diff(np.flatnonzero(read)) > 1) + 1)
 labels = {"xlabel": "position of the Z axis, mm", "ylabel": "error of Z, µm"}
 with picture(__file__, "Readings (dots) and prediction (lines) as the screw warms", **labels) as ax:
-    for sweep in sweeps[1::2]:
+    for k, sweep in enumerate(sweeps[1::2]):
         hours = run.time_s[sweep[0]] / 3600
-        color = colormaps["plasma"](0.9 * hours / (run.time_s[-1] / 3600))
+        color = colormaps["plasma"](0.22 * k)
         ax.plot(position_mm[sweep], read_um[sweep], "o", ms=4, color=color)
         ax.plot(position_mm[sweep], predicted_um[sweep], color=color, label=f"{hours:.1f} h")

@@ -44,7 +44,8 @@ assert forward_um.mean() > 1.15 * left_out_um.mean()
 assert forward_um[-4:].mean() > 1.3 * left_out_um[-4:].mean()  # the faster, the less the past helps
 
 rpm = [1500 + 225 * k for k in later]
-labels = {"xlabel": "spindle speed of the run, 1/min", "ylabel": "S of the z error, µm", "ylim": (0, None)}
+labels = {"xlabel": "spindle speed of the run, 1/min", "ylabel": "S of the z error, µm"}
 with picture(__file__, "One model, the same runs, two ways to examine it", **labels) as ax:
     ax.plot(rpm, forward_um, "o-", color=WARM, label="forward: learned from slower, earlier runs")
     ax.plot(rpm, left_out_um, "o-", color=COLD, label="leave-batch-out: learned from all others")
+    ax.set_ylim(0, None)

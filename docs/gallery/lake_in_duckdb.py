@@ -30,7 +30,7 @@ with tempfile.TemporaryDirectory() as folder:
 
 assert len(table) == 30 == sum(row.status == "new" for row in report.rows)
 mean = table[table["rpm"].isin([2000, 4000, 6000])].groupby("rpm").mean(numeric_only=True)
-print(mean.round(1).to_string())
+print(f"error of z after 5 h, µm, by speed: {mean['error_um'].round(1).to_dict()}")
 assert mean["error_um"].is_monotonic_increasing and mean["rise_K"].is_monotonic_increasing
 assert abs(mean.loc[6000, "error_um"] - 90) < 10 and abs(mean.loc[6000, "rise_K"] - 20) < 2
 

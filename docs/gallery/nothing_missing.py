@@ -39,9 +39,10 @@ heats = sorted(heats, key=lambda d: d.limit)
 assert len(heats) >= 4 and heats[0].limit < 0.01 < 1.0  # W; a hundredth of a heater at full power is seen
 print(findings.statement.split(". An effect")[0])
 
-labels = [f"{d.mechanism.replace('_', ' ')}, {d.where.name}" for d in heats]
+labels = [f"{d.mechanism.replace('_', ' ')}: {d.words.split(': ')[1]}" for d in heats]
 title = "The least heat that these runs would have shown"
 with picture(__file__, title, xlabel="limit, mW (a heater at full power: 1000 mW)") as ax:
     ax.barh(labels, [1000 * d.limit for d in heats], color=COLD)
     ax.set_xscale("log")
+    ax.tick_params(axis="y", labelsize=7.5)
     ax.invert_yaxis()

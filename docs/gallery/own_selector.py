@@ -57,4 +57,3 @@ with picture(__file__, "Ridge regression on four points, later runs", **labels) 
     for selector, left_um, color in ((other, other_um, GREY), (own, own_um, COLD)):
         points = ", ".join(selector.select(first, "z", n_tsp=4))
         ax.plot(dates, left_um, "o-", color=color, label=f"{selector.key}: {points}")
-    ax.tick_params(axis="x", labelrotation=30)

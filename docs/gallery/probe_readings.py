@@ -35,4 +35,5 @@ title = "Two runs that the model has not seen"
 with picture(__file__, title, xlabel="hours", ylabel="error of z, µm") as ax:
     ax.plot(hours, alone.before_um["z"], color=GREY, label="without compensation")
     ax.plot(hours, alone.after_um["z"], color=WARM, label="compensated")
+    ax.set_ylim(-15, 135)
     ax.plot(hours, learning.after_um["z"], color=COLD, lw=1, label="compensated, one probe reading an hour")

@@ -41,8 +41,9 @@ assert renewed_um.mean() < 0.75 * kept_um.mean() and renewed_um.mean() < 2.2  # 
 assert (renewed_um < kept_um).mean() > 0.6
 
 title = "The same runs, predicted before they are learned from"
-with picture(__file__, title, ylabel="S of the z error, µm", ylim=(0, None)) as ax:
+with picture(__file__, title, ylabel="S of the z error, µm") as ax:
     dates = [b.start for b in later]
     ax.plot(dates, kept_um, "o-", color=WARM, label="model of the winter")
     ax.plot(dates, renewed_um, "o-", color=COLD, label="trained again before every run")
+    ax.set_ylim(0, None)
     ax.tick_params(axis="x", labelrotation=30)

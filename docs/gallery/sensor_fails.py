@@ -31,7 +31,7 @@ largest_um = {
     name: np.abs(error_um["z"][during]).max()
     for name, error_um in (("none", whole.before_um), ("whole", whole.after_um), ("failing", failing.after_um))
 }
-print("; ".join(sorted({r for r in failing.reason["z"] if "rear" in r})), largest_um)
+print("largest error while it is lost, µm:", {name: round(float(v), 1) for name, v in largest_um.items()})
 assert any("rear lost, replaced" in reason for reason in failing.reason["z"])
 assert set(np.array(failing.state["z"])[during]) == {"active"}
 assert largest_um["whole"] < 4.0 and largest_um["failing"] < 0.25 * largest_um["none"]  # µm
