@@ -28,7 +28,7 @@ from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
 from diagnosis.fitting.fitted import left_out_rows
 from diagnosis.result import Diagnosis
-from diagnosis.search.acceptance import least_gain
+from diagnosis.search.acceptance import flipped_threshold, least_gain
 from diagnosis.search.decision import Round, agreed_on
 from evidence.proof.scoring.answer_key import AnswerKey, Spot
 from evidence.proof.scoring.matching import names_term
@@ -62,7 +62,8 @@ def examined(kind: PlantKind, seed: int, out: str) -> dict[str, Any]:
             batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
             row |= _answered(diagnose(case.machine, batches), key, part)
             row["cpu_s"] = round(time.process_time() - begun, 1)
-            row |= _visible(true_model(case.machine, batches, answer))
+            if what == "one":
+                row |= _visible(true_model(case.machine, batches, answer))
     except (InputError, WorkError) as error:
         row["trouble"] = str(error)
     path.write_text(json.dumps(row, default=float))
@@ -101,7 +102,8 @@ def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any
 
     refits = [t for t in r.tried if t.fitted is not None]
     tried = [
-        {"name": t.candidate.name, "gain": t.gain, "level": t.level, "improved": t.improved, "least": least_gain(t, n),
+        {"name": t.candidate.name, "gain": t.gain, "level": t.level, "improved": t.improved, "worse": t.worse,
+         "least": least_gain(t),
          "structure": r.null.threshold(r.density, name=t.candidate.name), "agreed": agreed_on(t, n),
          "physics": t.candidate.kind.is_physics, "right": right(t.candidate), "refit": k,
          "left_out": _left_out(t.fitted)}
@@ -112,7 +114,8 @@ def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any
         for k, s in enumerate(r.screen.scored) if right(s.candidate)
     ]  # fmt: skip
     return {
-        "accepted": r.accepted, "threshold": r.threshold, "batches": n, "tried": tried, "before": _left_out(r.before),
+        "accepted": r.accepted, "threshold": r.threshold, "flipped": flipped_threshold(r.flipped, n),
+        "batches": n, "tried": tried, "before": _left_out(r.before),
         "refits": len(refits), "screened": len(r.screen.scored), "true": screened[:SHOWN],
     }  # fmt: skip
 

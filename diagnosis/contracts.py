@@ -258,6 +258,7 @@ class Fitted:
 class Tried:
     """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
 
+    `improved` counts the left-out batches whose squares fall, `worse` those that lose more than chance makes.
     `cluster` names the first of the candidates that these recordings cannot tell from it; `log_prior` is of its size.
     `alike` is the gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the
     threshold. `barred`: structure alone may gain as much with it.
@@ -271,6 +272,7 @@ class Tried:
     fitted: Fitted | None = None
     alike: float | None = None
     barred: bool = False
+    worse: int = 0
 
     @property
     def candidate(self) -> Candidate:

@@ -59,6 +59,7 @@ class Policy:
     film_area_sd: float = physical(0.2, "m2 per W/K", "about all of a film that is stated as a constant is natural")
     run_to_run_log_sd: float = physical(0.05, "log", "no heat and no exposure is the same in every run")
     time_skew_sd_rows: float = analytic(0.1, "rows", "a row is a mean over its interval, which blurs corners")
+    logger_skew_sd_rows: float = analytic(0.3, "rows", "a time stamp lies anywhere within its interval, uniformly")
 
     # Coarse network
     coarse_min_mean_square: float = convention(9.0, "given variances", "three times the noise need no finer network")
@@ -157,7 +158,7 @@ class Policy:
     second_pass_min_finalist_gain_nats: float = development(40.0, "nats", "one step may gain a tenth of the optimum")
 
     # Acceptance
-    min_improved_share: float = development(0.75, "of the left-out batches", "an effect helps most runs")
+    max_worse_share: float = development(0.25, "of the left-out batches", "an effect makes few runs worse")
     claim_min_gain_share: float = development(0.5, "of the highest gain", "what improves most batches comes first")
     alternatives_judged: int = cost(2, "finalists", "after one whose own null speaks against it")
     joint_gain_share: float = development(0.4, "of its gain alone", "an effect that keeps as much is not explained")
@@ -168,7 +169,7 @@ class Policy:
     run_to_run_min_sd: float = physical(0.02, "log", "no heat is the same from run to run to less")
     even_odds_gain_nats: float = development(110.0, "nats", "half of the claims on other numerics were false there")
     odds_gain_exponent: float = development(2.4, "log odds per log gain", "how trust grows with the gain")
-    odds_cost_worse_batch: float = development(1.2, "log odds", "each batch that does not improve")
+    odds_cost_worse_batch: float = development(1.2, "log odds", "each batch that gets worse")
     odds_cost_network: float = development(1.5, "log odds", "what only says how a network is drawn")
     odds_cost_lever: float = development(1.4, "log odds", "false levers gained up to 253 nats, true ones 343")
     odds_cost_labels: float = development(4.5, "log odds", "false exchanges gained up to 630 nats, true ones from 1200")
@@ -365,7 +366,7 @@ STAGES = {  # the first field of each
     "doubted_run_to_run_log_sd": "Priors of candidates",
     "doubted_value_max_log_factor": "Screening and shortlist",
     "refit_steps": "Refits",
-    "min_improved_share": "Acceptance",
+    "max_worse_share": "Acceptance",
     "null_machines": "Structural null",
     "few_runs_max_probability": "Probability",
     "knot_spacing_s": "Localisation",

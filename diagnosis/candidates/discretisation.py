@@ -15,6 +15,7 @@ import numpy as np
 from diagnosis.candidates.alternatives import heat_amplitudes
 from diagnosis.contracts import Candidate, CandidateKind, Fitted
 from diagnosis.policy import POLICY
+from twin.compiling.cells import several
 from twin.schema import TwinPart
 
 SLACK_MECHANISMS = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
@@ -30,9 +31,7 @@ def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
         if c.mechanism == "sensor_place":
             out[c.name] = POLICY.sensor_place_sd
         elif c.mechanism == "time_skew":
-            out[c.name] = (
-                POLICY.sensor_lag_sd_s if c.where.kind == "sensor" else POLICY.time_skew_sd_rows * fitted.step_s
-            )
+            out[c.name] = _skew_sd_s(c, fitted)
         elif c.mechanism == "natural_convection":
             assert c.part is not None and isinstance(c.part.at, dict)
             if (stated := films.get((c.where.name, str(c.part.at["air"])), 0.0)) > 0:
@@ -85,6 +84,14 @@ def from_run_to_run(fitted: Fitted) -> dict[int, float]:
         if p.scale == "log" and p.per_batch == 0 and (film or u.name in heats):
             out[k] = POLICY.run_to_run_log_sd
     return out
+
+
+def _skew_sd_s(c: Candidate, fitted: Fitted) -> float:
+    """Prior sd of a clock's skew: of a sensor, of one error, and of all errors together, which share a logger."""
+    if c.where.kind == "sensor":
+        return POLICY.sensor_lag_sd_s
+    together = c.part is not None and len(several(c.part.acts_on)) > 1
+    return (POLICY.logger_skew_sd_rows if together else POLICY.time_skew_sd_rows) * fitted.step_s
 
 
 def _sides(c: Candidate) -> set[str]:

@@ -152,7 +152,7 @@ def found_of(
     assert best is not None
     c = best.candidate
     _, nothing, unlisted = explanations(done)
-    trusted = trust(best, len(final.batches))
+    trusted = trust(best)
     parameters, was = reported_parameters(final, c, intervals, done.scatter)
     regime, windows = activity(final, c)
     return replace(
@@ -187,7 +187,7 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     c = best.tried.candidate
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
-    trusted = trust(best.tried, len(final.batches))
+    trusted = trust(best.tried)
     return Found(
         mechanism=c.mechanism,
         where=c.where,

@@ -93,22 +93,22 @@ def stands_out(t: Tried) -> bool:
     return not outside or any(outside)
 
 
-def trust(t: Tried, batches: int) -> float:
+def trust(t: Tried) -> float:
     """The probability that a claim with the gain of `t` is true, from claims on development plants."""
-    odds = POLICY.odds_gain_exponent * np.log(max(t.gain, 1.0) / POLICY.even_odds_gain_nats) - _doubts(t, batches)
+    odds = POLICY.odds_gain_exponent * np.log(max(t.gain, 1.0) / POLICY.even_odds_gain_nats) - _doubts(t)
     return float(1.0 / (1.0 + np.exp(-odds)))
 
 
-def least_gain(t: Tried, batches: int) -> float:
+def least_gain(t: Tried) -> float:
     """The gain in nats below which a candidate is not accepted: there `trust` is one half."""
     if not t.candidate.kind.is_physics:
         return POLICY.coarse_min_gain_nats
-    return float(POLICY.even_odds_gain_nats * np.exp(_doubts(t, batches) / POLICY.odds_gain_exponent))
+    return float(POLICY.even_odds_gain_nats * np.exp(_doubts(t) / POLICY.odds_gain_exponent))
 
 
-def _doubts(t: Tried, batches: int) -> float:
+def _doubts(t: Tried) -> float:
     c = t.candidate
-    doubts = POLICY.odds_cost_worse_batch * (batches - t.improved)
+    doubts = POLICY.odds_cost_worse_batch * t.worse
     if c.mechanism in MECHANISMS:  # alternatives that need no new physics are in no registry
         law = MECHANISMS[c.mechanism]
         doubts += POLICY.odds_cost_network * law.of_network + POLICY.odds_cost_labels * (

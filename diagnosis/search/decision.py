@@ -87,7 +87,7 @@ def decided(criteria: Criteria, tried: Sequence[Tried]) -> Round:
             now, criteria.seen, tuple(tried), least, criteria.null, np.zeros((0, 0)), False, seed=criteria.seed
         )
     best = first_claimable(tried, n)
-    if best.gain > least_gain(best, n) and best.candidate.kind.is_physics:  # agreed on or not
+    if best.gain > least_gain(best) and best.candidate.kind.is_physics:  # agreed on or not
         finer = _independent_refinement(criteria, best, tried)
         if finer is not None and (done := evaluated(criteria, tried, finer)).accepted:
             return done
@@ -121,7 +121,7 @@ def evaluated(criteria: Criteria, tried: Sequence[Tried], best: Tried) -> Round:
         if best.candidate.kind.is_physics:  # what structure makes is what a finer network is for
             structure = own.threshold(density, name=best.candidate.name)
     which = names.index(best.candidate.name) if best.candidate.name in names else None
-    least = least_gain(best, n if agreed else best.improved)  # else the threshold of one that all batches agree on
+    least = least_gain(best if agreed else replace(best, worse=0))  # as of one that no batch speaks against
     threshold = max(structure, flipped_threshold(flipped, n, which), least)
     accepted = best.gain > threshold and agreed and not _less_likely_than_nothing(best, threshold, null.temperature)
     tried = (best, *(t for t in tried if t is not best))
@@ -177,12 +177,12 @@ def effects_of(tried: Sequence[Tried], batches: int) -> list[Tried]:
 
 def gains_enough(t: Tried, batches: int) -> bool:
     """Whether, refitted, most batches agree on it and it gains what one of its kind takes."""
-    return t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t, batches)
+    return t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t)
 
 
 def agreed_on(t: Tried, batches: int) -> bool:
-    """Whether most batches improve and the interval of its size excludes no effect."""
-    return bool(t.improved >= POLICY.min_improved_share * batches and stands_out(t))
+    """Whether few batches get worse and the interval of its size excludes no effect."""
+    return bool(t.worse <= POLICY.max_worse_share * batches and stands_out(t))
 
 
 def _less_likely_than_nothing(best: Tried, threshold: float, temperature: float) -> bool:

@@ -38,9 +38,7 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     batches = len(done.before.batches)
 
     def agrees(x: Tried) -> bool:
-        return (
-            x is done.best or x.fitted is None or (x.improved >= POLICY.min_improved_share * batches and not x.barred)
-        )
+        return x is done.best or x.fitted is None or (x.worse <= POLICY.max_worse_share * batches and not x.barred)
 
     refits = [x for x in done.tried if x.fitted is not None]
     barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}

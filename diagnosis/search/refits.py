@@ -147,8 +147,8 @@ def judged(now: Fitted, t: Tried, roughly: bool = False, policy: Policy = POLICY
     memory = common_memory([now, t.fitted], policy)
     before, after = alone(now, memory), alone(t.fitted, memory, now if roughly else None)
     gain = _score(after, policy) - _score(before, policy)
-    better = improved(before, after, policy)
-    return replace(t, gain=gain, improved=better, log_prior=log_prior(t.scored, t.fitted))
+    better, worse = better_and_worse(before, after, policy)
+    return replace(t, gain=gain, improved=better, worse=worse, log_prior=log_prior(t.scored, t.fitted))
 
 
 def compared(now: Fitted, finalists: Sequence[Tried], policy: Policy = POLICY) -> list[Tried]:
@@ -170,10 +170,13 @@ def _score(evidence: Evidence, policy: Policy) -> float:
     return float(evidence.base_score(left_out=policy.leaves_batches_out)[0])
 
 
-def improved(before: Evidence, after: Evidence, policy: Policy = POLICY) -> int:
-    """Left-out batches whose squares fall."""
+def better_and_worse(before: Evidence, after: Evidence, policy: Policy = POLICY) -> tuple[int, int]:
+    """Left-out batches whose squares fall, and those whose squares rise by more than tells.
+
+    A batch in which a driver is off is predicted alike with and without its effect: it speaks neither for nor against.
+    """
     old, new = _squares(before, after, policy.leaves_batches_out)
-    return int((new < old).sum())
+    return int((new < old).sum()), int((new - old > 2.0 * POLICY.telling_nats).sum())
 
 
 def explained(before: Evidence, after: Evidence) -> float:

@@ -79,7 +79,7 @@ class UnlistedEffect(Terms):
             where=c.where,
             place=place_label(c.where, part),
             parameters={n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()},
-            probability=min(trust(self.tried, batches), probability_cap(self.fitted.runs)),
+            probability=min(trust(self.tried), probability_cap(self.fitted.runs)),
             name=self.name,
             context=f"it follows {listed([f.label for f in self.forms])}",
             regime=regime,

@@ -19,9 +19,10 @@ NONE: Any = None
 CRITERIA = Criteria(NOW, NONE, NONE, {}, 0)
 
 
-def tried(mechanism: str, gain: float, log_prior: float = 0.0, improved: int = BATCHES) -> Tried:
+def tried(mechanism: str, gain: float, log_prior: float = 0.0, worse: int = 0) -> Tried:
     c = Candidate(mechanism, Where("node", "head"), f"{mechanism}_head", "")
-    return Tried(Scored(c, gain, improved, 0.0, {}, 0.0, -1), gain, improved, c.name, log_prior, FITTED)
+    better = BATCHES - worse
+    return Tried(Scored(c, gain, better, 0.0, {}, 0.0, -1), gain, better, c.name, log_prior, FITTED, worse=worse)
 
 
 def test_an_effect_goes_that_the_others_make_needless() -> None:
@@ -62,8 +63,8 @@ def test_a_finer_network_that_an_effect_does_not_explain_comes_first(
     assert decision._independent_refinement(CRITERIA, best, [best, finer]) is (finer if first else None)
 
 
-def test_one_that_gains_little_or_not_in_most_batches_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_gains_little_or_makes_many_batches_worse_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decision, "refit", lambda *_: tried("coarse_network", 100.0))
     monkeypatch.setattr(decision, "optimised", lambda now, t, policy: t)
-    for finer in (tried("coarse_network", 39.0), tried("coarse_network", 100.0, improved=6)):
+    for finer in (tried("coarse_network", 39.0), tried("coarse_network", 100.0, worse=6)):
         assert decision._independent_refinement(CRITERIA, tried("belt_loss", 160.0), [finer]) is None

@@ -88,7 +88,7 @@ def test_what_is_accepted_clears_every_bar() -> None:
     for r in found("floor and shift").accepted:
         assert r.best is not None
         assert r.best.gain > r.threshold >= POLICY.even_odds_gain_nats
-        assert r.best.improved >= POLICY.min_improved_share * COUNT
+        assert r.best.worse <= POLICY.max_worse_share * COUNT
         assert r.threshold >= (r.own_null or r.null).threshold(r.density, name=r.best.candidate.name)
         assert r.sign_p < 0.2
 
