@@ -1,7 +1,7 @@
 """How well do recordings determine the parameters of a twin?
 
-A machine file gives every free parameter a prior. Six runs of a board whose values differ from the file are calibrated:
-the 90 % intervals shrink where the runs tell something, and hold the values that made the recordings.
+A machine file gives every free parameter a prior. Four runs of a board whose values differ from the file are
+calibrated: the 90 % intervals shrink where the runs tell something, and hold the values that made the recordings.
 """
 
 import tempfile
@@ -55,6 +55,5 @@ with picture(
         ax.plot([i.low / true, i.high / true], [row, row], color=WARM, lw=4)
     ax.axvline(1.0, color=COLD, lw=1)
     ax.set_yticks(range(len(SHOWN)), [name.replace(".", "\n") for name in SHOWN])
-    ax.minorticks_off()
-    ax.set_ylim(-0.5, 2.5)
     ax.set_xticks([0.2, 0.5, 1, 2, 4], ["0.2", "0.5", "1", "2", "4"])
+    ax.minorticks_off()

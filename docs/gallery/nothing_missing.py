@@ -1,7 +1,7 @@
 """Simulation and recordings agree: how large an effect may still hide?
 
 The machine file is right, and the diagnosis says so: the error of left-out runs is the noise. For every effect of the
-library it states how large it would have had to be to be seen; here those that are heats, next to the heaters' 1 W.
+library it states how large it would have had to be to be seen; here constant heats, next to 1 W of a heater.
 """
 
 import tempfile
@@ -33,16 +33,15 @@ findings = td.diagnose(BOARD, recorded).findings
 assert findings.verdict == "consistent" and not findings.findings
 rms = findings.fit.left_out_rms
 for channel, noise in rms.noise_floor.items():
-    assert 0.8 * noise < rms.before[channel] < 1.2 * noise
-heats = [d for d in findings.detection_limits if d.unit == "W" and d.limit]
+    assert 0.8 * noise < rms.before[channel] < 1.4 * noise
+heats = [d for d in findings.detection_limits if d.unit == "W" and d.limit and "(" not in d.words]
 heats = sorted(heats, key=lambda d: d.limit)
-assert len(heats) >= 4 and heats[0].limit < 0.01 < 1.0  # W; a hundredth of a heater at full power is seen
+assert len(heats) >= 4 and heats[-1].limit < 0.05  # W; a twentieth of a heater at full power is seen
 print(findings.statement.split(". An effect")[0])
 
 labels = [f"{d.mechanism.replace('_', ' ')}: {d.words.split(': ')[1]}" for d in heats]
 title = "The least heat that these runs would have shown"
 with picture(__file__, title, xlabel="limit, mW (a heater at full power: 1000 mW)") as ax:
     ax.barh(labels, [1000 * d.limit for d in heats], color=COLD)
-    ax.set_xscale("log")
-    ax.tick_params(axis="y", labelsize=7.5)
+    ax.set_xlim(0, 50)
     ax.invert_yaxis()

@@ -1,6 +1,6 @@
 """Which four of ten temperature sensors should the model read?
 
-Every selector of quick effort picks four points from the first twenty runs of a year; ridge regression on them is
+Eight selectors pick four points each from the first twenty runs of a year; ridge regression on them is
 judged on the ten later runs. Fewer sensors can do almost as well as all; the wrong ones cost three times the error.
 """
 
