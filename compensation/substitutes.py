@@ -35,6 +35,9 @@ _LEAST_ROWS = 3  # of a batch with all channels: a start, and a rise that change
 _NOISE_SHARES = (1e-5, 1e-4, 1e-3, 1e-2)  # noise variance tried, as a share of the mean square rise
 _RATE_QUANTILE = 0.999  # of the rate of change in training: a few outliers are no usual change
 _RATE_MARGIN = 3.0  # on that: a door or a coolant valve that training did not see
+_NOISE_SD = 6.0  # standard deviations of noise that one sample does not exceed
+_MAD = 1.4826  # sd per median absolute deviation of a Gaussian
+_SECOND_DIFFERENCE = np.sqrt(6.0)  # sd of x[k-1] - 2 x[k] + x[k+1] per sd of independent x
 _HELD_MARGIN = 1.5  # on the longest constant stretch of training
 _LEAST_SD_K = 1e-3  # below the resolution of any temperature sensor of a machine
 _SAME_K = 1e-9  # equal but for rounding: a frozen value is repeated exactly
@@ -82,7 +85,8 @@ class Substitutes:
         held_s: longest time that a channel was constant while its regression moved by more than sd_K, s, (n,).
         low, high: plausible range, in the unit of the channels, (n,).
         resolution_K: smallest step shown, K, (n,); 0 where not known.
-        step_s: step of the training grid, s; changes within a shorter time are mostly noise.
+        step_s: step of the training grid, s.
+        noise_K: standard deviation of the noise of a training row, K, (n,); None in models stored without it.
     """
 
     names: tuple[str, ...]
@@ -94,6 +98,7 @@ class Substitutes:
     high: Array
     resolution_K: Array
     step_s: float
+    noise_K: Array | None = None
 
     @classmethod
     def learn(cls, batches: Sequence[Batch], channels: Sequence[str]) -> Self:
@@ -136,7 +141,20 @@ class Substitutes:
             np.array([_FARTHEST_K if s.high is None else s.high for s in specs]),
             resolution_K,
             step_s,
+            _noise_K([values for _, values in runs], resolution_K),
         )
+
+    def usual_K(self, dt_s: float) -> Array:
+        """Largest usual change, K, (n,), between two samples that are `dt_s` apart.
+
+        Within a step of the training grid a body changes by its rate, and a sample by its noise: a row of training is
+        the mean of `step_s`, so that white noise of a sample is larger by the root of the ratio of the times.
+        """
+        widest = self.rate_K_per_s * max(dt_s, self.step_s)
+        if self.noise_K is not None and 0.0 < dt_s < self.step_s:
+            noise_K = _NOISE_SD * self.noise_K * np.sqrt(self.step_s / dt_s)
+            widest = np.minimum(widest, self.rate_K_per_s * dt_s + noise_K)
+        return np.asarray(widest + 2 * self.resolution_K)
 
     def weights(self, good: Mask) -> tuple[Array, Array]:
         """Regression of every channel on the good ones other than itself, for a mask (n,).
@@ -158,12 +176,14 @@ class Substitutes:
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings and arrays."""
-        return {**{name: getattr(self, name) for name in self.__dataclass_fields__}, "names": list(self.names)}
+        known = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {**{name: value for name, value in known.items() if value is not None}, "names": list(self.names)}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`; lists in place of arrays are read too."""
-        arrays = {k: np.asarray(plain[k], float) for k in cls.__dataclass_fields__ if k not in ("names", "step_s")}
+        fields = [k for k in cls.__dataclass_fields__ if k in plain or k != "noise_K"]
+        arrays = {k: np.asarray(plain[k], float) for k in fields if k not in ("names", "step_s")}
         return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), **arrays)
 
     @cached_property
@@ -301,7 +321,7 @@ class Guard:
         fresh = present & np.isnan(before)
         for i in np.flatnonzero(~present & ~watch.bad):
             status[i] = "lost" if np.isnan(x[i]) else "implausible"
-        usual_K = s.rate_K_per_s * max(dt_s, s.step_s) + 2 * s.resolution_K
+        usual_K = s.usual_K(dt_s)
         good = present & ~watch.bad & ~fresh
         good, weights, sd_K = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
         for i in np.flatnonzero(present & ~watch.bad & ~fresh & ~good):
@@ -453,6 +473,13 @@ def _regularised(rises_K: Sequence[Array], resolution_K: Array) -> tuple[Array, 
             best = score, total + noise, left_out_K2
     assert best is not None
     return best[1], best[2]
+
+
+def _noise_K(runs: Sequence[Array], resolution_K: Array) -> Array:
+    """Standard deviation of the noise of a row, K, (n,), from second differences; at least that of rounding."""
+    second = np.concatenate([np.diff(values, 2, axis=0) for values in runs])
+    own = _MAD * np.median(np.abs(second), axis=0) / _SECOND_DIFFERENCE
+    return np.asarray(np.maximum(own, np.maximum(resolution_K / np.sqrt(12.0), _LEAST_SD_K)))
 
 
 def _held_s(time_s: Array, rises_K: Array, predicted_K: Array, sd_K: Array) -> Array:

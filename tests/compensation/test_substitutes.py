@@ -279,3 +279,35 @@ def test_values_are_finite_and_in_range_unless_a_fault_says_otherwise(
             assert isfinite(value) or name in str(checked.fault)
             assert not isfinite(value) or learned.low[i] <= value <= learned.high[i]
             assert (checked.status[name] == "ok") == (name not in checked.sd_K)
+
+
+def _seconds(learned: Substitutes, batch: Batch, offset_K: float) -> list[str]:
+    """Statuses of a fast channel that is sampled every 20 s and steps by `offset_K` after an hour."""
+    fast = learned.names[int(np.argmax(learned.rate_K_per_s))]
+    guard, out = Guard(learned), []
+    watch = guard.begin()
+    for time_s in np.arange(batch.time_s[0], batch.time_s[-1], 20.0):
+        values = {n: float(np.interp(time_s, batch.time_s, batch.values(n))) for n in learned.names}
+        values[fast] += offset_K * (time_s >= batch.time_s[0] + 3600.0)
+        watch, checked = guard.step(watch, float(time_s), values)
+        out.append(checked.status[fast])
+    return out
+
+
+def test_samples_closer_than_the_training_s_rows_change_in_proportion_to_their_time(
+    learned: Substitutes, batches: list[Batch]
+) -> None:
+    loose = replace(learned, sd_K=np.full(len(learned.names), 10.0))  # a regression that notices nothing
+    step_K = 0.9 * float(np.max(loose.rate_K_per_s)) * STEP_S  # usual between rows of training, not within 20 s
+    assert step_K < loose.sd_K.min() * LIMITS.step_sd
+    found = _seconds(loose, batches[-1], step_K)
+    assert found[:180] == ["ok"] * 180 and found[180] == "stepping"
+    assert set(_seconds(loose, batches[-1], 0.0)) == {"ok"}
+    assert (loose.usual_K(20.0) <= loose.usual_K(STEP_S)).all()
+
+
+def test_a_model_stored_without_the_noise_of_its_rows_is_read(learned: Substitutes) -> None:
+    plain = {k: v for k, v in learned.as_plain().items() if k != "noise_K"}
+    old = Substitutes.from_plain(plain)
+    assert old.noise_K is None and "noise_K" not in old.as_plain()
+    np.testing.assert_allclose(old.usual_K(20.0), old.usual_K(STEP_S))
