@@ -224,7 +224,7 @@ def _diagnosis(
         intervals=tuple(intervals.values()),
         added=changed_parts(part, part_after),
         notes=_notes(findings, len(batches)),
-        plan_text=run.plan_text if run is not None else None,
+        plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
     )
 

@@ -213,8 +213,8 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
     text = "Nothing is missing: the remaining error is the noise"
     if times > POLICY.noise_max_ratio or of_one:
         text = (
-            f"Nothing is missing that these runs could show: the remaining error, {few(times)} times the noise in the "
-            f"median channel{of_one}, is what a network this coarse leaves"
+            f"No missing effect is supported by these runs; the remaining error, {few(times)} times the noise in the "
+            f"median channel{of_one}, is not explained: a network this coarse may leave as much"
         )
     text += f" ({', '.join(left)})" if left else ""
     seen = []

@@ -85,7 +85,7 @@ def headline(verdict: str, probabilities: Sequence[float]) -> str:
     the = "The" if most >= POLICY.plain_probability else the
     effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
     return {
-        "consistent": "Consistent: nothing is missing that these runs could show.",
+        "consistent": "Consistent: no missing effect is supported by these runs.",
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} nothing else is "
         "missing that these runs could show.",
         "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",

@@ -209,14 +209,14 @@ def test_verdicts() -> None:
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
-        "Nothing is missing that these runs could show: the remaining error, 11 times the noise in the median channel "
-        "and 25 times in y, is what a network this coarse leaves (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y "
+        "No missing effect is supported by these runs; the remaining error, 11 times the noise in the median channel "
+        "and 25 times in y, is not explained: a network this coarse may leave as much (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y "
         "30 µm (noise 1.2))."
     )
     one = (*after, Rms("x", "um", 1.0, 1.1, 1.0), Rms("front", "degC", 0.35, 0.35, 0.03, sensor=True))
     assert verdict_statement("consistent", rms=one).startswith(
-        "Nothing is missing that these runs could show: the remaining error, 1.1 times the noise in the median channel "
-        "and 12 times in front, is what a network this coarse leaves (z 1.3"
+        "No missing effect is supported by these runs; the remaining error, 1.1 times the noise in the median channel "
+        "and 12 times in front, is not explained: a network this coarse may leave as much (z 1.3"
     )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "

@@ -152,7 +152,7 @@ def test_a_second_run_replaces_only_when_asked(diagnose: Diagnosed, toy: Toy, tm
         "inputs.json",
         "mine.txt",
     }  # nothing was found: the old machine file would mislead
-    assert "Consistent: nothing is missing that these runs could show." in done.out and "machine.yml" not in done.out
+    assert "Consistent: no missing effect is supported by these runs." in done.out and "machine.yml" not in done.out
     assert "an effect above the limits below would have been seen" in done.out
 
 
