@@ -210,8 +210,8 @@ def test_verdicts() -> None:
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
         "No missing effect is supported by these runs; the remaining error, 11 times the noise in the median channel "
-        "and 25 times in y, is not explained: a network this coarse may leave as much (z 13 µm (noise 1.2), x 6.0 µm (noise 1.2), y "
-        "30 µm (noise 1.2))."
+        "and 25 times in y, is not explained: a network this coarse may leave as much (z 13 µm (noise 1.2), x 6.0 µm "
+        "(noise 1.2), y 30 µm (noise 1.2))."
     )
     one = (*after, Rms("x", "um", 1.0, 1.1, 1.0), Rms("front", "degC", 0.35, 0.35, 0.03, sensor=True))
     assert verdict_statement("consistent", rms=one).startswith(

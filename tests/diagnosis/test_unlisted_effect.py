@@ -48,8 +48,10 @@ def values(out: Terms) -> dict[str, float]:
         (flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", {"square_cross": 3e-6},
          "W into bed with the square of rpm (at 5000 rpm) while coolant is on"),
         (flux("saddle", None, constant="25 W"), "saddle", {"constant": 25.0}, "W into saddle"),
-        (flux("column", "coolant", linear="30 W", product="8 W/K"), "column", {"linear": 30.0, "product": 8.0},
-         "W into column while coolant is on"),
+        pytest.param(
+            flux("column", "coolant", linear="30 W", product="8 W/K"), "column", {"linear": 30.0, "product": 8.0},
+            "W into column while coolant is on", marks=pytest.mark.slow,
+        ),
         (shift("z", linear="8 um"), "z", {"linear": 8.0}, "µm of z while coolant is on"),
         (shift("y", "column", "rpm", product="0.0005 um/K"), "y", {"product": 0.0005},
          "µm of y per K of column's rise, in proportion to rpm (at 5000 rpm)"),

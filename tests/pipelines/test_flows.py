@@ -46,6 +46,7 @@ def test_same_numbers_with_prefect_and_without(flows: ModuleType, store: Any, ye
     assert ("grid z pls", 3, 3) in steps and ("ingest", 1, 1) in steps and ("report", 1, 1) in steps
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_once_is_tried_again(
     flows: ModuleType, store: Any, year: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

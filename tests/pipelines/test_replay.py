@@ -89,6 +89,7 @@ def recorded(given: Given) -> Replay:
     return result
 
 
+@pytest.mark.slow
 def test_every_run_is_predicted_by_a_champion_that_has_not_seen_it(recorded: Replay, given: Given) -> None:
     assert [g.n_batches for g in recorded.retrainings] == [6, 8, 9]
     runs = recorded.runs_of("z")
@@ -118,6 +119,7 @@ def test_errors_are_those_of_the_models_by_hand(recorded: Replay, given: Given) 
     assert 0 <= s.covered <= s.bounded == 3
 
 
+@pytest.mark.slow
 def test_the_retraining_that_learned_the_bed_is_promoted_and_worth_it(recorded: Replay) -> None:
     first, second, last = recorded.retrainings
     assert (first.before, first.after, first.outcome) == (None, 1, "champion")
@@ -130,6 +132,7 @@ def test_the_retraining_that_learned_the_bed_is_promoted_and_worth_it(recorded: 
     assert score.retrained == 1 and score.against_frozen.difference_um == pytest.approx(after.frozen_S_um - after.S_um)
 
 
+@pytest.mark.slow
 def test_the_page_and_the_json_say_the_same(recorded: Replay, tmp_path: Path) -> None:
     text, page = (p.read_text(encoding="utf-8") for p in write_replay_files(recorded, tmp_path))
     plain, s = json.loads(text), recorded.score("z")
@@ -141,6 +144,7 @@ def test_the_page_and_the_json_say_the_same(recorded: Replay, tmp_path: Path) ->
     assert f"{s.n} runs: S {s.S_um:.2f} µm" in worth(recorded, "z")
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(recorded: Replay, given: Given) -> None:
     before = (given.folder / "recorded" / "progress.json").stat().st_mtime_ns
     assert given.replay("recorded") == recorded

@@ -49,6 +49,7 @@ def geometric_mean(ratios: list[float]) -> float:
     return math.exp(sum(math.log(r) for r in ratios) / len(ratios))
 
 
+@pytest.mark.slow
 def test_spindle_fl_needs_several_bodies_and_one_heat() -> None:
     found = drafted("spindle_fl", 5)
     machine, _ = recorded("spindle_fl")

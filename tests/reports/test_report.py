@@ -255,6 +255,7 @@ def test_simulated_is_said_everywhere_or_nowhere(simulated: bool, toy_batches: M
         assert captions and all("(SIMULATED)" in line for line in captions)
 
 
+@pytest.mark.slow
 def test_findings_say_what_when_and_whether_masked(toy_batches: Maker, tmp_path: Path) -> None:
     both = results(toy_batches, findings=True)
     text = markdown_of([training(both["z"]), training(both["x"])], tmp_path)

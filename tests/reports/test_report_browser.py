@@ -108,6 +108,7 @@ def test_every_picture_is_readable_and_nothing_overflows_the_page(width_px: int,
         assert p["width"] <= p["box"] or "left-out" not in p["id"], f"{p['id']}: curves of one batch need no scrolling"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width_px", "height_px"), [(390, 844), (1200, 900)])
 def test_the_first_screen_reaches_the_curves(width_px: int, height_px: int, page: Path, scratch: Path) -> None:
     assert measured(page, width_px, scratch, opened=False)["curves"] < height_px

@@ -62,6 +62,7 @@ def test_recordings_become_a_promoted_model_and_a_prediction(folder: Path) -> No
     assert td.Lake(folder / "var" / "lake").batch_ids("small") == [f.stem for f in files]
 
 
+@pytest.mark.slow
 def test_recordings_become_a_diagnosis(two: Path) -> None:
     batches = td.read("runs", two)
     found = td.diagnose(two, batches, out="diagnosis")
