@@ -108,7 +108,8 @@ def test_pieces_of_bodies_are_known_by_name() -> None:
 def test_a_piece_with_a_sensor_of_another_body_can_be_refined() -> None:
     known = four_bodies()
     now = fitted(known, runs(known, count=4))
-    piece = next(c for c in coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0])) if c.name == "coarse_network_t_head")
+    every = coarse_candidates(now, np.array([1.0, 100.0, 1.0, 1.0]))
+    piece = next(c for c in every if c.name == "coarse_network_t_head")
     part = piece.applied(now.part)
     moved = part.sensors["t_bed"].model_copy(update={"at": "t_head_near"})
     finer = refitted(now, with_parts(part, {"sensors.t_bed": moved}), steps=0)
