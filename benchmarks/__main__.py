@@ -55,7 +55,7 @@ QUICK = Sizes(("mlr", "ridge", "huber"), batches=10, repeats=1, csv_gb=0.05, twi
 
 
 def table_rows(sizes: Sizes, done: Callable[[str], None] = lambda part: None) -> list[Row]:
-    """Every row of the table; `done` is told each part when it is measured."""
+    """Every row of the table; `done` gets the name of each part when it is measured."""
     out: list[Row] = []
     with threadpool_limits(limits=1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)

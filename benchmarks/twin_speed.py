@@ -1,4 +1,4 @@
-"""Speed of the twin: a year of the sample machine, many parameter sets, a Jacobian; beside scipy's stiff solvers.
+"""Speed of the twin: a year of the sample machine, many parameter sets, a Jacobian; next to scipy's stiff solvers.
 
     python benchmarks/twin.py [--repeats 7] [--sets 500]
 
@@ -241,7 +241,7 @@ def scipy_table(all_ways: list[Way], year_ms: dict[str, tuple[float, float]]) ->
 
 
 def rows(all_ways: list[Way], repeats: int, batches: int = BATCHES, hours: float = HOURS) -> list[Row]:
-    """Rows of the table: the year of each way beside LSODA at 1 mK and at the twin's own accuracy.
+    """Rows of the table: the year of each way next to LSODA at 1 mK and at the twin's own accuracy.
 
     LSODA integrates the temperatures of the first batch, times their number.
     """

@@ -24,7 +24,7 @@ import numpy as np
 from compensation.contracts import check_limits
 from data.arrays import Array, Mask
 from data.batch import Batch
-from data.checks.base import THERMAL
+from data.checks.base import THERMAL, robust_sigma
 from data.errors import InputError, one_of
 
 Status = Literal["ok", "lost", "implausible", "stepping", "frozen"]
@@ -36,7 +36,6 @@ _NOISE_SHARES = (1e-5, 1e-4, 1e-3, 1e-2)  # noise variance tried, as a share of 
 _RATE_QUANTILE = 0.999  # of the rate of change in training: a few outliers are no usual change
 _RATE_MARGIN = 3.0  # on that: a door or a coolant valve that training did not see
 _NOISE_SD = 6.0  # standard deviations of noise that one sample does not exceed
-_MAD = 1.4826  # sd per median absolute deviation of a Gaussian
 _SECOND_DIFFERENCE = np.sqrt(6.0)  # sd of x[k-1] - 2 x[k] + x[k+1] per sd of independent x
 _HELD_MARGIN = 1.5  # on the longest constant stretch of training
 _LEAST_SD_K = 1e-3  # below the resolution of any temperature sensor of a machine
@@ -478,7 +477,7 @@ def _regularised(rises_K: Sequence[Array], resolution_K: Array) -> tuple[Array, 
 def _noise_K(runs: Sequence[Array], resolution_K: Array) -> Array:
     """Standard deviation of the noise of a row, K, (n,), from second differences; at least that of rounding."""
     second = np.concatenate([np.diff(values, 2, axis=0) for values in runs])
-    own = _MAD * np.median(np.abs(second), axis=0) / _SECOND_DIFFERENCE
+    own = np.array([robust_sigma(v, r) for v, r in zip(second.T, resolution_K, strict=True)]) / _SECOND_DIFFERENCE
     return np.asarray(np.maximum(own, np.maximum(resolution_K / np.sqrt(12.0), _LEAST_SD_K)))
 
 

@@ -41,7 +41,7 @@ from models.trust import Region, fit_siblings
 from models.updating import Updater, out_of_fold
 from pipelines import audit, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
-from pipelines.runs import close_interrupted, code_version, model_versions, registered_models, versions_by_model
+from pipelines.runs import close_interrupted, code_version, model_versions, models_with_versions, registered_models
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
@@ -309,12 +309,10 @@ def status(settings: Settings) -> pd.DataFrame:
                "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
-        models = list(registered_models(client))
-        versions = versions_by_model(client)  # read after the models: a champion is among them
-        for model in models:
+        for model, versions in models_with_versions(client):
             log = audit.read(model)
             ends = audit.latest_ends(log.reigns, log.champion)
-            for v in versions[model.name]:
+            for v in versions:
                 tags, until = v.tags, ends.get(int(v.version))
                 aliases = sorted(a for a, number in model.aliases.items() if str(number) == str(v.version))
                 rows.append({

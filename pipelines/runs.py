@@ -14,11 +14,12 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pandas as pd
@@ -288,36 +289,22 @@ def _dataset(batch: DatasetRecord, context: str) -> DatasetInput:
 
 def experiments(client: MlflowClient, **tags: str | None) -> list[Experiment]:
     """Every experiment of thermodrift, or those with these tags."""
-    found, token = [], None
     wanted = {"kind": _PROGRAM} | {k: v for k, v in tags.items() if v is not None}
     # MLflow's language of filters has no way to write a quote.
     which = " and ".join(f"tags.{k} = '{v}'" for k, v in wanted.items() if "'" not in v)
-    while True:
-        page = client.search_experiments(filter_string=which, page_token=token)
-        found += [e for e in page if wanted.items() <= e.tags.items()]
-        if not (token := page.token):
-            return found
+    return [e for e in _all(client.search_experiments, filter_string=which) if wanted.items() <= e.tags.items()]
 
 
 def registered_models(client: MlflowClient) -> Iterator[RegisteredModel]:
-    """Every registered model; the store gives 1000 at a time."""
-    token = None
-    while True:
-        page = client.search_registered_models(max_results=1000, page_token=token)
-        yield from page
-        if not (token := page.token):
-            return
+    """Every registered model."""
+    return _all(client.search_registered_models, max_results=1000)
 
 
 def model_versions(client: MlflowClient, name: str | None = None) -> list[ModelVersion]:
     """Every version in the registry, or those of one model, the newest of a model first."""
     which = f"name = '{name}'" if name is not None and "'" not in name else None  # a filter cannot write a quote
-    found, token = [], None
-    while True:
-        page = client.search_model_versions(which, max_results=10_000, page_token=token)
-        found += [v for v in page if name in (None, v.name)]
-        if not (token := page.token):
-            return sorted(found, key=lambda v: -int(v.version))
+    every = _all(client.search_model_versions, filter_string=which, max_results=10_000)
+    return sorted((v for v in every if name in (None, v.name)), key=lambda v: -int(v.version))
 
 
 def versions_by_model(client: MlflowClient) -> dict[str, list[ModelVersion]]:
@@ -328,10 +315,23 @@ def versions_by_model(client: MlflowClient) -> dict[str, list[ModelVersion]]:
     return found
 
 
+def models_with_versions(client: MlflowClient) -> list[tuple[RegisteredModel, list[ModelVersion]]]:
+    """Every registered model and its versions, the newest first; versions are read last: a champion is among them."""
+    models = list(registered_models(client))
+    versions = versions_by_model(client)
+    return [(model, versions[model.name]) for model in models]
+
+
 def _runs(client: MlflowClient, which: str, **tags: str | None) -> Iterator[Run]:
-    ids, token = [e.experiment_id for e in experiments(client, **tags)], None
-    while ids:
-        page = client.search_runs(ids, which, page_token=token, order_by=["attributes.start_time DESC"])
+    if ids := [e.experiment_id for e in experiments(client, **tags)]:
+        yield from _all(client.search_runs, ids, which, order_by=["attributes.start_time DESC"])
+
+
+def _all(search: Callable[..., Any], *args: Any, **more: Any) -> Iterator[Any]:
+    """What a search of the client gives, page after page."""
+    token = None
+    while True:
+        page = search(*args, page_token=token, **more)
         yield from page
         if not (token := page.token):
             return

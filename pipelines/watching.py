@@ -108,20 +108,18 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
 def _champions(settings: Settings) -> dict[str, list[Champion]]:
     """Champions by machine."""
     from pipelines import audit
-    from pipelines.runs import registered_models, versions_by_model
+    from pipelines.runs import models_with_versions
     from pipelines.tracking import open_store, store_errors
 
     client, found = open_store(settings), dict[str, list[Champion]]()
     with store_errors(settings):
-        models = list(registered_models(client))
-        versions = versions_by_model(client)  # read after the models: a champion is among them
-        for model in models:
+        for model, versions in models_with_versions(client):
             log = audit.read(model)
             if not log.machine or not log.target:
                 continue
             version, since, source, tags = log.champion, "", "", dict[str, str]()
             if version is not None:
-                v = next(v for v in versions[model.name] if int(v.version) == version)
+                v = next(v for v in versions if int(v.version) == version)
                 source, tags = str(v.source), dict(v.tags)
                 reigns = [r for r in log.reigns if r.until is None]
                 since = reigns[-1].since.isoformat(timespec="seconds") if reigns else tags.get("trained_at", "")

@@ -93,6 +93,11 @@ def stands_out(t: Tried) -> bool:
     return not outside or any(outside)
 
 
+def few_worse(t: Tried, batches: int) -> bool:
+    """Whether few of the left-out batches get worse."""
+    return t.worse <= POLICY.max_worse_share * batches
+
+
 def trust(t: Tried) -> float:
     """The probability that a claim with the gain of `t` is true, from claims on development plants."""
     odds = POLICY.odds_gain_exponent * np.log(max(t.gain, 1.0) / POLICY.even_odds_gain_nats) - _doubts(t)

@@ -13,7 +13,7 @@ from diagnosis.contracts import Fitted, Tried
 from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import Screen, alone
-from diagnosis.search.acceptance import flipped_gains, flipped_threshold, least_gain, sign_p, stands_out
+from diagnosis.search.acceptance import few_worse, flipped_gains, flipped_threshold, least_gain, sign_p, stands_out
 from diagnosis.search.null import Null, null_with
 from diagnosis.search.refits import common_memory, optimised, refit
 
@@ -176,13 +176,13 @@ def effects_of(tried: Sequence[Tried], batches: int) -> list[Tried]:
 
 
 def gains_enough(t: Tried, batches: int) -> bool:
-    """Whether, refitted, most batches agree on it and it gains what one of its kind takes."""
+    """Whether, refitted, few batches speak against it and it gains what one of its kind takes."""
     return t.fitted is not None and agreed_on(t, batches) and t.gain > least_gain(t)
 
 
 def agreed_on(t: Tried, batches: int) -> bool:
     """Whether few batches get worse and the interval of its size excludes no effect."""
-    return bool(t.worse <= POLICY.max_worse_share * batches and stands_out(t))
+    return few_worse(t, batches) and stands_out(t)
 
 
 def _less_likely_than_nothing(best: Tried, threshold: float, temperature: float) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from diagnosis.contracts import Tried
 from diagnosis.policy import POLICY
+from diagnosis.search.acceptance import few_worse
 from diagnosis.search.decision import Round
 
 
@@ -38,7 +39,7 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     batches = len(done.before.batches)
 
     def agrees(x: Tried) -> bool:
-        return x is done.best or x.fitted is None or (x.worse <= POLICY.max_worse_share * batches and not x.barred)
+        return x is done.best or x.fitted is None or (few_worse(x, batches) and not x.barred)
 
     refits = [x for x in done.tried if x.fitted is not None]
     barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}
