@@ -17,7 +17,7 @@ from docs.gallery.__main__ import main  # noqa: E402
 
 NAMES = gallery.names()
 QUICKEST = ("thermal_test", "heat_flows")
-OTHER_FILES = {"__init__", "__main__", "drawing"}
+OTHER_FILES = {"__init__", "__main__", "board", "drawing"}
 
 
 def _runs_and_draws(name: str) -> None:

@@ -10,13 +10,10 @@ from pathlib import Path
 import numpy as np
 
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, GREY, WARM, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages: [{{minutes: 7, heater1: {0}}}, {{minutes: 6, heater2: {1}}}, {{minutes: 6, heater1: {1}, heater2: 0}}]
-surroundings: {{room: {2} degC}}
+STAGES = """ [{{minutes: 7, heater1: {0}}}, {{minutes: 6, heater2: {1}}}, {{minutes: 6, heater1: {1}, heater2: 0}}]
 """
 POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
 TRUE = {"capacity: {value: 2.5 J/K": "capacity: {value: 3.2 J/K", "value: 12 mW/K": "value: 9 mW/K",
@@ -26,12 +23,9 @@ with tempfile.TemporaryDirectory() as folder:
     text = BOARD.read_text()
     for stated, true in TRUE.items():
         text = text.replace(stated, true)
-    truth, recorded = Path(folder) / "truth.yml", []
+    truth = Path(folder) / "truth.yml"
     truth.write_text(text)
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(truth, plan, noise=True, seed=k).batch)
+    recorded = board_runs(POWERS, truth, stages=STAGES)
     found = td.calibrate(BOARD, recorded)
 
 SHOWN = {  # prior value, its spread in the logarithm, true value, unit

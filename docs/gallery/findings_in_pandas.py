@@ -11,32 +11,20 @@ from pathlib import Path
 import pandas as pd
 
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, GREY, WARM, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages:
-  - {{minutes: 7, heater1: {0}}}
-  - {{minutes: 6, heater2: {1}}}
-  - {{minutes: 6, heater1: {1}}}
-  - {{minutes: 6, heater1: 0, heater2: 0}}
-surroundings: {{room: {2} degC}}
-"""
 POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
 HIDDEN = """
     hidden: {law: free_flux, into: heater1, at: {body: heater1}, drivers: {level: heater1}, parameters: {product: 0.1 mW/K}}
 """  # noqa: E501
 
 with tempfile.TemporaryDirectory() as folder:
-    text, recorded = BOARD.read_text(), []
+    text = BOARD.read_text()
     truth, lacking = Path(folder) / "truth.yml", Path(folder) / "lacking.yml"
     truth.write_text(text.replace("  mechanisms:\n", "  mechanisms:" + HIDDEN))
     lacking.write_text(text[: text.index("  links:")] + text[text.index("  exposures:") :])
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(truth, plan, noise=True, seed=k).batch)
+    recorded = board_runs(POWERS, truth)
     td.diagnose(lacking, recorded, out=Path(folder) / "out")
     read = json.loads((Path(folder) / "out" / "findings.json").read_text())
 

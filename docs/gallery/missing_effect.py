@@ -8,26 +8,13 @@ import tempfile
 from pathlib import Path
 
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, WARM, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages:
-  - {{minutes: 7, heater1: {0}}}
-  - {{minutes: 6, heater2: {1}}}
-  - {{minutes: 6, heater1: {1}}}
-  - {{minutes: 6, heater1: 0, heater2: 0}}
-surroundings: {{room: {2} degC}}
-"""
 POWERS = [(60, 30, 20), (20, 80, 21), (80, 40, 22), (30, 100, 23), (100, 100, 24), (50, 20, 25)]  # %, %, degC
 
 with tempfile.TemporaryDirectory() as folder:
-    recorded = []
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(BOARD, plan, noise=True, seed=k).batch)
+    recorded = board_runs(POWERS)
 
     text = BOARD.read_text()
     start, end = text.index("  links:"), text.index("  exposures:")

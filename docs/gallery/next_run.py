@@ -8,28 +8,21 @@ import tempfile
 from pathlib import Path
 
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, WARM, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages:
+STAGES = """
   - {{minutes: 1, heater1: 0}}
   - {{minutes: 8, heater1: {0}, heater2: {0}}}
   - {{minutes: 8, heater1: {1}, heater2: {1}}}
   - {{minutes: 8, heater1: 0, heater2: 0}}
-surroundings: {{room: {2} degC}}
 """
 POWERS = [(60, 30, 20), (20, 80, 21), (80, 40, 22), (30, 100, 23), (100, 50, 24), (50, 20, 25)]  # %, %, degC
 
 with tempfile.TemporaryDirectory() as folder:
     text, lacking = BOARD.read_text(), Path(folder) / "lacking.yml"
     lacking.write_text(text[: text.index("    sag1:")] + text[text.index("    sag2:") :])
-    recorded = []
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(BOARD, plan, noise=True, seed=k).batch)
+    recorded = board_runs(POWERS, stages=STAGES)
     diagnosis = td.diagnose(lacking, recorded)
 
     plan = Path(folder) / "next_run.yml"

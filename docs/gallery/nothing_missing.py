@@ -4,31 +4,13 @@ The machine file is right, and the diagnosis says so: the error of left-out runs
 library it states how large it would have had to be to be seen; here constant heats, next to 1 W of a heater.
 """
 
-import tempfile
-from pathlib import Path
-
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages:
-  - {{minutes: 7, heater1: {0}}}
-  - {{minutes: 6, heater2: {1}}}
-  - {{minutes: 6, heater1: {1}}}
-  - {{minutes: 6, heater1: 0, heater2: 0}}
-surroundings: {{room: {2} degC}}
-"""
 POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
 
-with tempfile.TemporaryDirectory() as folder:
-    recorded = []
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(BOARD, plan, noise=True, seed=k).batch)
-findings = td.diagnose(BOARD, recorded).findings
+findings = td.diagnose(BOARD, board_runs(POWERS)).findings
 
 assert findings.verdict == "consistent" and not findings.findings
 rms = findings.fit.left_out_rms

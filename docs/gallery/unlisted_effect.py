@@ -10,18 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import thermodrift as td
+from docs.gallery.board import BOARD, board_runs
 from docs.gallery.drawing import COLD, GOLD, INK, WARM, picture
 
-BOARD = Path(__file__).parents[2] / "machines" / "tclab_board.yml"
-PLAN = """
-step: 10 s
-stages:
-  - {{minutes: 7, heater1: {0}}}
-  - {{minutes: 6, heater2: {1}}}
-  - {{minutes: 6, heater1: {1}}}
-  - {{minutes: 6, heater1: 0, heater2: 0}}
-surroundings: {{room: {2} degC}}
-"""
 POWERS = [(60, 30, 20), (20, 80, 22), (80, 40, 24), (30, 100, 26)]  # %, %, degC
 
 HIDDEN = """
@@ -29,12 +20,9 @@ HIDDEN = """
 """  # noqa: E501
 
 with tempfile.TemporaryDirectory() as folder:
-    truth, recorded = Path(folder) / "truth.yml", []
+    truth = Path(folder) / "truth.yml"
     truth.write_text(BOARD.read_text().replace("  mechanisms:\n", "  mechanisms:" + HIDDEN))
-    for k, powers in enumerate(POWERS):
-        plan = Path(folder) / f"run{k}.yml"
-        plan.write_text(PLAN.format(*powers))
-        recorded.append(td.simulate(truth, plan, noise=True, seed=k).batch)
+    recorded = board_runs(POWERS, truth)
     findings = td.diagnose(BOARD, recorded).findings
 
 (found,) = findings.findings
