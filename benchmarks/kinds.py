@@ -14,14 +14,17 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from data.batch import Batch
 from data.errors import InputError, WorkError
+from data.machine import Machine
 from data.processes import Processes
 from diagnosis.contracts import Candidate, Fitted
 from diagnosis.diagnose import diagnose
@@ -35,7 +38,7 @@ from evidence.proof.scoring.matching import names_term
 from evidence.proof.scoring.true_model import TrueModel, true_model
 from evidence.proof.spec import KIND_PLANTS, Kind, PlantKind
 from evidence.proof.suite.build import answer_of
-from evidence.proof.suite.other_kinds import drawn_kind, kind_case
+from evidence.proof.suite.other_kinds import drawn_kind, executed_kind, kind_case
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
@@ -43,8 +46,8 @@ SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
 
 
-def examined(kind: PlantKind, seed: int, out: str) -> dict[str, Any]:
-    """One case, from its file where it is done already."""
+def examined(kind: PlantKind, seed: int, out: str, proposed: int = 0) -> dict[str, Any]:
+    """One case, from its file where it is done already; with so many proposed runs after the first answer."""
     path = Path(out) / f"{kind}_{seed}.json"
     if path.exists():
         return dict(json.loads(path.read_text()))
@@ -60,8 +63,10 @@ def examined(kind: PlantKind, seed: int, out: str) -> dict[str, Any]:
         with threadpool_limits(limits=1):
             part = twin_part(case.machine)
             batches, _ = usable_batches(compile_network(case.machine, part=part), case.batches)
-            row |= _answered(diagnose(case.machine, batches), key, part)
+            done = diagnose(case.machine, batches)
+            row |= _answered(done, key, part)
             row["cpu_s"] = round(time.process_time() - begun, 1)
+            row["proposed"] = list(_proposed(done, case.machine, batches, answer["redraw"], key, proposed))
             if what == "one":
                 row |= _visible(true_model(case.machine, batches, answer))
     except (InputError, WorkError) as error:
@@ -85,6 +90,28 @@ def _answered(done: Diagnosis, key: AnswerKey, part: TwinPart) -> dict[str, Any]
     ]
     rounds = [_round(r, key, bodies) for r in done.search.rounds] if done.search is not None else []
     return {"right": right, "listed": listed, "verdict": found.verdict, "rounds": rounds}
+
+
+def _proposed(
+    done: Diagnosis, machine: Machine, batches: Sequence[Batch], redraw: Mapping[str, Any], key: AnswerKey, runs: int
+) -> Iterator[dict[str, Any]]:
+    """The answers after one, two, … proposed runs, each executed on the plant, until none is proposed."""
+    batches = list(batches)
+    for k in range(1, runs + 1):
+        proposal = done.findings.next_experiment
+        if done.plan_text is None or proposal is None:
+            return
+        about = {"run": proposal.run, "separates": proposal.separates}
+        try:
+            run = executed_kind(redraw, done.plan_text.replace("name: ", f"name: proposed {k}, ", 1))
+        except InputError as error:  # a plan that this plant cannot run
+            yield about | {"trouble": str(error)}
+            return
+        if len(run.machine.channels) > len(machine.channels):  # one more sensor, which stays on the machine
+            machine = run.machine
+        batches.append(replace(run.batch, batch_id=f"proposed_{k}"))
+        done = diagnose(machine, batches)
+        yield about | _answered(done, key, twin_part(machine))
 
 
 def _visible(truth: TrueModel) -> dict[str, Any]:
@@ -128,6 +155,28 @@ def _left_out(fitted: Fitted | None) -> list[list[float]]:
     return [[float(v) for v in own["rms"]] for _, own in rms.groupby("channel")]
 
 
+def after_proposed(rows: Sequence[Mapping[str, Any]], runs: int) -> list[str]:
+    """One line for each number of proposed runs, over all kinds: effects named first, claims, false alarms."""
+    out = []
+    for k in range(runs + 1):
+        named = {"one": 0, "nothing": 0, "unlisted": 0, "right": 0, "made": 0}
+        for r in rows:
+            if "verdict" not in r:
+                continue
+            answers = [r, *(a for a in r.get("proposed", ()) if "verdict" in a)]
+            answer = answers[min(k, len(answers) - 1)]  # the last one stays where no further run is proposed
+            named["made"] += len(answers) > k
+            named[r["what"]] += bool(answer["listed"])
+            named["right"] += r["what"] == "one" and answer["right"]
+        of = {what: sum(r["what"] == what and "verdict" in r for r in rows) for what in SHARES}
+        out.append(
+            f"after {k} proposed runs ({named['made']} made): {named['right']} of {of['one']} single effects named, "
+            f"{named['one']} claim anything, {named['nothing']} of {of['nothing']} false alarms, "
+            f"{named['unlisted']} of {of['unlisted']} unlisted flagged"
+        )
+    return out
+
+
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """One line a kind, and one for all."""
     out = ["kind        n none/one/unl   named of visible   named of one   claims   false alarms   unlisted   CPU s"]
@@ -156,10 +205,12 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=12, help="of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--proposed", type=int, default=0, help="proposed runs that are executed after the answer")
     parser.add_argument("--out", type=Path, default=Path("var/kinds"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    tasks = [(kind, given.first + k, str(given.out)) for k in range(given.cases) for kind in given.kinds]
+    seeds = range(given.first, given.first + given.cases)
+    tasks = [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in given.kinds]
     rows = []
     with Processes(given.workers) as pool:
         for k, row in pool.completed(examined, tasks):
@@ -167,7 +218,7 @@ def main() -> None:
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
             first = next(iter(row.get("listed", ())), {"name": row.get("trouble", "no claim")})
             print(f"{tasks[k][0]:<10} {effect:<28} {first['name'][:60]}  {row['cpu_s']:.0f} s", flush=True)
-    print("\n".join(table(rows)))
+    print("\n".join([*table(rows), *(after_proposed(rows, given.proposed) if given.proposed else ())]))
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
 from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, settle
 from diagnosis.localisation.where_when import Located, locate
-from diagnosis.next_experiment.proposal import Proposal, settling_run
+from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run, settling_run
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
 from diagnosis.screening.screen import alone, limits
@@ -155,7 +155,7 @@ def _diagnosis(
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
-    run = settling_run(done, named)
+    run = settling_run(named)
     separates = run.label if run is not None else ""
     found = []
     for r in named:
@@ -167,6 +167,8 @@ def _diagnosis(
     rest, slow = residual_ratio(done), slow_residual_ratio(rms, final)
     listed = [f for f in found if not f.kind.is_unlisted]
     verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
+    if run is None and verdict != "explained":
+        run = revealing_run(done)
     remarks += residual_remarks(rest, slow, final.runs)
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
@@ -178,8 +180,9 @@ def _diagnosis(
         found,
         rms,
         detection_limits,
-        separates,
-        [place_label(Where(n.where.kind, n.where.name), part_after) for n in detection_limits],
+        separates=run.label if run is not None else "",
+        possible=[n for n in run.separates if n != NOTHING] if run is not None else (),
+        places=[place_label(Where(n.where.kind, n.where.name), part_after) for n in detection_limits],
     )
     everything = made.empty_tables() | {
         "rms": rms_table,

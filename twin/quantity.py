@@ -96,7 +96,8 @@ class Spec:
     """What a parameter is, wherever it stands: unit, meaning, usual value and prior, bounds, sign.
 
     `scale` says in which coordinate it is fitted: log (positive), linear (signed), logit (a share between 0 and 1).
-    `spread` is the prior's sd in that coordinate and, like `value`, the default where a machine file gives none.
+    `spread` is the prior's sd in that coordinate and, like `value`, the default where a machine file gives none. `per`
+    names the law's driver in whose own unit it counts: `unit` is then that of one unit of the driver.
     """
 
     name: str
@@ -107,6 +108,7 @@ class Spec:
     low: float = -math.inf
     high: float = math.inf
     scale: Scale = "log"
+    per: str = ""
 
 
 @dataclass(frozen=True)

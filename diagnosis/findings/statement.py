@@ -165,13 +165,14 @@ def verdict_statement(
     rms: Sequence[Rms] = (),
     limits: Sequence[DetectionLimit] = (),
     separates: str = "",
+    possible: Sequence[str] = (),
     places: Sequence[str] = (),
 ) -> str:
     """The verdict as a sentence.
 
     Args:
         limits: detection limits, the most informative first, with the `places` (`place_label`) of each.
-        separates: the run that would tell tied explanations apart.
+        separates: the run that would tell the explanations `possible` apart, or show whether they hold.
     """
     # of several effects each says by itself how sure it is, and what may be in its place
     doubts = [_doubt(f) if len(found) > 1 else "" for f in found]
@@ -184,20 +185,28 @@ def verdict_statement(
     hedge = _hedge(found[0].probability) if len(found) == 1 else ""
     fall = falls(rms)
     if verdict == "consistent":
-        return _consistent(rms, limits, places)
+        return _consistent(rms, limits, places) + _open_question(separates, possible)
     if verdict == "undecidable":
         tied = found and found[0].tied
         text = "Something is missing." if tied else "Something is missing, and these runs cannot tell what."
         text += f" {claim_phrase(found[0])}." if found else ""
+        if not tied:
+            return text + _open_question(separates, possible)
         return text + (f" {_capital(separates)} would tell." if separates else "")
     if verdict == "unlisted":
         text = "No listed mechanism explains the difference"
         return f"{text}: {said}{f'; with it {fall}' if fall else ''}."
     if verdict == "partly_explained":
         text = _capital(f"{hedge} part of the difference is {said}".strip())
-        return f"{text}{f'; with it {fall}' if fall else ''}. Something else is still missing."
+        more = f"{text}{f'; with it {fall}' if fall else ''}. Something else is still missing."
+        return more + _open_question(separates, possible)
     text = _capital(f"{hedge} the difference is {said}".strip())
     return f"{text}{f'; with it {fall}' if fall else ''}. Nothing else is missing that these runs could show."
+
+
+def _open_question(run: str, possible: Sequence[str]) -> str:
+    """What these runs support too little for a claim, and the run that would show it."""
+    return f" Too weak for a claim: {listed(possible)}. {_capital(run)} would show more." if run and possible else ""
 
 
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""The next experiment: where recordings leave alternative explanations tied, the run that would tell them apart."""
+"""The next experiment: the run that separates tied explanations, or shows an effect that these runs leave possible."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from diagnosis.findings.report_data import few, listed
 from diagnosis.next_experiment.foreseen import Foreseen, begun, foreseen
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.policy import POLICY
-from diagnosis.search.decision import Round
+from diagnosis.search.acceptance import least_gain
+from diagnosis.search.decision import Round, agreed_on
 from diagnosis.search.probability import explanations
 from diagnosis.search.refits import refit
 from diagnosis.search.search import Search
 
+NOTHING = "nothing else is missing"  # the alternative to effects that recordings leave possible
 COLUMNS = ("run", "hours", "nats", "nats_per_hour", "sensor", "nats_with_sensor", "hardest")
 
 
@@ -76,11 +78,19 @@ class _Option:
         return self.run.hours + (POLICY.sensor_cost_h if self.sensor else 0.0)
 
 
-def next_experiment(alternatives: Mapping[str, Fitted], runs: Sequence[Run] | None = None) -> Proposal:
+def next_experiment(
+    alternatives: Mapping[str, Fitted],
+    runs: Sequence[Run] | None = None,
+    lacking_nats: Mapping[str, float] | None = None,
+) -> Proposal:
     """The run for two or more alternatives by name, the likeliest first; `runs` replace the menu.
 
-    Of runs that settle it the shortest, else the one that tells most per hour. A pair that no run separates does not
-    count.
+    Of runs that settle it the shortest, else the one that brings most of what is needed per hour. A pair that no run
+    separates does not count.
+
+    Args:
+        lacking_nats: by alternative, what must be gained over the first before it is decided; default for all pairs:
+            `POLICY.settling_nats`.
 
     Raises:
         ValueError: fewer than two alternatives, or alternatives that show different channels.
@@ -96,15 +106,26 @@ def next_experiment(alternatives: Mapping[str, Fitted], runs: Sequence[Run] | No
     separable = np.max([o.pairs for o in options], axis=0) >= POLICY.telling_nats
     if not separable.any():
         return _nothing(options, separable, names)
-    settling = [o for o in options if _least(o, separable) >= POLICY.settling_nats]
+    needed = _needed_nats(names, lacking_nats or {})
+    settling = [o for o in options if _settled(o, separable, needed) >= 1.0]
     if settling:
         best = min(settling, key=lambda o: (o.cost_h, -_least(o, separable)))
     else:
-        best = max(options, key=lambda o: _least(o, separable) / o.cost_h)
+        best = max(options, key=lambda o: _settled(o, separable, needed) / o.cost_h)
     if _least(best, separable) < POLICY.telling_nats:  # no run does for all pairs: the one that does for the likeliest
         separable &= np.arange(len(separable)) == int(np.argmax(separable))
-        best = max(options, key=lambda o: _least(o, separable) / o.cost_h)
+        best = max(options, key=lambda o: _settled(o, separable, needed) / o.cost_h)
     return _proposal(best, options, separable, names, fits[0])
+
+
+def _needed_nats(names: Sequence[str], lacking_nats: Mapping[str, float]) -> Array:
+    """What each pair (P,) must be apart: what the second lacks against the first, else what settles a tie."""
+    return np.array(
+        [
+            max(lacking_nats.get(second, 0.0) if first == names[0] else 0.0, POLICY.settling_nats)
+            for first, second in combinations(names, 2)
+        ]
+    )
 
 
 def _menu(fits: Sequence[Fitted]) -> list[Run]:
@@ -130,6 +151,11 @@ def _options(seen: Foreseen, runs: Sequence[Run]) -> list[_Option]:
 
 def _least(option: _Option, separable: Array) -> float:
     return float(option.pairs[separable].min())
+
+
+def _settled(option: _Option, separable: Array, needed: Array) -> float:
+    """The least share of what the pairs need."""
+    return float((option.pairs / needed)[separable].min())
 
 
 def _proposal(
@@ -191,7 +217,7 @@ def _table(options: Sequence[_Option], separable: Array, pairs: Sequence[tuple[s
     return table.sort_values("nats", ascending=False, kind="stable", ignore_index=True)
 
 
-def settling_run(done: Search, named: Sequence[Round]) -> Proposal | None:
+def settling_run(named: Sequence[Round]) -> Proposal | None:
     """For the first finding that is in doubt; None where none is, or nothing could be simulated."""
     for r in named:
         every, _, _ = explanations(r)
@@ -204,13 +230,51 @@ def settling_run(done: Search, named: Sequence[Round]) -> Proposal | None:
             fitted = e.tried.fitted or _refitted(r, e.tried)
             if fitted is not None:
                 alternatives[e.tried.candidate.label] = fitted
-        if len(alternatives) < 2:
-            continue
-        try:
-            return next_experiment(alternatives)
-        except (InputError, WorkError, ValueError):
-            return None  # what cannot be simulated cannot be proposed
+        if len(alternatives) >= 2:
+            return _simulated(alternatives)
     return None
+
+
+def revealing_run(done: Search) -> Proposal | None:
+    """For the effects that gain most in the last round without being claimed, against none of them.
+
+    None where nothing gains, or nothing could be simulated.
+    """
+    last = done.rounds[-1]
+    if last.accepted:
+        return None
+    alternatives, lacking_nats = {NOTHING: last.before}, {}
+    for t in possible(last):
+        assert t.fitted is not None
+        alternatives[t.candidate.label] = t.fitted
+        lacking_nats[t.candidate.label] = claim_threshold(last, t) - t.gain
+    return _simulated(alternatives, lacking_nats) if len(alternatives) >= 2 else None
+
+
+def possible(last: Round) -> list[Tried]:
+    """The effects that a round leaves possible, the likeliest of each cluster, best first: they gain more than settles
+    a tie, and most batches do not speak against them."""
+    batches = len(last.before.batches)
+    out: dict[str, Tried] = {}
+    for t in last.tried:
+        physics = t.candidate.kind.is_physics and t.candidate.change is None
+        if physics and t.fitted is not None and t.gain >= POLICY.settling_nats and agreed_on(t, batches):
+            out.setdefault(t.cluster, t)
+    return sorted(out.values(), key=lambda t: -t.gain)[: POLICY.separated_alternatives]
+
+
+def claim_threshold(last: Round, t: Tried) -> float:
+    """What a candidate of a round must gain to be claimed, in nats."""
+    structure = last.null.threshold(last.density, name=t.candidate.name)
+    stated = (last.threshold if t is last.best else 0.0, structure, least_gain(t))
+    return max(nats for nats in stated if np.isfinite(nats))  # too few machines of a null give no threshold
+
+
+def _simulated(alternatives: Mapping[str, Fitted], lacking_nats: Mapping[str, float] | None = None) -> Proposal | None:
+    try:
+        return next_experiment(alternatives, lacking_nats=lacking_nats)
+    except (InputError, WorkError, ValueError):
+        return None  # what cannot be simulated cannot be proposed
 
 
 def _refitted(r: Round, t: Tried) -> Fitted | None:

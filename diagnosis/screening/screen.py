@@ -23,6 +23,7 @@ from twin.calibration.fit_problem import Block, Unknown
 from twin.calibration.least_squares import x_of
 from twin.calibration.problem import unknown
 from twin.mechanisms import MECHANISMS
+from twin.quantity import Spec
 
 
 @dataclass(frozen=True)
@@ -276,13 +277,24 @@ def limits(fitted: Fitted, seen: Screen, threshold: float) -> pd.DataFrame:
         limit = s.sd * (np.sqrt(2.0 * threshold) + POLICY.limit_power_sd)
         by = int(np.argmax(np.abs(shadow[: len(names), s.column]) * own[: len(names)]))
         unseen = limit > max(abs(spec.low), abs(spec.high)) or not np.isfinite(limit)
+        value, unit = np.nan if unseen else float(limit), _unit(fitted, c, spec)
         rows.append(
-            (c.mechanism, c.where.kind, c.where.name, c.label, np.nan if unseen else float(limit), spec.unit,
-             s.absorbed, names[by] if s.absorbed > POLICY.limit_absorbed_share else "")
+            (c.mechanism, c.where.kind, c.where.name, c.label, value, unit, s.absorbed,
+             names[by] if s.absorbed > POLICY.limit_absorbed_share else "")
         )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["limits"]))
     digits = table.assign(size=np.log(table["limit"]).round(9))  # what differs by rounding alone is of equal size
     return digits.sort_values(["mechanism", "size", "name", "words"], ignore_index=True).drop(columns="size")
+
+
+def _unit(fitted: Fitted, c: Candidate, spec: Spec) -> str:
+    """The unit of an amplitude: "W/%" where it counts per unit of a driver in per cent."""
+    drivers = c.part.drivers if c.part is not None else None
+    if not spec.per or not drivers:
+        return spec.unit
+    channel = drivers if isinstance(drivers, str) else drivers.get(spec.per)
+    unit = fitted.machine.channels[channel].unit if channel else "1"
+    return spec.unit if unit == "1" else f"{spec.unit}/{unit}"
 
 
 def _usual(s: Scored) -> tuple[float, ...]:

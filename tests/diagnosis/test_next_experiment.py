@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ import pytest
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, load_machine
-from diagnosis.contracts import Fitted
+from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
 from diagnosis.next_experiment.foreseen import AlternativeModel, begun, foreseen, with_free_offset
 from diagnosis.next_experiment.menu import Run, menu
-from diagnosis.next_experiment.proposal import COLUMNS, Proposal, next_experiment
+from diagnosis.next_experiment.proposal import COLUMNS, NOTHING, Proposal, next_experiment, revealing_run
 from diagnosis.policy import POLICY
+from diagnosis.search.decision import Round
+from diagnosis.search.search import Search
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
@@ -184,6 +187,43 @@ def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
     assert got.sensor == "saddle" and set(got.table["sensor"]) == {"saddle"}
     assert got.label.endswith(" with one more sensor at saddle") and got.nats > POLICY.settling_nats
     assert "# Put one more temperature sensor at saddle before.\n" in got.plan_text
+
+
+def test_what_a_claim_lacks_decides_how_much_a_run_must_bring() -> None:
+    alternatives, little = tied(), proposal()
+    much = next_experiment(alternatives, lacking_nats={"loss": 1e6})  # no run brings it: the most per hour
+    rate = little.table["nats_per_hour"]
+    assert much.label == little.table["run"][rate.argmax()] and much.nats_per_hour == pytest.approx(rate.max())
+    enough = next_experiment(alternatives, lacking_nats={"loss": little.table["nats"].max() - 1e-6})
+    assert enough.label == little.table["run"][0]
+    assert next_experiment(alternatives, lacking_nats={"loss": -3.0}).label == little.label
+
+
+def unclaimed(*gains: float, threshold: float = 60.0, accepted: bool = False) -> Search:
+    """A search whose last round tried the effect of a machine, by so many nats each, in clusters of their own."""
+    before, after = tied()["loss"], tied()["air"]
+    part = after.part.mechanisms["spin"]
+    tried = []
+    for k, gain in enumerate(gains):
+        c = Candidate("rotating_convection", Where("link", "shaft-room"), f"spin{k}", f"spin {k}", part)
+        scored = Scored(c, gain, 4, 0.0, {}, 1.0, -1)
+        tried.append(Tried(scored, gain, 4, f"c{k}", 0.0, after))
+    null: Any = SimpleNamespace(threshold=lambda density, name: threshold)
+    screen: Any = None
+    return Search(before, before, (Round(before, screen, tuple(tried), threshold, null, np.zeros((0, 0)), accepted),))
+
+
+def test_a_run_is_proposed_for_what_gains_too_little() -> None:
+    run = revealing_run(unclaimed(20.0))
+    assert run is not None and run.separates == (NOTHING, "spin 0") and run.plan_text
+    alone = next_experiment({NOTHING: tied()["loss"], "spin 0": tied()["air"]}, lacking_nats={"spin 0": 90.0})
+    assert run.label == alone.label and run.nats == pytest.approx(alone.nats)
+
+
+def test_no_run_is_proposed_where_nothing_gains_or_all_is_claimed() -> None:
+    assert revealing_run(unclaimed()) is None
+    assert revealing_run(unclaimed(POLICY.settling_nats - 0.1)) is None
+    assert revealing_run(unclaimed(20.0, accepted=True)) is None
 
 
 def test_rivals_that_no_run_separates() -> None:

@@ -207,6 +207,12 @@ def test_verdicts() -> None:
         "at the bed 12 W, sunlight on one face at the bed 20 W/m² and 1 more in the table of limits."
     )
     assert verdict_statement("consistent") == "Nothing is missing: the remaining error is the noise."
+    more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
+    open_question = {"separates": "a night switched off", "possible": ["heat to the floor: bed"]}
+    assert verdict_statement("consistent", **open_question).endswith(f"the noise. {more}")
+    assert verdict_statement("partly_explained", [SINK], [Z], **open_question).endswith(f"still missing. {more}")
+    assert verdict_statement("undecidable", **open_question).endswith(f"cannot tell what. {more}")
+    assert "Too weak" not in verdict_statement("consistent", separates="a night switched off")
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
         "No missing effect is supported by these runs; the remaining error, 11 times the noise in the median channel "

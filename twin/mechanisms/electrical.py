@@ -26,7 +26,7 @@ class ElectricalHeat(Mechanism):
     needs = "heater"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"level": "1"}
-    parameters = (Spec("gain", "W", "heat per unit of the driver", 1.0, 1.0, 0.0, 1e6),)
+    parameters = (Spec("gain", "W", "heat per unit of the driver", 1.0, 1.0, 0.0, 1e6, per="level"),)
     off: ClassVar[Mapping[str, float]] = {"gain": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
