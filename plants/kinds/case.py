@@ -49,6 +49,7 @@ KINDS = Registry(
 )
 IDLE = ("chip_conveyor", "mist_extraction", "light", "door", "lubrication")
 NEARLY_ALWAYS = 0.95
+NAMED_SEEDS = 10**12  # a machine's name ends with its seed modulo this: seeds of sealed suites have 256 bits
 
 
 def effects_of(kind: str) -> tuple[str, ...]:
@@ -133,7 +134,7 @@ def posed(
     sizes = fitted_sizes(plant, planned, chosen, list(wanted.values()))
     joints = ["-".join(pair) for pair in links_W_per_K(full)] if decoys else []
     misread = {lot.pick(joints): float(np.exp(1.2 * lot.sign() * full.setting.file_error))} if joints else {}
-    machine = machine_file(plant, full, f"{kind}_{seed:04d}", seed, idle, misread)
+    machine = machine_file(plant, full, f"{kind}_{seed % NAMED_SEEDS:04d}", seed, idle, misread)
     return KindPosed(seed, kind, full, plant, chosen, sizes, small, idle_runs, machine, recorder, tuple(misread))
 
 

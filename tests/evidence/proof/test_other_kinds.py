@@ -86,6 +86,11 @@ def test_nothing_on_disk_names_the_effect_or_holds_the_seed(tmp_path: Path) -> N
     assert built.machine.machine == built.answer["options"]["name"] == built.answer["machine"]
 
 
+def test_a_sealed_suite_has_seeds_of_256_bits() -> None:
+    built = build(kind_case("case_0001", "nothing", "board", 2**256 - 1, "sealed"))
+    assert str(2**256 - 1) not in "".join(built.recordings) and len(built.machine.machine) < 20
+
+
 def test_the_key_has_the_sigma_and_draws_the_case_again() -> None:
     built = board()
     (one,) = built.answer["terms"]
