@@ -21,7 +21,7 @@ from evidence.proof.scoring.matching import means
 from evidence.proof.scoring.outcomes import outcomes
 from evidence.proof.spec import DEVELOPED_ON, KIND_PLANTS, KINDS, UNSEEN, CaseSpec, is_unseen
 from evidence.proof.suite import Built, build, suite, write_built
-from evidence.proof.suite.other_kinds import AMBIGUOUS, FAULTS, INVISIBLE_SIGMA, SIGMA, kind_effects, sigma
+from evidence.proof.suite.other_kinds import AMBIGUOUS, FAULTS, INVISIBLE_SIGMA, SIGMA, kind_case, kind_effects, sigma
 from evidence.proof.suite.suite import case, possible
 from plants.kinds import effects_of, unlisted_of
 from plants.plant import machine_text
