@@ -4,15 +4,12 @@ Simulated recordings of the sample machine; put your own machine file and folder
 """
 
 import tempfile
-from pathlib import Path
 
 import thermodrift as td
-from plants.sample.sample_year import write_sample_year
 
-machine = td.load_machine(Path(__file__).parent.parent / "machines" / "sample_vmc.yml")
 with tempfile.TemporaryDirectory() as folder:
-    write_sample_year(Path(folder), seed=0)
-    *train, left_out = td.read(folder, machine)
+    machine, recordings = td.sample_year(folder, seed=0)
+    *train, left_out = td.read(recordings, machine)
 
 points = td.SELECTORS["fuzzy_correlation"]().select(train, "z", n_tsp=4)
 model = td.FAMILIES["ridge"]().fit(train, points, "z")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -88,8 +90,12 @@ class Comparison:
         return {**asdict(self), "words": self.words}
 
 
-def score_um(cells: pd.DataFrame, rule: PromotionRule) -> pd.Series:
-    """The rule's score of every row under its own protocol, µm, smaller is better."""
+def score_um(cells: Any, rule: PromotionRule) -> Any:
+    """The rule's score of every row under its own protocol, µm, smaller is better.
+
+    Args:
+        cells: a table, or the arrays of its columns S_mean_um, S_std_um and max_abs_um by name.
+    """
     if rule.score == "max_abs":
         return cells["max_abs_um"].astype(float)
     spread = cells["S_std_um"] if rule.score == "S_mean + S_std" else 0.0
@@ -130,6 +136,17 @@ def judged(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
         out["score_um"] = cell.sum().to_numpy() / sum(rule.protocols[p] for p in offered)
     out["tsp_stability"] = table.groupby(KEYS, sort=False)["tsp_stability"].min().to_numpy()
     return out.reset_index(drop=True)
+
+
+def ranked(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
+    """The best cell of every family, the smallest combined score first; columns as `judged`.
+
+    Raises:
+        InputError: as `judged`.
+    """
+    table = judged(cells, rule)
+    order = table.sort_values(["score_um", "rank", "n_tsp"], kind="stable")
+    return order.drop_duplicates("family").reset_index(drop=True)
 
 
 def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
@@ -257,33 +274,84 @@ def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
     scores = result.scores[result.scores["protocol"].isin(offered)]
     if scores.empty or (scores["batch_id"] == "*").any() or scores["batch_id"].nunique() < 3:
         return pd.DataFrame(columns=columns)
-    parts = {p: _pivoted(result, p) for p in offered}
+    left = _Left.of(result, offered)
     rows = []
     for batch_id in scores["batch_id"].unique():
-        seen = []
-        for cells, S_um, max_abs_um in parts.values():
-            others = S_um.drop(columns=batch_id, errors="ignore")
-            if others.shape[1] > 1:
-                worst = max_abs_um.drop(columns=batch_id, errors="ignore").max(axis=1)
-                seen.append(cells.assign(
-                    S_mean_um=others.mean(axis=1).to_numpy(), S_std_um=others.std(axis=1).to_numpy(),
-                    max_abs_um=worst.to_numpy(),
-                ))  # fmt: skip
-        choice = _choose(judged(pd.concat(seen), rule), rule)
-        for p, (_, S_um, _) in parts.items():
-            if batch_id in S_um:
-                own = S_um.loc[(choice.selector, choice.family, choice.n_tsp), batch_id] * rule.protocols[p]
-                rows.append((batch_id, p, choice.cell, own))
+        table = left.judged_without(batch_id, rule)
+        choice = _choose(table, rule)
+        for p, S_um in left.scores_of(choice, batch_id).items():
+            rows.append((batch_id, p, choice.cell, S_um * rule.protocols[p]))
     return pd.DataFrame(rows, columns=columns)
 
 
-def _pivoted(result: GridResult, protocol: str) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """The cells of a protocol, and in their order S and max |e| by batch (C, K)."""
-    cells = result.cells[result.cells["protocol"] == protocol].reset_index(drop=True)
-    scores = result.scores[result.scores["protocol"] == protocol]
-    S_um, max_abs_um = (scores.pivot(index=KEYS, columns="batch_id", values=v) for v in ("S_um", "max_abs_um"))
-    order = pd.MultiIndex.from_frame(cells[KEYS])
-    return cells, S_um.loc[order], max_abs_um.loc[order]
+@dataclass(frozen=True)
+class _Left:
+    """The C cells that all of the protocols have, with the left-out scores by batch.
+
+    `table` has P C rows, protocol after protocol; `S_um`, `max_abs_um` (C, K) and `batch_ids` (K,) by protocol.
+    """
+
+    protocols: tuple[str, ...]
+    table: pd.DataFrame
+    cells: pd.MultiIndex
+    batch_ids: dict[str, list[str]]
+    S_um: dict[str, NDArray[np.float64]]
+    max_abs_um: dict[str, NDArray[np.float64]]
+
+    @classmethod
+    def of(cls, result: GridResult, protocols: Sequence[str]) -> Self:
+        own = {p: result.cells[result.cells["protocol"] == p] for p in protocols}
+        every = [pd.MultiIndex.from_frame(table[KEYS]) for table in own.values()]
+        common = every[0]
+        for index in every[1:]:
+            common = common[common.isin(index)]
+        table = pd.concat([t.iloc[i.get_indexer(common)] for t, i in zip(own.values(), every, strict=True)])
+        texts = {c: object for c in table if not pd.api.types.is_numeric_dtype(table[c])}  # quicker to take from
+        ids, S_um, max_abs_um = {}, {}, {}
+        for p in protocols:
+            scores = result.scores[result.scores["protocol"] == p]
+            wide = scores.pivot(index=KEYS, columns="batch_id", values=["S_um", "max_abs_um"]).loc[common]
+            S_um[p], max_abs_um[p] = (wide[name].to_numpy(float) for name in ("S_um", "max_abs_um"))
+            ids[p] = [str(k) for k in wide["S_um"].columns]
+        return cls(tuple(protocols), table.astype(texts).reset_index(drop=True), common, ids, S_um, max_abs_um)
+
+    def judged_without(self, batch_id: str, rule: PromotionRule) -> pd.DataFrame:
+        """`judged` as the other batches show it.
+
+        Raises:
+            InputError: no cell has a finite score.
+        """
+        others = {p: np.array([k != batch_id for k in self.batch_ids[p]]) for p in self.protocols}
+        run = [p for p in self.protocols if others[p].sum() > 1]
+        n, found = len(self.cells), []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a cell without any score has NaN, as intended
+            for p in run:
+                S_um = self.S_um[p][:, others[p]]
+                worst = np.nanmax(self.max_abs_um[p][:, others[p]], axis=1)
+                found.append({
+                    "S_mean_um": np.nanmean(S_um, axis=1), "S_std_um": np.nanstd(S_um, axis=1, ddof=1),
+                    "max_abs_um": worst,
+                })  # fmt: skip
+            at = np.array([self.protocols.index(p) for p in run])
+            score = np.stack([score_um(f, rule) * rule.protocols[p] for p, f in zip(run, found, strict=True)])
+            stability = np.nanmin(self.table["tsp_stability"].to_numpy(float).reshape(-1, n)[at], axis=0)
+        kept = np.flatnonzero(np.isfinite(score).all(axis=0))
+        if not len(kept):
+            raise InputError(f"promotion rule: no cell of {', '.join(run)} has a finite {rule.score}")
+        decides = score[:, kept].argmax(axis=0)
+        own = {name: np.stack([f[name] for f in found])[decides, kept] for name in found[0]}
+        combined = score[decides, kept]
+        if rule.combine == "mean":
+            combined = score[:, kept].sum(axis=0) / sum(rule.protocols[p] for p in run)
+        table = self.table.take(at[decides] * n + kept).reset_index(drop=True)
+        return table.assign(**own, score_um=combined, tsp_stability=stability[kept])
+
+    def scores_of(self, choice: Choice, batch_id: str) -> dict[str, float]:
+        """The left-out S in µm of a batch by a cell, by protocol."""
+        cell = self.cells.get_loc((choice.selector, choice.family, choice.n_tsp))
+        ids = {p: self.batch_ids[p] for p in self.protocols if batch_id in self.batch_ids[p]}
+        return {p: float(self.S_um[p][cell, own.index(batch_id)]) for p, own in ids.items()}
 
 
 def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) -> Comparison:

@@ -6,14 +6,13 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, Literal
 
 import mlflow
-import numpy as np
 import pandas as pd
 import yaml
 from filelock import FileLock
@@ -25,11 +24,8 @@ from mlflow.protos.databricks_pb2 import RESOURCE_DOES_NOT_EXIST, ErrorCode
 from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
 
-from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, closest
-from data.machine import parse_machine
-from features.design import Design
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.conformal import RunBound
@@ -37,9 +33,8 @@ from models.metrics import residual_std_um
 from models.outlook import Outlook, outlook
 from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
-from models.trust import Region, fit_siblings
-from models.updating import Updater, out_of_fold
-from pipelines import audit, model_store, pyfunc_model, store
+from models.trust import Region
+from pipelines import audit, fitted_model, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION
 from pipelines.runs import close_interrupted, code_version, model_versions, models_with_versions, registered_models
 from pipelines.settings import Settings
@@ -456,14 +451,10 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
     choice, result, info = new.choice, new.result, _info(new)
     tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | tags
     bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)
-    siblings = fit_siblings(new.family, new.batches)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        info = info | {"step_s": _step_s(new.batches), "trained": _trained(new), "largest_um": _largest_um(new)}
-        updater, substitutes = _at_the_machine(new)
-        model_store.save(folder, new.family, new.machine_yaml, new.region, info, bound, siblings, updater, substitutes)
-        stored = model_store.load(folder)
-        served = write_served(stored, folder, info["step_s"])
+        stored = fitted_model.write(folder, new.family, new.machine_yaml, new.batches, new.region, info, bound)
+        served = write_served(stored, folder, stored.info["step_s"])
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]
         signature = ModelSignature(
@@ -514,47 +505,6 @@ def _begin_model(client: MlflowClient, training_id: str, choice: Choice) -> str:
     metrics = [Metric(k, v, at_ms, 0, model_id=model.model_id) for k, v in run.data.metrics.items()]
     client.log_batch(training_id, metrics=metrics)
     return str(model.model_id)
-
-
-def _step_s(batches: Sequence[Batch]) -> float:
-    """Time between the rows that the model was trained on; 0 where there are none."""
-    return max((b.step_s for b in batches if b.n_rows > 1), default=0.0)
-
-
-def _trained(new: Newcomer) -> dict[str, list[float]]:
-    """Least and greatest value of every raw channel of the inputs in the training."""
-    found = {}
-    for channel in dict.fromkeys(i.partition("@")[0] for i in new.family.inputs):
-        values = np.concatenate([np.empty(0), *(b.masked(channel) for b in new.batches if channel in b.table)])
-        if np.isfinite(values).any():
-            found[channel] = [float(np.nanmin(values)), float(np.nanmax(values))]
-    return found
-
-
-def _largest_um(new: Newcomer) -> float:
-    """Largest error in the training, relative to each batch's start, µm; 0 without batches."""
-    errors = [np.abs(zeroed_error_um(b, new.family.target)) for b in new.batches]
-    return float(max((np.nanmax(e) for e in errors if np.isfinite(e).any()), default=0.0))
-
-
-def _at_the_machine(new: Newcomer) -> tuple[Updater | None, Substitutes | None]:
-    """The filter of readings and the substitutes of sensors.
-
-    None where the batches are too few for them, or where the family does not run at a machine: some of those take
-    minutes to be fitted again.
-    """
-    updater, substitutes, family = None, None, new.family
-    if not new.batches or not family.has_program():
-        return None, None
-    batches = sorted(new.batches, key=lambda b: (b.start is None, b.start, b.batch_id))
-    with suppress(InputError):
-        machine = parse_machine(new.machine_yaml, "machine.yml")
-        design = Design.build(batches, family.inputs, family.target, machine)
-        updater = Updater.learn(out_of_fold(design, family.key, range(len(batches))))
-    with suppress(InputError):
-        channels = list(dict.fromkeys(i.partition("@")[0] for i in family.inputs))
-        substitutes = Substitutes.learn(batches, channels)
-    return updater, substitutes
 
 
 def _example(stored: model_store.StoredModel, channels: Sequence[str]) -> pd.DataFrame:

@@ -63,7 +63,7 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
             not serve.
     """
     machine = load_machine(request.machine_file)
-    targets = _targets(request.targets, machine)
+    targets = error_channels(request.targets, machine)
     missing = [str(p) for p in request.recordings if not p.exists()]
     if missing:
         raise InputError(f"recordings {', '.join(missing)}: no such file or folder; give existing ones")
@@ -80,7 +80,12 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
     return machine, targets
 
 
-def _targets(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
+def error_channels(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
+    """The error channels that are wanted, or all.
+
+    Raises:
+        InputError: a machine without one, or an unknown channel.
+    """
     allowed = machine.names("error")
     if not allowed:
         raise InputError(

@@ -19,7 +19,6 @@ EXAMPLES = sorted(DOCS.glob("[0-9]*.py"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SESSIONS = sorted((DOCS / "how-to").glob("*.md"))
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
-BY_HAND = DOCS / "how-to" / "by_hand.md"  # the numbered examples, which run as files
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +56,7 @@ def test_there_are_examples() -> None:
     assert [p.stem for p in EXAMPLES] == ["01_by_hand", "02_add_a_family"]
 
 
-@pytest.mark.parametrize("page", [p for p in SESSIONS if p != BY_HAND], ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", SESSIONS, ids=lambda p: p.stem)
 def test_a_how_to_runs_as_written(page, call, monkeypatch) -> None:
     assert Session(page, call, monkeypatch).run()
 

@@ -21,15 +21,19 @@ if TYPE_CHECKING:
     from models.crossing import Plan
     from thermodrift.api import (
         calibrate,
+        cross,
         diagnose,
         export,
         ingest,
+        leaderboard,
         load_model,
         predict,
         read,
         registry,
         rehearse,
         replay,
+        sample_year,
+        save_model,
         simulate,
         train,
     )
@@ -39,9 +43,9 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "diagnose",
-    "export", "ingest", "load_machine", "load_model", "predict", "read", "registry", "rehearse", "replay", "simulate",
-    "testing", "train",
+    "FAMILIES", "MECHANISMS", "SELECTORS", "CalibrationOptions", "Lake", "Plan", "__version__", "calibrate", "cross",
+    "diagnose", "export", "ingest", "leaderboard", "load_machine", "load_model", "predict", "read", "registry",
+    "rehearse", "replay", "sample_year", "save_model", "simulate", "testing", "train",
 ]  # fmt: skip
 _MODULES = {
     "CalibrationOptions": "twin.calibration", "FAMILIES": "models", "Lake": "data.lake",

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, closest
 from data.machine import Machine, load_machine
 
 if TYPE_CHECKING:
@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from data.ingest import IngestReport
     from data.lake import Lake
     from diagnosis.result import Diagnosis
+    from models.base import Family
     from models.crossing import Plan
     from models.replay import Replay
+    from models.result import GridResult
     from pipelines.commands.simulate import Simulated
     from pipelines.model_store import StoredModel
     from pipelines.training import TrainOutcome
@@ -37,6 +39,17 @@ if TYPE_CHECKING:
 AnyMachine = Machine | Path | str
 Paths = Path | str | Sequence[Path | str]
 _log = logging.getLogger("thermodrift").info
+
+
+def sample_year(folder: Path | str, seed: int = 0) -> tuple[Path, list[Path]]:
+    """Write the built-in sample year: SIMULATED recordings of 30 runs, and the machine file.
+
+    Returns:
+        The machine file and the recordings, all in `folder`.
+    """
+    from pipelines.commands.simulate import write_sample
+
+    return write_sample(Path(folder), seed)
 
 
 def read(recordings: Paths, machine: AnyMachine, *, need_error: bool = True) -> list[Batch]:
@@ -107,6 +120,84 @@ def train(
         workers=processes,
     )  # fmt: skip
     return training.train(request, settings.load(), DirectCaller(), _log)
+
+
+def cross(
+    batches: Sequence[Batch],
+    machine: AnyMachine,
+    *,
+    channels: Sequence[str] = (),
+    plan: Plan | None = None,
+    processes: int = 1,
+) -> dict[str, GridResult]:
+    """Every selector with every model family, judged on runs left out; nothing is stored or tracked.
+
+    Args:
+        batches: what `read` gives.
+        channels: error channels to learn; default: all.
+        plan: selectors, families, protocols and effort; default: ``Plan()``.
+
+    Returns:
+        By channel the tables of the crossing; `leaderboard` ranks its cells, its `predictions` are the curves left out.
+
+    Raises:
+        InputError: an unknown channel, selector or family, or too few batches.
+    """
+    from models.crossing import Plan
+    from models.grid import run_grid
+    from pipelines.training import error_channels
+
+    known = _machine(machine)
+    done = run_grid(
+        batches, error_channels(channels, known), plan or Plan(), known, workers=processes, progress=_progress
+    )
+    return {channel: result for channel, (_, result) in done.items()}
+
+
+def leaderboard(result: GridResult, protocol: str = "") -> pd.DataFrame:
+    """The best cell of every family, the smallest score S_mean + S_std first.
+
+    Args:
+        result: one channel of `cross` or of ``train(…).results``.
+        protocol: how the cells are judged; default: by the worst of forward, leave-season-out and leave-batch-out.
+
+    Returns:
+        family, selector, n_tsp, score_um, S_mean_um, S_std_um, max_abs_um (µm), inputs ("|"-joined), and the protocol
+        that decides.
+
+    Raises:
+        InputError: a protocol that is unknown or was not run.
+    """
+    from models.promotion import ranked
+    from models.protocols import PROTOCOLS, PromotionRule
+
+    if protocol and protocol not in PROTOCOLS:
+        raise InputError(f"unknown protocol {protocol!r}: {closest(protocol, PROTOCOLS)}")
+    rule = PromotionRule()
+    table = ranked(result.cells, rule.only(protocol) if protocol else rule)
+    return table[
+        ["family", "selector", "n_tsp", "score_um", "S_mean_um", "S_std_um", "max_abs_um", "inputs", "protocol"]
+    ]
+
+
+def save_model(model: Family, batches: Sequence[Batch], machine_file: Path | str, folder: Path | str) -> StoredModel:
+    """Store a fitted family as a model folder, which `load_model`, `predict`, `rehearse` and `export` take.
+
+    Args:
+        model: fitted, for example ``td.FAMILIES["ridge"]().fit(batches, inputs, "z")``.
+        batches: those it was fitted on; they give the region, beyond which a prediction is flagged.
+        folder: new or empty.
+
+    Raises:
+        InputError: a machine file that cannot be used, or a folder that holds something.
+    """
+    from pipelines import fitted_model
+
+    into = Path(folder)
+    if into.exists() and (not into.is_dir() or any(into.iterdir())):
+        raise InputError(f"folder {into}: is not empty; give a new one")
+    load_machine(machine_file)
+    return fitted_model.write(into, model, Path(machine_file).read_text(encoding="utf-8"), batches)
 
 
 def load_model(uri: Path | str) -> StoredModel:

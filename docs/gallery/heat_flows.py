@@ -11,7 +11,6 @@ import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GOLD, GREEN, INK, picture
-from twin.views.heat_flows import heat_flows
 
 MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 PLAN = """
@@ -25,7 +24,7 @@ with tempfile.TemporaryDirectory() as folder:
     plan = Path(folder) / "day.yml"
     plan.write_text(PLAN)
     done = td.simulate(MACHINE, plan)
-flows = heat_flows(done.simulation, done.inputs)
+flows = done.heat_flows()
 totals = flows.totals().set_index(["kind", "name"])["energy_kJ"]
 heat_kJ, stored_kJ, lost_kJ = (totals[kind].sum() for kind in ("heat", "storage", "loss"))
 room_kJ = totals["loss", "room"]

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from twin.run_plan import RunPlan
     from twin.simulation import Simulation
     from twin.simulation.inputs import Inputs
+    from twin.views.heat_flows import HeatFlows
 
 STEP_TOLERANCE_K = 0.01  # of the time integration
 OVERVIEW, TWIN = "overview.png", "twin.html"
@@ -68,6 +69,12 @@ class Simulated:
     simulation: Simulation
     batch: Batch
     report: Path | None = None
+
+    def heat_flows(self) -> HeatFlows:
+        """Where the heat comes from, is stored and goes: watts by law, body, surrounding and link over time."""
+        from twin.views.heat_flows import heat_flows
+
+        return heat_flows(self.simulation, self.inputs)
 
 
 @dataclass(frozen=True)
@@ -361,20 +368,21 @@ def _heats(table: pd.DataFrame) -> Table:
     return shown
 
 
-def _write_sample_year(folder: Path, seed: int) -> None:
-    """The recordings of the sample machine and its machine file; a file of that name is kept, it may be edited."""
+def write_sample(folder: Path, seed: int, say: Say = lambda text: None) -> tuple[Path, list[Path]]:
+    """The machine file and the recordings of the sample machine; a machine file there is kept, it may be edited."""
     from data.files import write_atomic
     from plants.sample.sample_machine import FILE
     from plants.sample.sample_year import write_sample_year
 
     files = write_sample_year(folder, seed=seed)
-    console.line(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
+    say(f"{folder}: {len(files)} simulated recordings of the sample machine, seed {seed}")
     own = folder / FILE.name
     if own.exists():
-        console.line(f"{own}: kept as it is")
+        say(f"{own}: kept as it is")
     else:
         write_atomic(own, FILE.read_bytes())
-        console.line(f"{own}: its machine file")
+        say(f"{own}: its machine file")
+    return own, files
 
 
 def simulate(
@@ -393,7 +401,7 @@ def simulate(
     if sample_year:
         if plans or machine is not None:
             raise InputError("simulate: --sample-year has its own machine and plans; leave out --machine and PLANS")
-        _write_sample_year(to or Path("sample_year"), seed)
+        write_sample(to or Path("sample_year"), seed, console.line)
         return
     if not plans and machine is None:
         raise InputError(

@@ -62,6 +62,52 @@ def test_recordings_become_a_promoted_model_and_a_prediction(folder: Path) -> No
     assert td.Lake(folder / "var" / "lake").batch_ids("small") == [f.stem for f in files]
 
 
+def test_a_crossing_stores_nothing_and_is_ranked(folder: Path) -> None:
+    machine, _ = write_machine(folder / "small.yml", "small"), write_year(folder / "in")
+    batches = td.read("in", machine)
+    before = sorted(folder.rglob("*"))
+    plan = td.Plan(("none", "correlation"), ("zero", "ridge"), ("leave-batch-out",), (2,))
+    crossed = td.cross(batches, machine, channels=["z"], plan=plan)
+    assert list(crossed) == ["z"] and sorted(folder.rglob("*")) == before
+    board = td.leaderboard(crossed["z"])
+    assert list(board["family"]) == ["ridge", "zero"] and board["score_um"].is_monotonic_increasing
+    cells = crossed["z"].cells
+    best = (cells["S_mean_um"] + cells["S_std_um"])[cells["family"] == "ridge"].min()
+    assert board["score_um"][0] == pytest.approx(best) and set(board["protocol"]) == {"leave-batch-out"}
+    pd.testing.assert_frame_equal(td.leaderboard(crossed["z"], "leave-batch-out"), board)
+    with pytest.raises(InputError, match="unknown protocol 'forwards': did you mean 'forward'"):
+        td.leaderboard(crossed["z"], "forwards")
+    with pytest.raises(InputError, match="expected one of its protocols forward;"):
+        td.leaderboard(crossed["z"], "forward")
+    with pytest.raises(InputError, match="no error channel 'w'"):
+        td.cross(batches, machine, channels=["w"], plan=plan)
+
+
+def test_a_fitted_family_becomes_a_model_folder(folder: Path) -> None:
+    machine, files = write_machine(folder / "small.yml", "small"), write_year(folder / "in")
+    batches = td.read("in", machine)
+    points = td.SELECTORS["correlation"]().select(batches[:-1], "z", n_tsp=2)
+    ridge = td.FAMILIES["ridge"]().fit(batches[:-1], points, "z")
+    stored = td.save_model(ridge, batches[:-1], machine, folder / "by_hand")
+    predicted = td.predict(folder / "by_hand", files[-1])
+    np.testing.assert_allclose(predicted["predicted_um"], ridge.predict(batches[-1]), rtol=1e-6, atol=1e-6)
+    assert stored.family.key == "ridge" and predicted["expected_S_um"].isna().all()
+    assert td.rehearse(folder / "by_hand", [files[-1]]).band_um("z")
+    assert td.export(folder / "by_hand", "json", out=folder / "exported")
+    with pytest.raises(InputError, match="by_hand: is not empty; give a new one"):
+        td.save_model(ridge, batches, machine, folder / "by_hand")
+
+
+def test_the_sample_year_is_written_with_its_machine_file(tmp_path: Path) -> None:
+    machine, files = td.sample_year(tmp_path / "year", seed=3)
+    assert len(files) == 30 and machine.parent == files[0].parent == tmp_path / "year"
+    (first, *_) = td.read(files[:1], machine)
+    assert first.simulated
+    machine.write_text(machine.read_text() + "# edited\n")
+    td.sample_year(tmp_path / "year", seed=3)
+    assert machine.read_text().endswith("# edited\n")
+
+
 @pytest.mark.slow
 def test_recordings_become_a_diagnosis(two: Path) -> None:
     batches = td.read("runs", two)

@@ -1,0 +1,98 @@
+"""A fitted family as a folder that serves it: with the region of its training, and what it needs at a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compensation.substitutes import Substitutes
+from data.batch import Batch
+from data.errors import InputError
+from data.machine import parse_machine
+from features.design import Design
+from features.rises import zeroed_error_um
+from models.base import Family
+from models.conformal import RunBound
+from models.trust import Region, fit_siblings
+from models.updating import Updater, out_of_fold
+from pipelines import model_store
+
+
+def write(
+    folder: Path,
+    family: Family,
+    machine_yaml: str,
+    batches: Sequence[Batch],
+    region: Region | None = None,
+    info: Mapping[str, Any] | None = None,
+    bound: RunBound | None = None,
+) -> model_store.StoredModel:
+    """Write the model folder of a family that was fitted on these batches, and read it back.
+
+    Args:
+        machine_yaml: text of the machine file; it is stored with the model.
+        region: where the model was trained; default: from the batches.
+        info: what else is kept with the model, plain data.
+        bound: the bound of a run's error; without it predictions state none.
+
+    Raises:
+        InputError: a family that is not fitted, or a machine file that cannot be used.
+    """
+    known = {
+        "step_s": step_s(batches),
+        "trained": _trained(family, batches),
+        "largest_um": _largest_um(family, batches),
+    }
+    updater, substitutes = _at_the_machine(family, machine_yaml, batches)
+    model_store.save(
+        folder, family, machine_yaml, region or Region.of(batches, family.inputs), dict(info or {}) | known, bound,
+        fit_siblings(family, batches), updater, substitutes,
+    )  # fmt: skip
+    return model_store.load(folder)
+
+
+def step_s(batches: Sequence[Batch]) -> float:
+    """Time between the rows that the model was trained on; 0 where there are none."""
+    return max((b.step_s for b in batches if b.n_rows > 1), default=0.0)
+
+
+def _trained(family: Family, batches: Sequence[Batch]) -> dict[str, list[float]]:
+    """Least and greatest value of every raw channel of the inputs in the training."""
+    found = {}
+    for channel in dict.fromkeys(i.partition("@")[0] for i in family.inputs):
+        values = np.concatenate([np.empty(0), *(b.masked(channel) for b in batches if channel in b.table)])
+        if np.isfinite(values).any():
+            found[channel] = [float(np.nanmin(values)), float(np.nanmax(values))]
+    return found
+
+
+def _largest_um(family: Family, batches: Sequence[Batch]) -> float:
+    """Largest error in the training, relative to each batch's start, µm; 0 without batches."""
+    errors = [np.abs(zeroed_error_um(b, family.target)) for b in batches]
+    return float(max((np.nanmax(e) for e in errors if np.isfinite(e).any()), default=0.0))
+
+
+def _at_the_machine(
+    family: Family, machine_yaml: str, batches: Sequence[Batch]
+) -> tuple[Updater | None, Substitutes | None]:
+    """The filter of readings and the substitutes of sensors.
+
+    None where the batches are too few for them, or where the family does not run at a machine: some of those take
+    minutes to be fitted again.
+    """
+    updater, substitutes = None, None
+    if not batches or not family.has_program():
+        return None, None
+    ordered = sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
+    with suppress(InputError):
+        machine = parse_machine(machine_yaml, "machine.yml")
+        design = Design.build(ordered, family.inputs, family.target, machine)
+        updater = Updater.learn(out_of_fold(design, family.key, range(len(ordered))))
+    with suppress(InputError):
+        channels = list(dict.fromkeys(i.partition("@")[0] for i in family.inputs))
+        substitutes = Substitutes.learn(ordered, channels)
+    return updater, substitutes
