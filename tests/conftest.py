@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -56,3 +57,21 @@ def quick_looks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(data.ingest, "LOOK_AGAIN_S", 0.0)
         yield
+
+
+ON_PREFECTS_SERVER = tuple(f"tests/pipelines/test_{n}.py" for n in ("flows", "diagnosis_flow", "retraining"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """With --dist loadfile the files on Prefect's server share a process, since a server takes half a minute."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class OneServer(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "on Prefect's server" if file in ON_PREFECTS_SERVER else file
+
+    return OneServer(config, log)

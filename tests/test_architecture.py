@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -61,13 +62,16 @@ def _imported(path: Path) -> Iterator[str]:
                 yield full if full in MODULES else str(node.module)
 
 
-GRAPH = {name: set(_imported(path)) - {name} for name, path in MODULES.items()}
+@cache
+def graph() -> Mapping[str, set[str]]:
+    """What each module imports; reading them all takes seconds."""
+    return {name: set(_imported(path)) - {name} for name, path in MODULES.items()}
 
 
 def test_a_file_imports_only_what_its_room_may() -> None:
     wrong = [
         (name, other)
-        for name, others in GRAPH.items()
+        for name, others in graph().items()
         for other in others
         if (top := other.split(".")[0]) in ALLOWED and top != (room := name.split(".")[0]) and top not in ALLOWED[room]
     ]
@@ -77,7 +81,7 @@ def test_a_file_imports_only_what_its_room_may() -> None:
 def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
     wrong = [
         (name, other)
-        for name, others in GRAPH.items()
+        for name, others in graph().items()
         for other in others
         if other.split(".")[0] in ORCHESTRATION and not name.startswith("pipelines")
     ]
@@ -86,7 +90,7 @@ def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
 
 def test_no_cycle() -> None:
     """Repeatedly take away what imports nothing that is left; a cycle cannot be taken away."""
-    left = {name: {o for o in others if o in MODULES} for name, others in GRAPH.items()}
+    left = {name: {o for o in others if o in MODULES} for name, others in graph().items()}
     while free := {name for name, others in left.items() if not others & left.keys()}:
         left = {name: others for name, others in left.items() if name not in free}
     assert not left, f"import cycles among {sorted(left)}"
@@ -95,7 +99,7 @@ def test_no_cycle() -> None:
 @pytest.mark.parametrize("module", sorted(m for m in MODULES if m.split(".")[0] == "plants"))
 def test_a_plant_names_nothing_of_the_twin(module: str) -> None:
     """A plant that shared code with what is examined on it would prove nothing; registries name modules in strings."""
-    foreign = {o.split(".")[0] for o in GRAPH[module]} - PLANTS_MAY_USE - set(sys.stdlib_module_names)
+    foreign = {o.split(".")[0] for o in graph()[module]} - PLANTS_MAY_USE - set(sys.stdlib_module_names)
     assert not foreign
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)}

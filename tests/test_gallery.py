@@ -78,7 +78,7 @@ def test_a_script_that_fails_is_reported(monkeypatch, tmp_path, capsys) -> None:
     assert "FAILED" in said.out and "not so" in said.err and "failed: bad" in said.err
 
 
-@pytest.mark.parametrize("name", QUICKEST)
+@pytest.mark.parametrize("name", [QUICKEST[0], *(pytest.param(n, marks=pytest.mark.slow) for n in QUICKEST[1:])])
 def test_the_quickest_scripts_run(name: str) -> None:
     _runs_and_draws(name)
 

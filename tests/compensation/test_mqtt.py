@@ -17,7 +17,7 @@ import pytest
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
-from compensation.connectors import open_sink, open_source
+from compensation.connectors import mqtt, open_sink, open_source
 from compensation.contracts import Correction, Sample, Source
 from data.errors import InputError, WorkError
 from data.machine import Machine, parse_machine
@@ -319,8 +319,9 @@ def test_a_frozen_broker_holds_a_write_up_for_a_bounded_time(broker: Broker, mac
 
 
 def test_no_broker_is_a_work_error_and_silence(
-    broker: Broker, machine: Machine, capsys: pytest.CaptureFixture[str]
+    broker: Broker, machine: Machine, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(mqtt, "_FIRST_CONNECTION_S", 0.3)
     broker.stop()
     source, sink = open_source(broker.address, machine), open_sink(broker.address, machine)
     with pytest.raises(WorkError, match=r"cannot be reached .*dropped; check the broker"):

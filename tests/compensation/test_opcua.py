@@ -223,6 +223,7 @@ def test_a_node_that_takes_no_offset_is_named(control: Control, machine: Machine
     sink.close()
 
 
+@pytest.mark.slow
 def test_source_and_sink_recover_from_a_restart_of_the_server(
     control: Control, machine: Machine, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -57,7 +57,7 @@ def the_one(batch: Batch, check: str, channel: str | None) -> Finding:
 SEEDS = range(6)
 
 
-@pytest.mark.parametrize("step_s", [60.0, 300.0])
+@pytest.mark.parametrize("step_s", [pytest.param(60.0, marks=pytest.mark.slow), 300.0])
 def test_clean_batches_raise_nothing(step_s: float) -> None:
     machine = toy_machine()
     batches = [toy_batch(seed, step_s) for seed in range(30)]

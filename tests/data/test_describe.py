@@ -43,7 +43,7 @@ def draft(files):
     return text, parse_machine(text, "draft")
 
 
-@pytest.mark.parametrize("suffix", ["csv", "xlsx", "parquet"])
+@pytest.mark.parametrize("suffix", ["csv", pytest.param("xlsx", marks=pytest.mark.slow), "parquet"])
 def test_draft_reads_the_files_it_was_drafted_from(tmp_path, suffix):
     files = []
     for k, stem in enumerate(("20240105", "20240712")):
@@ -229,7 +229,14 @@ def test_columns_that_are_no_clock():
         assert look_at(sheet, "test").time is None
 
 
-@pytest.mark.parametrize("form", ["%Y/%m/%d-%H:%M:%S", "%Y-%m-%d_%H-%M-%S", "%d.%m.%Y, %H:%M:%S", "%Y%m%d-%H%M%S"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y/%m/%d-%H:%M:%S",
+        *(pytest.param(f, marks=pytest.mark.slow) for f in ("%Y-%m-%d_%H-%M-%S", "%d.%m.%Y, %H:%M:%S")),
+        "%Y%m%d-%H%M%S",
+    ],
+)
 def test_spellings_of_time_stamps(tmp_path, form):
     stamps = pd.date_range("2021-06-15 23:04:41", periods=300, freq="min")
     table = warm_up("Stamp").assign(Stamp=stamps.strftime(form))
@@ -241,7 +248,9 @@ def test_spellings_of_time_stamps(tmp_path, form):
         assert batch.start == stamps[0] and batch.n_rows == 300
 
 
-@pytest.mark.parametrize(("suffix", "start"), [("csv", "07:00"), ("csv", "22:00"), ("xlsx", "22:00")])
+@pytest.mark.parametrize(
+    ("suffix", "start"), [pytest.param("csv", "07:00", marks=pytest.mark.slow), ("csv", "22:00"), ("xlsx", "22:00")]
+)
 def test_dates_and_times_of_day_in_two_columns(tmp_path, suffix, start):
     stamps = pd.date_range(f"2021-06-15 {start}", periods=300, freq="min")
     table = warm_up("Uhrzeit", Datum=stamps.strftime("%d.%m.%Y")).assign(Uhrzeit=stamps.strftime("%H:%M:%S"))

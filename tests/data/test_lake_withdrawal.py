@@ -176,6 +176,7 @@ def withdraw_one(lake: Lake, who: str) -> None:
             return
 
 
+@pytest.mark.slow
 def test_two_writers_at_once_store_one_of_two_copies(tmp_path: Path) -> None:
     calls = [f"store_copies(t.Path({str(tmp_path / 'lake')!r}), {who!r})" for who in ("x", "y")]
     assert [w.wait(300) for w in [run(call, "test_lake_withdrawal") for call in calls]] == [0, 0]

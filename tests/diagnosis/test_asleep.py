@@ -120,7 +120,9 @@ def compared(small: Small, chosen: list[Candidate], substeps: int) -> list[tuple
     return out
 
 
-@machines
+@pytest.mark.parametrize(
+    "small", [SMALL["two bodies"], pytest.param(SMALL["four bodies"], marks=pytest.mark.slow)], ids=SMALL
+)
 def test_its_derivatives_are_those_of_the_candidates_awake(small: Small) -> None:
     chosen = [c for c in one_of_each(smooth(small)) if c.mechanism != "jacket_chiller"]
     assert len(chosen) > 20

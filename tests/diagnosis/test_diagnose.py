@@ -58,6 +58,8 @@ CASES: dict[str, Callable[[], tuple[Machine, list[Batch]]]] = {
     "unlisted": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN})),
     "partly_explained": lambda: (clamped(), clamped_runs({"own": PER_LEVEL_AND_KELVIN, "lamp": LAMP})),
 }
+LONGEST = pytest.param("partly_explained", marks=pytest.mark.slow)
+VERDICTS = [*(v for v in CASES if v != "partly_explained"), LONGEST]
 
 
 @cache
@@ -65,7 +67,7 @@ def diagnosed(verdict: str) -> Diagnosis:
     return diagnose(*CASES[verdict]())
 
 
-@pytest.mark.parametrize("verdict", CASES)
+@pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_where_it_is_due(verdict: str) -> None:
     done = diagnosed(verdict)
     told = done.findings
@@ -76,7 +78,7 @@ def test_every_verdict_where_it_is_due(verdict: str) -> None:
     assert again.verdict == verdict and len(again.findings) == len(told.findings)
 
 
-@pytest.mark.parametrize("verdict", CASES)
+@pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_table_is_there_and_of_its_columns(verdict: str) -> None:
     done = diagnosed(verdict)
     assert {k: tuple(t.columns) for k, t in done.tables.items()} == dict(COLUMNS)
@@ -88,7 +90,7 @@ def test_every_table_is_there_and_of_its_columns(verdict: str) -> None:
     assert ((probability >= 0) & (probability <= 0.99)).all()
 
 
-@pytest.mark.parametrize("verdict", ["explained", "unlisted", "partly_explained"])
+@pytest.mark.parametrize("verdict", ["explained", "unlisted", LONGEST])
 def test_with_what_was_found_only_noise_is_left(verdict: str) -> None:
     rms = diagnosed(verdict).findings.fit.left_out_rms
     for key, after in rms.after.items():
@@ -114,12 +116,12 @@ def test_what_was_found_is_a_part_of_the_machine() -> None:
     assert done.part_before == twin_part(done.machine)
 
 
-def test_no_listed_mechanism_is_said_with_its_size() -> None:
-    for verdict in ("unlisted", "partly_explained"):
-        told = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
-        assert len(told) == 1 and "no listed mechanism" in told[0].statement
-        product = told[0].parameters["product"]
-        assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
+@pytest.mark.parametrize("verdict", ["unlisted", LONGEST])
+def test_no_listed_mechanism_is_said_with_its_size(verdict: str) -> None:
+    told = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
+    assert len(told) == 1 and "no listed mechanism" in told[0].statement
+    product = told[0].parameters["product"]
+    assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
 
 
 @pytest.mark.slow
@@ -136,6 +138,7 @@ def test_what_listed_mechanisms_only_share_in_is_told_whole() -> None:
     assert re.search(r"[1-9]\d W into the head \(it follows rpm vacuum\)", found.statement)
 
 
+@pytest.mark.slow
 def test_part_of_it_has_a_name_of_its_own() -> None:
     named = [f for f in diagnosed("partly_explained").findings.findings if f.mechanism != "free_flux"]
     assert [(f.mechanism, f.where.name) for f in named] == [("cabinet_heat", "shaft")]
@@ -211,6 +214,7 @@ def test_a_channel_that_was_not_always_recorded() -> None:
     assert len(rows[rows["channel"] == "t_head"]) == 2 and len(rows[rows["channel"] == "z"]) == 4
 
 
+@pytest.mark.slow
 def test_two_runs_are_cut_and_nothing_is_too_sure() -> None:
     known = two_bodies()
     given = [

@@ -53,7 +53,13 @@ def limit_of(name: str) -> pd.Series:
     return own.iloc[0]
 
 
-@pytest.mark.parametrize("name", HIDDEN)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(k, marks=pytest.mark.slow if k in ("floor_sink_head_room", "spindle_growth_z_head") else [])
+        for k in HIDDEN
+    ],
+)
 def test_an_effect_of_three_times_its_limit_is_seen_and_of_a_third_is_not(name: str) -> None:
     law, parameter = HIDDEN[name]
     told = limit_of(name)

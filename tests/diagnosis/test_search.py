@@ -76,6 +76,7 @@ def told(done: Search) -> dict[str, Interval]:
     return out
 
 
+@pytest.mark.slow
 def test_a_cold_floor_is_found_with_its_size() -> None:
     done = found("floor")
     assert names(done) == ["floor_sink_head_room"]
@@ -100,7 +101,7 @@ def test_where_nothing_is_missing_nothing_is_accepted() -> None:
     assert done.final.noise.factor.max() < 1.2
 
 
-@pytest.mark.parametrize("seed", range(2, 4))
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_nor_with_other_values_and_noise(seed: int) -> None:
     done = search(fitted(two_bodies(), runs(two_bodies(), count=4, seed=seed)))
     assert not done.accepted
@@ -136,13 +137,13 @@ def test_two_effects_at_once_are_both_found() -> None:
     assert done.final.noise.factor.max() < 1.2
 
 
-def test_the_best_is_first_and_slack_is_no_news() -> None:
-    for case in ("floor", "scatter"):
-        for r in found(case).rounds:
-            full = [t for t in r.tried if t.fitted is not None and t.candidate.mechanism != "coarse_network"]
-            order = [t.standing(r.null.temperature) for t in full]
-            assert order == sorted(order, reverse=True)
-            assert not {t.candidate.name for t in r.tried} & never_reported(proposed(r.before), r.before)
+@pytest.mark.parametrize("case", [pytest.param("floor", marks=pytest.mark.slow), "floor and shift", "scatter"])
+def test_the_best_is_first_and_slack_is_no_news(case: str) -> None:
+    for r in found(case).rounds:
+        full = [t for t in r.tried if t.fitted is not None and t.candidate.mechanism != "coarse_network"]
+        order = [t.standing(r.null.temperature) for t in full]
+        assert order == sorted(order, reverse=True)
+        assert not {t.candidate.name for t in r.tried} & never_reported(proposed(r.before), r.before)
 
 
 def test_an_effect_is_asked_where_the_finer_network_before_it_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,6 +287,7 @@ def test_a_refit_that_gained_little_in_one_step_is_fitted_on_before_nothing_is_c
     assert more == [far, third]  # not what was refused once, wherever it begins
 
 
+@pytest.mark.slow
 def test_what_only_the_second_look_refits_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The shortlist passes the floor over, and what imitates it is refused."""
     asked: list[Round] = []

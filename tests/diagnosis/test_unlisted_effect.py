@@ -38,16 +38,26 @@ def values(out: Terms) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("concealed", "place", "true", "label"),
     [
-        (flux("bed", linear="40 W"), "bed", {"linear": 40.0}, "W into bed while coolant is on"),
+        pytest.param(
+            flux("bed", linear="40 W"), "bed", {"linear": 40.0}, "W into bed while coolant is on",
+            marks=pytest.mark.slow,
+        ),
         (flux("column", "rpm", product="0.0008 W/K"), "column", {"product": 0.0008},
          "W into column per K of column above 20 degC, in proportion to rpm (at 5000 rpm)"),
-        (flux("saddle", "rpm", square="-4e-6 W"), "saddle", {"square": -4e-6},
-         "W out of saddle with the square of rpm (at 5000 rpm)"),
+        pytest.param(
+            flux("saddle", "rpm", square="-4e-6 W"), "saddle", {"square": -4e-6},
+            "W out of saddle with the square of rpm (at 5000 rpm)", marks=pytest.mark.slow,
+        ),
         (flux("bed", "rpm", "coolant", cross="0.012 W"), "bed", {"cross": 0.012},
          "W into bed in proportion to rpm (at 5000 rpm) while coolant is on"),
-        (flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", {"square_cross": 3e-6},
-         "W into bed with the square of rpm (at 5000 rpm) while coolant is on"),
-        (flux("saddle", None, constant="25 W"), "saddle", {"constant": 25.0}, "W into saddle"),
+        pytest.param(
+            flux("bed", "rpm", "coolant", square_cross="3e-6 W"), "bed", {"square_cross": 3e-6},
+            "W into bed with the square of rpm (at 5000 rpm) while coolant is on", marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            flux("saddle", None, constant="25 W"), "saddle", {"constant": 25.0}, "W into saddle",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             flux("column", "coolant", linear="30 W", product="8 W/K"), "column", {"linear": 30.0, "product": 8.0},
             "W into column while coolant is on", marks=pytest.mark.slow,
@@ -84,6 +94,7 @@ def test_noise_and_a_drifting_sensor_follow_nothing() -> None:
     assert best is None or best.tried.gain < POLICY.even_odds_gain_nats or best.tried.improved < 6
 
 
+@pytest.mark.slow
 def test_a_place_that_has_one_already_gets_a_second_beside_it() -> None:
     """A file that a diagnosis mended before keeps what it states."""
     given = case(flux("bed", linear="40 W"))

@@ -30,7 +30,7 @@ def drawn(rng: np.random.Generator, n: int, power: float) -> pd.DataFrame:
     ("n", "power"),
     [
         (4, 0.25),
-        (16, 0.0),
+        pytest.param(16, 0.0, marks=pytest.mark.slow),
         pytest.param(16, 0.7, marks=pytest.mark.slow),
         pytest.param(60, 0.7, marks=pytest.mark.slow),
     ],

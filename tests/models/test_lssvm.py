@@ -80,7 +80,7 @@ def test_left_out_residuals_are_those_of_refits(sizes):
     omega, y, known, group, m = padded(sizes=sizes)
     system = system_of(omega, y, known, 30.0)
     one, two = system.left_out(m)[0], system.pairs_left_out(m)
-    alpha, bias = system.solutions(m, np.arange(5))
+    alpha, bias = system.solutions(m, np.arange(5)[:, None])
     for f in range(5):
         for g in range(5):
             train = np.flatnonzero((known > 0) & (group != f) & (group != g))
@@ -92,6 +92,27 @@ def test_left_out_residuals_are_those_of_refits(sizes):
                 np.testing.assert_allclose(alpha[f, train], a, atol=1e-7)
                 assert bias[f] == pytest.approx(b, abs=1e-7)
                 assert not alpha[f, np.setdiff1d(np.arange(len(y)), train)].any()
+
+
+@pytest.mark.parametrize("gaps", [[[1], [0, 3]], [[0, 1, 2]]])
+def test_residuals_without_several_groups_are_those_of_refits(gaps):
+    omega, y, known, group, m = padded()
+    system = system_of(omega, y, known, 30.0)
+    found = system.others_left_out(m, [np.array(gap) for gap in gaps])
+    for gap, residual in zip(gaps, found, strict=True):
+        assert np.isnan(residual[gap]).all()
+        alpha, bias = system.solutions(m, np.array([gap]))
+        for g in np.setdiff1d(np.arange(5), gap):
+            train = np.flatnonzero((known > 0) & ~np.isin(group, [*gap, g]))
+            a, b = solved(omega[np.ix_(train, train)], y[train], 30.0)
+            test = np.flatnonzero((known > 0) & (group == g))
+            np.testing.assert_allclose(
+                residual[g][: len(test)], y[test] - omega[np.ix_(test, train)] @ a - b, atol=1e-7
+            )
+        kept = np.flatnonzero((known > 0) & ~np.isin(group, gap))
+        a, b = solved(omega[np.ix_(kept, kept)], y[kept], 30.0)
+        np.testing.assert_allclose(alpha[0, kept], a, atol=1e-7)
+        assert bias[0] == pytest.approx(b, abs=1e-7)
 
 
 def test_a_kernel_of_low_rank_takes_the_short_way_to_the_same_inverse(monkeypatch):

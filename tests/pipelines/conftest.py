@@ -6,10 +6,39 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 from pipelines import settings as settings_module
+
+PNG = bytes.fromhex(  # one grey pixel
+    "89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55"
+    "0000000a49444154789c636800000082008177cd72b60000000049454e44ae426082"
+)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A home that a test makes in this process gets a copy of one empty store."""
+    from tests.toys import empty_store
+
+    with empty_store.copied_stores(empty_store.empty_store(tmp_path_factory)):
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Figures are built and not drawn, which takes a second for each report; a file marked `drawn` does draw them."""
+    from matplotlib.figure import Figure
+
+    def save(figure: Figure, out: Any, *, format: str, **_: Any) -> None:
+        out.write(b'<svg xmlns="http://www.w3.org/2000/svg"/>' if format == "svg" else PNG)
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("drawn") is None:
+            patch.setattr(Figure, "savefig", save)
+        yield
 
 
 @pytest.fixture(scope="session")

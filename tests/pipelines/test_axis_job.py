@@ -30,6 +30,7 @@ from reports.comparison.tables import left_out_batches
 from tests.reports.test_report_browser import CHROMIUM, console, measured, open_page
 from tests.toys.report_training import settings, training
 
+pytestmark = pytest.mark.drawn
 MACHINE_FILE = Path(__file__).parents[2] / "machines" / "sample_lathe.yml"
 
 

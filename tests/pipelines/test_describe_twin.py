@@ -13,6 +13,7 @@ from pipelines import cli, console
 from pipelines.commands.describe import describe_twin
 from tests.twin.machines import TWO_BODIES
 
+pytestmark = pytest.mark.drawn
 MACHINES = Path(cli.__file__).resolve().parents[1] / "machines"
 Call = Callable[..., tuple[int, str, str]]
 

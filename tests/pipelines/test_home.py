@@ -46,6 +46,7 @@ def full(*_: object, **__: object) -> Any:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_while_the_store_is_made_leaves_nothing(tmp_path: Path, store: Any) -> None:
     """A process that may write no file above 100 kB gets the errors of a full disk."""
     environment = {**os.environ, "THERMODRIFT_HOME": str(tmp_path)}

@@ -102,7 +102,7 @@ def test_a_plant_without_screw_or_feed_has_no_nut() -> None:
         assert {"films", "joints"} <= has <= {kind.key for kind in EVERYDAY}
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_steps_keep_their_second_order(seed: int) -> None:
     """Against a step of 5 s: half the step, a quarter of the error; a sensor could not see it."""
     p = plant(seed, "feed")

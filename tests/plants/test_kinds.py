@@ -127,9 +127,9 @@ def test_all_effects_have_places_that_the_file_names(kind: str) -> None:
     [
         ("lathe", {"cabinet_heat": 6.0, "speed_shift": 3.0}),
         ("board", {"missing_link": 8.0}),
-        ("horizontal", {"joint_conductance": 5.0}),
+        pytest.param("horizontal", {"joint_conductance": 5.0}, marks=pytest.mark.slow),
         ("gantry", {"bending": 4.0, "sensor_drift": 2.0}),
-        ("bench", {"cable_heat": 10.0}),
+        pytest.param("bench", {"cable_heat": 10.0}, marks=pytest.mark.slow),
         ("battery", {"tab_heat": 5.0, "unlisted_warm_current": 5.0}),
     ],
 )

@@ -19,7 +19,16 @@ from plants.volumes.structure import Plate, Volumes, even, integrate
 from tests.plants.plant_cases import NONE, SEED, Array, plant
 
 
-@pytest.mark.parametrize("key", [None, "preload_feedback", "draught", "rotating_convection", "natural_convection"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        pytest.param(None, marks=pytest.mark.slow),
+        "preload_feedback",
+        pytest.param("draught", marks=pytest.mark.slow),
+        pytest.param("rotating_convection", marks=pytest.mark.slow),
+        "natural_convection",
+    ],
+)
 def test_half_the_step_changes_no_cell_by_a_hundredth_of_a_kelvin(key: str | None) -> None:
     kinds = [EFFECTS[key]] if key else []
     p = plant()

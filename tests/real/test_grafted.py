@@ -47,7 +47,7 @@ def test_there_are_cases_of_both_machines_and_none_without_recordings(tmp_path: 
     assert cases(tmp_path) == []
 
 
-@pytest.mark.parametrize("name", GRAFTED)
+@pytest.mark.parametrize("name", [GRAFTED[0], *(pytest.param(n, marks=pytest.mark.slow) for n in GRAFTED[1:])])
 def test_a_case_and_its_reference_differ_where_the_answer_says_and_nowhere_else(name: str) -> None:
     case, plain = built(name), built(CASES[name].reference)
     assert case.answer["reference"] == plain.answer["case"] and plain.answer["reference"] is None

@@ -79,6 +79,7 @@ def test_the_spindle_recording_is_clean() -> None:
     assert [f.message for b in batches for f in b.findings] == []
 
 
+@pytest.mark.slow
 def test_minutes_read_as_seconds_mask_no_good_sensor_of_the_lathe() -> None:
     if not LATHE.is_dir():
         pytest.skip("no ../shared/data/lathe_gv1203")

@@ -84,6 +84,7 @@ def test_lathe_drafted_lies_between_nothing_and_the_twin_that_was_written_for_it
     assert 1.0 < geometric_mean([left[c] / written[c] for c in left]) < 4.0
 
 
+@pytest.mark.slow
 def test_lathe_heats_grow_with_speed_and_feed() -> None:
     part = drafted("lathe_gv1203", 4).part
     assert {m.law for m in part.mechanisms.values()} == {"belt_loss", "guide_friction"}

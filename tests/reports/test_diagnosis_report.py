@@ -171,7 +171,7 @@ def test_words_from_the_findings_are_text_and_no_markup(folder: Path) -> None:
 
 def test_a_wrong_place_is_told_in_one_line(folder: Path) -> None:
     with pytest.raises(InputError, match=r"report .*x.pdf: unsupported file extension '.pdf'; give .html"):
-        write_diagnosis_report(folder / "x.pdf", toy_diagnosis("explained"))
+        write_diagnosis_report(folder / "x.pdf", toy_diagnosis("explained"), pictures=False)
     (folder / "file").write_text("")
     with pytest.raises(InputError, match=r"report .*x.html: cannot be written \(.+\); give another place"):
         write_diagnosis_report(folder / "file" / "x.html", toy_diagnosis("explained"), pictures=False)

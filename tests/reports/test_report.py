@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -65,14 +67,36 @@ def html_of(trainings: list[Training], folder: Path) -> str:
     return write_report(trainings, folder / "r.html", settings(folder).promotion).read_text(encoding="utf-8")
 
 
+@cache
+def of_z(make: Maker) -> str:
+    """The page of the channel z, as it is."""
+    with TemporaryDirectory() as folder:
+        return markdown_of([training(results(make)["z"])], Path(folder))
+
+
+@cache
+def of_both(make: Maker) -> str:
+    """The HTML page of both channels."""
+    with TemporaryDirectory() as folder:
+        return html_of([training(results(make)[t], name=t) for t in "zx"], Path(folder))
+
+
+@cache
+def small(make: Maker) -> GridResult:
+    """A result of one family and no left-out prediction."""
+    plan = Plan(selectors=("none",), families=("mlr",), protocols=("train-on-one",))
+    ((_, result),) = run_grid(make(k=3, n=30, sensors=2), ["z"], plan).values()
+    return result
+
+
 def markdown_of(trainings: list[Training], folder: Path) -> str:
     return write_report(trainings, folder / "r.md", settings(folder).promotion).read_text(encoding="utf-8")
 
 
-def test_left_out_scores_are_those_of_the_predictions(toy_batches: Maker, tmp_path: Path) -> None:
+def test_left_out_scores_are_those_of_the_predictions(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     cell = choose(result.cells, RULE)
-    text = markdown_of([training(result)], tmp_path)
+    text = of_z(toy_batches)
     p = result.predictions
     s = []
     for b in result.batches["batch_id"]:
@@ -92,11 +116,9 @@ def test_left_out_scores_are_those_of_the_predictions(toy_batches: Maker, tmp_pa
 
 
 @pytest.mark.parametrize("key", ["family", "selector"])
-def test_a_leaderboard_holds_the_least_cell_of_each_and_both_baselines(
-    key: str, toy_batches: Maker, tmp_path: Path
-) -> None:
+def test_a_leaderboard_holds_the_least_cell_of_each_and_both_baselines(key: str, toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    rows = table_after(markdown_of([training(result)], tmp_path), f"z: best cell of every {key}, forward")
+    rows = table_after(of_z(toy_batches), f"z: best cell of every {key}, forward")
     families = column(rows, "family")
     assert sum(f.startswith("no model") for f in families) == sum(f.startswith("mean curve") for f in families) == 1
     cells = result.cells[(result.cells["protocol"] == "forward") & ~result.cells["family"].isin(["zero", "mean_curve"])]
@@ -108,9 +130,9 @@ def test_a_leaderboard_holds_the_least_cell_of_each_and_both_baselines(
         assert min(abs(v - least) for v in shown) <= 1.01 * rounded_um
 
 
-def test_protocols_have_tables_of_their_own_with_their_own_numbers(toy_batches: Maker, tmp_path: Path) -> None:
+def test_protocols_have_tables_of_their_own_with_their_own_numbers(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    text = markdown_of([training(result)], tmp_path)
+    text = of_z(toy_batches)
     for protocol in ("train-on-one", "leave-season-out", "leave-speed-out"):
         cells = result.cells[(result.cells["protocol"] == protocol) & (result.cells["family"] == "mean_curve")]
         rows = table_after(text, f"z: best cell of every family, {protocol}")
@@ -125,9 +147,8 @@ def test_protocols_have_tables_of_their_own_with_their_own_numbers(toy_batches: 
     assert float(column(rows, "4000 rpm")[i]) == pytest.approx(zero["S_um"].mean(), abs=0.051)
 
 
-def test_the_page_loads_nothing_and_is_small(toy_batches: Maker, tmp_path: Path) -> None:
-    both = results(toy_batches)
-    text = html_of([training(both["z"]), training(both["x"], name="t1")], tmp_path)
+def test_the_page_loads_nothing_and_is_small(toy_batches: Maker) -> None:
+    text = of_both(toy_batches)
     page = Page(text)
     assert page.loads and all(v[1:] in page.ids for v in page.loads if v.startswith("#"))
     assert [v for v in page.loads if not v.startswith("#")] == []
@@ -137,11 +158,11 @@ def test_the_page_loads_nothing_and_is_small(toy_batches: Maker, tmp_path: Path)
     assert len(text) < 350_000
 
 
-def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches: Maker, tmp_path: Path) -> None:
+def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches: Maker) -> None:
     both = results(toy_batches)
     z, x = (training(both[t], name=t) for t in "zx")
     page = page_of([z, x], RULE)
-    assert page.overview is not None and page_of([z], RULE).overview is None
+    assert page.overview is not None and page_of([training(small(toy_batches))], RULE).overview is None
     expected = outlook(both["z"], choose(both["z"].cells, RULE))
     own = dict(zip((c.title for c in page.overview.columns), page.overview.rows[0].cells, strict=True))
     digits = len(str(own["expected S"]).split(".")[1])
@@ -154,7 +175,7 @@ def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches:
         "season below 10 °C", "season 10–18 °C", "season 18–25 °C", "season above 25 °C",
         "speed 2000 rpm", "speed 4000 rpm", "speed 6000 rpm",
     ]  # fmt: skip
-    text = html_of([z, x], tmp_path)
+    text = of_both(toy_batches)
     verdict = page.channels[0].verdict.summary
     at = [text.index(v) for v in (page.overview.caption, "Expected next season", 'id="c1-left-out-1"', verdict)]
     assert at == sorted(at) and text.count(verdict) == 1
@@ -237,7 +258,7 @@ def test_hostile_names_stay_text(toy_batches: Maker, tmp_path: Path) -> None:
     assert "img" not in page.tags and "script" not in page.tags
     assert any(HOSTILE in w for w in page.words)
     assert "alert('$x$')</script>" not in text
-    markdown = markdown_of([training(both["z"])], tmp_path)
+    markdown = of_z(toy_batches)
     rows = table_after(markdown, f"Every batch, left out by {cell_words(choose(both['z'].cells, RULE))}")
     assert {len(r) for r in rows} == {len(rows[0])} and HOSTILE in [r[0] for r in rows]
     assert "<script" not in markdown.replace("\\<script", "")
@@ -321,8 +342,7 @@ def test_batches_with_other_content_count_as_new() -> None:
 
 
 def test_a_grid_without_leave_batch_out_still_makes_a_report(toy_batches: Maker, tmp_path: Path) -> None:
-    plan = Plan(selectors=("none",), families=("mlr",), protocols=("train-on-one",))
-    ((_, result),) = run_grid(toy_batches(k=3, n=30, sensors=2), ["z"], plan).values()
+    result = small(toy_batches)
     text = markdown_of([training(result)], tmp_path)
     assert "z: best cell of every family, train-on-one" in text
     assert "No left-out prediction of this model was kept." in html_of([training(result)], tmp_path)
@@ -352,14 +372,14 @@ def test_no_training_is_refused(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_told(toy_batches: Maker, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"report .*r\.md: cannot be written \(.+\); give another place"):
-        write_report([training(results(toy_batches)["z"])], tmp_path / "file" / "r.md", settings(tmp_path).promotion)
+        write_report([training(small(toy_batches))], tmp_path / "file" / "r.md", settings(tmp_path).promotion)
 
 
 def test_a_failure_leaves_the_old_report_whole(
     toy_batches: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = tmp_path / "new" / "r.md"
-    write_report([training(results(toy_batches)["z"])], target, settings(tmp_path).promotion)
+    write_report([training(small(toy_batches))], target, settings(tmp_path).promotion)
     before = target.read_text(encoding="utf-8")
 
     def broken(_: int) -> None:
@@ -367,7 +387,7 @@ def test_a_failure_leaves_the_old_report_whole(
 
     monkeypatch.setattr(atomic_file.os, "fsync", broken)
     with pytest.raises(InputError, match="No space left on device"):
-        write_report([training(results(toy_batches)["x"])], target, settings(tmp_path).promotion)
+        write_report([training(small(toy_batches), name="t1")], target, settings(tmp_path).promotion)
     assert target.read_text(encoding="utf-8") == before
     assert [p.name for p in target.parent.iterdir()] == ["r.md"]
 

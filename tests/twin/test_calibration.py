@@ -172,6 +172,7 @@ def test_what_a_left_out_batch_shows_never_reaches_its_fold(small: Machine, batc
     assert np.abs(folds[0][1].values - folds[1][1].values).max() > 0
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(small: Machine, batches: list[Batch]) -> None:
     problem = CalibrationProblem.of(compile_network(small), batches[:2])
     one, two = leave_batch_out(problem), leave_batch_out(problem, CalibrationOptions(processes=2))

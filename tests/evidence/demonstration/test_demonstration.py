@@ -87,7 +87,7 @@ def test_the_answering_process_sees_no_answer(case: tuple[Path, Machine]) -> Non
     ("name", "words"),
     [
         ("broken", "the diagnosis failed: no fit stays finite"),
-        ("dies", "the diagnosis failed: "),
+        pytest.param("dies", "the diagnosis failed: ", marks=pytest.mark.slow),
     ],
 )
 def test_a_diagnosis_that_fails_leaves_the_seal_closed(name: str, words: str, tmp_path: Path) -> None:

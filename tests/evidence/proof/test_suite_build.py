@@ -92,7 +92,10 @@ def test_recordings_read_back_whole() -> None:
         assert not any(np.isnan(batch.values(c)).any() for c in built.machine.names("driver"))
 
 
-@pytest.mark.parametrize("key", ["motor_loss", "column_bending", "spindle_growth", "mandrel"])
+@pytest.mark.parametrize(
+    "key",
+    ["motor_loss", *(pytest.param(k, marks=pytest.mark.slow) for k in ("column_bending", "spindle_growth")), "mandrel"],
+)
 def test_without_a_withheld_effect_the_machine_file_is_the_same(key: str) -> None:
     """What a file leaves out cannot be told from what the machine does not have."""
     lacks = ["coolant", "walls", "layers", "motor_loss", "bending", "growth", "mandrel"]
@@ -167,7 +170,7 @@ def test_real_recordings_need_their_folder() -> None:
         build(spec)
 
 
-@pytest.mark.parametrize("plant", ["elements", "volumes"])
+@pytest.mark.parametrize("plant", [pytest.param("elements", marks=pytest.mark.slow), "volumes"])
 def test_a_bearing_that_would_seize_is_drawn_weaker_and_the_answer_says_so(plant: str) -> None:
     """Preload that tightens with its own heat runs away: recordings of 300 degC are of no machine."""
     built = build(short(plant=plant, effects={"preload_feedback": 12.0}, hours=5.0))

@@ -11,8 +11,10 @@ from data.errors import InputError
 from evidence.studies import STUDIES
 from evidence.studies.base import Figure, Ordering, Study, StudyResult, run_studies
 
+BRIEF = ("coupled_lathe", "grey_distributed_lag")  # the others take longer, and are made of the same pieces
 
-@pytest.fixture(scope="module", params=list(STUDIES))
+
+@pytest.fixture(scope="module", params=[pytest.param(k, marks=[] if k in BRIEF else pytest.mark.slow) for k in STUDIES])
 def result(request: pytest.FixtureRequest) -> StudyResult:
     return run_studies([request.param], 2)[request.param]
 
