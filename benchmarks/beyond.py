@@ -1,4 +1,4 @@
-"""The lag dictionary beside ridge, PCR and MLR: a lathe's summer, a spindle's two days, the simulated year.
+"""The lag dictionary next to ridge, PCR and MLR: a lathe's summer, a spindle's two days, the simulated year.
 
     python -m benchmarks.beyond [--recordings FOLDER] [--sensors 6] [--selectors pca_elimination,fcgc,kmedoids]
 

@@ -127,7 +127,7 @@ def stages_table(case: Case, processes: int) -> None:
     found = diagnose(case.machine, case.batches, processes=processes, progress=tell).findings
     total = time.perf_counter() - start
     tell("end", 0, 0)
-    print(f"{'stages, one case, ' + str(processes) + ' processes':38} {'wall s':>8} {'share':>7} {'told':>6}")
+    print(f"{'stages, one case, ' + str(processes) + ' processes':38} {'wall s':>8} {'share':>7} {'calls':>6}")
     for step, seconds in spent.items():
         print(f"{step:38} {seconds:8.2f} {100 * seconds / total:6.1f}% {calls.get(step, 0):6}")
     what = ", ".join(f"{f.mechanism} at {f.where.name}" for f in found.findings) or "nothing"

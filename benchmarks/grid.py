@@ -1,4 +1,4 @@
-"""Speed of the grid on the simulated sample year, beside the plain ways to do the same fits.
+"""Speed of the grid on the simulated sample year, next to the plain ways to do the same fits.
 
     python -m benchmarks.grid [--repeats 3] [--families mlr,ridge,…]
 

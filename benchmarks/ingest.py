@@ -4,7 +4,7 @@
 
 "ingest" keeps every row of the 10 Hz recording, "ingest to 1 s" averages it onto a 1 s grid. "pyarrow alone" streams
 as ingest does, in bounded memory; "pyarrow in memory" reads the whole file at once, which is its fastest way. All may
-use pyarrow's pool of --threads (all cores unless told); ingest adds one thread that reads ahead. The ways run in
+use pyarrow's pool of --threads (all cores by default); ingest adds one thread that reads ahead. The ways run in
 processes of their own, taking turns; time and peak memory are theirs, without the interpreter's start. Prints a table.
 """
 
@@ -135,7 +135,7 @@ WAYS = PLAIN | OURS
 
 
 def one(way: str, csv: str, out: str, threads: str) -> None:
-    """In a child process: run one way and tell its time and peak memory."""
+    """In a child process: run one way and report its time and peak memory."""
     pa.set_cpu_count(int(threads))
     result = WAYS[way](Path(csv), Path(out))
     result["peak_MB"] = peak_MB()

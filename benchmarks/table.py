@@ -20,7 +20,7 @@ HEAD = ("what", "ours", "reference", "its time", "ratio", "target", "met", "grow
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured, in CPU seconds; NaN where there is nothing to tell.
+    """What was measured, in CPU seconds; NaN where there is nothing to report.
 
     ratio: the reference's time over ours. target_ratio: the least ratio, target_s: the most seconds, that are aimed at.
     limit: a further target by name, and whether it is met. growth: how the time grows, as exponents of a size. note:

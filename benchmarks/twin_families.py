@@ -1,4 +1,4 @@
-"""How well the twin predicts beside data-driven families, on the simulated sample year: few batches, seasons, sensors.
+"""How well the twin predicts next to data-driven families, on the simulated sample year: few batches, seasons, sensors.
 
     python benchmarks/twin_families.py [--out RESULTS.jsonl] [--draws 6] [--files true,moved,coarse] [--channels z,y,x]
 

@@ -28,7 +28,7 @@ from data.machine import RESERVED, Machine, Recording, TimeColumn
 
 SCHEMA = "thermodrift.batch/1"
 META_KEY = b"thermodrift"
-MEASURED = ("temperature", "ambient", "error")  # roles whose noise tells recordings apart
+MEASURED = ("temperature", "ambient", "error")  # roles whose noise distinguishes recordings
 PARALLEL_VALUES = 500_000
 
 

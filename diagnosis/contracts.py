@@ -259,7 +259,7 @@ class Tried:
     """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
 
     `improved` counts the left-out batches whose squares fall, `worse` those that lose more than chance makes.
-    `cluster` names the first of the candidates that these recordings cannot tell from it; `log_prior` is of its size.
+    `cluster` names the first of the candidates that these recordings cannot distinguish; `log_prior` is of its size.
     `alike` is the gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the
     threshold. `barred`: structure alone may gain as much with it.
     """

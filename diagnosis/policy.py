@@ -112,7 +112,7 @@ class Policy:
     label_swap_reweighting_rounds: int = cost(3, "rounds", "what no linear step can fit counts less")
     screen_min_gain_nats: float = convention(0.5, "nats", "a smaller gain in the screen is not looked at")
     screened_candidates: int = cost(80, "candidates", "of the screen that are clustered")
-    same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot tell two candidates apart")
+    same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
     shape_min_gain_nats: float = analytic(5.0, "nats", "what each parameter of a shape must gain in the screen")
     refits_best: int = cost(5, "refits", "the best of the screen in every round")
     refits_with_other_mechanisms: int = cost(7, "refits", "together with the best of every other mechanism")
@@ -244,7 +244,7 @@ class Policy:
     )
     unlisted_max_terms: int = convention(3, "terms", "of one effect")
     term_min_gain_nats: float = analytic(3.0, "nats", "what a further term must gain; closer terms are alike")
-    term_min_gain_share: float = analytic(0.02, "of the gain so far", "a smaller one only mends the form of the others")
+    term_min_gain_share: float = analytic(0.02, "of the gain so far", "a smaller one only improves the form of others")
 
     # Next experiment
     clear_probability: float = convention(0.9, "probability", "above it no run is proposed")

@@ -368,7 +368,7 @@ def _rate(n: Node, step_s: float) -> Step:
     rows = int(n.data["rows"][0])
 
     def step(s: Array, begin: bool, x: Array) -> Array:
-        kept = s.reshape(-1, n.size)  # a count of rows cannot be told from them, so unseen ones are NaN
+        kept = s.reshape(-1, n.size)  # a count of rows cannot be distinguished from them, so unseen ones are NaN
         if begin:
             kept[:] = np.nan
         kept[:-1] = kept[1:].copy()

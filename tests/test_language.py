@@ -25,6 +25,8 @@ INSTEAD: Mapping[str, str] = {  # regular expression, in lower case -> preferred
     r"previously|used to be": "the present state; history belongs in the changelog",
     r"and so on|etc\.": "the whole list, or what the members share",
     r"told|beside": "reported, stated; next to",
+    r"tells? .{0,40}\bapart|would tell": "distinguish, separate",
+    r"mend(s|ed|ing)?": "correct, repair",
     r"owes?|owed|debts?": "limited by; shortfall",
     r"honest(ly|y)?": "calibrated, out-of-sample, valid",
     r"mates|voices|sceptics?": "the term of the field",

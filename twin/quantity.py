@@ -185,7 +185,7 @@ def parameter(path: str, spec: Spec, given: Value | None, default_source: str = 
         raise ValueError(f"{path}: got {given.value!r}, expected a share below 1")
     if not low <= value <= high:
         raise ValueError(
-            f"{path}: {value:g} {spec.unit} lies outside the bounds {low:g} to {high:g}; widen them or mend it"
+            f"{path}: {value:g} {spec.unit} lies outside the bounds {low:g} to {high:g}; widen them or correct it"
         )
     spread = _deviation(path, "spread", spec, given.spread)
     free = given.free if given.free is not None else math.isfinite(spread)

@@ -376,7 +376,7 @@ def _ends(given: MechanismPart) -> dict[str, object]:
 
 
 def _exchanging(c: Candidate) -> set[str]:
-    """The ports that tell two instances at one body apart: with what it exchanges heat."""
+    """The ports that distinguish two instances at one body: with what it exchanges heat."""
     mechanism = MECHANISMS[c.mechanism]
     return {port for port in mechanism.ports if port == mechanism.takes_from}
 

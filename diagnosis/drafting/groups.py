@@ -73,7 +73,7 @@ def rows_of(machine: Machine, batches: Sequence[Batch]) -> Rows:
     if not whole:
         raise InputError(
             f"{where}: in every batch a driver or the ambient has no value for more than {MAX_GAP_S:g} s; "
-            "mend the recordings, or overrule the masks"
+            "correct the recordings, or overrule the masks"
         )
     at = np.unique(np.linspace(0, len(whole) - 1, min(POLICY.draft_max_batches, len(whole))).round().astype(int))
     parts, blocks = _parts([whole[k] for k in at.tolist()], remarks)
@@ -81,7 +81,7 @@ def rows_of(machine: Machine, batches: Sequence[Batch]) -> Rows:
     thin = tuple(_thinned(b, step_s) for b in parts)
     recorded = {r: tuple(n for n in used[r] if any(_numbers(b, n) for b in thin)) for r in ("temperature", "error")}
     if not recorded["temperature"]:
-        raise InputError(f"{where}: no temperature has a value in the batches that can be simulated; mend the others")
+        raise InputError(f"{where}: no temperature has a value in the batches that can be simulated; mask fewer")
     noise = {n: _noise(machine, batches, n, tops) for n in (*recorded["temperature"], *recorded["error"])}
     return Rows(thin, blocks, recorded["temperature"], recorded["error"], used["ambient"], tops, noise, tuple(remarks))
 

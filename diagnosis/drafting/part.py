@@ -204,7 +204,7 @@ def _noise(machine: Machine, rows: Rows, channel: str, unit: str) -> dict[str, s
 
 
 def _chain(channel: str, rows: Rows, rises: Rises, body_degC: Array) -> tuple[int, ...]:
-    """The bodies whose rises tell most of an error, one after the other, by ordinary least squares."""
+    """The bodies whose rises explain most of an error, one after the other, by ordinary least squares."""
     error = np.concatenate([_moved(b.values(channel)) for b in rows.batches])
     first = np.concatenate([[at[0]] * len(at) for at in rises.parts])
     rise_K = body_degC - body_degC[first]

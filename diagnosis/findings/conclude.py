@@ -146,7 +146,7 @@ def found_of(
     Args:
         intervals: of the final fit's parameters, by network name.
         rms: of batches left out, before and after this effect.
-        separates: the run that would tell it from its alternatives.
+        separates: the run that would distinguish it from its alternatives.
     """
     best, final = done.best, search.final
     assert best is not None

@@ -119,7 +119,7 @@ class Rms:
 
 @dataclass(frozen=True)
 class Other:
-    """Another explanation; `alike`: these runs cannot tell it from the one found."""
+    """Another explanation; `alike`: these runs cannot distinguish it from the one found."""
 
     mechanism: str
     where: Where
@@ -140,7 +140,7 @@ class Found:
             between runs the one estimate is its sd, as a share where the unit is 1.
         was: the machine file's values of a wrong parameter.
         size: the effect's size where no parameter is one (root mean square watts of a `free_flux`).
-        separates: the run that would tell the alternatives apart ("a night switched off").
+        separates: the run that would distinguish the alternatives ("a night switched off").
         caps: what limits the probability ("3 runs only").
     """
 
@@ -175,7 +175,7 @@ class Found:
 
     @property
     def tied(self) -> tuple[Other, ...]:
-        """Explanations that these runs cannot tell from it and that are at least half as probable."""
+        """Explanations that these runs cannot distinguish from it and that are at least half as probable."""
         if self.probability > POLICY.untied_probability:
             return ()
         least = POLICY.tied_min_probability_share * self.probability

@@ -114,7 +114,7 @@ class DetectionLimit(_Part):
 
 
 class NextExperiment(_Part):
-    """The run that would tell tied causes apart; `file`: the run plan, ready to use."""
+    """The run that would distinguish tied causes; `file`: the run plan, ready to use."""
 
     separates: tuple[str, ...]
     run: str

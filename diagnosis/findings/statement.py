@@ -116,7 +116,7 @@ def claim_phrase(found: Found) -> str:
         said = [text for _, text in sorted([own, *tied], key=lambda s: -s[0])]
         numbers = {2: "two", 3: "three", 4: "four"}
         return (
-            f"These runs cannot tell {numbers.get(len(said), str(len(said)))} explanations apart: {listed(said, 'or')}"
+            f"These runs cannot distinguish {numbers.get(len(said), str(len(said)))} explanations: {listed(said, 'or')}"
         )
     hedge = _hedge(found.probability)
     sentence = _sentence(found)
@@ -172,7 +172,7 @@ def verdict_statement(
 
     Args:
         limits: detection limits, the most informative first, with the `places` (`place_label`) of each.
-        separates: the run that would tell the explanations `possible` apart, or show whether they hold.
+        separates: the run that would distinguish the explanations `possible`, or show whether they hold.
     """
     # of several effects each says by itself how sure it is, and what may be in its place
     doubts = [_doubt(f) if len(found) > 1 else "" for f in found]
@@ -188,11 +188,11 @@ def verdict_statement(
         return _consistent(rms, limits, places) + _open_question(separates, possible)
     if verdict == "undecidable":
         tied = found and found[0].tied
-        text = "Something is missing." if tied else "Something is missing, and these runs cannot tell what."
+        text = "Something is missing." if tied else "Something is missing, and these runs do not show what."
         text += f" {claim_phrase(found[0])}." if found else ""
         if not tied:
             return text + _open_question(separates, possible)
-        return text + (f" {_capital(separates)} would tell." if separates else "")
+        return text + (f" {_capital(separates)} would decide." if separates else "")
     if verdict == "unlisted":
         text = "No listed mechanism explains the difference"
         return f"{text}: {said}{f'; with it {fall}' if fall else ''}."
@@ -313,12 +313,12 @@ def _replaced(path: str, was: float | None, now: Estimate) -> str:
 
 
 def _others(found: Found) -> list[str]:
-    """What would look the same, and the run that would tell; what is less likely is not named."""
+    """What would look the same, and the run that would distinguish them; what is less likely is not named."""
     alike = [o for o in found.others if o.alike and o not in found.tied][:_MAX_NAMED]
     if not alike:
-        return [f"{_capital(found.separates)} would tell them apart."] if found.tied and found.separates else []
+        return [f"{_capital(found.separates)} would distinguish them."] if found.tied and found.separates else []
     said = listed([f"{_other_phrase(o)} ({percent(o.probability)})" for o in alike])
-    run = f"; {found.separates} would tell them apart" if found.separates else ""
+    run = f"; {found.separates} would distinguish them" if found.separates else ""
     return [f"{_capital(said)} would look the same in these runs{run}."]
 
 

@@ -1,1 +1,1 @@
-"""The run that would tell tied explanations apart."""
+"""The run that would distinguish tied explanations."""

@@ -1,4 +1,4 @@
-"""Runs that a shop can do with a machine: the menu from which a diagnosis chooses the one that tells causes apart."""
+"""Runs that a shop can do with a machine: the menu from which a diagnosis chooses the one that distinguishes causes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Points = tuple[tuple[float, float], ...]  # (s, degC), straight lines between th
 class Run:
     """One run: what the machine does in `stages`, after what it did `before`, which is not recorded.
 
-    `label` names it in a sentence: "… would tell them apart". `surroundings` are the recorded channels over time; rows
+    `label` names it in a sentence: "… would distinguish them". `surroundings` are the recorded channels over time; rows
     and changes stand on multiples of `row_s`. `clock_h` is the time of day at which it begins, `settled_degC` where a
     machine without recorded surroundings has stood.
     """

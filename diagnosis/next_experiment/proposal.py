@@ -28,11 +28,11 @@ COLUMNS = ("run", "hours", "nats", "nats_per_hour", "sensor", "nats_with_sensor"
 
 @dataclass(frozen=True)
 class Proposal:
-    """A run that tells alternatives apart: `separates` names them, `label` goes before "would tell them apart".
+    """A run that distinguishes alternatives: `separates` names them, `label` goes before "would distinguish them".
 
     `nats` is the least, over all ordered pairs, by which the truth is expected to fit better than the other, and
     `tied` the pairs that no run separates. `plan_text` is a run plan file and `sensor` the body that needs one more
-    sensor, if any. Where nothing tells, `label` and `plan_text` are empty and nats are those of the best run.
+    sensor, if any. Where nothing does, `label` and `plan_text` are empty and nats are those of the best run.
     `table` has the whole menu, columns `COLUMNS`; `hardest` is the pair that the run separates least.
     """
 
@@ -48,19 +48,19 @@ class Proposal:
 
     @property
     def sentence(self) -> str:
-        """What is proposed, or that nothing tells and how near the best run comes."""
+        """What is proposed, or that nothing does and how near the best run comes."""
         if not len(self.table):
-            return "No run is known that would tell them apart: no driver is set by the shop and no room is recorded."
+            return "No run is known that would distinguish them: no driver is set by the shop and no room is recorded."
         if not self.label:
             best = self.table.iloc[int(self.table["nats"].argmax())]
             return (
-                f"None of {len(self.table)} runs would tell them apart: the best, {best['run']}, is expected to give "
-                f"{few(self.nats)} nats, and {POLICY.telling_nats:g} is the least that tells."
+                f"None of {len(self.table)} runs would distinguish them: the best, {best['run']}, is expected to give "
+                f"{few(self.nats)} nats, and {POLICY.telling_nats:g} is the least that counts."
             )
         settled = "which settles it" if self.nats >= POLICY.settling_nats else f"{POLICY.settling_nats:g} settle it"
         left = [f" {a} and {b} would stay tied." for a, b in self.tied]
         return (
-            f"{self.label[0].upper()}{self.label[1:]} would tell {listed(self.separates)} apart: {few(self.hours)} h, "
+            f"{self.label[0].upper()}{self.label[1:]} would distinguish {listed(self.separates)}: {few(self.hours)} h, "
             f"{few(self.nats)} nats expected, {settled}.{''.join(left)}"
         )
 
@@ -167,7 +167,7 @@ def _proposal(
     label = best.run.label + (f" with one more sensor at {best.sensor}" if best.sensor else "")
     nats = _least(best, separable)
     comments = [
-        f"Tells apart: {listed(separates)}. Expected: {few(nats)} nats in {few(best.run.hours)} h.",
+        f"Distinguishes: {listed(separates)}. Expected: {few(nats)} nats in {few(best.run.hours)} h.",
         f"Begin after {_prepared(best.run)}.",
     ]
     comments += [f"Put one more temperature sensor at {best.sensor} before."] if best.sensor else []

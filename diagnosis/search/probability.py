@@ -15,7 +15,7 @@ from diagnosis.search.decision import Round
 
 @dataclass(frozen=True)
 class Explanation:
-    """A candidate with its probability; `alike` where the recordings cannot tell it from the best."""
+    """A candidate with its probability; `alike` where the recordings cannot distinguish it from the best."""
 
     tried: Tried
     probability: float

@@ -171,7 +171,7 @@ def _score(evidence: Evidence, policy: Policy) -> float:
 
 
 def better_and_worse(before: Evidence, after: Evidence, policy: Policy = POLICY) -> tuple[int, int]:
-    """Left-out batches whose squares fall, and those whose squares rise by more than tells.
+    """Left-out batches whose squares fall, and those whose squares rise by more than chance makes.
 
     A batch in which a driver is off is predicted alike with and without its effect: it speaks neither for nor against.
     """

@@ -20,7 +20,7 @@ class Shortlist:
 
     Attributes:
         worth: the candidates, as the screen scored them.
-        clusters: of each the name of the first of those that these recordings cannot tell from it.
+        clusters: of each the name of the first of those that these recordings cannot distinguish from it.
         chosen: which of them are refitted, one of each cluster.
     """
 

@@ -1,7 +1,7 @@
 """How well do recordings determine the parameters of a twin?
 
 A machine file gives every free parameter a prior. Four runs of a board whose values differ from the file are
-calibrated: the 90 % intervals shrink where the runs tell something, and hold the values that made the recordings.
+calibrated: the 90 % intervals shrink where the runs are informative, and hold the values that made the recordings.
 """
 
 import tempfile

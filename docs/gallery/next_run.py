@@ -1,4 +1,4 @@
-"""The recordings fit two causes: which run would tell?
+"""The recordings fit two causes: which run would decide?
 
 Heater 1 gives less heat under load, but whose? In all runs both heaters are on together, so its own power and that of
 the other heater explain it alike. The diagnosis proposes one heater alone; there the causes are kelvins apart.

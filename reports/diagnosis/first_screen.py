@@ -19,7 +19,7 @@ _HEADLINES = {
     "found": "Found: what was concealed is what was named.",
     "found_and_more": "Found, but something that is not true was named as well.",
     "other_place": "Half right: the effect was named, at a wrong place.",
-    "in_set": "Not settled: what was concealed is among the explanations that these recordings cannot tell apart.",
+    "in_set": "Not settled: what was concealed is among the explanations that these recordings cannot distinguish.",
     "missed": "Not found: something was concealed, and no effect was named.",
     "wrong": "Not found: something else was named than what was concealed.",
     "false_alarm": "False alarm: nothing was concealed, and the diagnosis did not call that consistent.",

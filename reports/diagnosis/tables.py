@@ -25,7 +25,7 @@ _LIKELIHOOD = (
 NARROW = "\u202f"  # a space that does not break
 CHIPS = {
     "consistent": "consistent", "explained": "explained", "partly_explained": "partly explained",
-    "unlisted": "not in the library", "undecidable": "cannot tell yet",
+    "unlisted": "not in the library", "undecidable": "undecided",
 }  # fmt: skip
 _ALTERNATIVES = {
     "wrong_parameter": "a wrong parameter", "coarse_network": "too coarse a network",
@@ -90,7 +90,7 @@ def headline(verdict: str, probabilities: Sequence[float]) -> str:
         "missing that these runs could show.",
         "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",
         "unlisted": "Something is missing that no listed mechanism explains.",
-        "undecidable": "Something is missing, but these recordings cannot tell what.",
+        "undecidable": "Something is missing, but these recordings do not show what.",
     }[verdict]
 
 

@@ -275,7 +275,7 @@ def test_noise_is_stated_where_no_resolution_is(given: Machine, batches: list[Ba
          "ambient"),
         (lambda t: t.assign(room=t["room"].where((t["time_s"] < 3000) | (t["time_s"] > 6000))),
          "machine two_bodies: no network can be drafted: in every batch a driver or the ambient has no value for more "
-         "than 900 s; mend the recordings, or overrule the masks"),
+         "than 900 s; correct the recordings, or overrule the masks"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_drafted_is_told_in_one_line(

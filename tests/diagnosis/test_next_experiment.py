@@ -109,7 +109,7 @@ def test_a_run_is_chosen_that_the_recordings_were_not() -> None:
     assert by_words[cool] > POLICY.settling_nats
     # several settle it: the shortest of them
     assert chosen.hours == chosen.table.loc[chosen.table["nats"] >= POLICY.settling_nats, "hours"].min()
-    assert chosen.sentence.startswith(f"{chosen.label.capitalize()} would tell air and loss apart: 4.0 h, ")
+    assert chosen.sentence.startswith(f"{chosen.label.capitalize()} would distinguish air and loss: 4.0 h, ")
 
 
 @pytest.mark.parametrize(("truth", "other"), [("air", "loss"), ("loss", "air")])
@@ -230,7 +230,7 @@ def test_rivals_that_no_run_separates() -> None:
     alternatives = tied()
     same = next_experiment({"air": alternatives["air"], "twin": alternatives["air"]})
     assert (same.label, same.plan_text, same.separates, same.tied) == ("", "", (), (("air", "twin"),))
-    assert same.sentence.startswith("None of 6 runs would tell them apart: the best, ")
+    assert same.sentence.startswith("None of 6 runs would distinguish them: the best, ")
     three = next_experiment({"air": alternatives["air"], "twin": alternatives["air"], "loss": alternatives["loss"]})
     assert three.separates == ("air", "twin", "loss") and three.tied == (("air", "twin"),)
     assert three.label == proposal().label and three.nats == pytest.approx(proposal().nats)

@@ -64,7 +64,7 @@ def test_claim_evidence_advice_and_caveat() -> None:
     assert statement(SINK) == (
         "Missing: heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of the fit "
         "falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. Radiation to walls or from a hot "
-        "neighbour at the bed (8 %) would look the same in these runs; a night switched off would tell them apart."
+        "neighbour at the bed (8 %) would look the same in these runs; a night switched off would distinguish them."
     )
     capped = replace(SINK, others=(), separates="", caps=("3 runs only", "a resolution of 0.5 K"))
     assert statement(capped).endswith("runs. No surer than that: 3 runs only and a resolution of 0.5 K.")
@@ -84,14 +84,14 @@ def test_no_surer_than_the_probability(probability: float, begins: str) -> None:
 def test_a_tie_is_said_as_one() -> None:
     tied = replace(SINK, probability=0.52, others=(Other("radiation", BED, "the bed", 0.31, "surrounding: the room"),))
     assert statement(tied) == (
-        "These runs cannot tell two explanations apart: heat to the floor at the bed, 10 W/K (90 %: 9–12) (52 %) or "
+        "These runs cannot distinguish two explanations: heat to the floor at the bed, 10 W/K (90 %: 9–12) (52 %) or "
         "radiation to walls or from a hot neighbour at the bed (surrounding: the room) (31 %); with it the z error of "
         "runs left out of the fit falls from 9.1 to 1.4 µm (noise 1.2), more probable in 11 of 12 runs. A night "
-        "switched off would tell them apart."
+        "switched off would distinguish them."
     )
     likelier = replace(tied, probability=0.004, others=(replace(tied.others[0], probability=0.92),))
     assert claim_phrase(likelier) == (
-        "These runs cannot tell two explanations apart: radiation to walls or from a hot neighbour at the bed "
+        "These runs cannot distinguish two explanations: radiation to walls or from a hot neighbour at the bed "
         "(surrounding: the room) (92 %) or heat to the floor at the bed, 10 W/K (90 %: 9–12) (under 1 %)"
     )
     unlike = replace(tied, others=(replace(tied.others[0], alike=False),))
@@ -211,7 +211,7 @@ def test_verdicts() -> None:
     open_question = {"separates": "a night switched off", "possible": ["heat to the floor: bed"]}
     assert verdict_statement("consistent", **open_question).endswith(f"the noise. {more}")
     assert verdict_statement("partly_explained", [SINK], [Z], **open_question).endswith(f"still missing. {more}")
-    assert verdict_statement("undecidable", **open_question).endswith(f"cannot tell what. {more}")
+    assert verdict_statement("undecidable", **open_question).endswith(f"do not show what. {more}")
     assert "Too weak" not in verdict_statement("consistent", separates="a night switched off")
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
     assert verdict_statement("consistent", rms=coarse) == (
@@ -238,9 +238,9 @@ def test_verdicts() -> None:
     )
     tied = replace(SINK, probability=0.5, others=(Other("radiation", BED, "the bed", 0.4),))
     assert verdict_statement("undecidable", [tied], separates="a night switched off") == (
-        "Something is missing. These runs cannot tell two explanations apart: heat to "
+        "Something is missing. These runs cannot distinguish two explanations: heat to "
         "the floor at the bed, 10 W/K (90 %: 9–12) (50 %) or radiation to walls or from a hot neighbour at the bed "
-        "(40 %). A night switched off would tell."
+        "(40 %). A night switched off would decide."
     )
     assert verdict_statement("explained", [flux, tied, replace(SINK, probability=0.7, others=())]) == (
         "The difference is 60 W into the column back (when: coolant on, no lag), heat to the floor at the bed, 10 W/K "
@@ -249,7 +249,7 @@ def test_verdicts() -> None:
     )
     unsure = replace(SINK, probability=0.4, others=())
     assert verdict_statement("undecidable", [unsure]).startswith(
-        "Something is missing, and these runs cannot tell what. Perhaps (40 %) missing: heat to the floor at the bed"
+        "Something is missing, and these runs do not show what. Perhaps (40 %) missing: heat to the floor at the bed"
     )
 
 

@@ -91,7 +91,7 @@ def test_old_and_new_recordings_are_diagnosed_together_and_the_change_is_said(
     assert read_findings(out / "findings.json").verdict == "explained" and not (out / "next_run.yml").exists()
     changed = [line.removeprefix("changed: ") for line in done.out.splitlines() if line.startswith("changed: ")]
     assert changed == [
-        "Verdict: cannot tell yet → explained (b3 and b4 added, 5 recordings in all).",
+        "Verdict: undecided → explained (b3 and b4 added, 5 recordings in all).",
         "First finding: heat to the floor at bed, 52\u202f% → 97\u202f%.",
         "The proposed run (night stop: 3 h of spindle at 4000 rpm, then everything off, doors shut, recorded for 9 h) "
         "is the recording b4.",

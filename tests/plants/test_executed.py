@@ -26,7 +26,7 @@ OPTIONS: dict[str, Any] = {
 }  # fmt: skip
 HAS = frozenset(OPTIONS["has"])
 PLAN = """
-# Tells apart: one and other. Expected: 12 nats in 1.5 h.
+# Distinguishes: one and other. Expected: 12 nats in 1.5 h.
 # Begin after 6 h at rest, then 2 h spindle_rpm 4000 and coolant 1.
 # Put one more temperature sensor at shaft before.
 name: a staircase

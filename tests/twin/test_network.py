@@ -131,7 +131,7 @@ BAD = {
     ),
     "out of bounds": (
         {"links__shaft-head": {"value": "12 W/K", "spread": 0.5, "bounds": ["1 W/K", "10 W/K"]}},
-        "links.shaft-head.conductance: 12 W/K lies outside the bounds 1 to 10; widen them or mend it",
+        "links.shaft-head.conductance: 12 W/K lies outside the bounds 1 to 10; widen them or correct it",
     ),
     "an island": (
         {"exposures__shaft-room": None, "exposures__head-room": None},
@@ -168,7 +168,7 @@ BAD = {
     "an open chain": (
         {"errors__z__chain": [{"body": "shaft", "length": "0.4 m"}, {"body": "head", "length": "0.3 m", "sign": -1}]},
         "errors.z.chain does not close: its signed lengths add up to 0.1 m, expected 0 m, so warming all by 1 K "
-        "would give 1.1 um too much; mend a length or a sign, or state uniform_length",
+        "would give 1.1 um too much; correct a length or a sign, or state uniform_length",
     ),
     "shares above one": (
         {"mechanisms__belt__into": {"shaft": 0.7, "head": 0.6}},

@@ -75,7 +75,7 @@ def _open_chains(part: TwinPart) -> Iterator[str]:
             yield (
                 f"errors.{channel}.chain does not close: its signed lengths add up to {got:g} m, "
                 f"expected {expected:g} m, so warming all by 1 K would give {wrong_um:.1f} um too much; "
-                "mend a length or a sign, or state uniform_length"
+                "correct a length or a sign, or state uniform_length"
             )
 
 

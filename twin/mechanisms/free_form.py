@@ -44,7 +44,7 @@ class FreeFlux(Mechanism):
         "u level, v other or 0"
     )
     source = SECOND_ORDER
-    signature = "whatever the body's temperature lacks, as far as a driver and the temperature itself tell it"
+    signature = "whatever the body's temperature lacks, as far as a driver and the temperature itself show it"
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = ANY
     optional_drivers: ClassVar[frozenset[str]] = frozenset(ANY)

@@ -63,7 +63,7 @@ def read_plan_table(
         text = (at,) if unit == "timestamp" else ()
         blocks = list(sheet.blocks(header_row + 1, [at, *(p for p, _ in found.values())], text))
     if ragged := sum(b.ragged_rows for b in blocks):
-        raise InputError(f"{where}: {ragged} rows have too many or too few cells; mend them")
+        raise InputError(f"{where}: {ragged} rows have too many or too few cells; correct them")
     time_s = _joined([to_seconds(b.columns[at], unit, pattern, sheet.decimal) for b in blocks])
     _check_time(time_s, header[at], where)
     columns = {n: _column(blocks, p, sheet, u, units[n], f"{where}: column {n!r}") for n, (p, u) in found.items()}
@@ -170,7 +170,7 @@ def _check_time(time_s: Array, name: str, where: str) -> None:
         raise InputError(f"{where}: {len(time_s)} data rows, expected at least 2; the last one ends the plan")
     bad = np.flatnonzero(~np.isfinite(time_s))
     if len(bad):
-        raise InputError(f"{where}: data row {bad[0] + 1}: column {name!r} holds no readable time; mend it")
+        raise InputError(f"{where}: data row {bad[0] + 1}: column {name!r} holds no readable time; correct it")
     back = np.flatnonzero(np.diff(time_s) <= 0)
     if len(back):
         k = int(back[0]) + 1
@@ -185,7 +185,7 @@ def _column(blocks: Sequence[Any], position: int, sheet: Sheet, written: str, un
         if unreadable is not None:
             k = int(np.flatnonzero(unreadable)[0])
             cell = block.columns[position][k].as_py()
-            raise InputError(f"{where} data row {row + k + 1}: got {cell!r}, expected a number in {unit}; mend it")
+            raise InputError(f"{where} data row {row + k + 1}: got {cell!r}, expected a number in {unit}; correct it")
         parts.append(values)
         row += len(values)
     return convert(_joined(parts), written or unit, unit, where)

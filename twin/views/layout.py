@@ -1,7 +1,7 @@
 """Where the bodies of a network stand in a picture: strong links short, no crossings, always the same.
 
 Distances follow the resistance between bodies (Klein and Randić 1993), flattened by stress majorisation (Gansner, Koren
-and North 2004); then every body takes a place on a brick pattern and a search without chance mends crossings.
+and North 2004); then every body takes a place on a brick pattern and a search without chance removes crossings.
 """
 
 from __future__ import annotations

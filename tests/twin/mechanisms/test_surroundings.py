@@ -153,7 +153,7 @@ def test_floor_sink_at_a_place_and_beside_a_named_room() -> None:
         ),
         (
             {"law": "floor_sink", "at": {"body": "bed", "room": "hall"}, "parameters": {"conductance": "2 kW/K"}},
-            "exposures.bed-odd.conductance: 2000 W/K lies outside the bounds 0 to 1000; widen them or mend it",
+            "exposures.bed-odd.conductance: 2000 W/K lies outside the bounds 0 to 1000; widen them or correct it",
         ),
     ],
 )
