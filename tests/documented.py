@@ -2,9 +2,9 @@
 
 A fenced block with ``title="NAME"`` is a file; where NAME lies in a package, the package finds it. One with
 ``title="MODULE.py: REGISTRY"`` is a line of a registry. Other ``python`` blocks run one after the other in one
-namespace, in which MACHINES is the folder of machine files; a ``text`` block behind one is what it prints.
-``console`` blocks hold ``$ command`` and what it prints. Of printed lines the page may leave some out; … stands for any
-text, and numbers may differ a little from computer to computer.
+namespace; a ``text`` block behind one is what it prints. ``console`` blocks hold ``$ command`` and what it prints. Of
+printed lines the page may leave some out; … stands for any text, and numbers may differ a little from computer to
+computer.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Session:
 
     def __init__(self, page: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         self._page, self._call, self._patch = page, call, monkeypatch
-        self._names: dict[str, Any] = {"__name__": "page", "MACHINES": ROOT / "machines"}
+        self._names: dict[str, Any] = {"__name__": "page"}
         self._printed = ""
 
     def run(self) -> int:

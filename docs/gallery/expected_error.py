@@ -6,23 +6,20 @@ runs in ten stay below. Runs outside the trained region are flagged and get a wi
 
 import os
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 PLAN = td.Plan(("fuzzy_correlation",), ("transfer_function",), ("forward",), n_tsps=(4,))
 
 with tempfile.TemporaryDirectory() as folder:
     os.environ["THERMODRIFT_HOME"] = f"{folder}/home"
-    files = sorted(write_sample_year(Path(folder), seed=0))
-    td.train(MACHINE, files[:16], channels=["z"], plan=PLAN)
+    machine, files = td.sample_year(folder, seed=0)
+    td.train(machine, files[:16], channels=["z"], plan=PLAN)
     model = td.load_model("models:/sample_vmc-z@champion")
-    later = td.read(files[16:], MACHINE)
+    later = td.read(files[16:], machine)
     tables = [td.predict(model, batch) for batch in later]
 
 recorded_um = [b.values("z") - b.values("z")[0] for b in later]

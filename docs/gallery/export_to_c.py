@@ -10,29 +10,26 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 PLAN = td.Plan(("fuzzy_correlation",), ("ridge",), ("forward",), n_tsps=(4,))
 compiler = shutil.which("cc") or sys.exit("export_to_c: no C compiler (cc) on this computer")
 
 with tempfile.TemporaryDirectory() as folder:
     os.environ["THERMODRIFT_HOME"] = f"{folder}/home"
-    files = sorted(write_sample_year(Path(folder), seed=0))
-    td.train(MACHINE, files[:18], channels=["z"], plan=PLAN)
+    machine, files = td.sample_year(folder, seed=0)
+    td.train(machine, files[:18], channels=["z"], plan=PLAN)
     name = "models:/sample_vmc-z@champion"
     td.export(name, "c", folder)
     library = f"{folder}/sample_vmc.so"
     source = f"{folder}/sample_vmc.c"
     subprocess.run([compiler, "-O2", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
     program, model = ctypes.CDLL(library), td.load_model(name)
-    (run,) = td.read(files[20], MACHINE)
+    (run,) = td.read(files[20], machine)
     predicted_um = td.predict(model, run)["predicted_um"].to_numpy()
 
     by_c_um, error_um = np.empty(run.n_rows), ctypes.c_double()

@@ -11,9 +11,7 @@ import duckdb
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GOLD, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 QUERY = """
 select batch, max(spindle_rpm) as rpm,
        arg_max(front, time_s) - arg_min(front, time_s) as rise_K,
@@ -23,9 +21,9 @@ group by batch order by batch
 """
 
 with tempfile.TemporaryDirectory() as folder:
-    write_sample_year(Path(folder) / "year", seed=0)
+    machine, files = td.sample_year(Path(folder) / "year", seed=0)
     lake = td.Lake(Path(folder) / "lake")
-    report = td.ingest(Path(folder) / "year", MACHINE, lake)
+    report = td.ingest(files, machine, lake)
     table = duckdb.sql(QUERY.format(lake=Path(folder) / "lake")).df()
 
 assert len(table) == 30 == sum(row.status == "new" for row in report.rows)

@@ -5,7 +5,6 @@ suite runs it on data with known answers; then it competes with plain correlatio
 """
 
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +12,6 @@ import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, picture
 from features.selectors.base import Selector
 from features.selectors.statistics import check_n_tsps, in_order, ranking, training_statistics
-from plants.sample.sample_year import write_sample_year
-
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 
 
 class Distinct(Selector):
@@ -35,7 +31,8 @@ class Distinct(Selector):
 
 checks = list(td.testing.check_selector(Distinct))  # a promise that is not kept raises an error that says which
 with tempfile.TemporaryDirectory() as folder:
-    batches = td.read(sorted(write_sample_year(Path(folder), seed=0)), MACHINE)
+    machine, files = td.sample_year(folder, seed=0)
+    batches = td.read(files, machine)
 first, later = batches[:20], batches[20:]
 
 

@@ -6,19 +6,16 @@ and with one probe reading an hour, from which the correction learns what the mo
 
 import os
 import tempfile
-from pathlib import Path
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 PLAN = td.Plan(("fuzzy_correlation",), ("ridge",), ("forward",), n_tsps=(4,))
 
 with tempfile.TemporaryDirectory() as folder:
     os.environ["THERMODRIFT_HOME"] = f"{folder}/home"
-    files = sorted(write_sample_year(Path(folder), seed=0))
-    td.train(MACHINE, files[:18], channels=["z"], plan=PLAN)
+    machine, files = td.sample_year(folder, seed=0)
+    td.train(machine, files[:18], channels=["z"], plan=PLAN)
     model = "models:/sample_vmc-z@champion"
     alone = td.rehearse(model, files[18:20], sample_s=20)
     learning = td.rehearse(model, files[18:20], sample_s=20, readings_h=1.0)

@@ -5,19 +5,17 @@ came before. Both predict the rest of the year, each run before any model has le
 """
 
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 WINTER = 4  # runs
 
 with tempfile.TemporaryDirectory() as folder:
-    batches = td.read(write_sample_year(Path(folder), seed=0), MACHINE)
+    machine, files = td.sample_year(folder, seed=0)
+    batches = td.read(files, machine)
 batches.sort(key=lambda b: b.start)
 
 

@@ -5,20 +5,18 @@ judged on the ten later runs. Fewer sensors can do almost as well as all; the wr
 """
 
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 SELECTORS = ("fuzzy_correlation", "sequential_forward", "vif_pruning", "elastic_net_path", "correlation", "fcgc",
              "kmedoids", "fcm_grey", "none")  # fmt: skip
 
 with tempfile.TemporaryDirectory() as folder:
-    batches = td.read(sorted(write_sample_year(Path(folder), seed=0)), MACHINE)
+    machine, files = td.sample_year(folder, seed=0)
+    batches = td.read(files, machine)
 batches.sort(key=lambda b: b.start)
 first, later = batches[:20], batches[20:]
 

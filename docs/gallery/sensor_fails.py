@@ -6,21 +6,18 @@ the other sensors and stays active: the error grows by some micrometres, and com
 
 import os
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 import thermodrift as td
 from docs.gallery.drawing import COLD, GREY, PALE, WARM, picture
-from plants.sample.sample_year import write_sample_year
 
-MACHINE = Path(__file__).parents[2] / "machines" / "sample_vmc.yml"
 PLAN = td.Plan(("fuzzy_correlation",), ("ridge",), ("forward",), n_tsps=(4,))
 
 with tempfile.TemporaryDirectory() as folder:
     os.environ["THERMODRIFT_HOME"] = f"{folder}/home"
-    files = sorted(write_sample_year(Path(folder), seed=0))
-    td.train(MACHINE, files[:18], channels=["z"], plan=PLAN)
+    machine, files = td.sample_year(folder, seed=0)
+    td.train(machine, files[:18], channels=["z"], plan=PLAN)
     model = "models:/sample_vmc-z@champion"
     whole = td.rehearse(model, files[20], sample_s=20)
     failing = td.rehearse(model, files[20], sample_s=20, failures=["rear:lost@3h+45min"])
