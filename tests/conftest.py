@@ -59,6 +59,15 @@ def quick_looks() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """From its first use on, a home that a test makes in this process gets a copy of one empty store."""
+    from tests.toys import empty_store
+
+    with empty_store.copied_stores(empty_store.empty_store(tmp_path_factory)):
+        yield
+
+
 ON_PREFECTS_SERVER = tuple(f"tests/pipelines/test_{n}.py" for n in ("flows", "diagnosis_flow", "retraining"))
 
 

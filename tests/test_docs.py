@@ -29,7 +29,7 @@ def _registry_as_before(monkeypatch):
 
 
 @pytest.fixture
-def call(monkeypatch, capsys, tmp_path):
+def call(monkeypatch, capsys, tmp_path, copied_stores):
     """Commands in an empty folder, as a new user has it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("THERMODRIFT_HOME", raising=False)

@@ -19,25 +19,29 @@ PNG = bytes.fromhex(  # one grey pixel
 
 
 @pytest.fixture(scope="session", autouse=True)
-def copied_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A home that a test makes in this process gets a copy of one empty store."""
-    from tests.toys import empty_store
-
-    with empty_store.copied_stores(empty_store.empty_store(tmp_path_factory)):
-        yield
+def no_migrations(copied_stores: None) -> None:
+    """Homes get a copy of one empty store."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def plain_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Figures are built and not drawn, which takes a second for each report; a file marked `drawn` does draw them."""
+    """No figure is drawn, which takes a second or two for each report; a file marked `drawn` does draw them."""
     from matplotlib.figure import Figure
+
+    from reports.diagnosis import page
+
+    write = page.write_diagnosis_report
 
     def save(figure: Figure, out: Any, *, format: str, **_: Any) -> None:
         out.write(b'<svg xmlns="http://www.w3.org/2000/svg"/>' if format == "svg" else PNG)
 
+    def write_without(path: Path, d: Any, pictures: bool = True, *given: Any, **more: Any) -> None:
+        write(path, d, False, *given, **more)
+
     with pytest.MonkeyPatch.context() as patch:
         if request.node.get_closest_marker("drawn") is None:
             patch.setattr(Figure, "savefig", save)
+            patch.setattr(page, "write_diagnosis_report", write_without)
         yield
 
 

@@ -45,7 +45,14 @@ def row(goals: pd.DataFrame, measure: str, plant: str = "all") -> dict[str, Any]
     return dict(at.iloc[0])
 
 
-def test_every_goal_is_measured_over_all_and_by_plant() -> None:
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of resampling, for tests that look at no interval."""
+    for module in ("goals", "goal_table"):
+        monkeypatch.setattr(f"evidence.proof.scoring.{module}.DRAWS", 50)
+
+
+def test_every_goal_is_measured_over_all_and_by_plant(few_draws: None) -> None:
     goals = goal_table(*examined())
     assert list(goals.columns) == list(GOAL_COLUMNS)
     assert set(goals["plant"]) == {"all", "elements", "volumes"}
@@ -64,7 +71,7 @@ def test_every_goal_is_measured_over_all_and_by_plant() -> None:
     assert absent["n"] == 0 and pd.isna(absent["value"]) and pd.isna(absent["met"])
 
 
-def test_an_answer_that_is_told_the_truth_is_held_to_the_same_bars() -> None:
+def test_an_answer_that_is_told_the_truth_is_held_to_the_same_bars(few_draws: None) -> None:
     """Of ten visible effects (80 W by the true model, 60 to 110) eight pass the bar; of a pair both must."""
     keys, given, true = {}, {}, {}
     for k in range(12):
@@ -93,7 +100,7 @@ def test_an_answer_that_is_told_the_truth_is_held_to_the_same_bars() -> None:
         assert pd.isna(informed(nothing)[0])
 
 
-def test_what_is_unlisted_or_confounded_is_told_the_truth_too() -> None:
+def test_what_is_unlisted_or_confounded_is_told_the_truth_too(few_draws: None) -> None:
     """Of four each the last gains less than a claim takes; what is unlisted has no amplitude that could be compared."""
     keys, given, true = {}, {}, {}
     for kind, mechanism in (("unlisted", None), ("confounded", "cabinet_heat")):
