@@ -84,7 +84,7 @@ def parts(sizes: Sizes) -> Iterator[tuple[str, list[Row]]]:
     yield "twin", twin_speed.rows(twin_speed.ways(), sizes.repeats, sizes.twin_batches, sizes.twin_h)
     yield "ingest", ingest.rows(sizes.csv_gb, sizes.repeats)
     yield "complete crossing", [complete(batches, sizes.whole)]
-    yield "nets on a GPU", [on_gpu(sizes.repeats)]
+    yield "nets on a GPU", list(on_gpu(batches, sizes.repeats))
 
 
 def lag_dictionary(batches: Sequence[Batch], repeats: int) -> Row:
@@ -115,21 +115,23 @@ def complete(batches: Sequence[Batch], run: bool) -> Row:
     return Row(what, wall_s, target_s=grid.TARGET_WHOLE_S)
 
 
-def on_gpu(repeats: int) -> Row:
-    """Training of the sequence net on a GPU, next to the processor."""
+def on_gpu(batches: Sequence[Batch], repeats: int) -> Iterator[Row]:
+    """Training of each sequence net on a GPU, next to the processor: all batches but one, error z."""
     import torch
 
     from models import FAMILIES
 
-    what = "nets on a GPU, tcn, one fold"
     if not torch.cuda.is_available():
-        return Row(what, reference="the same on the processor", note="not run (no GPU)")
-    design = grid_growth.recordings(10, 4, 300)
-    took = [
-        median_s(partial(FAMILIES["tcn"](device=device).fit_design, design, range(9)), repeats)
-        for device in ("cuda", "cpu")
-    ]
-    return Row(what, took[0], "the same on the processor", took[1])
+        yield Row("nets on a GPU", reference="the same on the processor", note="not run (no GPU)")
+        return
+    design = Design.build(batches, temperature_inputs(batches)[: grid.POINTS], "z")
+    for key in ("tcn", "gru", "lstm"):
+        train = range(len(batches) - 1)
+        took = [
+            median_s(partial(FAMILIES[key](device=device).fit_design, design, train), repeats)
+            for device in ("cuda", "cpu")
+        ]
+        yield Row(f"nets on a GPU, {key}, {len(train)} batches", took[0], "the same on the processor", took[1])
 
 
 def main() -> None:
