@@ -61,7 +61,13 @@ def folds_of(batches: int) -> list[Fold]:
 def seconds_per_fold(design: Design, family: str, **options: int) -> float:
     folds = folds_of(design.n_batches)
     start = time.process_time()
-    FamilyScores.run(design, FAMILIES[family](**options), folds, [(design, list(range(len(folds))))])
+    FamilyScores.run(
+        design,
+        FAMILIES[family](**options),
+        folds,
+        [(design, list(range(len(folds))))],
+        ["leave-batch-out"] * len(folds),
+    )
     return (time.process_time() - start) / len(folds)
 
 

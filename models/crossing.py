@@ -230,15 +230,16 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
     family = FAMILIES[key]
     target = crossing.design.target
     cells = crossing.cells(family) if suits(key, crossing.batches[0].channels[target]) else []
-    scores, summaries, failures = [], [], []
+    scores, summaries = [], []
     predictions: dict[str, NDArray[np.float32]] = {}
-    for protocol, folds in crossing.folds.items():
-        if not folds or not cells:
-            continue
-        judged = FamilyScores.run(crossing.design, family(), folds, crossing.needed(folds, cells))
-        failures += [(f"family {key}", f"{protocol}, {text}") for text in judged.failures]
+    run = {p: folds for p, folds in crossing.folds.items() if folds and cells}
+    every, protocols = [f for folds in run.values() for f in folds], [p for p, folds in run.items() for _ in folds]
+    judged = FamilyScores.run(crossing.design, family(), every, crossing.needed(every, cells), protocols)
+    end = 0
+    for protocol, folds in run.items():
+        own, end = range(end, end + len(folds)), end + len(folds)
         picked = {cell: [judged.column.get((crossing.inputs(cell[0], f.train, cell[1]), i), -1)
-                         for i, f in enumerate(folds)] for cell in cells}  # fmt: skip
+                         for i, f in zip(own, folds, strict=True)] for cell in cells}  # fmt: skip
         scored = [cell for cell in cells if min(picked[cell]) >= 0]
         if not scored:
             continue
@@ -247,7 +248,7 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
         names = pd.DataFrame(scored, columns=["selector", "n_tsp"]).assign(protocol=protocol, family=key)[CELL_KEYS]
         inputs = [crossing.inputs(selector, crossing.everything, n_tsp) for selector, n_tsp in scored]
         summary = summary.assign(
-            n_parameters=judged.n_parameters,
+            n_parameters=judged.parameters(own),
             rank=family.rank,
             tsp_stability=[crossing.stability(protocol, *cell) for cell in scored],
             inputs=["|".join(i) for i in inputs],
@@ -264,7 +265,7 @@ def cross_family(crossing: Crossing, key: str) -> FamilyResult:
         pd.concat(scores, ignore_index=True) if scores else pd.DataFrame(),
         pd.concat(summaries, ignore_index=True) if summaries else pd.DataFrame(),
         predictions,
-        failures,
+        [(f"family {key}", f"{protocol}, {text}") for protocol, text in judged.failures],
     )
 
 

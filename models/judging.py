@@ -1,4 +1,4 @@
-"""Scoring of one family under one protocol: every distinct set of inputs and fold, fitted and scored once."""
+"""Scoring of one family: every distinct set of inputs and fold, fitted and scored once."""
 
 from __future__ import annotations
 
@@ -37,23 +37,33 @@ class _Column:
 
 @dataclass
 class FamilyScores:
-    """Every distinct (inputs, fold) of one family under one protocol, with its scores on every tested batch."""
+    """Every distinct (inputs, fold) of one family, with its scores on every tested batch."""
 
     column: dict[tuple[Inputs, int], int]
     tested: dict[str, Array]  # score -> (columns, K), NaN where a batch is not tested
     fit_S_um: Array  # (columns,), over the training batches, at most 100 of them, 4 of an iterative family
     kept: dict[int, Array]  # column -> prediction on the fold's tested rows
-    n_parameters: int
-    failures: list[str]
+    n_parameters: NDArray[np.int64]  # (columns,)
+    failures: list[tuple[str, str]]  # protocol and what could not be fitted
 
     @classmethod
     def run(
-        cls, design: Design, family: Family, folds: Sequence[Fold], needed: Sequence[tuple[Design, list[int]]]
+        cls,
+        design: Design,
+        family: Family,
+        folds: Sequence[Fold],
+        needed: Sequence[tuple[Design, list[int]]],
+        protocols: Sequence[str],
     ) -> FamilyScores:
-        """Fit and score. `needed`: each distinct subset of the design's inputs with the folds it is wanted for."""
+        """Fit and score the folds of all protocols together, since they share most of the work.
+
+        Args:
+            needed: each distinct subset of the design's inputs with the folds it is wanted for.
+            protocols: of every fold; where a subset cannot be fitted, each protocol's folds are tried by themselves.
+        """
         total = sum(len(which) for _, which in needed)
         tested = {name: np.full((total, design.n_batches), np.nan) for name in [*SCORES, *CERTAINTY, "n_rows"]}
-        out = cls({}, tested, np.full(total, np.nan), {}, 0, [])
+        out = cls({}, tested, np.full(total, np.nan), {}, np.zeros(total, np.int64), [])
         most = _FITTED_ON if family.closed_form else _FITTED_ON_ITERATIVE
         trained = [f.train[:: -(-len(f.train) // most)] for f in folds]
         pending: list[_Column] = []
@@ -62,14 +72,8 @@ class FamilyScores:
             [sub for sub, _ in needed], [[folds[i].train for i in which] for _, which in needed]
         )
         for (sub, which), fitted in zip(needed, subsets, strict=True):
-            try:
-                if isinstance(fitted, InputError):
-                    raise fitted
-                columns = _columns(sub, fitted, which, folds, trained)
-            except InputError as error:
-                out.failures.append(f"{len(sub.inputs)} points: {error}")
-                continue
-            out.n_parameters = max(out.n_parameters, columns[0].n_parameters)
+            columns, failures = _columns_or_failures(sub, family, fitted, which, folds, trained, protocols)
+            out.failures += failures
             pending += columns
             waiting += sum(p.nbytes for c in columns for p in c.predicted_um.values())
             if waiting > _AT_ONCE_BYTES:
@@ -77,6 +81,14 @@ class FamilyScores:
                 pending, waiting = [], 0
         out._judge(design, folds, trained, pending)
         return out
+
+    def parameters(self, folds: range) -> int:
+        """The most numbers learned from any set of inputs, each on the first of these folds that it is wanted for."""
+        first: dict[Inputs, int] = {}
+        for (inputs, fold), column in self.column.items():
+            if fold in folds:
+                first.setdefault(inputs, column)
+        return int(self.n_parameters[list(first.values())].max())
 
     def _judge(
         self, design: Design, folds: Sequence[Fold], trained: Sequence[Sequence[int]], pending: Sequence[_Column]
@@ -108,6 +120,7 @@ class FamilyScores:
             own = [S_um for S_um in fit_S[c] if np.isfinite(S_um)]
             fitted = column.fitting_S_um
             self.fit_S_um[first + c] = fitted if fitted is not None else sum(own) / max(1, len(own))
+            self.n_parameters[first + c] = column.n_parameters
             self.column[column.inputs, column.fold] = first + c
 
     def left_out(self, design: Design, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -116,6 +129,34 @@ class FamilyScores:
         for fold, column in zip(folds, columns, strict=True):
             out[design.rows(fold.test[0])] = self.kept[int(column)]
         return out
+
+
+def _columns_or_failures(
+    design: Design,
+    family: Family,
+    fitted: list[Family] | InputError,
+    which: Sequence[int],
+    folds: Sequence[Fold],
+    trained: Sequence[Sequence[int]],
+    protocols: Sequence[str],
+) -> tuple[list[_Column], list[tuple[str, str]]]:
+    """The columns of a subset, and the protocols whose folds cannot be fitted on it, with the reason."""
+    try:
+        if isinstance(fitted, InputError):
+            raise fitted
+        return _columns(design, fitted, which, folds, trained), []
+    except InputError as error:
+        own = dict.fromkeys(protocols[i] for i in which)
+        if len(own) == 1:
+            return [], [(next(iter(own)), f"{len(design.inputs)} points: {error}")]
+    columns: list[_Column] = []
+    failures: list[tuple[str, str]] = []
+    for protocol in own:
+        some = [i for i in which if protocols[i] == protocol]
+        (alone,) = family.fit_subsets([design], [[folds[i].train for i in some]])
+        more, failed = _columns_or_failures(design, family, alone, some, folds, trained, protocols)
+        columns, failures = columns + more, failures + failed
+    return columns, failures
 
 
 def _columns(
@@ -156,13 +197,15 @@ def score_table(
     names = [*SCORES, *CERTAINTY]
     if protocol == "train-on-one":
         fold_names, ids = [f.name for f in folds], ["*"] * len(folds)
+        own, place = np.unique(columns, return_inverse=True)
+        tested = {name: values[own] for name, values in judged.tested.items()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # the mean of an empty slice is NaN, as intended
             # max |e| is the greatest of all, every other score a mean over the tested batches.
-            per_fold = {n: (np.nanmax if n == "max_abs_um" else np.nanmean)(judged.tested[n], axis=1) for n in names}
-            per_fold["S_std_um"] = np.nanstd(judged.tested["S_um"], axis=1, ddof=1)
-            per_fold["n_rows"] = np.nansum(judged.tested["n_rows"], axis=1)
-        values = {name: column[columns] for name, column in per_fold.items()}
+            per_fold = {n: (np.nanmax if n == "max_abs_um" else np.nanmean)(tested[n], axis=1) for n in names}
+            per_fold["S_std_um"] = np.nanstd(tested["S_um"], axis=1, ddof=1)
+            per_fold["n_rows"] = np.nansum(tested["n_rows"], axis=1)
+        values = {name: column[place].reshape(columns.shape) for name, column in per_fold.items()}
         fit_S_um = judged.fit_S_um[columns]
         spread = values["S_std_um"].mean(axis=1)
     else:

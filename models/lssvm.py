@@ -75,18 +75,20 @@ class LSSVM(KernelExpansion):
         self.sigmas, self.gammas = [float(s) for s in sigmas], [float(g) for g in gammas]
 
     def fit_folds(self, design: Design, folds: Sequence[Sequence[int]]) -> list[Self]:
-        """Folds that leave out one batch share one inverse per (γ, σ); the others are stacked where alike in size.
+        """Folds that leave out at most half of the batches share one inverse per (γ, σ); the others are stacked where
+        alike in size.
 
         Raises:
             InputError: fewer than 2 usable rows in a fold.
         """
         rows, batch = self._decimated(design)
         present = np.unique(batch)
-        gaps = [present[~np.isin(present, list(fold))] for fold in folds]
-        shared = [f for f, gap in enumerate(gaps) if len(gap) == 1 and len(present) >= 4]
+        gaps = [np.flatnonzero(~np.isin(present, list(fold))) for fold in folds]
+        # From 3 batches on the inner groups are batches; beyond a half a fold's own inverse is the cheaper one.
+        shared = [f for f, gap in enumerate(gaps) if 1 <= len(gap) <= min(len(present) / 2, len(present) - 3)]
         out: dict[int, Self] = {}
         if len(shared) > 1 and self.tuning == "closed_form":
-            out |= self._fit_shared(design, rows, batch, {f: int(gaps[f][0]) for f in shared})
+            out |= self._fit_shared(design, rows, batch, {f: gaps[f] for f in shared})
         alone: dict[int, tuple[Rows, Rows]] = {}
         for f, fold in enumerate(folds):
             if f not in out:
@@ -109,20 +111,25 @@ class LSSVM(KernelExpansion):
         rows = evenly(design, range(design.n_batches), most)
         return rows, design.group[rows]
 
-    def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gap: dict[int, int]) -> dict[int, Self]:
-        """Fold f leaves out batch gap[f]: its inner residuals are those of pairs of batches left out."""
-        present, compact = np.unique(batch, return_inverse=True)
+    def _fit_shared(self, design: Design, rows: Rows, batch: Rows, gaps: dict[int, Rows]) -> dict[int, Self]:
+        """Fold f leaves out the batches gaps[f]: its inner residuals are those of one more batch left out."""
+        _, compact = np.unique(batch, return_inverse=True)
         problem = self._problem(design, [rows], [_layout(compact)])
-        m, left = problem.group_rows, np.searchsorted(present, list(gap.values()))
-        best = _Best.empty(len(gap), problem.n)
+        m, sets = problem.group_rows, list(gaps.values())
+        inside = np.ones((len(sets), problem.n // m), bool)
+        for i, gap in enumerate(sets):
+            inside[i, gap] = False
+        alike = [np.flatnonzero([len(gap) == size for gap in sets]) for size in sorted({len(gap) for gap in sets})]
+        best = _Best.empty(len(sets), problem.n)
         for sigma, gamma, system in problem.systems(self):
-            score = problem.score(system.pairs_left_out(m)[left], ~np.eye(len(present), dtype=bool)[left])
-            better = np.flatnonzero(score < best.score)
-            if len(better):
-                best.take(better, sigma, gamma, score[better], *system.solutions(m, left[better]))
-        folds = range(len(gap))
-        inside = [problem.known[0] & (np.arange(problem.n) // m != left[f]) for f in folds]
-        return {f: self._made(design, problem, best, i, 0, inside[i]) for i, f in enumerate(gap)}
+            score = problem.score(_inner_residuals(system, m, sets), inside)
+            for some in alike:
+                better = some[score[some] < best.score[some]]
+                if len(better):
+                    left = np.stack([sets[i] for i in better])
+                    best.take(better, sigma, gamma, score[better], *system.solutions(m, left))
+        kept = problem.known[0] & np.repeat(inside, m, axis=1)
+        return {f: self._made(design, problem, best, i, 0, kept[i]) for i, f in enumerate(gaps)}
 
     def _fit_stack(self, design: Design, alone: dict[int, tuple[Rows, Rows]]) -> dict[int, Self]:
         problem = self._problem(design, [r for r, _ in alone.values()], [layout for _, layout in alone.values()])
@@ -202,16 +209,15 @@ class _Problem:
         return self.known.shape[1]
 
     @cached_property
-    def _products(self) -> list[tuple[Array, Array]]:
-        return [products(u, u) for u in self.u]
+    def _products(self) -> tuple[Array, Array]:
+        return products(self.u, self.u)
 
     def kernels(self, sigma: float, linear: bool) -> list[Kernel]:
         """The kernel of every training set."""
-        out = []
-        for product, known in zip(self._products, self.known.astype(float), strict=True):
-            omega = (kernel_of if self.bias else kernel_from_origin)(*product, sigma, linear)
-            out.append(Kernel(omega if known.all() else omega * known[:, None] * known))
-        return out
+        omega = (kernel_of if self.bias else kernel_from_origin)(*self._products, sigma, linear)
+        if not self.known.all():
+            omega *= self.known[:, :, None] & self.known[:, None, :]
+        return [Kernel(own) for own in omega]
 
     def system(self, kernels: list[Kernel], gamma: float) -> Bordered:
         """Solved; NaN where γ is lost in rounding."""
@@ -252,6 +258,20 @@ class _Best:
     def take(self, at: Rows, sigma: float, gamma: float, score: Array, alpha: Array, bias: Array) -> None:
         self.score[at], self.sigma[at], self.gamma[at] = score, sigma, gamma
         self.alpha[at], self.bias[at] = alpha, bias
+
+
+def _inner_residuals(system: Bordered, m: int, sets: Sequence[Rows]) -> Array:
+    """Residuals (F, G, m) of every group when it and the groups of a set are left out."""
+    single = [i for i, gap in enumerate(sets) if len(gap) == 1]
+    single = single if len(single) > 1 else []
+    rest = [i for i in range(len(sets)) if i not in single]
+    n_groups = system.alpha.shape[1] // m
+    out = np.empty((len(sets), n_groups, m))
+    if single:
+        out[single] = system.pairs_left_out(m)[[int(sets[i][0]) for i in single]]
+    if rest:
+        out[rest] = system.others_left_out(m, [sets[i] for i in rest])
+    return out
 
 
 def _stacks(shapes: dict[int, tuple[int, ...]]) -> list[list[int]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -170,7 +171,11 @@ class Region:
 
 def watched(batch: Batch, inputs: Sequence[str]) -> dict[str, Array]:
     """The quantities of a batch that a region knows: inputs, start temperatures of their channels, drivers."""
-    return {name: feature(batch, name) for name in _names(batch, inputs) if name.partition("@")[0] in batch.table}
+    return {name: feature(batch, name) for name in _watched_names(batch, inputs)}
+
+
+def _watched_names(batch: Batch, inputs: Sequence[str]) -> list[str]:
+    return [name for name in _names(batch, inputs) if name.partition("@")[0] in batch.table]
 
 
 def _names(batch: Batch, inputs: Sequence[str]) -> list[str]:
@@ -207,6 +212,7 @@ def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
     slow.
     """
     runs, curves, cell = [], [], f"{selector}|{family}|{n_tsp}"
+    known = cache(lambda k, name: feature(crossing.batches[k], name))  # sets of inputs have most quantities in common
     for protocol, folds in crossing.folds.items():
         if protocol == "train-on-one" and not FAMILIES[family].closed_form:
             continue
@@ -217,7 +223,10 @@ def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
             except InputError:
                 continue
             siblings = [p for key in siblings_of(family, design.inputs) if (p := _sibling(design, key, own))]
-            values = [watched(b, design.inputs) for b in crossing.batches]
+            values = [
+                {name: known(k, name) for name in _watched_names(b, design.inputs)}
+                for k, b in enumerate(crossing.batches)
+            ]
             units = {name: feature_unit(b, name) for b, v in zip(crossing.batches, values, strict=True) for name in v}
             for i, fold in enumerate(own):
                 region = Region.of_values([values[k] for k in fold.train], design.inputs, units)
@@ -281,6 +290,13 @@ def _rms(values_um: Array) -> float:
 
 def farthest(beyond: Mapping[str, Array]) -> tuple[float, str]:
     """How far a batch went (95 % quantile over the rows), and in which quantity; ("", 0) inside everywhere."""
-    far = {name: float(np.nanquantile(d, 0.95)) for name, d in beyond.items() if np.isfinite(d).any()}
-    name = max(far, key=lambda n: far[n], default="")
-    return (far[name], name) if name and far[name] > 0 else (0.0, "")
+    if not beyond:
+        return 0.0, ""
+    ranked = np.sort(np.stack(list(beyond.values())), axis=1)  # NaN comes last
+    most = (~np.isnan(ranked)).sum(axis=1) - 1
+    place = 0.95 * most
+    low, every = place.astype(int), np.arange(len(ranked))
+    at_low, at_high = ranked[every, low], ranked[every, np.minimum(low + 1, most)]
+    far = np.nan_to_num(at_low + (place - low) * (at_high - at_low), nan=0.0)
+    first = int(np.argmax(far))
+    return (float(far[first]), list(beyond)[first]) if far[first] > 0 else (0.0, "")

@@ -20,7 +20,6 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import solve_triangular
 
 from data.arrays import Array, Index, Mask
 from data.errors import InputError
@@ -153,12 +152,16 @@ class Updater:
         runs = [(_parts(track, rows), track.residual_um[rows]) for track, rows in sampled]
         mean_square = float(np.mean(np.concatenate([r for _, r in runs]) ** 2))
         moved = float(np.mean(np.concatenate([np.diag(parts[1]) for parts, _ in runs])))
+        stacks = [
+            tuple(np.stack(each) for each in zip(*(run for run in runs if len(run[1]) == n), strict=True))
+            for n in sorted({len(r) for _, r in runs})
+        ]
         share = np.array([*_SHARES.values()]) / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
         centre = np.log(max(mean_square, _LEAST_UM2) * share)
 
         def missed(theta: Array) -> float:
             off = (theta - centre) / _PRIOR_SPREAD
-            return 0.5 * float(off @ off) + sum(_missed(np.exp(theta), *run) for run in runs)
+            return 0.5 * float(off @ off) + sum(_missed(np.exp(theta), *stack) for stack in stacks)
 
         reach = _FARTHEST * _PRIOR_SPREAD
         best = minimize(missed, centre, method="L-BFGS-B", bounds=[(c - reach, c + reach) for c in centre]).x
@@ -234,10 +237,12 @@ def _parts(track: Track, rows: Index) -> Array:
 
 
 def _missed(variance_um2: Array, parts: Array, residual_um: Array) -> float:
-    """Negative log-likelihood of one run's residuals (n,) whose covariance has these parts (P, n, n)."""
-    factor = np.linalg.cholesky(np.tensordot(variance_um2, parts, 1))
-    white = solve_triangular(factor, residual_um, lower=True)
-    return 0.5 * float(white @ white) + float(np.log(np.diag(factor)).sum())
+    """Negative log-likelihood of the residuals (R, n) of R runs whose covariances have these parts (R, P, n, n)."""
+    runs, n = residual_um.shape
+    cov = (variance_um2 @ parts.reshape(runs, len(variance_um2), -1)).reshape(runs, n, n)
+    factor = np.linalg.cholesky(cov)
+    white = np.linalg.solve(factor, residual_um[:, :, None])
+    return 0.5 * float((white**2).sum()) + float(np.log(np.einsum("rii->ri", factor)).sum())
 
 
 def _sampled(track: Track) -> Index:

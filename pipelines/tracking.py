@@ -213,11 +213,15 @@ def training_record(
         tags["mlflow.note.content"] = best.summary + (f"; {best.caution}" if best.caution else "")
     values = tuple((k, _read(v), 0) for k, v in {**metrics, **counts}.items() if np.isfinite(v))
     groups = result.cells.groupby(["selector", "family"], sort=False)
+    scores = result.scores.groupby(["selector", "family"], sort=False).indices
+    best_of = _best_cells(result.cells, rule)
     return Record(
         id=record_id or uuid.uuid4().hex, kind="training", machine=result.machine, target=result.target,
         simulated=result.simulated, name=name, tags=_short(tags), params=_short(plain), metrics=values,
         started_ms=started_ms or ended_ms, ended_ms=ended_ms, datasets=dataset_records(result.batches),
-        children=tuple(_child(cells, result, rule) for _, cells in groups),
+        children=tuple(
+            _child(cells, result.scores.take(scores.get(key, [])), rule, best_of.get(key)) for key, cells in groups
+        ),
     )  # fmt: skip
 
 
@@ -330,28 +334,30 @@ def _short(texts: Mapping[str, str]) -> dict[str, str]:
     return {k: v[:_MAX_CHARACTERS] for k, v in texts.items()}
 
 
-def _child(cells: pd.DataFrame, result: GridResult, rule: PromotionRule) -> Entity:
-    """All cells of one selector and family."""
+def _best_cells(cells: pd.DataFrame, rule: PromotionRule) -> dict[Any, pd.Series]:
+    """The best cell by selector and family, of those that all of the rule's protocols have scored."""
+    try:
+        every = judged(cells, rule)
+    except InputError:  # no score under the rule
+        return {}
+    return {key: own.nsmallest(1, "score_um").iloc[0] for key, own in every.groupby(["selector", "family"], sort=False)}
+
+
+def _child(cells: pd.DataFrame, scores: pd.DataFrame, rule: PromotionRule, best: pd.Series | None) -> Entity:
+    """All cells of one selector and family, and their scores; `best` None: of the protocols that they were run by."""
     selector, family = (str(cells[c].iloc[0]) for c in ("selector", "family"))
     metrics: list[tuple[str, float, int]] = []
-    for row in cells.to_dict("records"):
+    for row in cells[["protocol", "n_tsp", *CURVES]].to_dict("records"):
         prefix = str(row["protocol"]).replace("-", "_")
         metrics += [(f"{prefix}_by_n_tsp/{to}", _read(row[name]), int(row["n_tsp"])) for name, to in CURVES.items()]
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
-    try:
-        best = judged(cells, rule).nsmallest(1, "score_um").iloc[0]
-    except InputError:  # no score under the rule
-        best = None
+    best = best if best is not None else next(iter(_best_cells(cells, rule).values()), None)
     if best is not None:
         params |= {"n_tsp": str(best["n_tsp"]), "inputs": str(best["inputs"]).replace("|", ", ")}
         # First, as the page of a run lists them.
         metrics = [*((name, value, 0) for name, value in _cell_metrics(best).items()), *metrics]
-        s = result.scores
-        picked = s[
-            (s["protocol"].to_numpy() == best["protocol"]) & (s["selector"].to_numpy() == selector)
-            & (s["family"].to_numpy() == family) & (s["n_tsp"].to_numpy() == best["n_tsp"])
-        ]  # fmt: skip
+        picked = scores[(scores["protocol"] == best["protocol"]) & (scores["n_tsp"] == best["n_tsp"])]
         key = f"{str(best['protocol']).replace('-', '_')}_by_fold/S_um"
         metrics += [(key, _read(v), i) for i, v in enumerate(picked.groupby("fold", sort=False)["S_um"].mean())]
     finite = tuple(m for m in metrics if np.isfinite(m[1]))

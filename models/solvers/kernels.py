@@ -90,16 +90,16 @@ def kernel(u: Array, v: Array, sigma: float, linear: bool) -> Array:
 
 
 def products(u: Array, v: Array) -> tuple[Array, Array]:
-    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p: all that a kernel needs besides σ."""
-    p = max(1, u.shape[1])
-    dot = u @ v.T / p
-    half = dot - (u**2).sum(axis=1)[:, None] / (2.0 * p)
-    half -= (v**2).sum(axis=1) / (2.0 * p)
+    """−|u_i − v_j|²/(2p), never above 0, and u_i·v_j/p: all that a kernel needs besides σ; (..., n, m)."""
+    p = max(1, u.shape[-1])
+    dot = u @ np.swapaxes(v, -1, -2) / p
+    half = dot - (u**2).sum(axis=-1)[..., :, None] / (2.0 * p)
+    half -= (v**2).sum(axis=-1)[..., None, :] / (2.0 * p)
     return np.minimum(half, 0.0, out=half), dot
 
 
 def kernel_of(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
-    """Ω (n, m) from what `products` gives."""
+    """Ω (..., n, m) from what `products` gives."""
     omega: Array = half / sigma**2
     np.exp(omega, out=omega)
     if linear:
@@ -108,10 +108,10 @@ def kernel_of(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
 
 
 def kernel_from_origin(half: Array, dot: Array, sigma: float, linear: bool) -> Array:
-    """`k(u, v) − k(u, 0) − k(0, v) + k(0, 0)` (n, n) between n rows u, from what `products` gives."""
+    """`k(u, v) − k(u, 0) − k(0, v) + k(0, 0)` (..., n, n) between n rows u, from what `products` gives."""
     omega = kernel_of(half, dot, sigma, linear)
-    to_origin = np.exp(-np.einsum("ii->i", dot) / (2.0 * sigma**2))
-    omega += 1.0 - to_origin[:, None] - to_origin
+    to_origin = np.exp(-np.einsum("...ii->...i", dot) / (2.0 * sigma**2))
+    omega += 1.0 - to_origin[..., :, None] - to_origin[..., None, :]
     return omega
 
 
@@ -210,18 +210,15 @@ class Bordered:
 
     @classmethod
     def of(cls, kernels: list[Kernel], known: Array, y: Array, gamma: float, bias: bool = True) -> Self:
-        n = y.shape[1]
-        inverse = np.empty((len(kernels), n, n))
-        for s, kernel in enumerate(kernels):
-            try:
-                inverse[s] = kernel.inverse(gamma)
-            except np.linalg.LinAlgError:
-                inverse[s] = np.nan
-        u = (inverse @ known[:, :, None])[..., 0]
-        corner = -1.0 / (u * known).sum(axis=1) if bias else np.zeros(len(kernels))
-        ones = -corner[:, None] * u
-        for s in range(len(kernels)):
-            inverse[s] -= u[s][:, None] * ones[s]
+        inverse = _inverses(kernels, gamma)
+        if bias:
+            u = (inverse @ known[:, :, None])[..., 0]
+            corner = -1.0 / (u * known).sum(axis=1)
+            ones = -corner[:, None] * u
+            for s in range(len(kernels)):
+                inverse[s] -= u[s][:, None] * ones[s]
+        else:
+            corner, ones = np.zeros(len(kernels)), np.zeros_like(y)
         return cls(kernels, known, y, gamma, inverse, ones, corner, (inverse @ y[:, :, None])[..., 0])
 
     def left_out(self, m: int) -> Array:
@@ -256,15 +253,39 @@ class Bordered:
         out[g, f] = alone[f] - (across @ e_g[:, :, None])[..., 0]
         return out
 
+    def others_left_out(self, m: int, gaps: Sequence[NDArray[np.int64]]) -> Array:
+        """Residuals (F, G, m) of the first system: [f, g] those of group g when it and the groups gaps[f] are left out.
+
+        By elimination of the gap, as `pairs_left_out`; NaN for the groups in the gap.
+        """
+        n = self.alpha.shape[1]
+        n_groups = n // m
+        blocks = np.einsum("gigj->gij", self.inverse[0].reshape(n_groups, m, n_groups, m))
+        own = np.empty((len(gaps), *blocks.shape))
+        alpha = np.empty((len(gaps), n_groups, m))
+        for f, gap in enumerate(gaps):
+            at = _rows_of(gap, m)
+            away = self.inverse[0][:, at]
+            factor, info = lapack.dpotrf(away[at].T, lower=1, overwrite_a=1)
+            # Written over the rows of `away`: R⁻¹ C_Pi for every row i, R Rᵀ = C_PP.
+            away = blas.dtrsm(1.0 if info == 0 else np.nan, factor, away.T, lower=1, overwrite_b=1).T
+            pull = blas.dtrsv(factor, self.alpha[0, at], lower=1)
+            w = away.reshape(n_groups, m, len(at))
+            own[f] = blocks - w @ w.transpose(0, 2, 1)
+            alpha[f] = (self.alpha[0] - away @ pull).reshape(n_groups, m)
+            own[f, gap], alpha[f, gap] = np.eye(m), np.nan
+        return _solved(own, alpha)
+
     def solutions(self, m: int, left: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
-        """α (S, n) and b (S,); given `left` those of the first system, one for each group left out (F, n), (F,).
+        """α (S, n) and b (S,); given `left` (F, P), F sets of P groups, those of the first system without each set:
+        (F, n), (F,).
 
         Refined once against Ω itself: an explicit inverse loses digits where γ is large.
         """
         inside = self.known[:, :, None]
         if left is not None:
             inside = np.repeat(inside, len(left), axis=2)
-            inside.reshape(-1, m, len(left))[left, :, np.arange(len(left))] = 0.0
+            inside.reshape(-1, m, len(left))[left, :, np.arange(len(left))[:, None]] = 0.0
         alpha, bias = self._applied(inside * self.y[:, :, None], np.zeros((len(self.y), inside.shape[2])), m, left)
         alpha *= inside
         smooth = np.stack([k.omega @ a for k, a in zip(self.kernels, alpha, strict=True)])
@@ -274,18 +295,41 @@ class Bordered:
         return (alpha[:, :, 0], bias[:, 0]) if left is None else (alpha[0].T, bias[0])
 
     def _applied(self, right: Array, top: Array, m: int, left: NDArray[np.int64] | None) -> tuple[Array, Array]:
-        """The inverse times [top; right] (S, 1 + n, F), with α held at 0 on each column's group left out."""
+        """The inverse times [top; right] (S, 1 + n, F), with α held at 0 on each column's groups left out."""
         alpha = self.inverse @ right + self.ones[:, :, None] * top[:, None]
         bias = (self.ones[:, None] @ right)[:, 0] + self.corner[:, None] * top
         if left is not None:
-            n, at = self.alpha.shape[1], np.arange(len(left))
-            own = self.inverse[0].reshape(n // m, m, n // m, m)[left, :, left]
-            pull = _solved(own, alpha[0].reshape(n // m, m, -1)[left, :, at])
-            held = np.zeros((n // m, m, len(left)))
-            held[left, :, at] = pull
-            alpha = alpha - self.inverse @ held.reshape(1, n, -1)
-            bias = bias - self.ones @ held.reshape(n, -1)
+            at, every = _rows_of(left, m), np.arange(len(left))
+            pull = _solved(self.inverse[0][at[:, :, None], at[:, None, :]], alpha[0][at, every[:, None]])
+            held = np.zeros(alpha.shape[1:])
+            held[at, every[:, None]] = pull
+            alpha = alpha - self.inverse @ held[None]
+            bias = bias - self.ones @ held
         return alpha, bias
+
+
+def _rows_of(groups: NDArray[np.int64], m: int) -> NDArray[np.int64]:
+    """Rows (..., P m) of groups (..., P) of m rows each."""
+    rows = groups[..., None] * m + np.arange(m)
+    return np.asarray(rows.reshape(*groups.shape[:-1], -1))
+
+
+def _inverses(kernels: Sequence[Kernel], gamma: float) -> Array:
+    """(Ω + I/γ)⁻¹ of every kernel, (S, n, n), small ones at once; NaN where it is not positive definite."""
+    n = len(kernels[0].omega)
+    if len(kernels) > 1 and n < _THIN_FROM_ROWS:
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(np.stack([k.omega for k in kernels]) + np.eye(n) / gamma))
+            return np.asarray(root.transpose(0, 2, 1) @ root)
+        except np.linalg.LinAlgError:
+            pass  # one of them: the others are kept below
+    out = np.empty((len(kernels), n, n))
+    for s, kernel in enumerate(kernels):
+        try:
+            out[s] = kernel.inverse(gamma)
+        except np.linalg.LinAlgError:
+            out[s] = np.nan
+    return out
 
 
 def _solved(matrices: Array, right: Array) -> Array:
