@@ -220,7 +220,7 @@ def training_record(
         simulated=result.simulated, name=name, tags=_short(tags), params=_short(plain), metrics=values,
         started_ms=started_ms or ended_ms, ended_ms=ended_ms, datasets=dataset_records(result.batches),
         children=tuple(
-            _child(cells, result.scores.take(scores.get(key, [])), rule, best_of.get(key)) for key, cells in groups
+            _child(cells, result.scores.iloc[scores.get(key, [])], rule, best_of.get(key)) for key, cells in groups
         ),
     )  # fmt: skip
 
