@@ -75,7 +75,8 @@ class _Option:
 
     @property
     def cost_h(self) -> float:
-        return self.run.hours + (POLICY.sensor_cost_h if self.sensor else 0.0)
+        """Hours that the machine is taken: preparation, the run, and mounting a sensor."""
+        return self.run.hours + self.run.preparation.hours + (POLICY.sensor_cost_h if self.sensor else 0.0)
 
 
 def next_experiment(
@@ -85,8 +86,8 @@ def next_experiment(
 ) -> Proposal:
     """The run for two or more alternatives by name, the likeliest first; `runs` replace the menu.
 
-    Of runs that settle it the shortest, else the one that brings most of what is needed per hour. A pair that no run
-    separates does not count.
+    Of runs that settle it the shortest, with its preparation, else the one that brings most of what is needed per hour.
+    A pair that no run separates does not count.
 
     Args:
         lacking_nats: by alternative, what must be gained over the first before it is decided; default for all pairs:
@@ -238,7 +239,7 @@ def settling_run(named: Sequence[Round]) -> Proposal | None:
 def revealing_run(done: Search) -> Proposal | None:
     """For the effects that gain most in the last round without being claimed, against none of them.
 
-    None where nothing gains, or nothing could be simulated.
+    None where nothing gains, no run brings as much as settles a tie, or nothing could be simulated.
     """
     last = done.rounds[-1]
     if last.accepted:
@@ -248,7 +249,8 @@ def revealing_run(done: Search) -> Proposal | None:
         assert t.fitted is not None
         alternatives[t.candidate.label] = t.fitted
         lacking_nats[t.candidate.label] = claim_threshold(last, t) - t.gain
-    return _simulated(alternatives, lacking_nats) if len(alternatives) >= 2 else None
+    run = _simulated(alternatives, lacking_nats) if len(alternatives) >= 2 else None
+    return run if run is not None and run.nats >= POLICY.settling_nats else None
 
 
 def possible(last: Round) -> list[Tried]:

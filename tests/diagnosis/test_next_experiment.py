@@ -191,9 +191,13 @@ def test_one_more_sensor_where_no_run_tells_by_itself() -> None:
 
 def test_what_a_claim_lacks_decides_how_much_a_run_must_bring() -> None:
     alternatives, little = tied(), proposal()
-    much = next_experiment(alternatives, lacking_nats={"loss": 1e6})  # no run brings it: the most per hour
-    rate = little.table["nats_per_hour"]
-    assert much.label == little.table["run"][rate.argmax()] and much.nats_per_hour == pytest.approx(rate.max())
+    much = next_experiment(alternatives, lacking_nats={"loss": 1e6})  # no run brings it: the most per hour of machine
+    taken_h = {
+        r.label: r.hours + sum(s.seconds for s in r.before) / 3600
+        for r in menu(alternatives["air"].machine, alternatives["air"].batches, ["rpm"])
+    }
+    rate = little.table["nats"] / little.table["run"].map(taken_h)
+    assert much.label == little.table["run"][rate.argmax()]
     enough = next_experiment(alternatives, lacking_nats={"loss": little.table["nats"].max() - 1e-6})
     assert enough.label == little.table["run"][0]
     assert next_experiment(alternatives, lacking_nats={"loss": -3.0}).label == little.label

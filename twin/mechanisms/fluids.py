@@ -137,7 +137,9 @@ class CuttingFluid(Mechanism):
     drivers: ClassVar[Mapping[str, str]] = {"flow": "1"}
     ports = ("body", "tank")
     takes_from: ClassVar[str | None] = "tank"
-    parameters = (Spec("conductance", "W/K", "exchange with the fluid at full flow", 200.0, 0.8, 0.0, 5000.0),)
+    parameters = (
+        Spec("conductance", "W/K", "exchange with the fluid at full flow", 200.0, 0.8, 0.0, 5000.0, per="flow"),
+    )
     off: ClassVar[Mapping[str, float]] = {"conductance": 0.0}
     port_roles: ClassVar[Mapping[str, PortRole]] = {"tank": "surrounding"}
 

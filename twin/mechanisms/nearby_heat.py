@@ -24,7 +24,7 @@ class CabinetHeat(Mechanism):
     acts_at = ("node",)
     drivers: ClassVar[Mapping[str, str]] = {"running": "1"}
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"running"})
-    parameters = (Spec("heat", "W", "heat that reaches the machine", 200.0, 0.8, 0.0, 10e3),)
+    parameters = (Spec("heat", "W", "heat that reaches the machine", 200.0, 0.8, 0.0, 10e3, per="running"),)
     off: ClassVar[Mapping[str, float]] = {"heat": 0.0}
 
     def heat_W(self, view: View, p: Mapping[str, Numeric]) -> Numeric:
@@ -49,7 +49,7 @@ class HydraulicUnit(Mechanism):
     optional_drivers: ClassVar[frozenset[str]] = frozenset({"running"})
     along_time = True  # it works on whole intervals
     parameters = (
-        Spec("heat", "W", "heat that reaches the machine while the pump runs", 500.0, 0.8, 0.0, 20e3),
+        Spec("heat", "W", "heat that reaches the machine while the pump runs", 500.0, 0.8, 0.0, 20e3, per="running"),
         Spec("duty", "1", "share of the time that the pump runs", 0.4, 0.8, 0.0, 1.0, "logit"),
         Spec("period", "min", "length of a cycle", 10.0, 0.7, 0.1, 1440.0),
     )
