@@ -6,12 +6,12 @@ FREEZE := $(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | sed 's
 
 .PHONY: run test lint docs gallery prove bench clean lock
 
-# The diagnosis works on one core, so the demonstration runs beside the training; its lines follow at the end.
+# The diagnosis works on one core, so the demonstration runs while the training does; its lines follow at the end.
 run: $(READY)  ## the main job on the built-in sample year, and a sealed demonstration of the diagnosis
 	$(BIN)/thermodrift simulate --sample-year --out var/sample_year
-	$(BIN)/thermodrift demonstrate > var/demonstration.txt 2>&1 & beside=$$!; trap 'kill $$beside 2>/dev/null' EXIT; \
+	$(BIN)/thermodrift demonstrate > var/demonstration.txt 2>&1 & demonstration=$$!; trap 'kill $$demonstration 2>/dev/null' EXIT; \
 	$(BIN)/thermodrift train --machine machines/sample_vmc.yml --recordings var/sample_year --effort quick \
-	&& { wait $$beside; ended=$$?; cat var/demonstration.txt; exit $$ended; }
+	&& { wait $$demonstration; ended=$$?; cat var/demonstration.txt; exit $$ended; }
 
 test: $(READY)  ## with bytecode, since many tests start processes
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
