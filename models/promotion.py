@@ -90,12 +90,8 @@ class Comparison:
         return {**asdict(self), "words": self.words}
 
 
-def score_um(cells: Any, rule: PromotionRule) -> Any:
-    """The rule's score of every row under its own protocol, µm, smaller is better.
-
-    Args:
-        cells: a table, or the arrays of its columns S_mean_um, S_std_um and max_abs_um by name.
-    """
+def score_um(cells: pd.DataFrame, rule: PromotionRule) -> pd.Series:
+    """The rule's score of every row under its own protocol, µm, smaller is better."""
     if rule.score == "max_abs":
         return cells["max_abs_um"].astype(float)
     spread = cells["S_std_um"] if rule.score == "S_mean + S_std" else 0.0
@@ -122,20 +118,38 @@ def judged(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
             f"promotion rule: got trainings by {', '.join(run)}, expected one of its protocols {wanted}; "
             "add one of them to the training or to promotion.protocols in mlflow.yml"
         )
-    table = cells[cells["protocol"].isin(offered)].reset_index(drop=True)
+    table, common = _common_cells(cells, [p for p in dict.fromkeys(cells["protocol"]) if p in offered])
+    return _decided(table, len(common), rule)
+
+
+def _common_cells(cells: pd.DataFrame, protocols: Sequence[str]) -> tuple[pd.DataFrame, pd.MultiIndex]:
+    """The rows (P C) of the cells that all of the protocols have, protocol after protocol, and the cells (C,)."""
+    own = [cells[cells["protocol"] == p] for p in protocols]
+    every = [pd.MultiIndex.from_frame(table[KEYS]) for table in own]
+    common = every[0]
+    for index in every[1:]:
+        common = common[common.isin(index)]
+    rows = [t.iloc[i.get_indexer(common)] for t, i in zip(own, every, strict=True)]
+    return pd.concat(rows, ignore_index=True), common
+
+
+def _decided(table: pd.DataFrame, n: int, rule: PromotionRule) -> pd.DataFrame:
+    """`judged` of `n` cells, given their rows by protocol as `_common_cells` orders them.
+
+    Raises:
+        InputError: no cell has a finite score.
+    """
     weight = table["protocol"].map(rule.protocols).to_numpy(float)
-    table["score_um"] = score_um(table, rule) * weight
-    table = table[np.isfinite(table["score_um"])]
-    cell = table.groupby(KEYS, sort=False)["score_um"]
-    table = table[cell.transform("size") == len(offered)]
-    if table.empty:
-        raise InputError(f"promotion rule: no cell of {', '.join(offered)} has a finite {rule.score}")
-    cell = table.groupby(KEYS, sort=False)["score_um"]
-    out = table.loc[cell.idxmax().to_numpy()].copy()
-    if rule.combine == "mean":
-        out["score_um"] = cell.sum().to_numpy() / sum(rule.protocols[p] for p in offered)
-    out["tsp_stability"] = table.groupby(KEYS, sort=False)["tsp_stability"].min().to_numpy()
-    return out.reset_index(drop=True)
+    score = (score_um(table, rule).to_numpy() * weight).reshape(-1, n)
+    kept = np.flatnonzero(np.isfinite(score).all(axis=0))
+    if not len(kept):
+        run = ", ".join(rule.offered(set(table["protocol"])))
+        raise InputError(f"promotion rule: no cell of {run} has a finite {rule.score}")
+    decides, score = score[:, kept].argmax(axis=0), score[:, kept]
+    combined = score.max(axis=0) if rule.combine == "worst" else score.sum(axis=0) / weight[::n].sum()
+    stability = table["tsp_stability"].to_numpy(float).reshape(-1, n)[:, kept]
+    out = table.take(decides * n + kept).reset_index(drop=True)
+    return out.assign(score_um=combined, tsp_stability=np.fmin.reduce(stability, axis=0))
 
 
 def ranked(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
@@ -300,12 +314,7 @@ class _Left:
 
     @classmethod
     def of(cls, result: GridResult, protocols: Sequence[str]) -> Self:
-        own = {p: result.cells[result.cells["protocol"] == p] for p in protocols}
-        every = [pd.MultiIndex.from_frame(table[KEYS]) for table in own.values()]
-        common = every[0]
-        for index in every[1:]:
-            common = common[common.isin(index)]
-        table = pd.concat([t.iloc[i.get_indexer(common)] for t, i in zip(own.values(), every, strict=True)])
+        table, common = _common_cells(result.cells, protocols)
         texts = {c: object for c in table if not pd.api.types.is_numeric_dtype(table[c])}  # quicker to take from
         ids, S_um, max_abs_um = {}, {}, {}
         for p in protocols:
@@ -313,7 +322,7 @@ class _Left:
             wide = scores.pivot(index=KEYS, columns="batch_id", values=["S_um", "max_abs_um"]).loc[common]
             S_um[p], max_abs_um[p] = (wide[name].to_numpy(float) for name in ("S_um", "max_abs_um"))
             ids[p] = [str(k) for k in wide["S_um"].columns]
-        return cls(tuple(protocols), table.astype(texts).reset_index(drop=True), common, ids, S_um, max_abs_um)
+        return cls(tuple(protocols), table.astype(texts), common, ids, S_um, max_abs_um)
 
     def judged_without(self, batch_id: str, rule: PromotionRule) -> pd.DataFrame:
         """`judged` as the other batches show it.
@@ -323,7 +332,7 @@ class _Left:
         """
         others = {p: np.array([k != batch_id for k in self.batch_ids[p]]) for p in self.protocols}
         run = [p for p in self.protocols if others[p].sum() > 1]
-        n, found = len(self.cells), []
+        found = []
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a cell without any score has NaN, as intended
             for p in run:
@@ -333,19 +342,9 @@ class _Left:
                     "S_mean_um": np.nanmean(S_um, axis=1), "S_std_um": np.nanstd(S_um, axis=1, ddof=1),
                     "max_abs_um": worst,
                 })  # fmt: skip
-            at = np.array([self.protocols.index(p) for p in run])
-            score = np.stack([score_um(f, rule) * rule.protocols[p] for p, f in zip(run, found, strict=True)])
-            stability = np.nanmin(self.table["tsp_stability"].to_numpy(float).reshape(-1, n)[at], axis=0)
-        kept = np.flatnonzero(np.isfinite(score).all(axis=0))
-        if not len(kept):
-            raise InputError(f"promotion rule: no cell of {', '.join(run)} has a finite {rule.score}")
-        decides = score[:, kept].argmax(axis=0)
-        own = {name: np.stack([f[name] for f in found])[decides, kept] for name in found[0]}
-        combined = score[decides, kept]
-        if rule.combine == "mean":
-            combined = score[:, kept].sum(axis=0) / sum(rule.protocols[p] for p in run)
-        table = self.table.take(at[decides] * n + kept).reset_index(drop=True)
-        return table.assign(**own, score_um=combined, tsp_stability=stability[kept])
+        rows = self.table[self.table["protocol"].isin(run)].reset_index(drop=True)
+        own = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
+        return _decided(rows.assign(**own), len(self.cells), rule)
 
     def scores_of(self, choice: Choice, batch_id: str) -> dict[str, float]:
         """The left-out S in µm of a batch by a cell, by protocol."""
