@@ -118,9 +118,9 @@ def test_what_was_found_is_a_part_of_the_machine() -> None:
 
 @pytest.mark.parametrize("verdict", ["unlisted", LONGEST])
 def test_no_listed_mechanism_is_said_with_its_size(verdict: str) -> None:
-    told = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
-    assert len(told) == 1 and "no listed mechanism" in told[0].statement
-    product = told[0].parameters["product"]
+    fluxes = [f for f in diagnosed(verdict).findings.findings if f.mechanism == "free_flux"]
+    assert len(fluxes) == 1 and "no listed mechanism" in fluxes[0].statement
+    product = fluxes[0].parameters["product"]
     assert product.value == pytest.approx(6.0, rel=0.05) and product.unit == "W/K"
 
 

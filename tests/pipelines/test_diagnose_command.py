@@ -128,8 +128,8 @@ def test_the_next_run_is_told(diagnose: Diagnosed, toy: Toy, tmp_path: Path) -> 
     named = said.model_copy(update={"statement": f"Perhaps (52 %) {said.statement}"})
     toy.change = lambda d: replace(d, findings=d.findings.model_copy(update={"findings": (named,)}))
     lines = diagnose("--no-report").out.splitlines()
-    told = ["Something is missing, but these recordings do not show what.", f"1. {named.statement}"]
-    assert lines[1:3] == told  # the sentence says its probability itself
+    verdict = ["Something is missing, but these recordings do not show what.", f"1. {named.statement}"]
+    assert lines[1:3] == verdict  # the sentence says its probability itself
     run = next(line for line in lines if line.startswith("next run: "))
     assert run.startswith("next run: Night stop: 3 h of spindle at 4000 rpm, then everything off") and "; 12 h" in run
     assert "note: Fewer than 4 batches: no probability above 80 % is stated." in lines
