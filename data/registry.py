@@ -6,14 +6,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any
 
 from data.errors import InputError, closest
-
-Effort = Literal["quick", "usual", "complete", "on_request"]
-"""The smallest effort that includes a member: seconds, the usual, the complete set, or only on request by name."""
-
-EFFORTS: tuple[Effort, ...] = ("quick", "usual", "complete", "on_request")
 
 
 class Registry(Mapping[str, Any]):

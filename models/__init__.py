@@ -35,5 +35,6 @@ FAMILIES = Registry(
         "random_forest": "models.random_forest:RandomForest",
         "hist_gradient_boosting": "models.hist_gradient_boosting:HistGradientBoosting",
         "gm_dl": "models.gm_dl:GMDL",
+        "stack": "models.stack:Stack",
     },
 )

@@ -20,7 +20,6 @@ from data.arrays import Array
 from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import Machine
-from data.registry import Effort
 from features.design import Design
 from models.program import Builder, Program
 
@@ -46,7 +45,8 @@ class Family(ABC):
     needs_twin: ClassVar[bool] = False  # True: only for machines whose file has a twin part
     needs_position: ClassVar[bool] = False  # True: only for error channels that are measured along an axis
     shares_targets: ClassVar[bool] = False  # True: error channels of one training set share most of the work
-    effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
+    on_request: ClassVar[bool] = False  # True: so slow that it competes only where it is named
+    combines: ClassVar[bool] = False  # True: made of the other families' left-out predictions
     packages: ClassVar[tuple[str, ...]] = ()  # what it imports to learn that an installation may lack
     has_sd: ClassVar[bool] = False  # True: `sd_um` gives the predictive standard deviation
     rank: ClassVar[int] = 50  # simplicity for ties in the promotion rule: smaller is simpler

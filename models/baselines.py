@@ -29,7 +29,6 @@ class MeanCurve(Family):
     key = "mean_curve"
     summary = "mean error curve of the training batches over the time since the start"
     source = "baseline"
-    effort = "quick"
     uses_inputs = False
     rank = 1
 
@@ -128,7 +127,6 @@ class Zero(Family):
     key = "zero"
     summary = "no model: predicts zero error"
     source = "baseline"
-    effort = "quick"
     uses_inputs = False
     rank = 0
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError, closest
-from data.registry import Effort, check_packages
+from data.registry import check_packages
 from features.design import Design, decimated_rows
 from features.nets import Nets
 from models.base import Family
@@ -43,7 +43,6 @@ class BP(Family):
     key = "bp"
     summary = "BP neural network, Levenberg–Marquardt"
     source = "Hagan and Menhaj 1994"
-    effort: ClassVar[Effort] = "usual"
     closed_form = False
     packages = ("torch",)
     rank = 70
@@ -153,7 +152,6 @@ class BPLinear(BP):
     key = "bp_linear"
     summary = "BP neural network with linear transfer: a linear map found iteratively"
     source = "year-round PCR study; Hagan and Menhaj 1994"
-    effort: ClassVar[Effort] = "complete"
     rank = 20
 
     def __init__(self, hidden: int = 3, starts: int = 1, decay: float = 3e-4, iterations: int = 30,

@@ -1,13 +1,14 @@
 """Plan of a grid, and for one error channel its stacked rows, folds, selected inputs and the scoring of families.
 
-Folds share work: the rows are stacked once, a selector learns once per training set, and a set of inputs that
-several selectors or numbers of points arrive at is fitted once.
+Folds share work: the rows are stacked once, a selector learns once per training set, when it is first needed, and a
+set of inputs that several selectors or numbers of points arrive at is fitted once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -17,34 +18,45 @@ from data.batch import Batch, Channel
 from data.checks import usable_channels, why_missing
 from data.errors import InputError
 from data.machine import Machine
-from data.registry import EFFORTS, Effort, Registry, check_packages, packages_reason
+from data.registry import Registry, check_packages, packages_reason
 from features.design import Design
 from features.rises import temperature_inputs
 from features.selectors import SELECTORS
+from features.selectors.statistics import training_statistics
 from features.stability import tsp_stability
 from models import FAMILIES
 from models.base import Family
-from models.judging import FamilyScores, score_table
+from models.judging import KEPT, FamilyScores, score_table
 from models.protocols import PROTOCOLS, Fold, folds_of, forward_obstacle
 from models.result import CELL_KEYS
 
 Inputs = tuple[str, ...]
+STUDIED = ("train-on-one", "forward-gap")  # protocols of published studies and of long pauses, which decide nothing
+Cell = tuple[str, int]  # of a family: selector and number of points
+
+Effort = Literal["quick", "usual", "complete"]
+# Cells that are scored by all folds; `complete` scores all. More of them cost time in proportion and change little.
+FINALISTS: Mapping[Effort, int] = {"quick": 12, "usual": 36, "complete": 0}
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Selectors, families and protocols of a grid. If none are named: those that this `effort` includes.
+    """Selectors, families and protocols of a grid; of what is not named, all that suit the machine and are installed.
 
-    `n_tsps` None means 1 to all; iterative families (bp, lssvm) take `iterative_n_tsps` and all.
+    `effort` says how many cells are scored by all folds (`FINALISTS`): a race finds them (`models.race`). Where both
+    selectors and families are named, or the effort is "complete", every cell is. `n_tsps` None means 1 to all;
+    iterative families (bp, lssvm) take `iterative_n_tsps` and all. Without `protocols`: all, after a race without
+    those of `STUDIED`.
     """
 
     selectors: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
-    protocols: tuple[str, ...] = tuple(PROTOCOLS)
+    protocols: tuple[str, ...] = ()
     n_tsps: tuple[int, ...] | None = None
     iterative_n_tsps: tuple[int, ...] = (2, 4)
     effort: Effort = "usual"
-    left_out: tuple[tuple[str, str], ...] = ()  # what the effort includes and cannot run here, and why
+    left_out: tuple[tuple[str, str], ...] = ()  # what cannot run here, and why
+    finalists: int | None = None  # 0: no race; None: not yet known, see `suited`
 
     def suited(self, machine: Machine | None, channels: Sequence[Channel] = ()) -> Plan:
         """The plan with its selectors and families by name; `channels` are the error channels that it is for.
@@ -67,14 +79,16 @@ class Plan:
                     f"family {key} needs the twin part of the machine file; add 'twin' to the file of "
                     f"{machine.machine if machine else 'the machine'}, or leave the family out"
                 )
-        taken = EFFORTS[: EFFORTS.index(self.effort) + 1]
         suitable = [f for f in FAMILIES if has_twin or not FAMILIES[f].needs_twin]
         suitable = [f for f in suitable if has_axis or not FAMILIES[f].needs_position]
-        included = (s for s in SELECTORS if SELECTORS[s].effort in taken)
-        selectors, without = _runnable("selector", SELECTORS, self.selectors or tuple(included))
-        included = (f for f in suitable if FAMILIES[f].effort in taken)
-        families, more = _runnable("family", FAMILIES, self.families or tuple(included))
-        return replace(self, selectors=selectors, families=families, left_out=(*self.left_out, *without, *more))
+        suitable = [f for f in suitable if not FAMILIES[f].on_request]
+        selectors, without = _runnable("selector", SELECTORS, self.selectors or tuple(SELECTORS))
+        families, more = _runnable("family", FAMILIES, self.families or tuple(suitable))
+        named = bool(self.selectors and self.families)
+        finalists = self.finalists if self.finalists is not None else 0 if named else FINALISTS[self.effort]
+        protocols = self.protocols or tuple(p for p in PROTOCOLS if not (finalists and p in STUDIED))
+        return replace(self, selectors=selectors, families=families, protocols=protocols, finalists=finalists,
+                       left_out=(*self.left_out, *without, *more))  # fmt: skip
 
     def points(self, family: type[Family], n_inputs: int) -> tuple[int, ...]:
         """The numbers of points a family is tried with."""
@@ -113,8 +127,8 @@ class Crossing:
     design: Design
     plan: Plan
     folds: dict[str, list[Fold]]
-    chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]]  # (selector, training batches) -> n -> inputs
     excluded: tuple[tuple[str, str], ...]
+    chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = field(default_factory=dict)  # see `inputs`
     subsets: dict[Inputs, Design] = field(default_factory=dict)
     stabilities: dict[tuple[str, str, int], float] = field(default_factory=dict)
 
@@ -128,7 +142,21 @@ class Crossing:
         return self.subsets[inputs]
 
     def inputs(self, selector: str, train: tuple[int, ...], n_tsp: int) -> Inputs:
-        return self.chosen[selector, train][n_tsp] if n_tsp else ()
+        """The inputs that a selector chooses on a training set; it learns all numbers of points at the first call."""
+        if not n_tsp:
+            return ()
+        if (selector, train) not in self.chosen:
+            n_all = range(1, len(self.design.inputs) + 1)
+            self.chosen[selector, train] = SELECTORS[selector]().select_design(self.design, train, n_all)
+        return self.chosen[selector, train][n_tsp]
+
+    def select(self, selectors: Iterable[str], folds: Iterable[Fold]) -> dict[Any, dict[int, Inputs]]:
+        """What these selectors choose on the training sets of these folds, as `chosen` holds it."""
+        for selector in selectors:
+            for fold in folds:
+                self.inputs(selector, fold.train, 1)
+        wanted = {(s, f.train) for s in selectors for f in folds}
+        return {key: self.chosen[key] for key in wanted}
 
     def stability(self, protocol: str, selector: str, n_tsp: int) -> float:
         """How alike the folds' choices are (mean Jaccard similarity); the same for every family."""
@@ -146,8 +174,10 @@ class Crossing:
                 folds_of_inputs.setdefault(self.inputs(selector, fold.train, n_tsp), {})[i] = None
         return [(self.subset(inputs), sorted(which)) for inputs, which in folds_of_inputs.items()]
 
-    def cells(self, family: type[Family]) -> list[tuple[str, int]]:
+    def cells(self, family: type[Family]) -> list[Cell]:
         """(selector, n_tsp) pairs that differ for this family; baselines without inputs have one."""
+        if family.combines or not suits(family.key, self.batches[0].channels[self.design.target]):
+            return []
         if not family.uses_inputs:
             return [("none", 0)]
         p = len(self.design.inputs)
@@ -164,8 +194,16 @@ class FamilyResult:
 
     scores: pd.DataFrame
     cells: pd.DataFrame
-    predictions: dict[str, NDArray[np.float32]]
+    predictions: dict[str, NDArray[np.float32]]  # "protocol|selector|family|n_tsp" -> by fold and tested batch
     failures: list[tuple[str, str]]
+
+    @classmethod
+    def joined(cls, parts: Sequence[FamilyResult]) -> FamilyResult:
+        """The shares of several families or rounds together."""
+        tables = [[getattr(p, name) for p in parts if len(getattr(p, name))] for name in ("scores", "cells")]
+        scores, cells = (pd.concat(own, ignore_index=True) if own else pd.DataFrame() for own in tables)
+        predictions = {name: values for p in parts for name, values in p.predictions.items()}
+        return cls(scores, cells, predictions, list(dict.fromkeys(f for p in parts for f in p.failures)))
 
 
 def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
@@ -174,7 +212,7 @@ def with_target(batches: Sequence[Batch], target: str) -> list[Batch]:
 
 
 def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine | None = None) -> Crossing:
-    """Stack the batches and run every selector on every training set.
+    """Stack the batches and cut them into folds.
 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
@@ -201,76 +239,81 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
     folds = {p: folds_of(p, kept) for p in plan.protocols}
     if "forward" in plan.protocols and (obstacle := forward_obstacle(kept)):
         lost.append(("forward", obstacle))
-    chosen: dict[tuple[str, tuple[int, ...]], dict[int, Inputs]] = {}
-    n_all = range(1, len(inputs) + 1)
-
-    def choose(train: tuple[int, ...]) -> None:
-        for key in plan.selectors:
-            if (key, train) not in chosen:
-                chosen[key, train] = SELECTORS[key]().select_design(design, train, n_all)
-
-    choose(tuple(range(len(kept))))
     for protocol, group in folds.items():
         for fold in list(group):
             try:
-                choose(fold.train)
+                training_statistics(design, fold.train, "none")
             except InputError as error:
                 # A single batch can have too few complete rows to learn from; the other folds still stand.
                 group.remove(fold)
                 lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
-    return Crossing(kept[0].machine, tuple(kept), design, plan, folds, chosen, (*excluded, *lost, *plan.left_out))
+    return Crossing(kept[0].machine, tuple(kept), design, plan, folds, (*excluded, *lost, *plan.left_out))
 
 
 def _first_lost(lost: Sequence[tuple[str, str]]) -> str:
     return f"; {lost[0][1]}" if lost else ""
 
 
-def cross_family(crossing: Crossing, key: str) -> FamilyResult:
-    """Fit and score one family over all its cells, folds and protocols."""
+def cross_family(
+    crossing: Crossing,
+    key: str,
+    cells: Sequence[Cell] | None = None,
+    folds: Mapping[str, Sequence[Fold]] | None = None,
+    keep: bool = True,
+) -> FamilyResult:
+    """Fit and score one family.
+
+    Args:
+        cells: which; None: all that differ.
+        folds: of which protocols; None: all of the crossing.
+        keep: whether to keep the predictions under the protocols of `KEPT`.
+    """
     family = FAMILIES[key]
-    target = crossing.design.target
-    cells = crossing.cells(family) if suits(key, crossing.batches[0].channels[target]) else []
+    cells = crossing.cells(family) if cells is None else list(cells)
     scores, summaries = [], []
     predictions: dict[str, NDArray[np.float32]] = {}
-    run = {p: folds for p, folds in crossing.folds.items() if folds and cells}
-    every, protocols = [f for folds in run.values() for f in folds], [p for p, folds in run.items() for _ in folds]
-    judged = FamilyScores.run(crossing.design, family(), every, crossing.needed(every, cells), protocols)
+    run = {p: own for p, own in (crossing.folds if folds is None else folds).items() if own and cells}
+    every, protocols = [f for own in run.values() for f in own], [p for p, own in run.items() for _ in own]
+    judged = FamilyScores.run(crossing.design, family(), every, crossing.needed(every, cells), protocols, keep)
     end = 0
-    for protocol, folds in run.items():
-        own, end = range(end, end + len(folds)), end + len(folds)
+    for protocol, tested in run.items():
+        own, end = range(end, end + len(tested)), end + len(tested)
         picked = {cell: [judged.column.get((crossing.inputs(cell[0], f.train, cell[1]), i), -1)
-                         for i, f in zip(own, folds, strict=True)] for cell in cells}  # fmt: skip
+                         for i, f in zip(own, tested, strict=True)] for cell in cells}  # fmt: skip
         scored = [cell for cell in cells if min(picked[cell]) >= 0]
         if not scored:
             continue
         columns = np.array([picked[cell] for cell in scored], int)
-        table, summary = score_table(crossing.design.batch_ids, folds, judged, columns, protocol)
+        table, summary = score_table(crossing.design.batch_ids, tested, judged, columns, protocol)
         names = pd.DataFrame(scored, columns=["selector", "n_tsp"]).assign(protocol=protocol, family=key)[CELL_KEYS]
-        inputs = [crossing.inputs(selector, crossing.everything, n_tsp) for selector, n_tsp in scored]
-        summary = summary.assign(
-            n_parameters=judged.parameters(own),
-            rank=family.rank,
-            tsp_stability=[crossing.stability(protocol, *cell) for cell in scored],
-            inputs=["|".join(i) for i in inputs],
-            n_inputs=[len(i) for i in inputs],
-            simulated=any(b.simulated for b in crossing.batches),
-        )
+        summary = summary.assign(n_parameters=judged.parameters(own), rank=family.rank)
         repeated = names.loc[names.index.repeat(len(table) // len(scored))].reset_index(drop=True)
         scores.append(pd.concat([repeated, table], axis=1))
         summaries.append(pd.concat([names, summary], axis=1))
-        if protocol == "leave-batch-out":
+        if keep and protocol in KEPT:
             for (selector, n_tsp), row in zip(scored, columns, strict=True):
-                predictions[f"{selector}|{key}|{n_tsp}"] = judged.left_out(crossing.design, folds, row)
-    return FamilyResult(
-        pd.concat(scores, ignore_index=True) if scores else pd.DataFrame(),
-        pd.concat(summaries, ignore_index=True) if summaries else pd.DataFrame(),
-        predictions,
-        [(f"family {key}", f"{protocol}, {text}") for protocol, text in judged.failures],
-    )
+                predictions[f"{protocol}|{selector}|{key}|{n_tsp}"] = judged.left_out(tested, row)
+    failures = [(f"family {key}", f"{protocol}, {text}") for protocol, text in judged.failures]
+    return FamilyResult.joined([
+        FamilyResult(pd.DataFrame(), pd.DataFrame(), predictions, failures),
+        *(FamilyResult(a, b, {}, []) for a, b in zip(scores, summaries, strict=True)),
+    ])  # fmt: skip
 
 
-def refit(crossing: Crossing, selector: str, family: str, n_tsp: int) -> Family:
-    """A cell's model fitted on all batches."""
-    inputs = crossing.inputs(selector, crossing.everything, n_tsp)
-    fitted: Family = FAMILIES[family]().fit_design(crossing.subset(inputs), crossing.everything)
+def refit(crossing: Crossing, selector: str, family: str, n_tsp: int, members: pd.DataFrame | None = None) -> Family:
+    """A cell's model fitted on all batches; a stack is made of `members`, see `GridResult.stack`."""
+    every = crossing.everything
+    model = unfitted(family, members)
+    inputs = crossing.inputs(selector, every, n_tsp)
+    fitted: Family = model.fit_design(crossing.subset(inputs), every)
     return fitted
+
+
+def unfitted(family: str, members: pd.DataFrame | None = None) -> Family:
+    """A family with its usual options; a stack with these members and weights."""
+    if members is None or not FAMILIES[family].combines:
+        plain: Family = FAMILIES[family]()
+        return plain
+    own = [(f, inputs.split("|")) for f, inputs in zip(members["family"], members["inputs"], strict=True)]
+    stack: Family = FAMILIES[family](own, members["weight"].tolist())
+    return stack

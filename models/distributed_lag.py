@@ -57,7 +57,6 @@ class DistributedLag(Family):
     key = "distributed_lag"
     summary = "distributed lag: temperatures of now and before, geometric, polynomial or free"
     source = "Koyck 1954; Almon 1965"
-    effort = "usual"
     rowwise = False
     rank = 25
 

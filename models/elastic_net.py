@@ -26,7 +26,6 @@ class ElasticNet(Tuned):
     key = "elastic_net"
     summary = "elastic net, penalty and mixing by leave-batch-out inside the training batches"
     source = "Zou and Hastie (2005), eq. 3; active sets: Lee, Battle, Raina and Ng (2007), algorithm 1"
-    effort = "usual"
     rank = 15
 
     def __init__(self, mixings: Sequence[float] = (1.0, 0.5, 0.1), least: float = 1e-5, n_penalties: int = 21) -> None:

@@ -48,7 +48,6 @@ class GM1N(Family):
     key = "gm1n"
     summary = "grey model GM(1,N), free-running"
     source = "Deng 1989"
-    effort = "quick"
     rowwise = False
     rank = 30
 

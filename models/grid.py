@@ -19,8 +19,9 @@ from features.selectors import SELECTORS
 from features.selectors.base import Diagnostic
 from features.stability import stability_over_batches
 from models import FAMILIES
-from models.crossing import Crossing, FamilyResult, Plan, cross_family, prepare
+from models.crossing import Crossing, FamilyResult, Plan, prepare
 from models.protocols import Fold, season, speed, start_ambient_degC
+from models.race import Job, drive
 from models.result import CELL_KEYS, GridResult
 from models.trust import LeftOut, left_out_runs
 from models.updating import COLUMNS, updated_scores
@@ -63,13 +64,16 @@ class Workers:
         self._pool, self._sharing = pools(n)
         self._crossings: Any = dict(crossings)
 
-    def cross(self, job: tuple[str, str]) -> FamilyResult:
-        """`cross_family` of (error channel, family); waits for it."""
-        return self._pool_of(job[1]).submit(_cross, self._crossings, job)()
+    def cross(self, job: Job) -> FamilyResult:
+        """The scores of a job; waits for them."""
+        return self._pool_of(job.family).submit(_cross, self._crossings, job)()
 
-    def distances(self, cell: tuple[str, str, str, int]) -> LeftOut:
-        """`left_out_runs` of (error channel, selector, family, n_tsp), where the crossing left its results."""
-        return self._pool_of(cell[2]).submit(_distances, self._crossings, cell)()
+    def distances(self, asked: tuple[tuple[str, str, str, int], Mapping[str, Any], Mapping[Any, Any]]) -> LeftOut:
+        """`left_out_runs` of (error channel, selector, family, n_tsp), where the crossing left its results.
+
+        With it come the cell's predictions and, as in `Job`, what its selector chose.
+        """
+        return self._pool_of(asked[0][2]).submit(_distances, self._crossings, *asked)()
 
     def readings(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
         """`updated_scores` forward in time of the same; empty for iterative families, whose many fits take hours."""
@@ -96,16 +100,6 @@ def workers_for(families: Sequence[str]) -> int:
     return (os.cpu_count() or 1) if any(not FAMILIES[f].closed_form for f in families) else 1
 
 
-def jobs_of(plan: Plan, targets: Sequence[str]) -> list[tuple[str, str]]:
-    """(error channel, family) pairs, the slow, iterative families first, so that none of them is alone at the end.
-
-    Of families that share work over the error channels one goes before all others; those that wait for it come last.
-    """
-    jobs = [(t, f) for f in sorted(plan.families, key=lambda f: FAMILIES[f].closed_form) for t in targets]
-    sharing = [(t, f) for f in plan.families if FAMILIES[f].shares_targets for t in targets]
-    return [*sharing[:1], *(j for j in jobs if j not in sharing), *sharing[1:]]
-
-
 def run_grid(
     batches: Sequence[Batch],
     targets: Sequence[str],
@@ -120,21 +114,19 @@ def run_grid(
     `progress` is called with what was done, how many of how many.
     """
     plan = plan.suited(machine, [b.channels[t] for b in batches[:1] for t in targets if t in b.channels])
-    with threadpool_limits(limits=1):
-        crossings = {t: prepare(batches, t, plan, machine) for t in targets}
-        jobs = jobs_of(plan, targets)
+    with threadpool_limits(limits=1), Workers(crossings := {t: prepare(batches, t, plan, machine) for t in targets},
+                                              workers) as crew:  # fmt: skip
 
-        def finished(job: tuple[str, str], n: int) -> None:
-            if progress:
-                progress(f"{job[0]} {job[1]}", n, len(jobs))
+        def cross(jobs: list[Job]) -> list[FamilyResult]:
+            return in_threads(
+                crew.cross, jobs, workers, lambda job, n: progress(job.label, n, len(jobs)) if progress else None
+            )
 
-        with Workers(crossings, workers) as crew:
-            done = dict(zip(jobs, in_threads(crew.cross, jobs, workers, finished), strict=True))
-    return {t: (crossings[t], assemble(crossings[t], [done[t, f] for f in plan.families])) for t in targets}
+        return {t: (crossings[t], assemble(crossings[t], *done)) for t, done in drive(crossings, cross).items()}
 
 
-def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
-    """One result from the families' shares."""
+def assemble(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, stack: pd.DataFrame) -> GridResult:
+    """The tables of one error channel from the scores of its cells and the table of the race."""
     design = crossing.design
     predictions = {
         "batch_id": np.array(design.batch_ids, dtype=object)[design.group],
@@ -143,11 +135,9 @@ def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
     }
     if design.along:
         predictions["position_mm"] = design.position_mm(design.along)
-    for r in results:
-        predictions |= r.predictions
-    failures = [f for r in results for f in r.failures]
-    cells = pd.concat([r.cells for r in results if len(r.cells)], ignore_index=True)
-    scores = pd.concat([r.scores for r in results if len(r.scores)], ignore_index=True)
+    every = "leave-batch-out|"
+    predictions |= {k.removeprefix(every): v for k, v in result.predictions.items() if k.startswith(every)}
+    cells, scores = _with_points(crossing, result.cells), result.scores
     first = [*CELL_KEYS, "fold", "batch_id"]
     return GridResult(
         machine=crossing.machine,
@@ -156,11 +146,25 @@ def assemble(crossing: Crossing, results: Sequence[FamilyResult]) -> GridResult:
         batches=batch_table(crossing.batches),
         scores=scores[[*first, *(c for c in scores if c not in first)]],
         cells=cells,
-        subsets=_subset_table(crossing),
+        subsets=_subset_table(crossing, cells),
         predictions=pd.DataFrame(predictions),
         findings=finding_table((b.batch_id, b.findings) for b in crossing.batches),
-        excluded=pd.DataFrame([*crossing.excluded, *failures], columns=["channel", "reason"]),
+        excluded=pd.DataFrame([*crossing.excluded, *result.failures], columns=["channel", "reason"]),
         selector_diagnostics=_diagnostics_table(crossing, cells),
+        race=race,
+        stack=stack,
+    )
+
+
+def _with_points(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
+    """The cells with the points that they choose from all runs, and how alike the folds' choices are."""
+    own = list(cells[CELL_KEYS].itertuples(index=False))
+    chosen = [crossing.inputs(selector, crossing.everything, n) for _, selector, _, n in own]
+    return cells.assign(
+        tsp_stability=[crossing.stability(protocol, selector, n) for protocol, selector, _, n in own],
+        inputs=["|".join(i) for i in chosen],
+        n_inputs=[len(i) for i in chosen],
+        simulated=any(b.simulated for b in crossing.batches),
     )
 
 
@@ -185,24 +189,25 @@ def batch_table(batches: Sequence[Batch]) -> pd.DataFrame:
     )
 
 
-def _subset_table(crossing: Crossing) -> pd.DataFrame:
+def _subset_table(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
     rows = []
     n_all = range(1, len(crossing.design.inputs) + 1)
-    for protocol, folds in [*crossing.folds.items(), ("all", [Fold("all", crossing.everything, ())])]:
-        for fold in folds:
-            for selector in crossing.plan.selectors:
-                for n in n_all if SELECTORS[selector].takes_n_tsp else n_all[-1:]:
-                    rows.append((protocol, selector, n, fold.name, "|".join(crossing.inputs(selector, fold.train, n))))
+    own = cells[cells["selector"].isin(SELECTORS) & (cells["n_tsp"] > 0)]
+    selecting = list(own[["protocol", "selector"]].drop_duplicates().itertuples(index=False))
+    for protocol, selector in [*selecting, *(("all", s) for s in own["selector"].unique())]:
+        for fold in crossing.folds.get(protocol, [Fold("all", crossing.everything, ())]):
+            for n in n_all if SELECTORS[selector].takes_n_tsp else n_all[-1:]:
+                rows.append((protocol, selector, n, fold.name, "|".join(crossing.inputs(selector, fold.train, n))))
     return pd.DataFrame(rows, columns=["protocol", "selector", "n_tsp", "fold", "inputs"])
 
 
 def _diagnostics_table(crossing: Crossing, cells: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    protocol = "leave-batch-out" if crossing.folds.get("leave-batch-out") else next(iter(crossing.folds))
+    protocol = cells["protocol"].iloc[0] if (p := "leave-batch-out") not in set(cells["protocol"]) else p
     fewer = cells[(cells["protocol"] == protocol) & (cells["n_inputs"] < len(crossing.design.inputs))]
-    for key in crossing.plan.selectors:
+    for key in dict.fromkeys(fewer["selector"].astype(str)):
         own = fewer[fewer["selector"] == key].dropna(subset="S_mean_um")
-        if SELECTORS[key].takes_n_tsp and len(own):
+        if key in SELECTORS and SELECTORS[key].takes_n_tsp and len(own):
             n = int(own["n_tsp"].iloc[int((own["S_mean_um"] + own["S_std_um"].fillna(0.0)).argmin())])
             stable = stability_over_batches([crossing.inputs(key, f.train, n) for f in crossing.folds[protocol]])
             found = SELECTORS[key]().diagnostics(crossing.design, crossing.everything, n)
@@ -215,12 +220,19 @@ def _start() -> None:
     one_thread()
 
 
-def _cross(crossings: Shared[dict[str, Crossing]], job: tuple[str, str]) -> FamilyResult:
-    return cross_family(crossings.get()[job[0]], job[1])
+def _cross(crossings: Shared[dict[str, Crossing]], job: Job) -> FamilyResult:
+    return job.run(crossings.get()[job.target])
 
 
-def _distances(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> LeftOut:
-    return left_out_runs(crossings.get()[cell[0]], *cell[1:])
+def _distances(
+    crossings: Shared[dict[str, Crossing]],
+    cell: tuple[str, str, str, int],
+    known: Mapping[str, Any],
+    chosen: Mapping[Any, Any],
+) -> LeftOut:
+    crossing = crossings.get()[cell[0]]
+    crossing.chosen.update(chosen)
+    return left_out_runs(crossing, *cell[1:], known)
 
 
 def _readings(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> pd.DataFrame:

@@ -29,7 +29,6 @@ class Huber(Linear):
     key = "huber"
     summary = "Huber regression: rows far off count linearly"
     source = "Huber (1964); scale and steps: Huber and Dutter (1974); the criterion: Owen (2007)"
-    effort = "usual"
     rank = 16
 
     def __init__(self, epsilons: Sequence[float] = (1.35,), ridge: float = 1e-6) -> None:

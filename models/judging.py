@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from models.protocols import Fold
 from models.result import CERTAINTY, SCORES
 
 Inputs = tuple[str, ...]
+KEPT = ("forward", "leave-batch-out", "leave-season-out")  # protocols whose predictions are kept
 _AT_ONCE_BYTES = 128 * 2**20
 _FITTED_ON, _FITTED_ON_ITERATIVE = 100, 4  # training batches, evenly chosen, that fitting accuracy is taken from
 
@@ -42,9 +43,10 @@ class FamilyScores:
     column: dict[tuple[Inputs, int], int]
     tested: dict[str, Array]  # score -> (columns, K), NaN where a batch is not tested
     fit_S_um: Array  # (columns,), over the training batches, at most 100 of them, 4 of an iterative family
-    kept: dict[int, Array]  # column -> prediction on the fold's tested rows
+    kept: dict[int, Array]  # column -> predictions on the rows of the batches that its fold tests, in their order
     n_parameters: NDArray[np.int64]  # (columns,)
     failures: list[tuple[str, str]]  # protocol and what could not be fitted
+    keep: frozenset[int]  # folds whose predictions are kept
 
     @classmethod
     def run(
@@ -54,16 +56,19 @@ class FamilyScores:
         folds: Sequence[Fold],
         needed: Sequence[tuple[Design, list[int]]],
         protocols: Sequence[str],
+        keep: bool = True,
     ) -> FamilyScores:
         """Fit and score the folds of all protocols together, since they share most of the work.
 
         Args:
             needed: each distinct subset of the design's inputs with the folds it is wanted for.
             protocols: of every fold; where a subset cannot be fitted, each protocol's folds are tried by themselves.
+            keep: whether to keep the predictions under the protocols of `KEPT`.
         """
+        kept = frozenset(i for i, p in enumerate(protocols) if keep and p in KEPT)
         total = sum(len(which) for _, which in needed)
         tested = {name: np.full((total, design.n_batches), np.nan) for name in [*SCORES, *CERTAINTY, "n_rows"]}
-        out = cls({}, tested, np.full(total, np.nan), {}, np.zeros(total, np.int64), [])
+        out = cls({}, tested, np.full(total, np.nan), {}, np.zeros(total, np.int64), [], kept)
         most = _FITTED_ON if family.closed_form else _FITTED_ON_ITERATIVE
         trained = [f.train[:: -(-len(f.train) // most)] for f in folds]
         pending: list[_Column] = []
@@ -80,6 +85,19 @@ class FamilyScores:
                 out._judge(design, folds, trained, pending)
                 pending, waiting = [], 0
         out._judge(design, folds, trained, pending)
+        return out
+
+    @classmethod
+    def of_predictions(cls, design: Design, predicted: Sequence[Mapping[int, Array]]) -> FamilyScores:
+        """Of one model per fold, given its predictions (n_k,) of every batch k that the fold tests."""
+        empty = {name: np.full((len(predicted), design.n_batches), np.nan) for name in [*SCORES, *CERTAINTY, "n_rows"]}
+        kept = {f: np.concatenate(list(own.values())) for f, own in enumerate(predicted)}
+        nothing = np.full(len(predicted), np.nan)
+        out = cls({}, empty, nothing, kept, np.zeros(len(predicted), np.int64), [], frozenset(kept))
+        for f, own in enumerate(predicted):
+            for k, values in own.items():
+                for name, got in batch_scores(design.y_um[design.rows(k)], values[:, None]).items():
+                    out.tested[name][f, k] = got[0]
         return out
 
     def parameters(self, folds: range) -> int:
@@ -99,8 +117,8 @@ class FamilyScores:
         for c, column in enumerate(pending):
             for k in column.predicted_um:
                 columns_of.setdefault(k, []).append(c)
-            if len(folds[column.fold].test) == 1:
-                self.kept[first + c] = column.predicted_um[folds[column.fold].test[0]]
+            if column.fold in self.keep:
+                self.kept[first + c] = np.concatenate([column.predicted_um[k] for k in folds[column.fold].test])
         for k, columns in columns_of.items():
             y = design.y_um[design.rows(k)]
             tests = [c for c in columns if k in folds[pending[c].fold].test]
@@ -123,12 +141,9 @@ class FamilyScores:
             self.n_parameters[first + c] = column.n_parameters
             self.column[column.inputs, column.fold] = first + c
 
-    def left_out(self, design: Design, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Every batch's prediction by the fold that left it out, on all rows of the design, µm."""
-        out = np.full(len(design.y_um), np.nan, np.float32)
-        for fold, column in zip(folds, columns, strict=True):
-            out[design.rows(fold.test[0])] = self.kept[int(column)]
-        return out
+    def left_out(self, folds: Sequence[Fold], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Predictions of one cell, fold after fold on the rows of the batches that it tests, µm."""
+        return np.concatenate([self.kept[int(c)] for _, c in zip(folds, columns, strict=True)]).astype(np.float32)
 
 
 def _columns_or_failures(

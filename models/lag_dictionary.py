@@ -75,7 +75,6 @@ class LagDictionary(Family):
     key = "lag_dictionary"
     summary = "dictionary of lags of temperatures, drivers and the start, batches pooled with a drift of their own"
     source = "generalised least squares with random effects, Henderson (1975); weights after Geisser and Eddy (1979)"
-    effort = "usual"
     closed_form = False
     rowwise = False
     has_sd = True

@@ -55,7 +55,6 @@ class LSSVM(KernelExpansion):
     key = "lssvm"
     summary = "least-squares support vector machine, RBF and linear kernel"
     source = "Suykens et al. 2002"
-    effort = "quick"
     rank = 60
 
     def __init__(

@@ -21,7 +21,6 @@ class MLR(Linear):
     key = "mlr"
     summary = "multiple linear regression: least squares on all chosen inputs"
     source = "Legendre (1805); minimum norm by singular values: Golub and Kahan (1965)"
-    effort = "quick"
     has_sd = True
     rank = 10
 

@@ -24,7 +24,6 @@ class PCR(Linear):
     key = "pcr"
     summary = "principal component regression, components to 95 % cumulative contribution"
     source = "Massy (1965); year-round study of a Vcenter-55 machining centre: covariance, 95 %, 4 points"
-    effort = "quick"
     rank = 11
 
     def __init__(self, contribution: float = 0.95) -> None:
@@ -50,7 +49,6 @@ class PCRByLeaveBatchOut(Tuned):
     key = "pcr_lbo"
     summary = "principal component regression, number of components by leave-batch-out inside the training batches"
     source = "Massy (1965); choice by prediction error: Mertens, Fearn and Thompson (1995)"
-    effort = "quick"
     rank = 13
 
     def _path(self, pool: Pool) -> Array:

@@ -24,7 +24,6 @@ class PLS(Tuned):
     key = "pls"
     summary = "partial least squares, number of components by leave-batch-out inside the training batches"
     source = "Wold, Martens and Wold (1983); from cross-products: de Jong and ter Braak (1994)"
-    effort = "quick"
     rank = 14
 
     def __init__(self, max_components: int = 10) -> None:

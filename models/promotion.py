@@ -1,36 +1,49 @@
-"""The promotion rule: which cell is best, whether it is trustworthy, and whether it beats a champion."""
+"""The promotion rule: which cell has the least expected loss, how far it may be trusted, whether it beats a champion.
+
+The expected loss of a cell in a future run is a weighted mean of its S over left-out runs. A run predicted from earlier
+ones counts most, since a future run is predicted so; a season or speed that was left out counts by its number of runs,
+pooled with the others (`PromotionRule.group_runs`). To it comes the cost of choosing: what the best of a family's cells
+loses where the other runs choose it (Varma and Simon 2006, BMC Bioinformatics 7:91).
+"""
 
 from __future__ import annotations
 
 import difflib
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from data.arrays import Array
 from data.errors import InputError
+from models.metrics import residual_std_um
 from models.protocols import PromotionRule
+from models.race import BASELINES, paired
 from models.result import GridResult
 
-BASELINES = ("zero", "mean_curve")
+Standing = Literal["champion", "provisional", "refused"]
 KEYS = ["selector", "family", "n_tsp"]
 _SIGN_PATTERNS = 2**16  # of up to 16 batches all are counted, of more so many are drawn
 _INTERVAL = 0.90
+_MAJORITY = 2 / 3  # of the runs that a provisional model must improve
+_GROUPED = ("leave-season-out", "leave-speed-out")
+_SHARES = np.linspace(0.05, 1.0, 20)  # of a correction that are tried as authority
+_UNMEASURED = 0.5  # authority of a provisional model whose left-out predictions are not known
 
 
 @dataclass(frozen=True)
 class Choice:
     """The cell that the rule picked.
 
-    `protocol` is the one that decides: under it the cell's weighted score is worst; `S_mean_um` and `S_std_um` are of
-    this protocol. `caution` is why the cell is not trustworthy: a baseline won, no set of points was stable, or the
-    cell is not shown to beat a baseline; empty where it is. The nested score predicts every batch by the cell that the
-    other batches chose, under the same protocol.
+    `score_um` is its expected loss, with the cost of choosing; `protocol` the leading one, `S_mean_um` and `S_std_um`
+    are of this protocol. The nested score predicts every run by the cell that the other runs chose, under the same
+    protocol. `standing`: "champion", where it is shown to beat every baseline; "provisional", where it is expected to
+    and better in two of three runs, but not shown beyond doubt; "refused", where it may harm. `caution` is why it is no
+    champion. `authority` is the share of the correction that a provisional model is worth.
     """
 
     protocol: str
@@ -47,10 +60,12 @@ class Choice:
     summary: str
     nested_S_mean_um: float = float("nan")
     nested_S_std_um: float = float("nan")
+    standing: Standing = "champion"
+    authority: float = 1.0
 
     @property
     def trusted(self) -> bool:
-        return not self.caution
+        return self.standing == "champion"
 
     @property
     def cell(self) -> str:
@@ -90,134 +105,167 @@ class Comparison:
         return {**asdict(self), "words": self.words}
 
 
-def score_um(cells: pd.DataFrame, rule: PromotionRule) -> pd.Series:
-    """The rule's score of every row under its own protocol, µm, smaller is better."""
-    if rule.score == "max_abs":
-        return cells["max_abs_um"].astype(float)
-    spread = cells["S_std_um"] if rule.score == "S_mean + S_std" else 0.0
-    return (cells["S_mean_um"] + spread).astype(float)
+@dataclass(frozen=True)
+class Losses:
+    """S of the C cells that all of the rule's protocols have scored, in R left-out runs.
+
+    `cells` (C rows): the row of `GridResult.cells` under the leading protocol, with the least `tsp_stability`. `S_um`
+    (C, R); `protocol`, `group` (what was left out), `batch_id`, `weight`: of the runs (R,).
+    """
+
+    cells: pd.DataFrame
+    S_um: Array
+    protocol: NDArray[np.object_]
+    group: NDArray[np.object_]
+    batch_id: NDArray[np.object_]
+    weight: Array
+    rule: PromotionRule
+
+    @classmethod
+    def of(cls, result: GridResult, rule: PromotionRule) -> Self:
+        """Cells without a finite S in every run are left out.
+
+        Raises:
+            InputError: none of the rule's protocols was run, or no cell has a finite score.
+        """
+        run = sorted(set(result.cells["protocol"]))
+        offered = rule.offered(run)
+        if not offered:
+            raise InputError(
+                f"promotion rule: got trainings by {', '.join(run)}, expected one of its protocols "
+                f"{', '.join(rule.protocols)}; add one of them to the training or to promotion.protocols in mlflow.yml"
+            )
+        tables = []
+        for p in offered:
+            own = result.scores[result.scores["protocol"] == p]
+            ids = own["batch_id"].where(own["batch_id"] != "*", own["fold"]).astype(str)
+            own = own.assign(run=ids)[[*KEYS, "protocol", "fold", "run", "S_um"]]
+            tables.append(own.pivot(index=KEYS, columns=["protocol", "fold", "run"], values="S_um"))
+        wide = pd.concat(tables, axis=1, join="inner")
+        wide = wide[np.isfinite(wide.to_numpy(float)).all(axis=1)]
+        if wide.empty:
+            raise InputError(f"promotion rule: no cell of {', '.join(offered)} has a finite S")
+        by_cell = result.cells.set_index(KEYS)
+        led = by_cell[by_cell["protocol"] == offered[0]].loc[wide.index]
+        stability = by_cell.loc[by_cell["protocol"].isin(offered), "tsp_stability"].groupby(level=[0, 1, 2]).min()
+        cells = led.assign(tsp_stability=stability.reindex(wide.index)).reset_index()
+        protocol, group, ids = (wide.columns.get_level_values(k).to_numpy(object) for k in range(3))
+        weight = np.array([rule.protocols[p] for p in protocol])
+        return cls(cells, wide.to_numpy(float), protocol, group, ids, weight, rule)
+
+    def counted(self, without: str | None = None) -> Array:
+        """What each run counts (R,), 0 for the batch that is left out; sums up to 1.
+
+        The mean of a group of n runs that was left out is pooled with the protocol's mean by n : `group_runs`.
+        """
+        out = np.where(self.batch_id == without, 0.0, self.weight)
+        for p in dict.fromkeys(self.protocol):
+            own = (self.protocol == p) & (out > 0)
+            if p in _GROUPED and own.any():
+                _, place, n = np.unique(self.group[own].astype(str), return_inverse=True, return_counts=True)
+                alone = (n / (n + self.rule.group_runs))[place]
+                out[own] *= alone + np.mean(1.0 - alone)
+        return np.asarray(out / out.sum()) if out.any() else out
+
+    def without_each(self) -> tuple[list[str], Array]:
+        """The batches (K) and every cell's loss (C, K) as the other batches show it."""
+        ids = [str(k) for k in dict.fromkeys(self.batch_id)]
+        return ids, self.S_um @ np.column_stack([self.counted(k) for k in ids])
+
+    def choosing_um(self) -> Array:
+        """Cost of choosing among the cells of its family (C,): the loss of the family's best cell where each run is
+        predicted by the cell that the others choose, less the loss of the best cell itself; 0 for a single cell."""
+        counted, family = self.counted(), self.cells["family"].to_numpy(str)
+        ids, left_um = self.without_each()
+        place = np.searchsorted(ids, self.batch_id.astype(str), sorter=(order := np.argsort(ids)))
+        at = order[place]
+        out = np.zeros(len(family))
+        if len(ids) > 2:  # of two batches the other one alone chooses
+            for key in np.unique(family):
+                own = np.flatnonzero(family == key)
+                chosen = own[np.argmin(left_um[own], axis=0)][at]
+                best_um = (self.S_um[own] @ counted).min()
+                out[own] = max(0.0, float(self.S_um[chosen, np.arange(len(at))] @ counted - best_um))
+        return out
+
+    def behind(self, cell: int, counted: Array) -> tuple[Array, Array]:
+        """How far every cell is behind one, with the standard error over batches, (C,) each."""
+        ids, place = np.unique(self.batch_id.astype(str), return_inverse=True)
+        d = (self.S_um - self.S_um[cell]) * counted
+        share = np.bincount(place, counted, len(ids)).astype(float)
+        by_batch = np.zeros((len(d), len(ids)))
+        np.add.at(by_batch.T, place, d.T)
+        some = share > 0
+        return paired(by_batch[:, some] / share[some], np.zeros(int(some.sum())), share[some])
 
 
-def judged(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
-    """One row per cell: its row of `cells` under the deciding protocol, with the combined score in `score_um`.
-
-    `tsp_stability` is the least over the protocols. Cells without a finite score under one of the protocols are left
-    out.
-
-    Args:
-        cells: `GridResult.cells`.
+def judged(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
+    """One row per cell that all of the rule's protocols have scored: its row of `GridResult.cells` under the leading
+    protocol, with `score_um`, the expected loss, of which `choosing_um` is the cost of choosing.
 
     Raises:
-        InputError: none of the rule's protocols was run, or no cell has a finite score.
+        InputError: as `Losses.of`.
     """
-    run = sorted(set(cells["protocol"]))
-    offered = rule.offered(run)
-    if not offered:
-        wanted = ", ".join(rule.protocols)
-        raise InputError(
-            f"promotion rule: got trainings by {', '.join(run)}, expected one of its protocols {wanted}; "
-            "add one of them to the training or to promotion.protocols in mlflow.yml"
-        )
-    table, common = _common_cells(cells, [p for p in dict.fromkeys(cells["protocol"]) if p in offered])
-    return _decided(table, len(common), rule)
+    return _scored(Losses.of(result, rule))
 
 
-def _common_cells(cells: pd.DataFrame, protocols: Sequence[str]) -> tuple[pd.DataFrame, pd.MultiIndex]:
-    """The rows (P C) of the cells that all of the protocols have, protocol after protocol, and the cells (C,)."""
-    own = [cells[cells["protocol"] == p] for p in protocols]
-    every = [pd.MultiIndex.from_frame(table[KEYS]) for table in own]
-    common = every[0]
-    for index in every[1:]:
-        common = common[common.isin(index)]
-    rows = [t.iloc[i.get_indexer(common)] for t, i in zip(own, every, strict=True)]
-    return pd.concat(rows, ignore_index=True), common
+def _scored(losses: Losses) -> pd.DataFrame:
+    choosing_um = losses.choosing_um()
+    loss_um = losses.S_um @ losses.counted() + choosing_um
+    return losses.cells.assign(score_um=loss_um, choosing_um=choosing_um)
 
 
-def _decided(table: pd.DataFrame, n: int, rule: PromotionRule) -> pd.DataFrame:
-    """`judged` of `n` cells, given their rows by protocol as `_common_cells` orders them.
-
-    Raises:
-        InputError: no cell has a finite score.
-    """
-    weight = table["protocol"].map(rule.protocols).to_numpy(float)
-    score = (score_um(table, rule).to_numpy() * weight).reshape(-1, n)
-    kept = np.flatnonzero(np.isfinite(score).all(axis=0))
-    if not len(kept):
-        run = ", ".join(rule.offered(set(table["protocol"])))
-        raise InputError(f"promotion rule: no cell of {run} has a finite {rule.score}")
-    decides, score = score[:, kept].argmax(axis=0), score[:, kept]
-    combined = score.max(axis=0) if rule.combine == "worst" else score.sum(axis=0) / weight[::n].sum()
-    stability = table["tsp_stability"].to_numpy(float).reshape(-1, n)[:, kept]
-    out = table.take(decides * n + kept).reset_index(drop=True)
-    return out.assign(score_um=combined, tsp_stability=np.fmin.reduce(stability, axis=0))
-
-
-def ranked(cells: pd.DataFrame, rule: PromotionRule) -> pd.DataFrame:
-    """The best cell of every family, the smallest combined score first; columns as `judged`.
+def ranked(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
+    """The best cell of every family, the smallest expected loss first; columns as `judged`, and `behind_um` the loss
+    against the first that is no baseline with its standard error `se_um`, without the cost of choosing.
 
     Raises:
         InputError: as `judged`.
     """
-    table = judged(cells, rule)
-    order = table.sort_values(["score_um", "rank", "n_tsp"], kind="stable")
+    losses = Losses.of(result, rule)
+    table = _scored(losses)
+    models = np.flatnonzero(~table["family"].isin(BASELINES))
+    at = int(models[np.argmin(table["score_um"].to_numpy()[models])]) if len(models) else 0
+    behind_um, se_um = losses.behind(at, losses.counted())
+    order = table.assign(behind_um=behind_um, se_um=se_um).sort_values(["score_um", "rank", "n_tsp"], kind="stable")
     return order.drop_duplicates("family").reset_index(drop=True)
 
 
-def choose(cells: pd.DataFrame, rule: PromotionRule) -> Choice:
-    """The cell to promote: least score among stable cells, ties to the simpler.
+def choose(result: GridResult, rule: PromotionRule) -> Choice:
+    """The cell to promote: least expected loss, ties within `ties_se` standard errors to the simpler.
 
-    Simpler is fewer inputs, then the family's rank, then fewer parameters, then the smaller score. A baseline is
-    chosen only where nothing beats it, and then it is not trustworthy.
-
-    Args:
-        cells: `GridResult.cells`.
+    Simpler is fewer inputs, then the family's rank, then fewer parameters, then the smaller loss. A baseline is chosen
+    only where nothing beats it.
 
     Raises:
         InputError: as `judged`.
     """
-    return _choose(judged(cells, rule), rule)
+    losses = Losses.of(result, rule)
+    table = _scored(losses)
+    at = _least(losses, table["score_um"].to_numpy(float), losses.counted())
+    return _picked(table, at, rule)
 
 
-def _choose(table: pd.DataFrame, rule: PromotionRule) -> Choice:
-    """`choose` from the table of `judged`."""
-    is_baseline = table["family"].isin(BASELINES)
-    baselines, candidates = table[is_baseline], table[~is_baseline]
-    stable = candidates[candidates["tsp_stability"].fillna(0.0) >= rule.min_tsp_stability]
-    caution = ""
-    if stable.empty and not candidates.empty:
-        top = candidates["tsp_stability"].max()
-        caution = f"no set of points is stable (best {top:.2f}, required {rule.min_tsp_stability:g})"
-        stable = candidates
-    floor = baselines["score_um"].min() if len(baselines) else np.inf
-    if stable.empty or stable["score_um"].min() >= floor:
-        winner = _simplest(baselines[baselines["score_um"] <= floor])
-        other = "" if stable.empty else f" (best other: {stable['score_um'].min():.2f} µm)"
-        return _picked(winner, rule, [], f"nothing beats {winner['family']}{other}")
-    best = stable.nsmallest(1, "score_um").iloc[0]
-    limit = best["score_um"] * (1 + rule.tie_percent / 100)
-    tied = stable[(stable["score_um"] <= limit) & (stable["score_um"] < floor)]
-    picked = _simplest(tied)
-    notes = []
-    # Selectors that arrive at the same points give the same model: one of them counts.
-    models = len(tied.drop_duplicates(["family", "inputs"]))
-    if (picked["family"], picked["inputs"]) != (best["family"], best["inputs"]):
-        notes.append(
-            f"the simplest of {models} within {rule.tie_percent:g} % of the best "
-            f"({_cell_words(best['family'], best['n_tsp'], best['selector'])}, {best['score_um']:.2f} µm)"
-        )
-    if len(baselines):
-        least = baselines.nsmallest(1, "score_um").iloc[0]
-        notes.append(f"{least['family']} has {least['score_um']:.2f} µm")
-    return _picked(picked, rule, notes, caution)
+def _least(losses: Losses, loss_um: Array, counted: Array) -> int:
+    """The cell of least loss, or the simplest that is not behind it by more than the ties allow."""
+    table = losses.cells
+    is_baseline = table["family"].isin(BASELINES).to_numpy()
+    best = int(np.argmin(np.where(is_baseline, np.inf, loss_um)))
+    floor_um = float(loss_um[is_baseline].min()) if is_baseline.any() else np.inf
+    if is_baseline[best] or loss_um[best] >= floor_um:
+        return _simplest(table, loss_um, is_baseline & (loss_um <= floor_um))
+    _, se_um = losses.behind(best, counted)
+    behind_um = loss_um - loss_um[best]
+    return _simplest(table, loss_um, ~is_baseline & (behind_um <= losses.rule.ties_se * se_um) & (loss_um < floor_um))
 
 
-def pick(cells: pd.DataFrame, rule: PromotionRule, cell: str) -> Choice:
+def pick(result: GridResult, rule: PromotionRule, cell: str) -> Choice:
     """A cell chosen by hand, as ``selector|family|n_tsp``.
 
     Raises:
         InputError: no such cell under the rule's protocols, with the closest; or as `judged`.
     """
-    table = judged(cells, rule)
+    table = judged(result, rule)
     labels = table["selector"] + "|" + table["family"] + "|" + table["n_tsp"].astype(str)
     if cell not in set(labels):
         near = difflib.get_close_matches(cell, labels, n=3, cutoff=0.3) or list(labels[:3])
@@ -225,42 +273,75 @@ def pick(cells: pd.DataFrame, rule: PromotionRule, cell: str) -> Choice:
             f"unknown cell {cell!r} of {', '.join(sorted(set(table['protocol'])))}; expected selector|family|n_tsp, "
             f"such as {', '.join(near)}"
         )
-    row = table[labels == cell].iloc[0]
-    caution = "a baseline, no model of the temperatures" if row["family"] in BASELINES else ""
-    return _picked(row, rule, ["chosen by hand"], caution)
+    at = int(np.flatnonzero(labels == cell)[0])
+    choice = _picked(table, at, rule, ["chosen by hand"])
+    if choice.family in BASELINES:
+        choice = replace(choice, standing="refused", caution="a baseline, no model of the temperatures")
+    return choice
 
 
 def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
-    """The rule's choice (or the cell picked by hand), with its nested score, tested against the baselines.
+    """The rule's choice (or the cell picked by hand), with its nested score, and how far it may be trusted.
 
-    The choice is trustworthy where the paired test shows it better than every baseline. The choice's own scores are
-    flattered by the search, so each batch enters the test with the nested score where there is one.
+    A champion is shown to be better than every baseline by the paired test. The choice's own scores are flattered by
+    the search, so each run enters the test with the nested score where there is one.
 
     Raises:
         InputError: as `choose` and `pick`.
     """
-    choice = pick(result.cells, rule, cell) if cell else choose(result.cells, rule)
-    own = left_out(result, rule, choice.selector, choice.family, choice.n_tsp)
-    nested = pd.DataFrame() if cell else score_of_choice(result, rule)
-    words, caution = choice.summary, choice.caution
+    choice = pick(result, rule, cell) if cell else choose(result, rule)
+    led = rule.only(choice.protocol)
+    own = left_out(result, led, choice.selector, choice.family, choice.n_tsp)
+    nested = pd.DataFrame() if cell else score_of_choice(result, led)
+    summary = choice.summary
     if len(nested):
-        S_um = nested.loc[nested["protocol"] == choice.protocol, "S_um"]
-        mean, std = float(S_um.mean()), float(S_um.std())
-        words += f"; each batch by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
+        mean, std = float(nested["S_um"].mean()), float(nested["S_um"].std())
+        summary += f"; each run by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
         choice = replace(choice, nested_S_mean_um=mean, nested_S_std_um=std)
         own = nested.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
-    if not caution:
+    if not choice.caution:
         for baseline in BASELINES:
-            rest = left_out(result, rule, "none", baseline, 0)
-            if len(rest) and not (test := compare_paired(own, rest, rule)).better:
-                caution = f"not shown to be better than {baseline} ({test.evidence})"
-                words += f"; {caution}: no trustworthy model"
+            rest = left_out(result, led, "none", baseline, 0)
+            if len(rest) and not (test := compare_paired(own, rest, led)).better:
+                choice = replace(choice, caution=f"not shown to be better than {baseline} ({test.evidence})")
                 break
-    return replace(choice, caution=caution, summary=words)
+    if choice.caution and choice.standing == "champion":
+        nothing = compare_paired(own, left_out(result, led, "none", "zero", 0), led)
+        helps = nothing.difference_um > 0 and nothing.n_better >= _MAJORITY * nothing.n_batches > 0
+        if helps:
+            share = authority(result.curves, choice)
+            choice = replace(choice, standing="provisional", authority=share)
+            summary += f"; provisional, {share:.2g} of the correction: {choice.caution}"
+        else:
+            choice = replace(choice, standing="refused")
+            summary += f"; {choice.caution}: no trustworthy model"
+    return replace(choice, summary=summary)
+
+
+def authority(curves: pd.DataFrame, choice: Choice) -> float:
+    """The share of a correction that a provisional model is worth, 0.05 to 1.
+
+    The smallest share whose mean S over left-out runs is within a standard error of the best share's.
+
+    Args:
+        curves: the choice's left-out predictions, see `GridResult.curves`; without them 0.5.
+    """
+    own = curves[curves["protocol"] == choice.protocol] if len(curves) else curves
+    runs = [g for _, g in own.groupby(["fold", "batch_id"], sort=False)] if len(own) else []
+    S_um = np.array([
+        [residual_std_um(g["recorded_um"].to_numpy(float) - a * g["predicted_um"].to_numpy(float)) for g in runs]
+        for a in _SHARES
+    ])  # fmt: skip
+    known = np.isfinite(S_um).all(axis=0) if len(runs) else np.zeros(0, bool)
+    if known.sum() < 2:
+        return _UNMEASURED
+    S_um = S_um[:, known]
+    behind_um, se_um = paired(S_um, S_um[np.argmin(S_um.mean(axis=1))])
+    return float(_SHARES[np.argmax(behind_um <= np.where(np.isfinite(se_um), se_um, 0.0))])
 
 
 def left_out(result: GridResult, rule: PromotionRule, selector: str, family: str, n_tsp: int) -> pd.DataFrame:
-    """Left-out S of one cell under the rule's protocols: batch_id, digest, protocol, S_um times the protocol's weight.
+    """Left-out S of one cell under the rule's protocols: batch_id, digest, protocol, S_um (µm).
 
     For train-on-one a row is the batch trained on.
     """
@@ -268,10 +349,8 @@ def left_out(result: GridResult, rule: PromotionRule, selector: str, family: str
     rows = s[s["protocol"].isin(rule.protocols) & (s["selector"] == selector) & (s["family"] == family)]
     rows = rows[rows["n_tsp"] == n_tsp]
     ids = rows["batch_id"].where(rows["batch_id"] != "*", rows["fold"]).astype(str)
-    weight = rows["protocol"].map(rule.protocols).to_numpy(float)
     table = pd.DataFrame({
-        "batch_id": ids.to_numpy(), "protocol": rows["protocol"].to_numpy(str),
-        "S_um": rows["S_um"].to_numpy(float) * weight,
+        "batch_id": ids.to_numpy(), "protocol": rows["protocol"].to_numpy(str), "S_um": rows["S_um"].to_numpy(float),
     })  # fmt: skip
     return table.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
 
@@ -279,85 +358,27 @@ def left_out(result: GridResult, rule: PromotionRule, selector: str, family: str
 def score_of_choice(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
     """Every batch judged by the cell that the other batches would have chosen: batch_id, protocol, cell, S_um.
 
-    The best of many cells has been chosen for its left-out score, which flatters it (Varma & Simon 2006,
-    BMC Bioinformatics 7:91). Here batch k is not used in the choice that predicts it. Empty for train-on-one, where a
-    score belongs to the batch trained on, and for two batches, where the other one alone has no spread.
+    By one protocol all cells of the last rounds of a race take part, not the finalists alone. Empty for train-on-one,
+    where a score belongs to the batch trained on, and for two batches, where the other one alone would choose.
     """
     columns = ["batch_id", "protocol", "cell", "S_um"]
-    offered = rule.offered(set(result.cells["protocol"]))
-    scores = result.scores[result.scores["protocol"].isin(offered)]
-    if scores.empty or (scores["batch_id"] == "*").any() or scores["batch_id"].nunique() < 3:
+    losses = Losses.of(result, rule)
+    ids, loss_um = losses.without_each()
+    if len(ids) < 3 or (losses.protocol == "train-on-one").all():
         return pd.DataFrame(columns=columns)
-    left = _Left.of(result, offered)
     rows = []
-    for batch_id in scores["batch_id"].unique():
-        table = left.judged_without(batch_id, rule)
-        choice = _choose(table, rule)
-        for p, S_um in left.scores_of(choice, batch_id).items():
-            rows.append((batch_id, p, choice.cell, S_um * rule.protocols[p]))
+    for k, own_um in zip(ids, loss_um.T, strict=True):
+        c = _least(losses, own_um, losses.counted(k))
+        cell = "|".join(str(v) for v in losses.cells.loc[c, KEYS])
+        rows += [(k, losses.protocol[r], cell, losses.S_um[c, r]) for r in np.flatnonzero(losses.batch_id == k)]
     return pd.DataFrame(rows, columns=columns)
-
-
-@dataclass(frozen=True)
-class _Left:
-    """The C cells that all of the protocols have, with the left-out scores by batch.
-
-    `table` has P C rows, protocol after protocol; `S_um`, `max_abs_um` (C, K) and `batch_ids` (K,) by protocol.
-    """
-
-    protocols: tuple[str, ...]
-    table: pd.DataFrame
-    cells: pd.MultiIndex
-    batch_ids: dict[str, list[str]]
-    S_um: dict[str, NDArray[np.float64]]
-    max_abs_um: dict[str, NDArray[np.float64]]
-
-    @classmethod
-    def of(cls, result: GridResult, protocols: Sequence[str]) -> Self:
-        table, common = _common_cells(result.cells, protocols)
-        texts = {c: object for c in table if not pd.api.types.is_numeric_dtype(table[c])}  # quicker to take from
-        ids, S_um, max_abs_um = {}, {}, {}
-        for p in protocols:
-            scores = result.scores[result.scores["protocol"] == p]
-            wide = scores.pivot(index=KEYS, columns="batch_id", values=["S_um", "max_abs_um"]).loc[common]
-            S_um[p], max_abs_um[p] = (wide[name].to_numpy(float) for name in ("S_um", "max_abs_um"))
-            ids[p] = [str(k) for k in wide["S_um"].columns]
-        return cls(tuple(protocols), table.astype(texts), common, ids, S_um, max_abs_um)
-
-    def judged_without(self, batch_id: str, rule: PromotionRule) -> pd.DataFrame:
-        """`judged` as the other batches show it.
-
-        Raises:
-            InputError: no cell has a finite score.
-        """
-        others = {p: np.array([k != batch_id for k in self.batch_ids[p]]) for p in self.protocols}
-        run = [p for p in self.protocols if others[p].sum() > 1]
-        found = []
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a cell without any score has NaN, as intended
-            for p in run:
-                S_um = self.S_um[p][:, others[p]]
-                worst = np.nanmax(self.max_abs_um[p][:, others[p]], axis=1)
-                found.append({
-                    "S_mean_um": np.nanmean(S_um, axis=1), "S_std_um": np.nanstd(S_um, axis=1, ddof=1),
-                    "max_abs_um": worst,
-                })  # fmt: skip
-        rows = self.table[self.table["protocol"].isin(run)].reset_index(drop=True)
-        own = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
-        return _decided(rows.assign(**own), len(self.cells), rule)
-
-    def scores_of(self, choice: Choice, batch_id: str) -> dict[str, float]:
-        """The left-out S in µm of a batch by a cell, by protocol."""
-        cell = self.cells.get_loc((choice.selector, choice.family, choice.n_tsp))
-        ids = {p: self.batch_ids[p] for p in self.protocols if batch_id in self.batch_ids[p]}
-        return {p: float(self.S_um[p][cell, own.index(batch_id)]) for p, own in ids.items()}
 
 
 def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) -> Comparison:
     """Is the newcomer better on the same batches? One-sided paired sign-flip test of the mean difference of S.
 
-    Batches are the independent samples: of several protocols a batch counts once, with the worst of its scores (or
-    their mean, as the rule combines them). Under "no difference" the sign of every batch's difference is a coin toss
+    Batches are the independent samples: of several protocols a batch counts once, with the mean of its scores as the
+    rule weights them. Under "no difference" the sign of every batch's difference is a coin toss
     (Fisher 1935); all 2^n patterns are counted up to 16 batches, above that a seeded draw. The 90 % interval is
     Student's over batches.
 
@@ -367,8 +388,9 @@ def compare_paired(new: pd.DataFrame, old: pd.DataFrame, rule: PromotionRule) ->
     """
     both = new.merge(old, on=["batch_id", "digest", "protocol"], suffixes=("_new", "_old"))
     both = both[np.isfinite(both["S_um_new"]) & np.isfinite(both["S_um_old"])]
-    by_batch = both.groupby("batch_id")[["S_um_new", "S_um_old"]]
-    both = by_batch.max() if rule.combine == "worst" else by_batch.mean()
+    weight = both["protocol"].map(rule.protocols).astype(float).fillna(1.0)
+    own = both[["S_um_new", "S_um_old"]].astype(float).mul(weight, axis=0).groupby(both["batch_id"]).sum()
+    both = own.div(weight.groupby(both["batch_id"]).sum(), axis=0)
     n = len(both)
     d = (both["S_um_old"] - both["S_um_new"]).to_numpy(float)
     new_mean = float(both["S_um_new"].mean()) if n else float("nan")
@@ -409,34 +431,48 @@ def sign_flip_p(difference: NDArray[np.float64]) -> float:
     return float(found.pvalue)
 
 
-def _simplest(table: pd.DataFrame) -> pd.Series:
-    order = ["n_inputs", "rank", "n_parameters", "score_um", "selects", "selector", "family", "n_tsp"]
-    return table.assign(selects=table["selector"] != "none").sort_values(order, kind="stable").iloc[0]
+def _simplest(table: pd.DataFrame, loss_um: Array, among: NDArray[np.bool_]) -> int:
+    order = ["n_inputs", "rank", "n_parameters", "loss_um", "selects", "selector", "family", "n_tsp"]
+    own = table.assign(selects=table["selector"] != "none", loss_um=loss_um)[among]
+    return int(own.sort_values(order, kind="stable").index[0])
 
 
-def _picked(row: pd.Series, rule: PromotionRule, notes: list[str], caution: str) -> Choice:
+def _picked(table: pd.DataFrame, at: int, rule: PromotionRule, notes: Sequence[str] = ()) -> Choice:
+    """The cell in that row of `judged`, with what the best other cell and the baselines have."""
+    row, notes = table.iloc[at], list(notes)
     name = _cell_words(row["family"], row["n_tsp"], row["selector"])
-    mean, std = row["S_mean_um"], row["S_std_um"]
-    if rule.score == "S_mean + S_std" and np.isclose(mean + std, row["score_um"]):
-        score = f"S_mean {mean:.2f} + S_std {std:.2f} = {row['score_um']:.2f} µm"
-    else:
-        score = f"{rule.score} {row['score_um']:.2f} µm"
-    words = f"{name}: {score}, {row['protocol']} over {int(row['n_batches'])} batches"
-    if caution:
-        notes = [*notes, f"{caution}: no trustworthy model"]
+    mean, std, loss = row["S_mean_um"], row["S_std_um"], row["score_um"]
+    others = table[~table["family"].isin(BASELINES)]
+    best = others.nsmallest(1, "score_um").iloc[0] if len(others) else row
+    if (best["family"], best["inputs"]) != (row["family"], row["inputs"]) and best["score_um"] < loss and not notes:
+        words = _cell_words(best["family"], best["n_tsp"], best["selector"])
+        notes.append(f"simpler than the best ({words}, {best['score_um']:.2f} µm) and not shown to be worse")
+    least = table[table["family"].isin(BASELINES)].nsmallest(1, "score_um")
+    caution = ""
+    if len(least) and row["family"] in BASELINES:
+        other = f" (best other: {best['score_um']:.2f} µm)" if len(others) else ""
+        caution = f"nothing beats {row['family']}{other}"
+        notes.append(f"{caution}: no trustworthy model")
+    elif len(least):
+        notes.append(f"{least.iloc[0]['family']} has {least.iloc[0]['score_um']:.2f} µm")
+    summary = (
+        f"{name}: expected loss {loss:.2f} µm; S {mean:.2f} ± {std:.2f} µm, {row['protocol']} over "
+        f"{int(row['n_batches'])} batches"
+    )
     return Choice(
         protocol=str(row["protocol"]),
         selector=str(row["selector"]),
         family=str(row["family"]),
         n_tsp=int(row["n_tsp"]),
         inputs=tuple(i for i in str(row["inputs"]).split("|") if i),
-        score_um=float(row["score_um"]),
-        S_mean_um=float(row["S_mean_um"]),
-        S_std_um=float(row["S_std_um"]),
+        score_um=float(loss),
+        S_mean_um=float(mean),
+        S_std_um=float(std),
         tsp_stability=float(row["tsp_stability"]),
         n_batches=int(row["n_batches"]),
         caution=caution,
-        summary="; ".join([words, *notes]),
+        summary="; ".join([summary, *notes]),
+        standing="refused" if caution else "champion",
     )
 
 

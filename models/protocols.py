@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 import numpy as np
 import pandas as pd
@@ -179,19 +179,22 @@ def _leave_group_out(labels: Sequence[str]) -> list[Fold]:
 class PromotionRule(BaseModel):
     """Which cell becomes the champion, and when a newcomer may replace one.
 
-    protocols: the protocols that judge, with weights of their scores; those that the recordings do not allow are left
-        out. combine: a cell's score is the worst of its weighted scores, or their weighted mean.
+    protocols: the protocols that judge, with what a run left out under them counts; those that the recordings do not
+        allow are left out.
+    group_runs: a left-out season or speed of so many runs counts half as it is and half as the mean of all runs
+        (partial pooling), so that a group of two runs does not decide.
+    ties_se: a simpler cell wins where it is behind by so many standard errors of the difference, or less.
+    significance: one-sided level of the paired comparison with the champion and with no model.
+    min_batches: fewer batches in common: the champion stays.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     protocols: dict[str, Annotated[float, Field(gt=0)]] = Field(
-        default={"forward": 1.0, "leave-season-out": 1.0, "leave-batch-out": 1.0}, min_length=1
+        default={"forward": 1.0, "leave-season-out": 0.25, "leave-batch-out": 0.25}, min_length=1
     )
-    combine: Literal["worst", "mean"] = "worst"
-    score: Literal["S_mean + S_std", "S_mean", "max_abs"] = "S_mean + S_std"
-    min_tsp_stability: Annotated[float, Field(ge=0, le=1)] = 0.7
-    tie_percent: Annotated[float, Field(ge=0, lt=100)] = 2.0
+    group_runs: Annotated[float, Field(ge=0)] = 4.0
+    ties_se: Annotated[float, Field(ge=0)] = 1.0
     significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     min_batches: Annotated[int, Field(ge=2)] = 5
 

@@ -42,6 +42,9 @@ class GridResult:
     - `selector_diagnostics`: selector, n_tsp, statistic, value, threshold, ok, comment: known weaknesses of
       each selector, measured on all batches at the n_tsp of its best cell (S_mean + S_std) short of all inputs; empty
       in older files.
+    - `race`: which cells were dropped in which round and why, see `models.race.rounds`; empty without a race. A cell of
+      the last rounds is in `scores` by the leading protocol alone, a finalist by all of them.
+    - `stack`: selector, family, n_tsp, inputs and weight of the members of the cell stack; empty without one.
     """
 
     machine: str
@@ -58,6 +61,8 @@ class GridResult:
     curves: pd.DataFrame = field(default_factory=pd.DataFrame)
     readings: pd.DataFrame = field(default_factory=pd.DataFrame)
     selector_diagnostics: pd.DataFrame = field(default_factory=pd.DataFrame)
+    race: pd.DataFrame = field(default_factory=pd.DataFrame)
+    stack: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def save(self, folder: Path) -> None:
         """One Parquet file per table and `result.json`."""

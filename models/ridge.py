@@ -23,7 +23,6 @@ class Ridge(Tuned):
     key = "ridge"
     summary = "ridge regression, penalty by leave-batch-out inside the training batches"
     source = "Hoerl and Kennard (1970), eq. 2.1"
-    effort = "quick"
     has_sd = True
     rank = 12
 

@@ -39,7 +39,6 @@ class ThermalExponential(Family):
     key = "thermal_exponential"
     summary = "exponential warm-up driven by spindle speed or time alone"
     source = "Newton's law of cooling; Golub and Pereyra 1973"
-    effort = "quick"
     uses_inputs = False
     rowwise = False
     rank = 5

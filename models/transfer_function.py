@@ -58,7 +58,6 @@ class TransferFunction(Family):
     key = "transfer_function"
     summary = "first-order responses to the sensors and to what is not settled at the start"
     source = "Ljung 1999, eq. 4.25; Golub and Pereyra 1973"
-    effort = "usual"
     closed_form = False
     rowwise = False
     has_sd = True

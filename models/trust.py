@@ -20,6 +20,7 @@ from features.rises import feature, feature_unit
 from models import FAMILIES
 from models.base import Family
 from models.crossing import Crossing, with_target
+from models.judging import KEPT
 from models.metrics import residual_std_um
 from models.program import Builder, Program
 from models.protocols import Fold
@@ -191,35 +192,46 @@ def _excess(values: Array, low: Array | float, high: Array | float) -> Array:
 SIBLINGS = ("ridge", "distributed_lag")  # linear in the present and in the past of the inputs: cheap, small, unlike
 COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "predicted_rms_um",
            "disagreement_um", "S_um"]  # fmt: skip
-DRAWN = ("forward", "leave-season-out", "leave-batch-out")  # protocols whose predictions are kept
+_BOUNDED = ("forward", "leave-season-out", "leave-speed-out", "leave-batch-out")  # protocols that a bound is made of
 
 
 class LeftOut(NamedTuple):
     """`runs`: a row per protocol, fold and left-out batch with the columns `COLUMNS`. `curves`: of the protocols
-    `DRAWN` protocol, fold, batch_id, time_s, along an axis position_mm, recorded_um and predicted_um on every row."""
+    `models.judging.KEPT` protocol, fold, batch_id, time_s, along an axis position_mm, recorded_um and predicted_um."""
 
     runs: pd.DataFrame
     curves: pd.DataFrame
 
 
-def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) -> LeftOut:
+def left_out_runs(
+    crossing: Crossing,
+    selector: str,
+    family: str,
+    n_tsp: int,
+    predictions: Mapping[str, Array] | None = None,
+) -> LeftOut:
     """Every left-out batch of a cell with what was known of it before its error.
 
     cell: "selector|family|n_tsp"; start: of the batch (NaT where unknown); distance: how far it went beyond the region
     of the fold's training batches, in trained widths (`Region.distance`; the 95 % quantile over its rows); farthest:
     in which quantity; predicted_rms_um: of the prediction; disagreement_um: see `disagreement_um`, NaN without
-    siblings; S_um: the fold's error. Folds that cannot be fitted are left out, and models of one batch where a fit is
-    slow.
+    siblings; S_um: the fold's error. Folds that cannot be fitted are left out, and protocols of studies where there are
+    others.
+
+    Args:
+        predictions: of the crossing, see `FamilyResult.predictions`; what they lack is fitted again.
     """
     runs, curves, cell = [], [], f"{selector}|{family}|{n_tsp}"
     known = cache(lambda k, name: feature(crossing.batches[k], name))  # sets of inputs have most quantities in common
-    for protocol, folds in crossing.folds.items():
-        if protocol == "train-on-one" and not FAMILIES[family].closed_form:
+    bounded = {p: folds for p, folds in crossing.folds.items() if p in _BOUNDED and folds} or crossing.folds
+    for protocol, folds in bounded.items():
+        given = _by_fold(crossing.design, folds, (predictions or {}).get(f"{protocol}|{cell}"))
+        if given is None and FAMILIES[family].combines:
             continue
         for design, which in crossing.needed(folds, [(selector, n_tsp)]):
             own = [folds[i] for i in which]
             try:
-                predicted = _predicted(design, family, own)
+                predicted = [given[i] for i in which] if given is not None else _predicted(design, family, own)
             except InputError:
                 continue
             siblings = [p for key in siblings_of(family, design.inputs) if (p := _sibling(design, key, own))]
@@ -236,7 +248,7 @@ def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
                     S_um = float(residual_std_um(recorded_um - error_um))
                     runs.append((cell, protocol, fold.name, batch.batch_id, batch.start,
                                  *farthest(region.beyond(values[k])), _rms(error_um), apart_um, S_um))  # fmt: skip
-                    if protocol in DRAWN:
+                    if protocol in KEPT:
                         at = {"position_mm": design.position_mm(design.along)[design.rows(k)]} if design.along else {}
                         curves.append(pd.DataFrame({
                             "protocol": protocol, "fold": fold.name, "batch_id": batch.batch_id,
@@ -244,6 +256,15 @@ def left_out_runs(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
                         }))  # fmt: skip
     table = pd.DataFrame(runs, columns=COLUMNS).astype({"start": "datetime64[ns]"})
     return LeftOut(table, pd.concat(curves, ignore_index=True) if curves else pd.DataFrame())
+
+
+def _by_fold(design: Design, folds: Sequence[Fold], predicted: Array | None) -> list[list[Array]] | None:
+    """Predictions of a protocol, one after the other, by fold and tested batch."""
+    if predicted is None:
+        return None
+    sizes = [[design.rows(k).stop - design.rows(k).start for k in f.test] for f in folds]
+    cut = np.split(np.asarray(predicted, float), np.cumsum([n for own in sizes for n in own])[:-1])
+    return [[cut.pop(0) for _ in own] for own in sizes]
 
 
 def siblings_of(family: str, inputs: Sequence[str]) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from data.registry import Effort
 from features.design import Design
 from models.base import Family, Plain
 from models.solvers.batches import Recent, by_batch, too_few_rows
@@ -38,7 +37,6 @@ class Twin(Family):
     key = "twin"
     summary = "physics twin, calibrated on the training batches, free-running from drivers and surroundings"
     source = "machine file; Mayr et al. (2012), CIRP Annals 61(2), sec. 4; MAP least squares, Tarantola (2005), ch. 3"
-    effort: ClassVar[Effort] = "usual"
     uses_inputs = False
     rowwise = False
     needs_twin = True

@@ -46,7 +46,7 @@ class TwinKalman(Twin):
     source = "Kalman (1960); Gelb (1974), sec. 6.1, linearised about the simulation"
     uses_inputs = True
     closed_form = False
-    effort = "on_request"
+    on_request = True
     rank = 40
 
     def __init__(

@@ -37,7 +37,6 @@ class TwinResidual(Twin):
     key = "twin_residual"
     summary = "physics twin plus a regression of its residual on the sensors"
     source = "Kennedy and O'Hagan (2001), eq. 4, a discrepancy added to a calibrated model; Hoerl and Kennard (1970)"
-    effort = "usual"
     uses_inputs = True
     closed_form = False
     rank = 35

@@ -58,6 +58,8 @@ def counted(step: str, work: Callable[[T], R], of: int, done: Done | None) -> Ca
 
 
 def label(item: object) -> str:
-    """An item as progress and task names show it: a name, or names and numbers; else empty."""
+    """An item as progress and task names show it: its label, a name, or names and numbers; else empty."""
+    if isinstance(own := getattr(item, "label", None), str):
+        return own
     parts = item if isinstance(item, tuple) else (item,)
     return " ".join(map(str, parts)) if all(isinstance(part, str | int) for part in parts) else ""

@@ -7,7 +7,7 @@ import json
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -18,9 +18,9 @@ import pandas as pd
 
 from data.files import write_atomic
 from models.crossing import Crossing, FamilyResult
+from models.race import Job
 from pipelines.caller import Say
 
-Job = tuple[str, str]  # error channel, family
 _SOURCES = ("data", "features", "models", "twin")
 LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
 _TOKEN = "token"
@@ -34,35 +34,30 @@ class Checkpoint:
     program's own source. So a changed recording, mask, option or line of code starts anew.
     """
 
-    def __init__(self, folder: Path, crossings: Mapping[str, Crossing], jobs: Sequence[Job]) -> None:
-        self.folder, self._jobs = folder / _digest(crossings), jobs
+    def __init__(self, folder: Path, crossings: Mapping[str, Crossing]) -> None:
+        self.folder = folder / _digest(crossings)
 
-    def kept(self, say: Say = lambda text: None) -> dict[Job, FamilyResult]:
-        """The jobs that an interrupted training finished; `say` receives how many, and what cannot be read."""
-        results, ended_s = {}, []
-        for job in self._jobs:
-            held = self._held(job)
-            if not held.is_dir():
-                continue
-            time_s = held.stat().st_mtime
-            try:
-                results[job] = _read(held)
-            except (OSError, ValueError, KeyError) as error:
-                say(f"{held}: is damaged ({error}); {' '.join(job)} is crossed again")
-                shutil.rmtree(held)
-            else:
-                ended_s.append(time_s)
-        if results:
-            last = datetime.fromtimestamp(max(ended_s))
-            say(f"resumes: {self._count(len(results))} were crossed on {last:%Y-%m-%d %H:%M}")
-        return results
+    def resume(self, say: Say = lambda text: None) -> None:
+        """`say` receives how many jobs an interrupted training finished."""
+        if held := self._kept():
+            last = datetime.fromtimestamp(max(h.stat().st_mtime for h in held))
+            say(f"resumes: {_count(len(held))} were crossed on {last:%Y-%m-%d %H:%M}")
 
-    def crossed(self, cross: Callable[[Job], FamilyResult]) -> Callable[[Job], FamilyResult]:
-        """`cross` that keeps what it returns."""
+    def crossed(
+        self, cross: Callable[[Job], FamilyResult], say: Say = lambda text: None
+    ) -> Callable[[Job], FamilyResult]:
+        """`cross` that keeps what it returns, and returns what is kept; `say` receives what cannot be read."""
 
         def work(job: Job) -> FamilyResult:
+            held = self.folder / job.label.replace(" ", "__")
+            if held.is_dir():
+                try:
+                    return _read(held)
+                except (OSError, ValueError, KeyError) as error:
+                    say(f"{held}: is damaged ({error}); {job.label} is crossed again")
+                    shutil.rmtree(held)
             result = cross(job)
-            _write(result, self._held(job))
+            _write(result, held)
             return result
 
         return work
@@ -77,19 +72,18 @@ class Checkpoint:
 
     def summary(self) -> str:
         """How many jobs are kept where."""
-        n = sum(self._held(job).is_dir() for job in self._jobs)
-        return f"{self._count(n)} are kept in {self.folder}; run the same command to go on"
+        return f"{_count(len(self._kept()))} kept in {self.folder}; run the same command to go on"
 
-    def _held(self, job: Job) -> Path:
-        return self.folder / "__".join(job)
-
-    def _count(self, n: int) -> str:
-        channels = len({target for target, _ in self._jobs})
-        return f"{n} of {len(self._jobs)} families" + (f" (of {channels} error channels)" if channels > 1 else "")
+    def _kept(self) -> list[Path]:
+        return [p for p in self.folder.glob("[!.]*") if p.is_dir()]
 
     def remove(self) -> None:
         """Remove the kept jobs, once they are tracked."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _count(n: int) -> str:
+    return f"{n} finished part{'s' if n != 1 else ''} of the crossing"
 
 
 def _write(result: FamilyResult, held: Path) -> None:

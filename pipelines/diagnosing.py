@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import count
@@ -39,7 +39,6 @@ from twin.calibration.calibrated_file import Origin
 from twin.compile import compile_network
 
 REPORT, PLAN, MACHINE, FINDINGS = "report.html", "next_run.yml", "machine.yml", "findings.json"
-_EVERY_BATCH = "leave-batch-out"  # the one protocol that predicts every batch, so that trainings can be compared
 FILES = (REPORT, PLAN, MACHINE, INPUTS, FINDINGS)  # the last one says that the others are complete
 
 
@@ -417,13 +416,16 @@ def _last_result(result: GridResult, settings: Settings, ids: Mapping[str, str])
 
 
 def _left_out_of(result: GridResult, family: str, rule: PromotionRule) -> list[tuple[str, float]] | None:
-    """Digest and left-out S of every batch, by the family's best cell."""
-    rule = rule.only(_EVERY_BATCH)
+    """Digest and left-out S of every batch, by the family's best cell under the first protocol that scored it."""
+    cells, scores = (t[t["family"] == family] for t in (result.cells, result.scores))
+    run = rule.offered(set(cells["protocol"]))
+    if not run:
+        return None
+    rule = rule.only(run[0])
     try:
-        cells = judged(result.cells[result.cells["family"] == family], rule)
+        best = judged(replace(result, cells=cells, scores=scores), rule).nsmallest(1, "score_um").iloc[0]
     except InputError:  # the family has no finite score
         return None
-    best = cells.nsmallest(1, "score_um").iloc[0]
     table = left_out(result, rule, str(best["selector"]), family, int(best["n_tsp"]))
     rows = [(str(d), float(s)) for d, s in zip(table["digest"], table["S_um"], strict=True) if np.isfinite(s)]
     return rows or None

@@ -21,10 +21,10 @@ from cronsim import CronSim, CronSimError
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from data.errors import InputError, closest
-from data.registry import EFFORTS
 from data.yaml_file import load_yaml
 from features.selectors import SELECTORS
 from models import FAMILIES
+from models.crossing import FINALISTS
 
 CRON = "0 5 * * 1"
 SEASON_DAYS = 92.0
@@ -125,7 +125,7 @@ class _Training(_Part):
     @field_validator("effort")
     @classmethod
     def _known_effort(cls, value: str) -> str:
-        return _known((value,), EFFORTS[:-1])[0]
+        return _known((value,), tuple(FINALISTS))[0]
 
     @field_validator("families")
     @classmethod

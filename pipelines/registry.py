@@ -382,12 +382,10 @@ def _against(
     old = left_out(then, rule, tags["selector"], tags["family"], int(tags["n_tsp"]))
     known = set(then.batches["batch_id"])
     unseen = [b for b in batches if b.batch_id not in known]
-    weights = pd.Series(rule.protocols, name="weight").drop("train-on-one", errors="ignore")
-    if unseen and len(weights):
+    judging = pd.DataFrame({"protocol": [p for p in rule.protocols if p != "train-on-one"]})
+    if unseen and len(judging):
         own = _score_unseen(champion, unseen, result.target, settings)
-        every = own.merge(weights.rename_axis("protocol").reset_index(), how="cross")
-        every["S_um"] *= every.pop("weight")
-        old = pd.concat([old, every], ignore_index=True)
+        old = pd.concat([old, own.merge(judging, how="cross")], ignore_index=True)
     comparison = compare_paired(new, old, rule)
     fresh = f" ({len(unseen)} of them new to the champion)" if unseen else ""
     return comparison, "", f"against version {champion.version}: {comparison.words}{fresh}"

@@ -196,10 +196,10 @@ def training_record(
     metrics: dict[str, float] = {}
     plain, tags = {k: str(v) for k, v in (params or {}).items()}, {}
     if rule.offered(set(result.cells["protocol"])):
-        best = choice or choose(result.cells, rule)
+        best = choice or choose(result, rule)
         expected = outlook(result, best)
         name += f" {best.family} {best.n_tsp} {best.selector}"
-        metrics |= _cell_metrics(_judged_row(result.cells, rule, best)) | {
+        metrics |= _cell_metrics(_judged_row(result, rule, best)) | {
             "nested_S_mean_um": best.nested_S_mean_um, "nested_S_std_um": best.nested_S_std_um,
             "expected_S_um": expected.S_um, "expected_S_bound90_um": expected.bound_um,
         }  # fmt: skip
@@ -214,13 +214,13 @@ def training_record(
     values = tuple((k, _read(v), 0) for k, v in {**metrics, **counts}.items() if np.isfinite(v))
     groups = result.cells.groupby(["selector", "family"], sort=False)
     scores = result.scores.groupby(["selector", "family"], sort=False).indices
-    best_of = _best_cells(result.cells, rule)
+    best_of = _best_cells(result, rule)
     return Record(
         id=record_id or uuid.uuid4().hex, kind="training", machine=result.machine, target=result.target,
         simulated=result.simulated, name=name, tags=_short(tags), params=_short(plain), metrics=values,
         started_ms=started_ms or ended_ms, ended_ms=ended_ms, datasets=dataset_records(result.batches),
         children=tuple(
-            _child(cells, result.scores.iloc[scores.get(key, [])], rule, best_of.get(key)) for key, cells in groups
+            _child(cells, result.scores.iloc[scores.get(key, [])], best_of.get(key)) for key, cells in groups
         ),
     )  # fmt: skip
 
@@ -314,10 +314,11 @@ def attach(training_id: str, path: Path, settings: Settings) -> None:
         client.log_artifact(training_id, str(path), "report")
 
 
-def _judged_row(cells: pd.DataFrame, rule: PromotionRule, choice: Choice) -> pd.Series:
-    """The chosen cell under the protocol that decides."""
+def _judged_row(result: GridResult, rule: PromotionRule, choice: Choice) -> pd.Series:
+    """The chosen cell under the leading protocol."""
     own = {"selector": choice.selector, "family": choice.family, "n_tsp": choice.n_tsp}
-    return judged(cells[(cells[list(own)] == pd.Series(own)).all(axis=1)], rule).iloc[0]
+    table = judged(result, rule)
+    return table[(table[list(own)] == pd.Series(own)).all(axis=1)].iloc[0]
 
 
 def _cell_metrics(row: pd.Series) -> dict[str, float]:
@@ -334,17 +335,17 @@ def _short(texts: Mapping[str, str]) -> dict[str, str]:
     return {k: v[:_MAX_CHARACTERS] for k, v in texts.items()}
 
 
-def _best_cells(cells: pd.DataFrame, rule: PromotionRule) -> dict[Any, pd.Series]:
+def _best_cells(result: GridResult, rule: PromotionRule) -> dict[Any, pd.Series]:
     """The best cell by selector and family, of those that all of the rule's protocols have scored."""
     try:
-        every = judged(cells, rule)
+        every = judged(result, rule)
     except InputError:  # no score under the rule
         return {}
     return {key: own.nsmallest(1, "score_um").iloc[0] for key, own in every.groupby(["selector", "family"], sort=False)}
 
 
-def _child(cells: pd.DataFrame, scores: pd.DataFrame, rule: PromotionRule, best: pd.Series | None) -> Entity:
-    """All cells of one selector and family, and their scores; `best` None: of the protocols that they were run by."""
+def _child(cells: pd.DataFrame, scores: pd.DataFrame, best: pd.Series | None) -> Entity:
+    """All cells of one selector and family, and their scores; `best` None: not all protocols of the rule scored one."""
     selector, family = (str(cells[c].iloc[0]) for c in ("selector", "family"))
     metrics: list[tuple[str, float, int]] = []
     for row in cells[["protocol", "n_tsp", *CURVES]].to_dict("records"):
@@ -352,7 +353,6 @@ def _child(cells: pd.DataFrame, scores: pd.DataFrame, rule: PromotionRule, best:
         metrics += [(f"{prefix}_by_n_tsp/{to}", _read(row[name]), int(row["n_tsp"])) for name, to in CURVES.items()]
     options = FAMILIES[family]().options() if family in FAMILIES else {}
     params = {"selector": selector, "family": family, **{f"option.{k}": str(v) for k, v in options.items()}}
-    best = best if best is not None else next(iter(_best_cells(cells, rule).values()), None)
     if best is not None:
         params |= {"n_tsp": str(best["n_tsp"]), "inputs": str(best["inputs"]).replace("|", ", ")}
         # First, as the page of a run lists them.

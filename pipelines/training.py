@@ -21,10 +21,11 @@ from data.checks import check_machine
 from data.errors import InputError, WorkError, check_suffix, closest
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
-from models import FAMILIES, promotion
-from models.crossing import Crossing, Plan, prepare, refit, with_target
-from models.grid import Pools, Workers, assemble, jobs_of, local_pools, workers_for
+from models import promotion
+from models.crossing import Crossing, FamilyResult, Plan, prepare, refit, unfitted, with_target
+from models.grid import Pools, Workers, assemble, local_pools, workers_for
 from models.outlook import Outlook, outlook
+from models.race import Job, Raced, drive
 from models.result import GridResult, Training
 from models.trust import Region
 from pipelines import registry, spool, stopping, tracking
@@ -164,20 +165,22 @@ def train(
     crossings = dict(zip(targets, prepared, strict=True))
     clock("features")
     say("grid")
-    jobs = jobs_of(plan, targets)
-    checkpoint = Checkpoint(home() / "unfinished", crossings, jobs)
-    done = checkpoint.kept(say)
-    left = [job for job in jobs if job not in done]
+    checkpoint = Checkpoint(home() / "unfinished", crossings)
+    checkpoint.resume(say)
     stopping.note(checkpoint.summary)
     with _kept(checkpoint):
         with Workers(crossings, request.workers or workers_for(plan.families), pools) as workers:
-            done |= zip(left, caller.map("grid", checkpoint.crossed(workers.cross), left), strict=True)
+
+            def cross(jobs: list[Job]) -> list[FamilyResult]:
+                return caller.map("grid", checkpoint.crossed(workers.cross, say), jobs)
+
+            raced = drive(crossings, cross)
             for t in targets:
-                outcome.results[t] = assemble(crossings[t], [done[t, f] for f in plan.families])
+                outcome.results[t] = assemble(crossings[t], *raced[t])
             clock("grid")
             if all(settings.promotion.offered(set(r.cells["protocol"])) for r in outcome.results.values()):
                 say("trust")
-                _judge(outcome, workers, caller, settings)
+                _judge(outcome, crossings, raced, workers, caller, settings)
                 clock("trust")
         say("track")
         token = checkpoint.token()
@@ -228,7 +231,7 @@ def promote_tracked(
     check_channels(batches, machine, lake)
     batches = check_machine(batches, machine)
     choice = promotion.decide(result, settings.promotion, cell)
-    family = FAMILIES[choice.family]().fit(batches, choice.inputs, result.target, machine)
+    family = unfitted(choice.family, result.stack).fit(batches, choice.inputs, result.target, machine)
     text = machine_file.read_text(encoding="utf-8")
     region = Region.of(batches, family.inputs)
     new = registry.Newcomer(result, choice, family, text, training_id, region, batches)
@@ -274,16 +277,29 @@ def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch],
     return True
 
 
-def _judge(outcome: TrainOutcome, workers: Workers, caller: Caller, settings: Settings) -> None:
-    """The chosen cells, and the error to expect of them."""
+def _judge(
+    outcome: TrainOutcome,
+    crossings: dict[str, Crossing],
+    raced: dict[str, Raced],
+    workers: Workers,
+    caller: Caller,
+    settings: Settings,
+) -> None:
+    """The chosen cells, the error to expect of them, and how far they may be trusted."""
     targets = list(outcome.results)
+    asked = []
     for t in targets:
-        outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
-    chosen = [(t, c.selector, c.family, c.n_tsp) for t, c in outcome.choices.items()]
-    for t, left_out in zip(targets, caller.map("trust", workers.distances, chosen), strict=True):
+        choice = outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
+        known = {k: v for k, v in raced[t].result.predictions.items() if k.endswith(f"|{choice.cell}")}
+        chosen = {key: own for key, own in crossings[t].chosen.items() if key[0] == choice.selector}
+        asked.append(((t, choice.selector, choice.family, choice.n_tsp), known, chosen))
+    for t, left_out in zip(targets, caller.map("trust", workers.distances, asked), strict=True):
         outcome.results[t] = replace(outcome.results[t], distances=left_out.runs, curves=left_out.curves)
+        if outcome.choices[t].standing == "provisional":  # its authority comes from the curves
+            outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
         outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
-    for t, readings in zip(targets, caller.map("readings", workers.readings, chosen), strict=True):
+    chosen_cells = [cell for cell, _, _ in asked]
+    for t, readings in zip(targets, caller.map("readings", workers.readings, chosen_cells), strict=True):
         outcome.results[t] = replace(outcome.results[t], readings=readings)
 
 
@@ -338,7 +354,7 @@ def _promote(
     if target not in outcome.training_ids:
         spool.keep_promotion(settings, outcome.records[target], text)
         return
-    family = refit(crossing, choice.selector, choice.family, choice.n_tsp)
+    family = refit(crossing, choice.selector, choice.family, choice.n_tsp, outcome.results[target].stack)
     region, training_id = Region.of(crossing.batches, family.inputs), outcome.training_ids[target]
     new = registry.Newcomer(outcome.results[target], choice, family, text, training_id, region, crossing.batches)
     try:

@@ -159,11 +159,12 @@ def leaderboard(result: GridResult, protocol: str = "") -> pd.DataFrame:
 
     Args:
         result: one channel of `cross` or of ``train(…).results``.
-        protocol: how the cells are judged; default: by the worst of forward, leave-season-out and leave-batch-out.
+        protocol: how the cells are judged; default: by the expected loss in a future run
+            (`models.promotion`).
 
     Returns:
-        family, selector, n_tsp, score_um, S_mean_um, S_std_um, max_abs_um (µm), inputs ("|"-joined), and the protocol
-        that decides.
+        family, selector, n_tsp, score_um, S_mean_um, S_std_um, max_abs_um (µm), inputs ("|"-joined), and the leading
+        protocol.
 
     Raises:
         InputError: a protocol that is unknown or was not run.
@@ -174,7 +175,7 @@ def leaderboard(result: GridResult, protocol: str = "") -> pd.DataFrame:
     if protocol and protocol not in PROTOCOLS:
         raise InputError(f"unknown protocol {protocol!r}: {closest(protocol, PROTOCOLS)}")
     rule = PromotionRule()
-    table = ranked(result.cells, rule.only(protocol) if protocol else rule)
+    table = ranked(result, rule.only(protocol) if protocol else rule)
     return table[
         ["family", "selector", "n_tsp", "score_um", "S_mean_um", "S_std_um", "max_abs_um", "inputs", "protocol"]
     ]

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from data.batch import Batch
-from data.registry import Effort
 from features.design import Design
 from features.rises import temperature_inputs
 
@@ -37,7 +36,6 @@ class Selector(ABC):
     summary: ClassVar[str]
     source: ClassVar[str]
     takes_n_tsp: ClassVar[bool] = True  # False: the selector decides itself (or keeps all)
-    effort: ClassVar[Effort] = "complete"  # smallest grid that includes it by default
     packages: ClassVar[tuple[str, ...]] = ()  # what it imports to learn that an installation may lack
 
     @abstractmethod

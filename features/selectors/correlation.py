@@ -22,7 +22,6 @@ class Correlation(Selector):
     key = "correlation"
     summary = "largest |correlation| with the error"
     source = "K. Pearson (1895), Proc. R. Soc. 58, 240–242"
-    effort = "quick"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

@@ -107,7 +107,6 @@ class ElasticNetPath(Selector):
     key = "elastic_net_path"
     summary = "picked most often by the elastic net on halves of the training batches"
     source = "N. Meinshausen and P. Bühlmann (2010), J. R. Statist. Soc. B 72, 417–473"
-    effort = "usual"
 
     def __init__(self, ridge: float = 0.01, subsamples: int = 50, seed: int = 0) -> None:
         self.ridge, self.subsamples, self.seed = float(ridge), int(subsamples), int(seed)

@@ -31,7 +31,6 @@ class Exhaustive(Selector):
     key = "exhaustive"
     summary = "of all subsets the least error on left-out training batches"
     source = "G. Furnival and R. Wilson (1974), Technometrics 16, 499–511"
-    effort = "usual"
 
     def __init__(self, most_inputs: int = 14, width: int = 16) -> None:
         self.most_inputs, self.width = int(most_inputs), int(width)

@@ -23,7 +23,6 @@ class FuzzyClusterGreyCorrelation(Selector):
     key = "fcgc"
     summary = "fuzzy clusters, from each the largest grey relational degree with the error"
     source = "fuzzy clustering + grey correlation (FCGC) of the year-round studies; J. L. Deng (1989) for the degree"
-    effort = "quick"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

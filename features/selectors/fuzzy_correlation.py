@@ -21,7 +21,6 @@ class FuzzyCorrelation(Selector):
     key = "fuzzy_correlation"
     summary = "fuzzy clusters, from each the largest |correlation| with the error"
     source = "coupled-lathe study: fuzzy clustering and correlation analysis; L. A. Zadeh (1971) for the closure"
-    effort = "quick"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

@@ -30,7 +30,6 @@ class KMedoids(Selector):
     key = "kmedoids"
     summary = "the inputs nearest to all others by 1 − |correlation|"
     source = "L. Kaufman and P. Rousseeuw (1990), Finding Groups in Data, ch. 2"
-    effort = "usual"
 
     def __init__(self, most_inputs: int = 14) -> None:
         self.most_inputs = int(most_inputs)

@@ -31,7 +31,6 @@ class MRMR(Selector):
     key = "mrmr"
     summary = "largest mutual information with the error less that with the points already chosen"
     source = "H. Peng, F. Long and C. Ding (2005), IEEE Trans. Pattern Anal. 27, 1226–1238"
-    effort = "usual"
 
     def __init__(self, most_rows: int = 40) -> None:
         self.most_rows = int(most_rows)

@@ -14,7 +14,6 @@ class NoSelection(Selector):
     key = "none"
     summary = "all inputs"
     source = "baseline"
-    effort = "quick"
     takes_n_tsp = False
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:

@@ -27,7 +27,6 @@ class PcaElimination(Selector):
     key = "pca_elimination"
     summary = "drop the largest loading of the smallest principal component, repeatedly"
     source = "year-round PCR study; after I. T. Jolliffe (1972), Appl. Statist. 21, 160–173, one variable at a time"
-    effort = "quick"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

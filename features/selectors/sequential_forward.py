@@ -24,7 +24,6 @@ class SequentialForward(Selector):
     key = "sequential_forward"
     summary = "one by one the input that lowers the error on left-out training batches most"
     source = "A. Whitney (1971), IEEE Trans. Comput. 20, 1100–1103"
-    effort = "usual"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

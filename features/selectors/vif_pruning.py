@@ -29,7 +29,6 @@ class VifPruning(Selector):
     key = "vif_pruning"
     summary = "drop the input that the others explain best, repeatedly"
     source = "D. Belsley, E. Kuh and R. Welsch (1980), Regression Diagnostics, ch. 3"
-    effort = "usual"
 
     def select_design(self, design: Design, train: Sequence[int], n_tsps: Sequence[int]) -> dict[int, tuple[str, ...]]:
         check_n_tsps(design, n_tsps, self.key)

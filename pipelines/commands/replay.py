@@ -96,10 +96,9 @@ def replay(
     Shows what each retraining was worth against a model that is never retrained and against none. The same command
     goes on where it was stopped.
     """
-    from data.registry import EFFORTS
-    from models.crossing import Plan
+    from models.crossing import FINALISTS, Plan
 
-    plan = Plan(effort=one_of(effort, EFFORTS[:-1], "--effort"))
+    plan = Plan(effort=one_of(effort, FINALISTS, "--effort"))
     with console.progress(as_json) as (say, done):
         result = replay_year(machine, tuple(recordings), out, split(channels), plan, start, every, disturb, say, done)
     if as_json:

@@ -126,10 +126,9 @@ def train(
     from pipelines import settings
 
     settings.configure_environment()
-    from data.registry import EFFORTS
     from features.selectors import SELECTORS
     from models import FAMILIES
-    from models.crossing import Plan
+    from models.crossing import FINALISTS, Plan
     from models.protocols import PROTOCOLS
     from pipelines.engine import ENGINES, open_engine
     from pipelines.training import TrainRequest, check_request
@@ -142,7 +141,7 @@ def train(
         names(selectors, SELECTORS, "selector") if selectors else (),
         names(families, FAMILIES, "family") if families else (),
         names(protocols, PROTOCOLS, "protocol"),
-        effort=one_of(effort, EFFORTS[:-1], "--effort"),
+        effort=one_of(effort, FINALISTS, "--effort"),
     )
     request = TrainRequest(machine, tuple(recordings or ()), split(channels), plan, report, promote)
     check_request(request, configured)  # before a server starts

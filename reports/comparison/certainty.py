@@ -49,7 +49,7 @@ def certainty_table(
     promoted = [choice.selector, choice.family, choice.n_tsp]
     own = stated[(stated[["selector", "family", "n_tsp"]] == promoted).all(axis=1)]
     rows = pd.concat([best_per(stated, "family"), own]).drop_duplicates(CELL_KEYS)
-    rows = rows.sort_values("score_um", kind="stable").reset_index(drop=True)
+    rows = rows.sort_values("S_mean_um", kind="stable").reset_index(drop=True)
     seasons = _inside_of_seasons(result, rows)
     columns = [
         Column("family"),

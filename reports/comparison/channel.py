@@ -83,17 +83,17 @@ def channel_part(
     """A channel's part from its trainings, newest first, and their promoted cells."""
     result, choice = group[0].result, choices[0]
     protocol = protocols_of(result)[0]
-    cells = scored(result, protocol, rule)
+    cells = scored(result, protocol)
     digits = decimals(choice.S_std_um, choice.n_batches)
     mark = mark_of(group[0])
-    promoted = Promoted(choice, rule, digits, mark)
+    promoted = Promoted(choice, digits, mark)
     boards = tuple(
         tables.leaderboard(result, cells, key, promoted, f"{name}: best cell of every {key}, {protocol}")
         for key in ("family", "selector")
     )
     others = []
     for other in protocols_of(result)[1:]:
-        own = scored(result, other, rule)
+        own = scored(result, other)
         if len(own):
             caption = f"{name}: best cell of every family, {other}"
             others.append(tables.leaderboard(result, own, "family", promoted, caption))

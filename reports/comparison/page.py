@@ -62,7 +62,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     channels, rows = [], []
     for i, (name, group) in enumerate(zip(names, groups, strict=True)):
         protocol = protocols_of(group[0].result)[0]
-        cells = scored(group[0].result, protocol, rule)
+        cells = scored(group[0].result, protocol)
         if cells.empty:
             raise InputError(f"report: training {group[0].training_id} has no cell with a finite score; train again")
         choices = [promoted_cell(t, rule, t is group[0]) for t in group]
@@ -138,9 +138,9 @@ def _facts(newest: Sequence[Training], n_batches: int) -> tuple[tuple[str, str],
 
 def _rule_sentence(r: PromotionRule) -> str:
     return (
-        f"The rule takes the cell whose {'worst' if r.combine == 'worst' else 'mean'} {r.score} by "
-        f"{listed(list(r.protocols))} is least among those whose points are stable "
-        f"(at least {r.min_tsp_stability:g}); within {r.tie_percent:g} % the simpler one. "
+        "The rule takes the cell of least expected loss in a future run, a mean of S over left-out runs weighted "
+        f"{listed([f'{w:g} by {p}' for p, w in r.protocols.items()])}, with the cost of choosing; within "
+        f"{r.ties_se:g} standard error{'s' if r.ties_se != 1 else ''} of the difference the simpler one. "
         "A newcomer replaces the champion only if it is better on the same batches "
         f"(paired sign-flip test, {100 * r.significance:g} %, at least {r.min_batches} batches)."
     )

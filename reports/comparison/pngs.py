@@ -23,10 +23,10 @@ def figure_pngs(result: GridResult) -> dict[str, bytes]:
     """
     rule = PromotionRule()
     protocol = protocols_of(result)[0]
-    cells = scored(result, protocol, rule)
+    cells = scored(result, protocol)
     if cells.empty:
         return {}
-    choice = choose(result.cells, rule.only(protocol))
+    choice = choose(result, rule.only(protocol))
     title, simulated = f"{result.machine} {result.target}, {protocol}", result.simulated
     best, shown = best_per(cells, "family"), left_out_batches(result, choice)
     tried = paths(cells)

@@ -210,11 +210,11 @@ def promoted_cell(training: Training, rule: PromotionRule, nested: bool = False)
     if nested and not math.isfinite(mean):
         own = decide(result, rule)
     else:
-        own = replace(choose(result.cells, rule), nested_S_mean_um=mean, nested_S_std_um=std)
+        own = replace(choose(result, rule), nested_S_mean_um=mean, nested_S_std_um=std)
     cell = str(training.promotion.get("cell", ""))
     if cell and cell != own.cell:
         try:
-            return pick(result.cells, rule, cell)
+            return pick(result, rule, cell)
         except InputError:
             pass  # promoted from another grid: the rule's own choice is shown instead
     return own

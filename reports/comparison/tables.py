@@ -12,8 +12,8 @@ import pandas as pd
 
 from data.arrays import Array
 from features.stability import tsp_frequency
-from models.promotion import BASELINES, Choice, score_um
-from models.protocols import PROTOCOLS, PromotionRule
+from models.promotion import BASELINES, Choice
+from models.protocols import PROTOCOLS
 from models.result import CELL_KEYS, GridResult
 from reports.labels import NOTHING, cell_label, count, family_label, listed, number, percent, selector_label
 from reports.layout import Column, Row, Scale, Shade, Strip, Table
@@ -56,12 +56,11 @@ def protocols_of(result: GridResult) -> list[str]:
     return [p for p in PROTOCOLS if p in run] + sorted(run - set(PROTOCOLS))
 
 
-def scored(result: GridResult, protocol: str, rule: PromotionRule) -> pd.DataFrame:
-    """The protocol's cells with a finite score, least score first; column score_um is the rule's."""
-    cells = result.cells[result.cells["protocol"] == protocol].copy()
-    cells["score_um"] = score_um(cells, rule)
-    order = ["score_um", "n_inputs", "rank", "selector", "family"]
-    return cells[np.isfinite(cells["score_um"])].sort_values(order, kind="stable").reset_index(drop=True)
+def scored(result: GridResult, protocol: str) -> pd.DataFrame:
+    """The protocol's cells with a finite S_mean, the least first."""
+    cells = result.cells[result.cells["protocol"] == protocol]
+    order = ["S_mean_um", "n_inputs", "rank", "selector", "family"]
+    return cells[np.isfinite(cells["S_mean_um"])].sort_values(order, kind="stable").reset_index(drop=True)
 
 
 def best_per(cells: pd.DataFrame, *keys: str) -> pd.DataFrame:
@@ -157,16 +156,16 @@ def _left_out(table: pd.DataFrame, protocol: str, column: str, batch_id: str, pl
 
 
 _MOST_GROUPS = 6
+_STABLE = 0.7  # mean Jaccard similarity of the points that the folds choose
 _MAX = "max\u00a0|e|"
 _WHAT_A_DOT_IS = {"train-on-one": "the model of one batch, mean over the batches it predicts"}
 
 
 @dataclass(frozen=True)
 class Promoted:
-    """The promoted cell with its `mark` in tables, the rule that orders them, and the decimals of a score."""
+    """The promoted cell with its `mark` in tables, and the decimals of a score."""
 
     choice: Choice
-    rule: PromotionRule
     digits: int
     mark: str = "chosen"
 
@@ -179,14 +178,14 @@ def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Pro
         key: family or selector.
         promoted: its cell gets a row of its own where it is no row's best.
     """
-    choice, rule, digits = promoted.choice, promoted.rule, promoted.digits
+    choice, digits = promoted.choice, promoted.digits
     base = is_baseline(cells)
     rows = best_per(cells[~base], key)
     own = _row_of(cells, choice)
     if own is not None and not (rows[CELL_KEYS] == own[CELL_KEYS]).all(axis=1).any():
         rows = pd.concat([rows, own.to_frame().T.astype(cells.dtypes)], ignore_index=True)
     rows = pd.concat([rows, cells[base]], ignore_index=True).drop_duplicates(CELL_KEYS)
-    rows = rows.sort_values("score_um", kind="stable").reset_index(drop=True)
+    rows = rows.sort_values("S_mean_um", kind="stable").reset_index(drop=True)
     protocol = str(rows["protocol"].iloc[0])
     per_batch = [part["S_um"].to_numpy(float) for part in S_by_batch(result, rows)]
     nothing = zero_um(cells)
@@ -197,7 +196,7 @@ def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Pro
     body = []
     for row, values, group in zip(rows.to_dict("records"), per_batch, groups, strict=True):
         chosen = own is not None and all(row[k] == own[k] for k in CELL_KEYS)
-        unstable = row["tsp_stability"] < rule.min_tsp_stability
+        unstable = row["tsp_stability"] < _STABLE
         cells_of: dict[str, str | Strip] = {
             "family": family_label(row["family"]),
             "selector": selector_label(row["selector"]) if row["n_tsp"] else NOTHING,
@@ -213,11 +212,11 @@ def leaderboard(result: GridResult, cells: pd.DataFrame, key: str, promoted: Pro
         }
         body.append(Row(tuple(cells_of[c.key] for c in columns), promoted.mark if chosen else ""))
     dots = _WHAT_A_DOT_IS.get(protocol, "a left-out batch")
-    notes = [f"Every dot is {dots} (log scale), the bar is S_mean. Order: {rule.score}; {_rests_on(result, protocol)}."]
+    notes = [f"Every dot is {dots} (log scale), the bar is S_mean; {_rests_on(result, protocol)}."]
     if any(isinstance(cell, Strip) and cell.beyond for row in body for cell in row.cells):
         notes.append("A number with › counts the dots beyond the axis.")
     if any("†" in str(cell) for row in body for cell in row.cells):
-        notes.append(f"† Below {rule.min_tsp_stability:g}: another training would choose other points.")
+        notes.append(f"† Below {_STABLE:g}: another training would choose other points.")
     return Table(caption, columns, tuple(body), result.simulated, scale, tuple(notes))
 
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from models.outlook import outlook
-from models.promotion import choose
+from models.promotion import pick
 from models.protocols import PromotionRule
 from models.result import GridResult
 from tests.toys.training import toy_batches, toy_result
@@ -28,7 +28,7 @@ def trained(forward: list[float], near: float = 2.0, n: int = 6) -> GridResult:
 
 
 def chosen(result: GridResult):
-    return outlook(result, choose(result.cells[result.cells["family"] == "mlr"], RULE))
+    return outlook(result, pick(result, RULE.only(result.cells["protocol"].iloc[-1]), "none|mlr|2"))
 
 
 def test_it_leads_with_forward_and_then_leave_batch_out() -> None:

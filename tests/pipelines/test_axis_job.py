@@ -58,7 +58,7 @@ def page(result: GridResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_fan_shows_every_reading_and_the_lines_of_the_left_out_model(result: GridResult) -> None:
-    shown = left_out_batches(result, choose(result.cells, PromotionRule()))
+    shown = left_out_batches(result, choose(result, PromotionRule()))
     assert [b.place for b in shown] == ["best", "median", "worst"]
     panel = left_out_panel("x_axis", result, shown, 1)
     assert panel is not None and len(panel.plots) == 3

@@ -49,7 +49,7 @@ def name(store: Any) -> str:
     result = toy_result(batches, {"none|mlr|2": [1.0] * 6})
     model, region = toy_model(batches)
     training_id = tracking.log_training(result, store)
-    choice = choose(result.cells, store.promotion)
+    choice = choose(result, store.promotion)
     new = registry.Newcomer(result, choice, model, machine_yaml("toy-clean"), training_id, region, batches)
     return registry.promote(new, store).name
 

@@ -165,7 +165,7 @@ def test_a_home_that_moved_or_was_copied_has_its_files(store: Any, tmp_path: Pat
     training_id = tracking.log_training(result, first)
     model, region = toy_model(batches)
     new = registry.Newcomer(
-        result, choose(result.cells, first.promotion), model, machine_yaml("toy-moved"), training_id, region
+        result, choose(result, first.promotion), model, machine_yaml("toy-moved"), training_id, region
     )
     promoted = registry.promote(new, first, force=True)
 

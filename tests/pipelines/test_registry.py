@@ -21,7 +21,7 @@ def train(store, machine: str, S_um: list[float], *, batches_given: bool = False
     result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
     training_id = tracking.log_training(result, store)
     model, region = toy_model(batches)
-    choice = choose(result.cells, store.promotion)
+    choice = choose(result, store.promotion)
     text, known = yaml or machine_yaml(machine), batches if batches_given else ()
     new = registry.Newcomer(result, choice, model, text, training_id, region, known)
     return registry.promote(new, store, force=force)
@@ -179,7 +179,7 @@ def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story,
 def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     batches = toy_batches("toy-zero", 6)
     result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})
-    choice: Choice = choose(result.cells, store.promotion)
+    choice: Choice = choose(result, store.promotion)
     from models.baselines import Zero
 
     zero, training_id = Zero().fit(batches, (), "z"), tracking.log_training(result, store)

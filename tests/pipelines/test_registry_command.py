@@ -55,9 +55,7 @@ def train(store: Any, machine: str, S_um: list[float], at: str = "", *, force: b
     result = replace(result, findings=pd.DataFrame([dict(f) for f in FINDINGS]))
     training_id = tracking.log_training(result, store)
     model, region = toy_model(batches)
-    new = registry.Newcomer(
-        result, choose(result.cells, store.promotion), model, machine_yaml(machine), training_id, region
-    )
+    new = registry.Newcomer(result, choose(result, store.promotion), model, machine_yaml(machine), training_id, region)
     with clock(at):
         return registry.promote(new, store, force=force)
 

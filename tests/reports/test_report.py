@@ -95,7 +95,7 @@ def markdown_of(trainings: list[Training], folder: Path) -> str:
 
 def test_left_out_scores_are_those_of_the_predictions(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    cell = choose(result.cells, RULE)
+    cell = choose(result, RULE)
     text = of_z(toy_batches)
     p = result.predictions
     s = []
@@ -163,7 +163,7 @@ def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches:
     z, x = (training(both[t], name=t) for t in "zx")
     page = page_of([z, x], RULE)
     assert page.overview is not None and page_of([training(small(toy_batches))], RULE).overview is None
-    expected = outlook(both["z"], choose(both["z"].cells, RULE))
+    expected = outlook(both["z"], choose(both["z"], RULE))
     own = dict(zip((c.title for c in page.overview.columns), page.overview.rows[0].cells, strict=True))
     digits = len(str(own["expected S"]).split(".")[1])
     assert own["status"] == "not promoted" and [r.mark for r in page.overview.rows] == ["", ""]
@@ -194,7 +194,7 @@ def test_no_model_never_wears_the_champions_colour(toy_batches: Maker, tmp_path:
 
 def test_the_curves_are_later_runs_predicted_from_earlier_ones(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    cell = choose(result.cells, RULE)
+    cell = choose(result, RULE)
     shown = left_out_batches(result, cell)
     s = result.scores
     own = s[(s["family"] == cell.family) & (s["selector"] == cell.selector) & (s["n_tsp"] == cell.n_tsp)]
@@ -216,25 +216,25 @@ def test_the_curves_are_later_runs_predicted_from_earlier_ones(toy_batches: Make
 
 def test_without_kept_curves_the_batches_are_those_left_out_one_by_one(toy_batches: Maker) -> None:
     result = replace(results(toy_batches)["z"], curves=pd.DataFrame())
-    cell = choose(result.cells, RULE)
+    cell = choose(result, RULE)
     shown = left_out_batches(result, cell)
     every = result.scores[(result.scores["protocol"] == LBO) & (result.scores["family"] == cell.family)]
     own = every[(every["selector"] == cell.selector) & (every["n_tsp"] == cell.n_tsp)]["S_um"]
     assert {b.protocol for b in shown} == {LBO} and [shown[0].S_um, shown[2].S_um] == [own.min(), own.max()]
-    other = replace(choose(result.cells, RULE.only(LBO)), family="mean_curve", selector="none", n_tsp=0)
+    other = replace(choose(result, RULE.only(LBO)), family="mean_curve", selector="none", n_tsp=0)
     assert {b.protocol for b in left_out_batches(results(toy_batches)["z"], other)} == {LBO}
 
 
 def test_a_long_curve_is_thinned(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     rows = result.curves.loc[result.curves.index.repeat(50)].reset_index(drop=True)
-    shown = left_out_batches(replace(result, curves=rows), choose(result.cells, RULE))
+    shown = left_out_batches(replace(result, curves=rows), choose(result, RULE))
     assert all(len(b.time_h) <= 400 and b.every == 5 for b in shown)
 
 
 def test_the_heat_maps_show_the_least_score_of_each_pair_and_how_often_a_point_is_chosen(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    cells = scored(result, LBO, RULE)
+    cells = scored(result, LBO)
     heat, chosen = heat_map("z", result, cells, 2), point_frequency("z", result, cells, LBO)
     assert heat is not None and chosen is not None
     pairs = cells[~cells["family"].isin(["zero", "mean_curve"]) & (cells["n_tsp"] > 0)]
@@ -259,7 +259,7 @@ def test_hostile_names_stay_text(toy_batches: Maker, tmp_path: Path) -> None:
     assert any(HOSTILE in w for w in page.words)
     assert "alert('$x$')</script>" not in text
     markdown = of_z(toy_batches)
-    rows = table_after(markdown, f"Every batch, left out by {cell_words(choose(both['z'].cells, RULE))}")
+    rows = table_after(markdown, f"Every batch, left out by {cell_words(choose(both['z'], RULE))}")
     assert {len(r) for r in rows} == {len(rows[0])} and HOSTILE in [r[0] for r in rows]
     assert "<script" not in markdown.replace("\\<script", "")
     assert figure_pngs(both["z"])
@@ -320,7 +320,7 @@ def test_two_trainings_are_compared_on_the_batches_they_share(toy_batches: Maker
     rows = table_after(text, "The trainings, each judged on its own batches")
     assert column(rows, "trained") == ["2026-01-10 08:00", "2025-06-01 08:00"]
     assert column(rows, "new batches") == ["+1", "–"] and column(rows, "batches") == ["6", "5"]
-    a, b = (choose(r.cells, RULE) for r in (now, before))
+    a, b = (choose(r, RULE) for r in (now, before))
 
     def per_batch(result: GridResult, c: Choice) -> dict[str, float]:
         s = result.scores[result.scores["protocol"] == LBO]
@@ -418,7 +418,7 @@ def test_the_strips_axis_is_logarithmic_and_keeps_what_leaves_it() -> None:
 
 def test_the_choice_of_points_is_shown_where_there_is_a_choice(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    shown = frequencies(result, scored(result, "leave-batch-out", RULE), "leave-batch-out")
+    shown = frequencies(result, scored(result, "leave-batch-out"), "leave-batch-out")
     everything = int(result.cells["n_inputs"].max())
     assert {f.selector for f in shown} == {"correlation", "pca_elimination"}
     assert all(f.n_tsp < everything and sum(f.share.values()) == pytest.approx(f.n_tsp) for f in shown)

@@ -82,7 +82,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def page(toy_batches: Maker, scratch: Path) -> Path:
     both = results(toy_batches, findings=True)
     before = results(toy_batches, k=5)["z"]
-    cell = choose(both["z"].cells, PromotionRule()).cell
+    cell = choose(both["z"], PromotionRule()).cell
     trainings = [
         training(both["z"], promotion(cell, comparison=COMPARISON), name="new"),
         training(before, name="old", when="2025-06-01"),

@@ -73,9 +73,9 @@ def test_the_share_inside_is_that_of_fits_done_one_by_one(
         sd = model.sd_um(Design.build([left_out], inputs, None), [0])[0]
         inside.append(np.mean(np.abs(recorded - model.predict(left_out)) <= 1.6449 * sd))
         sd_um.append(sd.mean())
-    cells = scored(result, LBO, RULE)
+    cells = scored(result, LBO)
     only = cells[(cells["family"] != "gaussian_process") | (cells["selector"] == "none")]
-    table = certainty_table("z", result, only, choose(result.cells, RULE), 2)
+    table = certainty_table("z", result, only, choose(result, RULE), 2)
     assert table is not None and [c.title for c in table.columns][5:7] == [
         "inside the 90 % interval",
         "season left out",

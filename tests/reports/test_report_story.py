@@ -31,7 +31,7 @@ OUTCOMES: dict[str, dict[str, object]] = {
 
 def test_the_outcome_of_a_training_in_one_sentence(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    choice = choose(result.cells, RULE)
+    choice = choose(result, RULE)
     shown = {k: verdict("z", training(result, promotion(choice.cell, **c)), choice) for k, c in OUTCOMES.items()}
     assert all(v.caution == "" for v in shown.values())
     check_snapshot(__file__, "outcomes", "".join(f"{k}: {v.summary}\n" for k, v in shown.items()))
@@ -39,7 +39,7 @@ def test_the_outcome_of_a_training_in_one_sentence(toy_batches: Maker) -> None:
 
 def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    rule_cell = choose(result.cells, RULE)
+    rule_cell = choose(result, RULE)
     nested = score_of_choice(result, RULE)
     nested = nested.loc[nested["protocol"] == rule_cell.protocol, "S_um"]
     computed = promoted_cell(training(result), RULE, nested=True)
@@ -57,8 +57,8 @@ def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Make
 def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     reason = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean_curve (8.10 µm)"
-    recorded = promotion(choose(result.cells, RULE).cell, caution=reason)
-    said = verdict("z", training(result, recorded), choose(result.cells, RULE))
+    recorded = promotion(choose(result, RULE).cell, caution=reason)
+    said = verdict("z", training(result, recorded), choose(result, RULE))
     short = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean curve"
     assert (said.caution, said.outcome) == (f"No trustworthy model: {short}.", "untrusted")
     assert said.summary.endswith(f" Not trustworthy: {short} (8.10 µm).")
@@ -66,15 +66,15 @@ def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
 
 def test_the_recorded_outcome_counts_not_a_later_doubt(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    choice = replace(choose(result.cells, RULE), caution="not shown to be better than zero")
+    choice = replace(choose(result, RULE), caution="not shown to be better than zero")
     said = verdict("z", training(result, promotion(choice.cell)), choice)
     assert (said.outcome, said.chip, said.caution) == ("champion", "champion", "")
 
 
 def test_nothing_promoted_and_nothing_to_trust_are_said(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
-    only = result.cells["family"].isin(["zero", "mean_curve"])
-    choice = choose(result.cells[only], RULE)
+    cells, scores = (t[t["family"].isin(["zero", "mean_curve"])] for t in (result.cells, result.scores))
+    choice = choose(replace(result, cells=cells, scores=scores), RULE)
     said = verdict("z", training(result), choice)
     assert said.summary.startswith("Nothing was promoted. The rule would take mean curve: ")
     assert said.caution == "No trustworthy model: nothing beats mean curve."

@@ -49,7 +49,7 @@ def results(make: Maker, k: int = 6, simulated: bool = True, findings: bool = Fa
 
 def judged(crossing: Crossing, result: GridResult) -> GridResult:
     """With the left-out runs and curves of the cell that the rule takes, as a training keeps them."""
-    cell = choose(result.cells, PromotionRule())
+    cell = choose(result, PromotionRule())
     kept = left_out_runs(crossing, cell.selector, cell.family, cell.n_tsp)
     return replace(result, distances=kept.runs, curves=kept.curves)
 

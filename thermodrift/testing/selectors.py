@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from data.batch import Batch, Channel
-from data.registry import EFFORTS
 from features.design import Design
 from features.selectors.base import Selector
 from thermodrift.testing.contract import Suite, expect, expect_described, expect_refused
@@ -63,7 +62,6 @@ SUITE: Suite[SelectorCase] = Suite()
 def says_what_it_is(c: SelectorCase) -> None:
     cls = c.selector
     expect_described(cls, Selector, "key", "summary", "source")
-    expect(cls.effort in EFFORTS, f"an effort of {EFFORTS}", cls.effort)
 
 
 @SUITE.check("equal sets are fitted once, so they must be equal tuples")

@@ -1,0 +1,251 @@
+"""Which cells are scored by all folds: a race of all families and selectors over the same left-out runs.
+
+Four rounds, each on the cells that the one before it left:
+
+1. families: every family with all points and with four, fitted once on the first three quarters of the runs and judged
+   on the last one (on every fourth run where it is not known which are later);
+2. points: every selector and number of points of the families that are left, on the same fold;
+3. runs: all folds of the leading protocol, forward where it is known which run is later, else leave-batch-out;
+4. finalists: all folds of the other protocols.
+
+After a round a cell is dropped where it is clearly worse than the leader on the same runs, by a one-sided paired t test
+(Maron and Moore 1994, Hoeffding races), and so many remain as the next round can afford (successive halving: Jamieson
+and Talwalkar 2016), the best first, of each family no more than a part of them. The best cells of the four best
+families go on in any case, as runners-up and members of a stack, and so do the baselines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from data.arrays import Array
+from models import FAMILIES
+from models.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
+from models.protocols import Fold
+
+ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", "behind_um", "se_um", "kept", "why"]
+BASELINES = ("zero", "mean_curve")
+_CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
+_JUDGED_SHARE, _JUDGED_RUNS = 0.25, 4  # judged in the first rounds; of fewer to learn from rich models look worse
+_FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all of many sensors is no fair trial
+_FAMILIES_KEPT, _SELECTORS_KEPT = 12, 4  # after the first and the second round
+_CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
+_RUNNERS_UP = 4  # families that are in every round
+_FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
+_POINTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # numbers of points tried: neighbours choose nearly the same
+
+
+@dataclass(frozen=True)
+class Job:
+    """Cells of one family to be scored; `chosen` are the selectors' choices that it needs."""
+
+    target: str
+    family: str
+    round: str
+    cells: tuple[Cell, ...]
+    folds: Mapping[str, Sequence[Fold]]
+    keep: bool
+    chosen: Mapping[Any, dict[int, Inputs]] = field(default_factory=dict, repr=False)
+
+    @property
+    def label(self) -> str:
+        return " ".join(filter(None, (self.target, self.family, self.round)))
+
+    def run(self, crossing: Crossing) -> FamilyResult:
+        """Score them."""
+        crossing.chosen.update(self.chosen)
+        return cross_family(crossing, self.family, self.cells, self.folds, self.keep)
+
+
+class Raced(NamedTuple):
+    """The scores of all cells of the last rounds, who was dropped when, and the members of the stack."""
+
+    result: FamilyResult
+    race: pd.DataFrame
+    stack: pd.DataFrame
+
+
+Rounds = Generator[list[Job], list[FamilyResult], Raced]
+
+
+def rounds(crossing: Crossing) -> Rounds:
+    """Yields the jobs of every round and takes their results; returns the result and a table of who was dropped when.
+
+    The table has the columns `ROUND_COLUMNS`: S_mean_um over the n_runs of that round, how far behind the leader with
+    the standard error of that difference, and why a cell is not kept.
+    """
+    every = {key: tuple(crossing.cells(FAMILIES[key])) for key in crossing.plan.families}
+    every = {key: cells for key, cells in every.items() if cells}
+    folds = {p: own for p, own in crossing.folds.items() if own}
+    led = next((p for p in ("forward", "leave-batch-out") if p in folds), next(iter(folds)))
+    if not crossing.plan.finalists:
+        results = yield _jobs(crossing, "", every, folds)
+        return _with_stack(crossing, FamilyResult.joined(results), pd.DataFrame(columns=ROUND_COLUMNS), led)
+    table: list[pd.DataFrame] = []
+    few = {"last": [_last(crossing, folds.get("forward", ()))]}
+    cells = {key: _first(own) for key, own in every.items()}
+    first = yield _jobs(crossing, "families", cells, few, keep=False)
+    left = _kept(first, "families", _FAMILIES_KEPT, table, most=1)
+    kept = {key for _, key, _ in left}
+    more = {key: _tried(every[key], crossing) for key in every if key in kept}
+    second = yield _jobs(crossing, "points", more, few, keep=False)
+    left = _kept(second, "points", _CELLS_PER_FINALIST * crossing.plan.finalists, table, selectors=_SELECTORS_KEPT)
+    third = yield _jobs(crossing, "runs", _by_family(left), {led: folds[led]})
+    left = _kept(third, "runs", crossing.plan.finalists, table)
+    rest = {p: own for p, own in folds.items() if p != led}
+    last = yield _jobs(crossing, "finalists", _by_family(left), rest) if rest else []
+    return _with_stack(crossing, FamilyResult.joined([*third, *last]), pd.concat(table, ignore_index=True), led)
+
+
+def _with_stack(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, led: str) -> Raced:
+    if not any(FAMILIES[key].combines for key in crossing.plan.families):
+        return Raced(result, race, pd.DataFrame())
+    from models.stack import stacked
+
+    more, members = stacked(crossing, result, led)
+    return Raced(FamilyResult.joined([result, more]), race, members)
+
+
+def drive(crossings: Mapping[str, Crossing], cross: Callable[[list[Job]], list[FamilyResult]]) -> dict[str, Raced]:
+    """The races of several error channels, round by round together; `cross` scores the jobs of a round."""
+    races = {target: rounds(crossing) for target, crossing in crossings.items()}
+    waiting = {target: next(race) for target, race in races.items()}
+    done = {}
+    while waiting:
+        jobs = [job for own in waiting.values() for job in own]
+        scored = dict(zip((job.label for job in jobs), cross(jobs), strict=True))
+        for target, own in list(waiting.items()):
+            try:
+                waiting[target] = races[target].send([scored[job.label] for job in own])
+            except StopIteration as end:
+                del waiting[target]
+                done[target] = end.value
+    return {target: done[target] for target in crossings}
+
+
+def _jobs(
+    crossing: Crossing,
+    name: str,
+    cells: Mapping[str, Sequence[Cell]],
+    folds: Mapping[str, Sequence[Fold]],
+    keep: bool = True,
+) -> list[Job]:
+    """A job per family, those that share work over the error channels first, then the slow, iterative ones."""
+    trained = [f for own in folds.values() for f in own]
+    by_cost = sorted(cells, key=lambda key: (not FAMILIES[key].shares_targets, FAMILIES[key].closed_form))
+    jobs = []
+    for key in by_cost:
+        selectors = dict.fromkeys(selector for selector, n in cells[key] if n)
+        chosen = crossing.select(selectors, trained)
+        jobs.append(Job(crossing.design.target, key, name, tuple(cells[key]), folds, keep, chosen))
+    return jobs
+
+
+def _last(crossing: Crossing, forward: Sequence[Fold]) -> Fold:
+    """The last quarter of the runs against those before them; without an order in time, every fourth run."""
+    order = [*forward[-1].train, *forward[-1].test] if forward else list(crossing.everything)
+    n = min(max(_JUDGED_RUNS, round(_JUDGED_SHARE * len(order))), len(order) // 2)
+    test = order[-n:] if forward else order[:: -(-len(order) // n)]
+    return Fold("last", tuple(k for k in order if k not in test), tuple(test))
+
+
+def _first(cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    return tuple(
+        c for c in cells if c == _FIRST_POINTS or (c[1] in (0, _most(cells)) and c[0] in ("none", cells[0][0]))
+    )
+
+
+def _most(cells: Sequence[Cell]) -> int:
+    return max(n for _, n in cells)
+
+
+def _tried(cells: Sequence[Cell], crossing: Crossing) -> tuple[Cell, ...]:
+    named = crossing.plan.n_tsps is not None
+    return tuple(c for c in cells if named or c[1] in (0, *_POINTS, _most(cells)))
+
+
+def _by_family(left: Sequence[tuple[str, str, int]]) -> dict[str, list[Cell]]:
+    found: dict[str, list[Cell]] = {}
+    for selector, family, n in left:
+        found.setdefault(family, []).append((selector, n))
+    return found
+
+
+def _kept(
+    results: Sequence[FamilyResult],
+    name: str,
+    places: int,
+    table: list[pd.DataFrame],
+    most: int | None = None,
+    selectors: int | None = None,
+) -> list[tuple[str, str, int]]:
+    """The cells that go on, and a row for each in `table`.
+
+    Args:
+        most: of a family; None: its share of the places.
+        selectors: how many may go on, those of the best cells, next to "none"; None: all.
+    """
+    scores = FamilyResult.joined(results).scores
+    keys = ["selector", "family", "n_tsp"]
+    wide = scores.pivot(index=keys, columns=["fold", "batch_id"], values="S_um")
+    S_um = np.where(np.isfinite(wide.to_numpy(float)), wide.to_numpy(float), np.inf)
+    S_mean_um = S_um.mean(axis=1)
+    names = list(wide.index)
+    is_base = np.array([family in BASELINES for _, family, _ in names])
+    order = np.lexsort(([FAMILIES[f].rank for _, f, _ in names], S_mean_um))
+    behind_um, se_um = paired(S_um, S_um[order[0]])
+    clear = behind_um > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * se_um
+    share = most if most is not None else -(-places // _FAMILY_SHARE)
+    why, taken, seen = ["" for _ in names], dict[str, int](), set[tuple[str, bytes]]()
+    n, through, twin = 0, {"none"}, name != "runs"
+    for i in order:
+        selector, family, _ = names[i]
+        same = (family, np.round(S_um[i], 9).tobytes())
+        if is_base[i]:
+            continue
+        if not np.isfinite(S_mean_um[i]):
+            why[i] = "not fitted"
+        elif family not in taken and (len(taken) < _RUNNERS_UP or (twin and FAMILIES[family].needs_twin)):
+            twin = twin and not FAMILIES[family].needs_twin
+            n, taken[family] = n + 1, 1
+            seen.add(same)
+            through.add(selector)
+        elif clear[i]:
+            why[i] = "clearly worse than the leader"
+        elif same in seen:
+            why[i] = "the same model as another cell"
+        elif n >= places or taken.get(family, 0) >= share:
+            why[i] = "not among the best"
+        elif selectors is not None and selector not in through and len(through) > selectors:
+            why[i] = "its selector is not among the best"
+        else:
+            through.add(selector)
+            n, taken[family] = n + 1, taken.get(family, 0) + 1
+            seen.add(same)
+    kept = [not w for w in why]
+    own = pd.DataFrame(names, columns=keys).assign(
+        round=name, n_runs=S_um.shape[1], S_mean_um=S_mean_um, behind_um=behind_um, se_um=se_um, kept=kept, why=why
+    )
+    table.append(own.iloc[order][ROUND_COLUMNS])
+    return [names[i] for i in range(len(names)) if kept[i]]
+
+
+def paired(S_um: Array, leader_um: Array, weight: Array | None = None) -> tuple[Array, Array]:
+    """Mean difference of S (C, R) to that of the leader (R,) on the same runs, and its standard error, (C,) each.
+
+    Args:
+        weight: of the runs (R,); None: equal.
+    """
+    w = np.ones(S_um.shape[1]) if weight is None else weight
+    with np.errstate(invalid="ignore"):
+        d = S_um - leader_um
+        mean = d @ w / w.sum()
+        n = len(w)
+        spread = np.sqrt(((w * (d - mean[:, None])) ** 2).sum(axis=1) * n / max(n - 1, 1)) / w.sum()
+    return mean, np.where(np.isfinite(spread) & (n > 1), spread, np.inf)
