@@ -48,6 +48,8 @@ class AxisModel:
         limits: of what is sent; along an axis they hold at the reference position and at its farther end.
         lever_mm: of an error along an axis the greatest distance from the reference position, at which a change of the
             slope moves the tool the most.
+        share: of the correction that the measured trust in the model supports, above 0 up to 1.
+        remark: on the model, in every record; empty: none.
     """
 
     axis: str
@@ -60,18 +62,25 @@ class AxisModel:
     updater: Updater | None = None
     limits: Limits = field(default_factory=Limits)
     lever_mm: float = 1000.0
+    share: float = 1.0
+    remark: str = ""
+
+    def __post_init__(self) -> None:
+        """Raises InputError where the share is not above 0 up to 1."""
+        if not 0.0 < self.share <= 1.0:
+            raise InputError(f"axis {self.axis}: got authority {self.share!r}, expected above 0 up to 1; train again")
 
     def authority(self, distance: float) -> float:
-        """Share of the correction that is applied so far outside of the trained region, in widths.
+        """Share of the correction that is applied so far outside of the trained region, in widths: at most `share`.
 
         The error there is expected to be `RunBound.factor` times that of an ordinary run; a correction whose error
         grows by a factor is worth its inverse. Without a bound it falls with the distance itself.
         """
         if distance <= SLACK:
-            return 1.0
+            return self.share
         if self.bound is None or not math.isfinite(factor := self.bound.factor(math.nan, distance)):
-            return 1.0 / (1.0 + distance)
-        return min(1.0, 1.0 / factor)
+            return min(self.share, 1.0 / (1.0 + distance))
+        return min(self.share, 1.0 / factor)
 
 
 @dataclass
@@ -84,11 +93,11 @@ class _Running:
     safety: Axis
     slope_safety: Axis  # of the slope's part at the lever
     error_um: float = 0.0  # of the last row, with readings
-    free_um: float = math.nan  # of the last row, of the model alone
+    free_um: float = math.nan  # of the last row, of the model alone, times its share
     scaled: Array = field(default_factory=lambda: np.zeros(0))  # inputs of the last row, for the filter
     slope_um_per_mm: float = 0.0
     odd_um: float = math.nan  # of the last reading, where it was rejected: how far it was off
-    trust: float = 1.0
+    trust: float = 1.0  # what the distance from the trained region leaves of the share
     why: str = ""
     at_s: float = 0.0  # since the start of the run
 
@@ -193,7 +202,7 @@ class Compensator:
                 slope[a.axis] = part_um / a.lever_mm * _MM_PER_M
             state[a.axis] = run.safety.state
             why = run.why if notes is not None else ""
-            reasons[a.axis] = "; ".join(r for r in (reason, why, notes) if r)
+            reasons[a.axis] = "; ".join(r for r in (reason, why, notes, a.remark) if r)
         return Correction(time_s, offset, slope, state, reasons)
 
     def _check_clock(self, time_s: float) -> None:
@@ -254,10 +263,12 @@ class Compensator:
                 run.at_s += self.period_s if run.model.started else 0.0
                 out = step(run.model, _row(a.program, values))
                 seen = watch(run.region, _row(a.watched, values))
+            # A reading corrects what is sent, so that the filter follows the share of the prediction and not the whole.
+            out = a.share * out
             run.free_um, run.scaled = float(out[0]), self._scaled(a, seen, float(out[0]))
             run.slope_um_per_mm = float(out[1]) if len(out) > 1 else 0.0
             distance, quantity = far(seen)
-            run.trust = a.authority(distance)
+            run.trust = a.authority(distance) / a.share
             run.why = f"{quantity} outside the trained region by {distance:.2g} widths" if run.trust < 1.0 else ""
             run.error_um = run.free_um
             if a.updater is not None and run.learned is not None and math.isfinite(run.free_um):

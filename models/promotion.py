@@ -30,7 +30,8 @@ class Choice:
     `protocol` is the one that decides: under it the cell's weighted score is worst; `S_mean_um` and `S_std_um` are of
     this protocol. `caution` is why the cell is not trustworthy: a baseline won, no set of points was stable, or the
     cell is not shown to beat a baseline; empty where it is. The nested score predicts every batch by the cell that the
-    other batches chose, under the same protocol.
+    other batches chose, under the same protocol. `standing` is what the forward runs show: a champion, provisional or
+    refused; `authority` is the share of the correction that they support.
     """
 
     protocol: str
@@ -47,6 +48,8 @@ class Choice:
     summary: str
     nested_S_mean_um: float = float("nan")
     nested_S_std_um: float = float("nan")
+    standing: str = "champion"
+    authority: float = 1.0
 
     @property
     def trusted(self) -> bool:

@@ -17,7 +17,7 @@ RUN = {"began": "2026-11-24T05:00:00+00:00", "ended": "2026-11-24T05:10:00+00:00
 
 def row_of(machine: str, **more: Any) -> dict[str, Any]:
     return {
-        "machine": machine, "channel": "z", "model": f"{machine}-z", "version": 3, "cell": "none|ridge|2",
+        "machine": machine, "channel": "z", "model": f"{machine}-z", "version": 3, "provisional": None, "cell": "none|ridge|2",
         "family": "ridge", "since": "", "trained_at": "", "reason": "", "simulated": False, "last_seen": "2026-11-01",
         "expected_S_um": 2.0, "bound90_S_um": 4.0, "expected_by": "forward", "n_seen": 6, "unknown": "",
         "age_days": 3.2, "seen_days_ago": 24.5, "newer_S_um": [], "newer_S_mean_um": None, "drift": None,
