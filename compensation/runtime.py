@@ -30,6 +30,7 @@ from models.updating import Updater
 
 SCHEMA = "thermodrift.compensation/1"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
+_LEAST_UM2 = 1e-12  # a variance of rounding alone
 _NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
 _MM_PER_M = 1000.0
 
@@ -291,6 +292,10 @@ class Compensator:
         total_um = measured_um - run.safety.sent_um  # the machine's own error: what is left less what was added
         known, row = run.learned, (run.at_s, run.free_um, run.scaled)
         expected_um, sd_um, _ = a.updater.step(known, *row)
+        if a.share < 1.0 and not known.mean.any():  # the first reading also finds what the share leaves out
+            left_out_um2, own_um2 = (run.free_um * (1.0 / a.share - 1.0)) ** 2, sd_um**2 - a.updater.noise_um2
+            known = replace(known, cov=known.cov * (1.0 + left_out_um2 / max(own_um2, _LEAST_UM2)))
+            expected_um, sd_um, _ = a.updater.step(known, *row)
         off_um = total_um - expected_um
         if not abs(off_um) <= _ODD_READING_SD * sd_um:
             again = abs(off_um - run.odd_um) <= _ODD_READING_SD * sd_um
