@@ -101,7 +101,7 @@ def train(
         recordings: files and folders to ingest first; default: what the lake holds.
         channels: error channels to learn; default: all.
         plan: selectors, families, protocols and effort; default: ``Plan()``.
-        promote: register the best cell, as champion or challenger.
+        promote: register the best cell, as champion, provisional or challenger.
 
     Returns:
         The results by channel, ids of trainings, promotions, and the path of the report.
