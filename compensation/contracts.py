@@ -34,7 +34,8 @@ class Correction:
         offset_um: axis → origin shift K0 in µm; the negative of the expected error, limited in size and rate.
         slope_um_per_m: axis → slope tan β in µm per m of travel; only axes whose error depends on the position.
         state: axis → `off`, `warm-up`, `active`, `hold` or `fade-out`.
-        reasons: axis → why it is not `active`, or acts with reduced authority; empty where it is and does not.
+        reasons: axis → why it is not `active`, or acts with reduced authority, and what its model is, where that is
+            no champion; empty where there is neither.
     """
 
     time_s: float

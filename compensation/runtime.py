@@ -30,6 +30,7 @@ from models.updating import Updater
 
 SCHEMA = "thermodrift.compensation/1"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
+_LEAST_UM2 = 1e-12  # a variance of rounding alone
 _NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
 _MM_PER_M = 1000.0
 
@@ -48,6 +49,8 @@ class AxisModel:
         limits: of what is sent; along an axis they hold at the reference position and at its farther end.
         lever_mm: of an error along an axis the greatest distance from the reference position, at which a change of the
             slope moves the tool the most.
+        share: of the correction that the measured trust in the model supports, above 0 up to 1.
+        remark: on the model, in every record; empty: none.
     """
 
     axis: str
@@ -60,18 +63,25 @@ class AxisModel:
     updater: Updater | None = None
     limits: Limits = field(default_factory=Limits)
     lever_mm: float = 1000.0
+    share: float = 1.0
+    remark: str = ""
+
+    def __post_init__(self) -> None:
+        """Raises InputError where the share is not above 0 up to 1."""
+        if not 0.0 < self.share <= 1.0:
+            raise InputError(f"axis {self.axis}: got authority {self.share!r}, expected above 0 up to 1; train again")
 
     def authority(self, distance: float) -> float:
-        """Share of the correction that is applied so far outside of the trained region, in widths.
+        """Share of the correction that is applied so far outside of the trained region, in widths: at most `share`.
 
         The error there is expected to be `RunBound.factor` times that of an ordinary run; a correction whose error
         grows by a factor is worth its inverse. Without a bound it falls with the distance itself.
         """
         if distance <= SLACK:
-            return 1.0
+            return self.share
         if self.bound is None or not math.isfinite(factor := self.bound.factor(math.nan, distance)):
-            return 1.0 / (1.0 + distance)
-        return min(1.0, 1.0 / factor)
+            return min(self.share, 1.0 / (1.0 + distance))
+        return min(self.share, 1.0 / factor)
 
 
 @dataclass
@@ -84,11 +94,11 @@ class _Running:
     safety: Axis
     slope_safety: Axis  # of the slope's part at the lever
     error_um: float = 0.0  # of the last row, with readings
-    free_um: float = math.nan  # of the last row, of the model alone
+    free_um: float = math.nan  # of the last row, of the model alone, times its share
     scaled: Array = field(default_factory=lambda: np.zeros(0))  # inputs of the last row, for the filter
     slope_um_per_mm: float = 0.0
     odd_um: float = math.nan  # of the last reading, where it was rejected: how far it was off
-    trust: float = 1.0
+    trust: float = 1.0  # what the distance from the trained region leaves of the share
     why: str = ""
     at_s: float = 0.0  # since the start of the run
 
@@ -193,7 +203,7 @@ class Compensator:
                 slope[a.axis] = part_um / a.lever_mm * _MM_PER_M
             state[a.axis] = run.safety.state
             why = run.why if notes is not None else ""
-            reasons[a.axis] = "; ".join(r for r in (reason, why, notes) if r)
+            reasons[a.axis] = "; ".join(r for r in (reason, why, notes, a.remark) if r)
         return Correction(time_s, offset, slope, state, reasons)
 
     def _check_clock(self, time_s: float) -> None:
@@ -254,10 +264,12 @@ class Compensator:
                 run.at_s += self.period_s if run.model.started else 0.0
                 out = step(run.model, _row(a.program, values))
                 seen = watch(run.region, _row(a.watched, values))
+            # A reading corrects what is sent, so that the filter follows the share of the prediction and not the whole.
+            out = a.share * out
             run.free_um, run.scaled = float(out[0]), self._scaled(a, seen, float(out[0]))
             run.slope_um_per_mm = float(out[1]) if len(out) > 1 else 0.0
             distance, quantity = far(seen)
-            run.trust = a.authority(distance)
+            run.trust = a.authority(distance) / a.share
             run.why = f"{quantity} outside the trained region by {distance:.2g} widths" if run.trust < 1.0 else ""
             run.error_um = run.free_um
             if a.updater is not None and run.learned is not None and math.isfinite(run.free_um):
@@ -280,6 +292,10 @@ class Compensator:
         total_um = measured_um - run.safety.sent_um  # the machine's own error: what is left less what was added
         known, row = run.learned, (run.at_s, run.free_um, run.scaled)
         expected_um, sd_um, _ = a.updater.step(known, *row)
+        if a.share < 1.0 and not known.mean.any():  # the first reading also finds what the share leaves out
+            left_out_um2, own_um2 = (run.free_um * (1.0 / a.share - 1.0)) ** 2, sd_um**2 - a.updater.noise_um2
+            known = replace(known, cov=known.cov * (1.0 + left_out_um2 / max(own_um2, _LEAST_UM2)))
+            expected_um, sd_um, _ = a.updater.step(known, *row)
         off_um = total_um - expected_um
         if not abs(off_um) <= _ODD_READING_SD * sd_um:
             again = abs(off_um - run.odd_um) <= _ODD_READING_SD * sd_um

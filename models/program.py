@@ -120,6 +120,16 @@ class Program:
 
         return run
 
+    def scaled(self, share: float) -> Self:
+        """This program with `share` times its outputs."""
+        size = [self.nodes[k].size for k in self.outputs]
+        parts = [
+            Node("affine", (k,), n, {"matrix": share * np.eye(n), "offset": np.zeros(n)})
+            for k, n in zip(self.outputs, size, strict=True)
+        ]
+        outputs = tuple(range(len(self.nodes), len(self.nodes) + len(parts)))
+        return replace(self, nodes=(*self.nodes, *parts), outputs=outputs)
+
     @property
     def width(self) -> int:
         """Number o of output values."""

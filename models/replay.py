@@ -78,7 +78,7 @@ class Retraining:
         n_batches: runs that it learned from.
         before, after: versions of the champion, None without one.
         version: what was registered, None where nothing was.
-        outcome: champion, challenger, unchanged, or "not trained".
+        outcome: champion, provisional, challenger, unchanged, or "not trained".
         why: the sentence of the promotion.
         expected_S_um, bound90_S_um: error of a run in the next season as the champion after it states it.
     """

@@ -167,6 +167,11 @@ class Updater:
         best = minimize(missed, centre, method="L-BFGS-B", bounds=[(c - reach, c + reach) for c in centre]).x
         return cls(tracks[0].inputs.shape[1], dict(zip(_SHARES, np.exp(best).tolist(), strict=True)))
 
+    @property
+    def noise_um2(self) -> float:
+        """Variance of the noise of a reading."""
+        return self.variance_um2["noise"]
+
     def begin(self) -> State:
         """State before the first row of a run."""
         v = self.variance_um2

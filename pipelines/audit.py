@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
 CHAMPION = "champion"
+PROVISIONAL = "provisional"  # of a version that is better than no model, but not beyond doubt; only without a champion
 Action = Literal["promote", "rollback"]
 When = str | date | datetime
 _KEY = re.compile(r"thermodrift\.log\.(\d+)\.[0-9a-f]+")
@@ -93,8 +94,8 @@ class Reign:
 class Log:
     """The entries of a registered model, oldest first, and for each whether it was carried out.
 
-    `champion` is the version that the alias names now. `trouble` is the one line on an entry that cannot be read, which
-    leaves the champions unknown; empty where all can be read.
+    `champion` and `provisional` are the versions that these aliases name now. `trouble` is the one line on an entry
+    that cannot be read, which leaves the champions unknown; empty where all can be read.
     """
 
     model: str
@@ -104,6 +105,7 @@ class Log:
     entries: tuple[Entry, ...]
     carried_out: tuple[bool, ...]
     trouble: str = ""
+    provisional: int | None = None
 
     @property
     def reigns(self) -> list[Reign]:
@@ -163,7 +165,7 @@ def move_champion(
     model = client.get_registered_model(name)
     number = 1 + max((int(m[1]) for key in model.tags if (m := _KEY.fullmatch(key))), default=0)
     entry = Entry(
-        when=now(), who=who(), host=platform.node(), action=action, model=name, from_version=_champion(model),
+        when=now(), who=who(), host=platform.node(), action=action, model=name, from_version=_named(model, CHAMPION),
         to_version=int(version), why=why[:_MAX_WHY], forced=forced, training_id=training_id, code_version=code_version,
     )  # fmt: skip
     key = f"thermodrift.log.{number:06d}.{uuid.uuid4().hex[:12]}"
@@ -188,12 +190,12 @@ def read(model: RegisteredModel) -> Log:
                 continue
             keyed.append((int(match[1]), entry.when, key, entry))
     keyed.sort(key=lambda k: k[:3])
-    entries, champion = [k[3] for k in keyed], _champion(model)
+    entries, champion = [k[3] for k in keyed], _named(model, CHAMPION)
     named = [*(e.from_version for e in entries[1:]), champion]
     carried = [k[2] + _DONE in model.tags or k[3].to_version == n for k, n in zip(keyed, named, strict=False)]
     tags = model.tags
     return Log(model.name, tags.get("machine", ""), tags.get("target", ""), champion, tuple(entries), tuple(carried),
-               trouble)  # fmt: skip
+               trouble, _named(model, PROVISIONAL))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -260,8 +262,8 @@ def _parsed(at: When) -> date | datetime:
         return datetime.fromisoformat(at.strip())
 
 
-def _champion(model: RegisteredModel) -> int | None:
-    version = model.aliases.get(CHAMPION)
+def _named(model: RegisteredModel, alias: str) -> int | None:
+    version = model.aliases.get(alias)
     return None if version is None else int(version)
 
 

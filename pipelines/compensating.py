@@ -26,7 +26,7 @@ from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from features.rises import feature_unit
-from pipelines.model_store import FILES, StoredModel, load
+from pipelines.model_store import FILES, StoredModel, is_champion, load
 from pipelines.settings import home
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
@@ -50,8 +50,42 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     lever_mm = max(abs(end - program.reference_mm) for end in ends_mm) if ends_mm else _LEVER_MM
     return AxisModel(
         family.target, program, family.inputs, tuple(feature_unit(empty, i) for i in family.inputs), stored.region,
-        stored.region.program(channels, period_s), stored.bound, stored.updater, limits, lever_mm,
+        stored.region.program(channels, period_s), stored.bound, stored.updater, limits, lever_mm, stored.authority,
+        stored.remark,
     )  # fmt: skip
+
+
+def labelled(names: Sequence[str], models: Sequence[StoredModel]) -> str:
+    """The models by name, each with its remark."""
+    return ", ".join(f"{n} ({m.remark})" if m.remark else n for n, m in zip(names, models, strict=True))
+
+
+def check_standing(models: Mapping[str, StoredModel], provisional: bool) -> None:
+    """Refuse models that may not act on a machine, by the names they were given.
+
+    A refused model acts only as the champion of a registry: nothing but `promote --force` makes it that, and the log
+    keeps who did it.
+
+    Args:
+        provisional: the operator accepts provisional models.
+
+    Raises:
+        InputError: a provisional model without the switch, or a refused one.
+    """
+    for name, m in models.items():
+        if m.standing == "provisional" and not provisional:
+            S_um, bound_um = (float(m.info.get(f"expected_S_{k}um", math.nan)) for k in ("", "bound90_"))
+            raise InputError(
+                f"model {name} is provisional: better than no model in most forward runs, not shown beyond doubt; it "
+                f"would act with {m.authority:g} of its correction, expected S {S_um:.2g} µm, 90 % below "
+                f"{bound_um:.2g} µm; add --provisional to accept that, or train on more runs"
+            )
+        if m.standing == "refused" and not is_champion(name):
+            raise InputError(
+                f"model {name} is refused: {m.info.get('caution') or 'not shown to be better than no model'}; train on "
+                "more runs; `thermodrift promote --force` makes it the champion all the same, and "
+                "models:/NAME@champion then acts with its whole correction"
+            )
 
 
 def compensator(
@@ -218,18 +252,29 @@ def rehearse_models(
 
 
 def write_export(
-    models: Mapping[str, Path], to: str, out: Path | None = None, given: Given | None = None, period_s: float = PERIOD_S
+    models: Mapping[str, Path],
+    to: str,
+    out: Path | None = None,
+    given: Given | None = None,
+    period_s: float = PERIOD_S,
+    provisional: bool = False,
 ) -> tuple[Export, list[Path]]:
     """Writes the models of one machine, folders by the names they are given, in one of the forms of `EXPORTS`.
+
+    Args:
+        provisional: see `check_standing`.
 
     Returns:
         What the files state, and the files.
 
     Raises:
-        InputError: an unknown form, models of different machines, or a family that the form cannot express.
+        InputError: an unknown form, models of different machines, a family that the form cannot express, or a model
+            that may not act.
     """
     exporter = EXPORTS[to]()
-    export = export_of({name: load(folder) for name, folder in models.items()}, models, given or Given(), period_s)
+    stored = {name: load(folder) for name, folder in models.items()}
+    check_standing(stored, provisional)
+    export = export_of(stored, models, given or Given(), period_s)
     return export, exporter.write(export, out or home() / "export" / export.machine)
 
 
@@ -248,7 +293,10 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
     axes = []
     for stored, made in zip(models.values(), running.axes, strict=True):
         trained = {c: (low, high) for c, (low, high) in stored.info.get("trained", {}).items()}
-        axes.append(ExportedAxis(made.axis, made.program, trained, made.limits))
+        # A file for a control has no place for a share: its outputs are the share of the error.
+        program = made.program if made.share == 1.0 else made.program.scaled(made.share)
+        remark = made.remark + ("; its outputs are that share" if made.share < 1.0 else "")
+        axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark))
     first = next(iter(models.values()))
     return Export(
         machine=first.machine.machine, model=", ".join(models), version=str(first.info.get("training_id", "")),

@@ -27,11 +27,11 @@ class FleetView:
 def fleet_view(home: Path, channels: Sequence[Mapping[str, Any]], now: datetime | None = None) -> FleetView:
     """The view of `channels` (see `watching.refresh`) at `now`.
 
-    A row: machine, channel, model, version (None: no champion), cell, family, since, trained_at, age_days (since the
-    training), reason, simulated, last_seen and seen_days_ago, expected_S_um, bound90_S_um, newer_S_um (a list),
-    newer_S_mean_um, drift (of it to the bound), outside_runs, of_runs, outside_why, sensors, next_run, schedule,
-    scheduled (a process serves it now), last_run and last_failure (began, ended, ok, summary), alerts (texts),
-    rules (theirs), unknown.
+    A row: machine, channel, model, version (None: no champion), provisional (its version, None: there is none), cell,
+    family, since, trained_at, age_days (since the training), reason, simulated, last_seen and seen_days_ago,
+    expected_S_um, bound90_S_um, newer_S_um (a list), newer_S_mean_um, drift (of it to the bound), outside_runs,
+    of_runs, outside_why, sensors, next_run, schedule, scheduled (a process serves it now), last_run and last_failure
+    (began, ended, ok, summary), alerts (texts), rules (theirs), unknown.
     """
     now = now or datetime.now(UTC)
     plans: dict[str, dict[str, Any]] = {}
@@ -72,8 +72,8 @@ def _row(state: Mapping[str, Any], plan: Mapping[str, Any], run: Mapping[str, An
     known = [r for r in state["runs"][-rules.of_runs :] if r["distance"] is not None]
     outside = [r for r in known if r["outside"]]
     newest = state["runs"][-1]["batch_id"] if state["runs"] else None
-    keys = ("machine", "channel", "model", "version", "cell", "family", "since", "trained_at", "reason", "simulated",
-            "last_seen", "expected_S_um", "bound90_S_um", "expected_by", "n_seen", "unknown")  # fmt: skip
+    keys = ("machine", "channel", "model", "version", "provisional", "cell", "family", "since", "trained_at", "reason",
+            "simulated", "last_seen", "expected_S_um", "bound90_S_um", "expected_by", "n_seen", "unknown")  # fmt: skip
     return {
         **{k: state[k] for k in keys},
         "age_days": days_since(state["trained_at"], now),
@@ -93,8 +93,9 @@ def _untrained(machine: str) -> Mapping[str, Any]:
     texts = dict.fromkeys(
         ("channel", "model", "cell", "family", "since", "trained_at", "reason", "last_seen", "expected_by"), ""
     )
-    return {**texts, "machine": machine, "version": None, "simulated": False, "expected_S_um": None,
-            "bound90_S_um": None, "n_seen": 0, "runs": [], "sensors": [], "unknown": "nothing ingested"}  # fmt: skip
+    return {**texts, "machine": machine, "version": None, "provisional": None, "simulated": False,
+            "expected_S_um": None, "bound90_S_um": None, "n_seen": 0, "runs": [], "sensors": [],
+            "unknown": "nothing ingested"}  # fmt: skip
 
 
 def _worst_first(row: Row) -> tuple[Any, ...]:

@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 from zipfile import BadZipFile
 
 import numpy as np
@@ -21,17 +22,20 @@ from numpy.typing import NDArray
 from compensation.substitutes import Substitutes
 from data.arrays import Array
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, one_of
 from data.machine import Machine, parse_machine
 from models.base import Family, family_from_plain
 from models.conformal import RunBound
 from models.trust import SLACK, Region, disagreement_um, farthest, watched
 from models.updating import Updater
+from pipelines.audit import CHAMPION
 
 SCHEMA = "thermodrift.model/3"
 _READABLE = ("thermodrift.model/2", SCHEMA)  # /2 had no bounds of a run
+_REGISTERED = re.compile(r"^models:/(?P<name>[^/@]+)(?:@(?P<alias>.+)|/(?P<version>.+))?$")
 FILES = ("model.json", "arrays.npz", "machine.yml")
 SERVED = ("serving.json", "model.onnx", "region.onnx")  # only of families that are programs
+Standing = Literal["champion", "provisional", "refused"]
 _AGAIN = "load the model from the registry again, or promote it again"
 
 
@@ -60,6 +64,30 @@ class StoredModel:
     @property
     def simulated(self) -> bool:
         return bool(self.info.get("simulated", False))
+
+    @property
+    def standing(self) -> Standing:
+        """What its forward runs have shown: fit to be champion, better than no model but not beyond doubt, or neither.
+
+        Raises:
+            InputError: another word, which a program of another version may have stored.
+        """
+        older = "refused" if self.info.get("trusted") is False else "champion"  # has no standing
+        return one_of(str(self.info.get("standing", older)), get_args(Standing), "standing of a model")
+
+    @property
+    def authority(self) -> float:
+        """Share of its correction that is sent. A refused model has none measured: by force it acts as a whole."""
+        if self.standing == "refused":
+            return 1.0
+        return float(self.info.get("authority", 1.0 if self.standing == "champion" else 0.0))
+
+    @property
+    def remark(self) -> str:
+        """What every record and file of it states; empty for a champion."""
+        if self.standing == "provisional":
+            return f"provisional model: {self.authority:g} of the correction"
+        return "" if self.standing == "champion" else "refused model: not shown to be better than none"
 
     def channels(self) -> tuple[str, ...]:
         """The channels that a recording must have: those of the inputs, and what drives it as `fitted` names it."""
@@ -123,6 +151,18 @@ class StoredModel:
     def _column(self, channel: str) -> str | int:
         part = self.machine.channels.get(channel)
         return channel if part is None or part.column is None else part.column
+
+
+def registered(uri: str) -> tuple[str, str] | None:
+    """Name, and alias or version, of ``models:/NAME@alias``; a name alone means its champion. None: another form."""
+    match = _REGISTERED.match(uri)
+    return None if match is None else (match["name"], match["alias"] or match["version"] or CHAMPION)
+
+
+def is_champion(uri: str) -> bool:
+    """Whether the champion of a registry is meant, as such."""
+    named = registered(uri)
+    return named is not None and named[1] == CHAMPION
 
 
 def save(

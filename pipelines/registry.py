@@ -1,4 +1,4 @@
-"""The model registry: versions in MLflow, promotion, the aliases champion and challenger, roll-back, and its status."""
+"""The model registry: versions in MLflow, promotion, aliases (champion, provisional, challenger), roll-back, status."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version as installed
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import mlflow
 import pandas as pd
@@ -25,7 +25,7 @@ from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
 
 from data.batch import Batch
-from data.errors import InputError, closest
+from data.errors import InputError, closest, one_of
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.conformal import RunBound
@@ -35,14 +35,14 @@ from models.promotion import Choice, Comparison, compare_paired, left_out
 from models.result import GridResult
 from models.trust import Region
 from pipelines import audit, fitted_model, model_store, pyfunc_model, store
-from pipelines.audit import CHAMPION
+from pipelines.audit import CHAMPION, PROVISIONAL
 from pipelines.runs import close_interrupted, code_version, model_versions, models_with_versions, registered_models
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
 _MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 _SERVED_PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")  # of a family that is an ONNX file
-Outcome = Literal["champion", "challenger", "unchanged"]
+Outcome = Literal["champion", "provisional", "challenger", "unchanged"]
 OUTCOME = "outcome"  # the last tag of a version; what lacks it was interrupted
 _INTERRUPTED = "its promotion was interrupted; `thermodrift promote` or the next training finishes it"
 
@@ -52,8 +52,8 @@ class Promotion:
     """The outcome for a training's best cell. `version` holds its model; `champion_version` is the champion now, None
     where no model is trustworthy. `outlook` is the error to expect in the next season.
 
-    `against` is the version that it was compared with, `obstacle` the reason why no comparison was possible; `caution`
-    and the nested score are the choice's (see `promotion.Choice`).
+    `against` is the version that it was compared with, `obstacle` the reason why no comparison was possible; `caution`,
+    `standing`, `authority` and the nested score are the choice's (see `promotion.Choice`).
     """
 
     outcome: Outcome
@@ -70,6 +70,8 @@ class Promotion:
     nested_S_mean_um: float = float("nan")
     nested_S_std_um: float = float("nan")
     outlook: Outlook | None = None
+    standing: str = "champion"
+    authority: float = 1.0
 
     @property
     def trusted(self) -> bool:
@@ -112,7 +114,9 @@ class Newcomer:
         """Same batches (id and content), same cell, same meaning of the machine file: same fingerprint."""
         table, choice = self.result.batches, self.choice
         seen = sorted((str(b), str(d)) for b, d in zip(table["batch_id"], table["digest"], strict=True))
-        cell = [choice.protocol, choice.cell, list(choice.inputs)]
+        cell: list[Any] = [choice.protocol, choice.cell, list(choice.inputs)]
+        if choice.standing == PROVISIONAL:  # a version that another rule has refused stays refused
+            cell += [PROVISIONAL, choice.authority]
         content = json.dumps([seen, *cell, yaml.safe_load(self.machine_yaml)], sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -139,7 +143,7 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
         same = [v for v in model_versions(client, name) if v.tags.get("fingerprint") == fingerprint]
         begun = next((v for v in same if _is_unfinished(client, v, new.training_id)), None)
         done = [v for v in same if OUTCOME in v.tags]
-        if begun is None and done and (champion is not None or force or not new.choice.trusted):
+        if begun is None and done and (champion is not None or force or _standing(new.choice) != CHAMPION):
             outcome = _keep(client, done[0], champion, new, force)
             known = done[0].tags.get("training_id") == new.training_id and not force  # what became of it is recorded
         else:
@@ -173,6 +177,7 @@ def _keep(
     return Promotion(
         "unchanged", name, int(version), None if stays is None else int(stays.version), choice.cell, choice.caution,
         summary, nested_S_mean_um=choice.nested_S_mean_um, nested_S_std_um=choice.nested_S_std_um, outlook=new.outlook,
+        standing=_standing(choice), authority=choice.authority,
     )  # fmt: skip
 
 
@@ -185,11 +190,11 @@ def _register(
     force: bool,
     begun: ModelVersion | None,
 ) -> Promotion:
-    """A version, compared with the champion, as champion or challenger.
+    """A version, compared with the champion, as champion, challenger or, where there is none, provisional.
 
     In this order: the model's files, the version with all its tags, the alias, the outcome on the version, the outcome
     on the training (in `promote`). After an interruption between any two the next call goes on with the version that
-    is there (`begun`): what lacks an outcome is neither champion nor challenger unless an alias names it.
+    is there (`begun`): what lacks an outcome is none of them unless an alias names it.
 
     Args:
         champion: what the alias names now, which may be `begun` itself.
@@ -203,13 +208,21 @@ def _register(
     comparison, obstacle, why = None, "", "first model of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
-    if not choice.trusted:
+    if _standing(choice) == PROVISIONAL:
+        why = f"better than no model, not shown beyond doubt; {choice.authority:g} of the correction is supported"
+    elif not choice.trusted:
         why = "no trustworthy model"
     why = f"by force; {why}" if force and (champion is not None or not choice.trusted) else why
     better = champion is None or (comparison is not None and comparison.better)
-    replaces = settled == CHAMPION if settled else force or (choice.trusted and better)
-    outcome: Outcome = "champion" if replaces else "challenger"
-    reason = why if choice.trusted else f"{why}, {choice.caution}"
+    outcome: Outcome = "challenger"
+    if settled:
+        outcome = one_of(settled, get_args(Outcome), OUTCOME)
+    elif force or (_standing(choice) == CHAMPION and better):
+        outcome = "champion"
+    elif champion is None and choice.standing == PROVISIONAL:
+        outcome = "provisional"
+    replaces = outcome == CHAMPION
+    reason = f"{why}, {choice.caution}" if choice.caution else why
     against = "" if champion is None else str(champion.version)
     tags = {"reason": reason, "against": against, "replaces": against if replaces else ""}
     if begun is None:
@@ -223,14 +236,19 @@ def _register(
         if replaces:
             _crown(client, name, version, reason, new.training_id, force)
         else:
-            client.set_registered_model_alias(name, CHALLENGER, version)
+            client.set_registered_model_alias(name, outcome, version)
     client.set_model_version_tag(name, version, OUTCOME, outcome)
     return Promotion(
         outcome, name, int(version), int(version) if replaces else None if champion is None else int(champion.version),
         choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
-        choice.nested_S_std_um, new.outlook,
+        choice.nested_S_std_um, new.outlook, _standing(choice), choice.authority,
     )  # fmt: skip
+
+
+def _standing(choice: Choice) -> str:
+    """A choice with a caution is no champion."""
+    return "refused" if choice.caution and choice.standing == CHAMPION else choice.standing
 
 
 def _alias_of(champion: ModelVersion | None, begun: ModelVersion) -> str:
@@ -251,7 +269,8 @@ def _info(new: Newcomer) -> dict[str, Any]:
         "leave_batch_out_S_std_um": expected.leave_batch_out_std_um, "expected": expected.summary,
         "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
         "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary, "trained_at": _now(),
-        "trusted": choice.trusted, "caution": choice.caution,
+        "trusted": choice.trusted, "caution": choice.caution, "standing": _standing(choice),
+        "authority": choice.authority,
     }  # fmt: skip
 
 
@@ -289,18 +308,19 @@ def rollback(name: str, settings: Settings, reason: str = "") -> Promotion:
         client.set_model_version_tag(name, present.version, "rolled_back", "true")
     summary = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
     return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
-                     back.tags.get("caution", ""), summary)  # fmt: skip
+                     back.tags.get("caution", ""), summary, standing=back.tags.get("standing", CHAMPION),
+                     authority=float(back.tags.get("authority", "1")))  # fmt: skip
 
 
 def status(settings: Settings) -> pd.DataFrame:
     """Every version of every model: name, version, aliases, expected_S_um, expected_S_bound90_um and expected_by (the
     protocol) of a run in the next season, leave_batch_out_S_mean_um, cell, score_um, n_batches, trained_at, simulated,
-    trusted, reason, was_champion_until (UTC, by the log of champions; empty for the champion), training_id; newest
-    version first within a name."""
+    trusted, standing (champion, provisional or refused, by its training), reason, was_champion_until (UTC, by the log
+    of champions; empty for the champion), training_id; newest version first within a name."""
     client = open_store(settings)
     numbers = ["expected_S_um", "expected_S_bound90_um", "leave_batch_out_S_mean_um", "score_um"]
     columns = ["name", "version", "aliases", "machine", "target", *numbers[:2], "expected_by", *numbers[2:3], "cell",
-               "score_um", "n_batches", "trained_at", "simulated", "trusted", "expected", "reason",
+               "score_um", "n_batches", "trained_at", "simulated", "trusted", "standing", "expected", "reason",
                "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
@@ -316,6 +336,7 @@ def status(settings: Settings) -> pd.DataFrame:
                     "aliases": ", ".join(aliases), **{n: float(tags.get(n, "nan")) for n in numbers},
                     "n_batches": int(tags.get("n_batches", 0)), "simulated": tags.get("simulated") == "true",
                     "trusted": tags.get("trusted") != "false",
+                    "standing": tags.get("standing") or ("refused" if tags.get("trusted") == "false" else CHAMPION),
                     "was_champion_until": "" if until is None else until.isoformat(timespec="seconds"),
                 })  # fmt: skip
     table = pd.DataFrame(rows, columns=columns)
@@ -349,10 +370,11 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
         return client.get_model_version_by_alias(name, which)
     versions = {str(v.version): v for v in model_versions(client, name)}
     if which == CHAMPION and versions:
-        newest = next(iter(versions.values()))
+        newest, provisional = next(iter(versions.values())), model.aliases.get(PROVISIONAL)
+        usable = f"; version {provisional} is provisional: models:/{name}@{PROVISIONAL}" if provisional else ""
         raise InputError(
             f"model {name!r} has no champion: {newest.tags.get('reason', 'none was promoted')}; name a version "
-            f"({', '.join(versions)}), or promote one by force"
+            f"({', '.join(versions)}), or promote one by force{usable}"
         )
     if which not in versions:
         kind = "version" if which.isdigit() else "alias"
@@ -418,8 +440,9 @@ def _crown(client: MlflowClient, name: str, version: str, why: str, training_id:
         client, name, version, action="promote", why=why, training_id=training_id, code_version=code_version(),
         forced=forced,
     )  # fmt: skip
-    if CHALLENGER in client.get_registered_model(name).aliases:  # it lost to an older champion
-        client.delete_registered_model_alias(name, CHALLENGER)
+    # A challenger lost to an older champion, and a provisional version stands in for one.
+    for alias in {CHALLENGER, PROVISIONAL} & client.get_registered_model(name).aliases.keys():
+        client.delete_registered_model_alias(name, alias)
 
 
 def _by_alias(client: MlflowClient, name: str, alias: str) -> ModelVersion | None:

@@ -236,7 +236,7 @@ def training_files(folder: Path, result: GridResult, figures: Mapping[str, bytes
 
 def trainings(machine: str | None = None, target: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
     """Finished trainings, newest first: training_id, machine, target, started, n_batches, best, score_um, simulated,
-    promotion (champion, challenger, unchanged or empty), model. Empty where there is none.
+    promotion (champion, provisional, challenger, unchanged or empty), model. Empty where there is none.
 
     Raises:
         WorkError: the store does not answer.

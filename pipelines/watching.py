@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pipelines.model_store import StoredModel
     from pipelines.settings import Settings
 
-SCHEMA = "thermodrift.status/1"
+SCHEMA = "thermodrift.status/2"
 KEPT_RUNS = 20  # of each channel, the newest
 _STATUS = "status.json"
 _VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE", "MLFLOW_TRACKING_URI")
@@ -36,7 +36,7 @@ _VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE", "MLFLOW_TRACKING_URI")
 
 @dataclass(frozen=True)
 class Champion:
-    """A champion as the registry has it; `version` None: the model has none, and `reason` says why."""
+    """A champion as the registry has it; `version` None: the model has none, then `provisional` may stand in for it."""
 
     name: str
     target: str
@@ -44,11 +44,12 @@ class Champion:
     since: str
     source: str
     tags: Mapping[str, str]
+    provisional: int | None = None
 
     @property
     def mark(self) -> list[Any]:
         """What the state of its channel depends on."""
-        return [self.name, self.version, self.source]
+        return [self.name, self.version, self.source, self.provisional]
 
 
 def warm() -> dict[str, Any] | None:
@@ -123,7 +124,7 @@ def _champions(settings: Settings) -> dict[str, list[Champion]]:
                 source, tags = str(v.source), dict(v.tags)
                 reigns = [r for r in log.reigns if r.until is None]
                 since = reigns[-1].since.isoformat(timespec="seconds") if reigns else tags.get("trained_at", "")
-            champion = Champion(model.name, log.target, version, since, source, tags)
+            champion = Champion(model.name, log.target, version, since, source, tags, log.provisional)
             found.setdefault(log.machine, []).append(champion)
     return found
 
@@ -176,10 +177,11 @@ def _gathered(
 def _channel(
     settings: Settings, machine: str, c: Champion, model: StoredModel | None, batches: Sequence[Batch], trouble: str
 ) -> dict[str, Any]:
-    """A channel: machine, channel, model; of the champion: version, cell, since, trained_at, reason, the error to
-    expect; `seen`: runs that it was trained on, with the last one's start; `runs`: the newest runs in the lake, oldest
-    first, with their distance from the trained region in widths and, where they are newer than the training, the
-    champion's S; `sensors`: channels without usable values in them; `unknown`: why something could not be found out."""
+    """A channel: machine, channel, model, provisional; of the champion: version, cell, since, trained_at, reason, the
+    error to expect; `seen`: runs that it was trained on, with the last one's start; `runs`: the newest runs in the
+    lake, oldest first, with their distance from the trained region in widths and, where they are newer than the
+    training, the champion's S; `sensors`: channels without usable values in them; `unknown`: why something could not be
+    found out."""
     from pipelines.tracking import load_training
 
     ids, starts = set[str](), list[str]()
@@ -192,7 +194,7 @@ def _channel(
     last_seen = starts[-1] if starts else ""
     runs = [_run(b, c, model, ids, last_seen) for b in batches[-KEPT_RUNS:]]
     return {
-        "machine": machine, "channel": c.target, "model": c.name, "version": c.version,
+        "machine": machine, "channel": c.target, "model": c.name, "version": c.version, "provisional": c.provisional,
         "cell": c.tags.get("cell", ""), "family": c.tags.get("family", ""), "since": c.since,
         "trained_at": c.tags.get("trained_at", ""), "reason": c.tags.get("reason", ""),
         "simulated": any(b.simulated for b in batches) or c.tags.get("simulated") == "true",

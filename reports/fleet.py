@@ -42,7 +42,7 @@ class FleetRow:
     machine: str
     channel: str
     simulated: bool
-    state: str  # alert, none (no champion) or ok
+    state: str  # alert, none (no champion, at best provisional) or ok
     state_label: str
     champion: FleetCell
     seen: FleetCell
@@ -119,13 +119,15 @@ def fleet_page(
 def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:
     has = r["version"] is not None
     state = "alert" if r["alerts"] else "ok" if has else "none"
-    label = count(len(r["alerts"]), "alert") if r["alerts"] else "ok" if has else "no champion"
+    lacking = "none" if r["provisional"] is None else f"v{r['provisional']} provisional"
+    badge = "ok" if has else "no champion" if r["provisional"] is None else "provisional"
+    label = count(len(r["alerts"]), "alert") if r["alerts"] else badge
     newer, bound = r["newer_S_mean_um"], r["bound90_S_um"]
     drifted = newer is not None and bound is not None and newer > bound
     seen = r["last_seen"] or ""
     return FleetRow(
         r["machine"], r["channel"], r["simulated"], state, label,
-        FleetCell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else FleetCell("none", r["reason"]),
+        FleetCell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else FleetCell(lacking, r["reason"]),
         FleetCell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
                   "old_champion" in r["rules"]),
         FleetCell(*_expected(r)),

@@ -101,7 +101,7 @@ def train(
         recordings: files and folders to ingest first; default: what the lake holds.
         channels: error channels to learn; default: all.
         plan: selectors, families, protocols and effort; default: ``Plan()``.
-        promote: register the best cell, as champion or challenger.
+        promote: register the best cell, as champion, provisional or challenger.
 
     Returns:
         The results by channel, ids of trainings, promotions, and the path of the report.
@@ -223,7 +223,7 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
 
     Returns:
         batch_id, time_s (s), predicted_um (µm, relative to the batch's start), outside_region, outside_of, distance,
-        expected_S_um, bound90_S_um, flagged, simulated; for an error along an axis position_mm as well.
+        expected_S_um, bound90_S_um, flagged, simulated, standing; for an error along an axis position_mm as well.
 
     Raises:
         InputError: a model or file that cannot be used, or a missing input.
@@ -264,7 +264,7 @@ def rehearse(
     Raises:
         InputError: models, recordings or failures that cannot be used.
     """
-    from pipelines.compensating import Given, rehearse_models
+    from pipelines.compensating import Given, labelled, rehearse_models
     from pipelines.recordings import read_files
 
     names = _uris(models)
@@ -275,7 +275,7 @@ def rehearse(
     if out is not None:
         from reports.rehearsal import write_rehearsal
 
-        write_rehearsal(Path(out), done, ", ".join(map(str, names)))
+        write_rehearsal(Path(out), done, labelled([str(n) for n in names], known))
     return done
 
 
@@ -319,15 +319,16 @@ def replay(
     )  # fmt: skip
 
 
-def export(models: Paths, to: str, out: Path | str | None = None) -> list[Path]:
+def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = False) -> list[Path]:
     """Write models for a control or another program: c, st, onnx, json, sinumerik, heidenhain or fanuc.
 
     Args:
         models: what `load_model` takes, one for each axis of one machine.
         out: folder of the files; None: below the home.
+        provisional: accept models that are better than none, but not shown beyond doubt.
 
     Raises:
-        InputError: an unknown form, or a family that it cannot express, with those that can.
+        InputError: an unknown form, a family that it cannot express, with those that can, or a model that may not act.
     """
     from pipelines.commands.predict import model_folder
     from pipelines.compensating import write_export
@@ -335,7 +336,7 @@ def export(models: Paths, to: str, out: Path | str | None = None) -> list[Path]:
 
     configure_environment()
     folders = {str(m): model_folder(str(m), load()) for m in _uris(models)}
-    return write_export(folders, to, None if out is None else Path(out))[1]
+    return write_export(folders, to, None if out is None else Path(out), provisional=provisional)[1]
 
 
 def registry(

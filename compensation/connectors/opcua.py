@@ -55,10 +55,11 @@ class Nodes(BaseModel):
     offsets_um: dict[str, str] = {}  # axis -> node
     slopes_um_per_m: dict[str, str] = {}
     states: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     state: str | None = None
     heartbeat: str | None = None
 
-    @field_validator("values", "readings", "offsets_um", "slopes_um_per_m", "states", "state", "heartbeat")
+    @field_validator("values", "readings", "offsets_um", "slopes_um_per_m", "states", "reasons", "state", "heartbeat")
     @classmethod
     def _node_ids(cls, given: Any) -> Any:
         for node_id in given.values() if isinstance(given, dict) else [given] if given is not None else []:
@@ -85,6 +86,7 @@ def _load_nodes(path: str, machine: Machine, where: str) -> Nodes:
         "offsets_um": errors,
         "slopes_um_per_m": errors,
         "states": errors,
+        "reasons": errors,
     }
     for section, names in known.items():
         for name in getattr(nodes, section):
@@ -288,6 +290,8 @@ class OpcUaSink:
           z: ns=2;s=Comp.Z.Slope
         states:                    # axis: node (String), `off`, `warm-up`, `active`, `hold` or `fade-out`
           z: ns=2;s=Comp.Z.State
+        reasons:                   # axis: node (String), why it is not active or acts in part; what its model is
+          z: ns=2;s=Comp.Z.Reason
         state: ns=2;s=Comp.State   # String, the state with most authority among the axes
         heartbeat: ns=2;s=Comp.Beat  # any integer: counts the corrections, from 0 again after the largest
 
@@ -308,6 +312,7 @@ class OpcUaSink:
             **{f"offset {axis}": node for axis, node in nodes.offsets_um.items()},
             **{f"slope {axis}": node for axis, node in nodes.slopes_um_per_m.items()},
             **{f"state {axis}": node for axis, node in nodes.states.items()},
+            **{f"reason {axis}": node for axis, node in nodes.reasons.items()},
             **({"state": nodes.state} if nodes.state else {}),
             **({"heartbeat": nodes.heartbeat} if nodes.heartbeat else {}),
         }
@@ -364,6 +369,7 @@ class OpcUaSink:
             **{f"offset {axis}": float(v) for axis, v in correction.offset_um.items()},
             **{f"slope {axis}": float(v) for axis, v in correction.slope_um_per_m.items()},
             **{f"state {axis}": v for axis, v in correction.state.items()},
+            **{f"reason {axis}": v for axis, v in correction.reasons.items()},
             "state": overall_state(correction),
         }
         if "heartbeat" in self._wanted:

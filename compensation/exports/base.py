@@ -52,12 +52,14 @@ class AxisModel:
         program: its outputs are the error in µm and, with `along`, the slope in µm/mm.
         region: channel → least and greatest trained value as recorded (not as a rise), in the program's unit.
         limits: of the correction.
+        remark: on the model; empty: none.
     """
 
     axis: str
     program: Program
     region: Mapping[str, tuple[float, float]]
     limits: Limits
+    remark: str = ""
 
     @property
     def step_um(self) -> float:
@@ -122,6 +124,7 @@ class AxisModel:
         }
         return {
             "axis": self.axis,
+            "remark": self.remark,
             "inputs": inputs,
             "outputs": [{"name": name, "unit": unit} for name, unit in self.output_units.items()],
             "position": position,
@@ -176,6 +179,7 @@ class Export:
         lines = [
             f"thermodrift: thermal error of machine {self.machine}",
             *["SIMULATED: trained on simulated recordings; not for a real machine."] * self.simulated,
+            *(f"axis {a.axis}: {a.remark}" for a in self.axes if a.remark),
             f"model {self.model}, version {self.version}, created {self.created}",
             f"sha256 {self.digest}",
             f"Sign: {SIGN}",

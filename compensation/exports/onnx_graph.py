@@ -49,6 +49,7 @@ def metadata(export: Export, axis: AxisModel) -> dict[str, str]:
     return {
         **{key: value if isinstance(value, str) else json.dumps(value) for key, value in export.described().items()},
         "axis": axis.axis,
+        "remark": axis.remark,
         **channels,
         **rest,
         "fallback": stated["fallback"],

@@ -14,6 +14,9 @@ MaxOffset = Annotated[
     float | None, typer.Option("--max-um", help="largest offset sent, µm; default: the training's largest error + 25 %")
 ]
 Rate = Annotated[float, typer.Option("--rate-um-per-s", help="largest rate of what is sent, µm/s")]
+Provisional = Annotated[
+    bool, typer.Option("--provisional", help="accept a model that is better than none, but not shown beyond doubt")
+]
 Period = Annotated[float, typer.Option("--period-s", help="time between two steps of the models, s")]
 
 
@@ -27,6 +30,7 @@ def compensate(
     period_s: Period = 10.0,
     state: Annotated[Path | None, typer.Option(help="file that survives a restart; default: var/compensation")] = None,
     replay: Annotated[bool, typer.Option(help="time is that of the samples; a CSV file ends at its end")] = False,
+    provisional: Provisional = False,
 ) -> None:
     """Answer the samples of a machine with corrections: limited in size and rate, safe when sensors or networks fail.
 
@@ -36,7 +40,7 @@ def compensate(
     """
     from compensation.connectors import open_sink, open_source
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, StateFile, compensator, serve
+    from pipelines.compensating import Given, StateFile, check_standing, compensator, serve
     from pipelines.settings import configure_environment, home, load
 
     if not period_s > 0:
@@ -44,12 +48,15 @@ def compensate(
     configure_environment()
     settings = load()
     stored = [load_model(m, settings) for m in models]
+    check_standing(dict(zip(models, stored, strict=True)), provisional)
     machine = stored[0].machine
     running = compensator(stored, Given(max_um, rate_um_per_s, sample_s), period_s, console.note)
     source = open_source(given, machine, follow=not replay or not given.endswith(".csv"))
     sinks = [open_sink(address, machine) for address in to or ["-"]]
     kept = StateFile(state or home() / "compensation" / f"{machine.machine}.json") if state or not replay else None
-    labels = ", ".join(f"{a.axis} ±{a.limits.max_offset_um:.3g} µm" for a in running.axes)
+    labels = ", ".join(
+        f"{a.axis} ±{a.limits.max_offset_um:.3g} µm{f' ({a.remark})' if a.remark else ''}" for a in running.axes
+    )
     stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
     console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
     serve(running, source, sinks, kept, console.note, replay)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pipelines import console
-from pipelines.commands.compensate import MaxOffset, Period, Rate
+from pipelines.commands.compensate import MaxOffset, Period, Provisional, Rate
 from pipelines.options import Json
 
 
@@ -19,6 +19,7 @@ def export(
     max_um: MaxOffset = None,
     rate_um_per_s: Rate = 0.1,
     period_s: Period = 10.0,
+    provisional: Provisional = False,
     as_json: Json = False,
 ) -> None:
     """Write a model for a control, as C, as structured text, as ONNX or as JSON, with its limits and its fallback."""
@@ -29,10 +30,11 @@ def export(
     configure_environment()
     settings = load()
     folders = {m: model_folder(m, settings) for m in models}
-    given, paths = write_export(folders, to, out, Given(max_um, rate_um_per_s), period_s)
+    given, paths = write_export(folders, to, out, Given(max_um, rate_um_per_s), period_s, provisional)
+    remarks = [f"{a.axis}: {a.remark}" for a in given.axes if a.remark]
     if as_json:
         console.print_json({"machine": given.machine, "simulated": given.simulated, "sha256": given.digest,
-                            "files": [str(p) for p in paths]})  # fmt: skip
+                            "files": [str(p) for p in paths], "remarks": remarks})  # fmt: skip
         return
-    for path in paths:
-        console.line(path)
+    for text in (*remarks, *paths):
+        console.line(text)

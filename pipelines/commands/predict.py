@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from data.batch import Batch
     from pipelines.model_store import StoredModel
     from pipelines.settings import Settings
-
-_REGISTERED = re.compile(r"^models:/(?P<name>[^/@]+)(?:@(?P<alias>.+)|/(?P<version>.+))?$")
 
 _NAMED = 3  # flagged runs in the summary line
 
@@ -49,7 +46,8 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
         return Path(model_uri)
     from mlflow.exceptions import MlflowException
 
-    from pipelines.registry import CHAMPION, find_version, local_folder
+    from pipelines.model_store import registered
+    from pipelines.registry import find_version, local_folder
     from pipelines.tracking import open_store, store_errors
 
     if model_uri.startswith("runs:/"):
@@ -59,12 +57,12 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
         except MlflowException:
             raise InputError(f"model {model_uri!r}: no run {run_id!r} in {settings.store_name}") from None
         return Path(local_folder(model_uri, settings))
-    match = _REGISTERED.match(model_uri)
-    if match is None:
+    named = registered(model_uri)
+    if named is None:
         raise InputError(f"model {model_uri!r}: expected models:/NAME@alias or models:/NAME/VERSION")
     with store_errors(settings):
         client = open_store(settings)
-        version = find_version(client, match["name"], match["alias"] or match["version"] or CHAMPION)
+        version = find_version(client, *named)
     return Path(local_folder(version.source, settings))
 
 
@@ -95,7 +93,7 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
         NaN where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
         quantities), distance (in widths of the trained range), of the whole run expected_S_um, bound90_S_um (nine runs
         in ten stay below) and flagged (why the run is unlike those that the bound comes from, empty where it is not),
-        simulated (model or recording).
+        simulated (model or recording), standing (of the model: champion, provisional or refused).
 
     Raises:
         InputError: an input of the model is missing.
@@ -111,7 +109,7 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
             "batch_id": batch.batch_id, "time_s": batch.time_s,
             **({"position_mm": batch.masked(along)} if along else {}), "predicted_um": predicted,
             "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
-            **run._asdict(), "simulated": model.simulated or batch.simulated,
+            **run._asdict(), "simulated": model.simulated or batch.simulated, "standing": model.standing,
         }))  # fmt: skip
     return pd.concat(tables, ignore_index=True) if tables else None
 
@@ -128,6 +126,8 @@ def summary(table: pd.DataFrame) -> str:
     expected, most = (_between(runs[c]) for c in ("expected_S_um", "bound90_S_um"))
     number = f"expect S {expected}, 90 % below {most}" if expected else "no expected error is stored; train again"
     parts = [f"{count(len(runs), 'run')}: {number}"]
+    if (standing := table["standing"].iloc[0]) != "champion":
+        parts.insert(0, f"{standing} model")
     flagged = runs[runs["flagged"] != ""]
     for run in flagged[:_NAMED].itertuples():
         may = f": error may exceed {run.bound90_S_um:.2g} µm" if expected else ""

@@ -81,12 +81,14 @@ def look_up(
 
 
 def overview(client: MlflowClient, logs: Sequence[Log]) -> pd.DataFrame:
-    """Every model: model, machine, target, champion (version), since (UTC), action, who, why, versions, note."""
+    """Every model: model, machine, target, champion and provisional (versions), since (UTC), action, who, why,
+    versions, note."""
     import pandas as pd
 
     from pipelines.runs import versions_by_model
 
-    columns = ["model", "machine", "target", "champion", "since", "action", "who", "why", "versions", "note"]
+    columns = ["model", "machine", "target", "champion", "provisional", "since", "action", "who", "why", "versions",
+               "note"]  # fmt: skip
     rows, versions = [], versions_by_model(client)
     for log in logs:
         reign = log.reigns[-1] if log.reigns and log.reigns[-1].version == log.champion else None
@@ -94,8 +96,9 @@ def overview(client: MlflowClient, logs: Sequence[Log]) -> pd.DataFrame:
         entry = reign.entry if reign else None
         rows.append({
             "model": log.model, "machine": log.machine, "target": log.target, "champion": log.champion,
-            "since": entry and entry.when, "action": entry.action if entry else "", "who": entry.who if entry else "",
-            "why": entry.why if entry else "", "versions": len(versions[log.model]), "note": note,
+            "provisional": log.provisional, "since": entry and entry.when, "action": entry.action if entry else "",
+            "who": entry.who if entry else "", "why": entry.why if entry else "", "versions": len(versions[log.model]),
+            "note": note,
         })  # fmt: skip
     return _typed(pd.DataFrame(rows, columns=columns))
 
@@ -243,7 +246,7 @@ def _typed(table: pd.DataFrame) -> pd.DataFrame:
     """Versions as whole numbers that may be missing, times in UTC."""
     import pandas as pd
 
-    for column in {"champion", "version", "from_version", "to_version"} & set(table):
+    for column in {"champion", "provisional", "version", "from_version", "to_version"} & set(table):
         table[column] = table[column].astype("Int64")
     for column in {"when", "since", "until"} & set(table):
         table[column] = pd.to_datetime(table[column], utc=True)
@@ -299,6 +302,7 @@ def _print_overview(table: pd.DataFrame) -> None:
         console.line("no model is registered; `thermodrift train` promotes the first")
     for m in _rows(table):
         now = "no champion" if m["champion"] is None else f"champion version {m['champion']}"
+        now += "" if m["provisional"] is None else f"; version {m['provisional']} is provisional"
         since = f" since {_local(m['since'])} ({m['action']} by {m['who']})" if m["since"] else ""
         note = f"; {m['note']}" if m["note"] else ""
         console.line(f"{m['model']}: {now}{since}; versions: {m['versions']}{note}")

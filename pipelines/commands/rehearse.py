@@ -50,7 +50,7 @@ def rehearse(
     Each recording follows the other after a night. With --through it speaks to a compensation that runs elsewhere.
     """
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, rehearse_models
+    from pipelines.compensating import Given, labelled, rehearse_models
     from pipelines.recordings import check_recordings, read_files
     from pipelines.settings import configure_environment, home, load
     from reports.rehearsal import write_rehearsal
@@ -68,10 +68,13 @@ def rehearse(
             done=lambda n, of: done("rehearse", n, of),
         )  # fmt: skip
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
-    write_rehearsal(page, r, ", ".join(models))
+    write_rehearsal(page, r, labelled(models, stored))
+    remarks = {m.family.target: m.remark for m in stored if m.remark}
     if as_json:
-        console.print_json(rehearsal_dict(r) | {"page": str(page)})
+        console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks})
         return
+    for a, remark in remarks.items():
+        console.line(f"{a:<10} {remark}")
     for a in r.before_um:
         before, after = r.band_um(a)
         console.line(f"{a:<10} band of 95 % of the rows: {before:.2f} µm without, {after:.2f} µm with compensation")

@@ -30,7 +30,7 @@ def print_fleet(view: FleetView) -> None:
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, title="Fleet", title_justify="left",
                   title_style="bold")  # fmt: skip
     for name, side, width in (
-        ("", "left", 1), ("machine", "left", 17), ("", "left", 4), ("champion", "left", 13), ("seen to", "left", 10),
+        ("", "left", 1), ("machine", "left", 17), ("", "left", 4), ("champion", "left", 14), ("seen to", "left", 10),
         ("expect µm", "right", 11), ("newer", "right", 7), ("out", "right", 3), ("next", "left", 5),
     ):  # fmt: skip
         table.add_column(name, justify=side, max_width=width, no_wrap=True, overflow="ellipsis")  # type: ignore[arg-type]
@@ -52,7 +52,8 @@ def print_fleet(view: FleetView) -> None:
 
 
 def _cells(r: Row) -> tuple[str, ...]:
-    champion = f"v{r['version']} {r['family']}" if r["version"] is not None else "none"
+    standing_in = "none" if r["provisional"] is None else f"v{r['provisional']} provisional"
+    champion = f"v{r['version']} {r['family']}" if r["version"] is not None else standing_in
     expect, bound, newer = (r[k] for k in ("expected_S_um", "bound90_S_um", "newer_S_mean_um"))
     due = datetime.fromisoformat(r["next_run"]).astimezone() if r["next_run"] else None
     return (
@@ -80,9 +81,10 @@ def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
     for m in models:
         alias = f" {m['aliases']}" if m["aliases"] else ""
         score = f"score {m['score_um']:.2f} µm" if m["score_um"] is not None else "no score"
+        badge = ", no trustworthy model" if m["standing"] == "refused" else ""
         console.line(
             f"  {m['name']}/{m['version']}{alias}: {m['expected'] or score}; {m['cell']} over "
-            f"{m['n_batches']} batches{_label(m)}{'' if m['trusted'] else ', no trustworthy model'}; {m['reason']}"
+            f"{m['n_batches']} batches{_label(m)}{badge}; {m['reason']}"
         )
     if not models:
         console.line("  none; `thermodrift train` promotes the first")

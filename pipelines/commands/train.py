@@ -59,8 +59,11 @@ def print_training(outcome: TrainOutcome) -> None:
         print_findings(pd.concat(found).drop_duplicates())
     label = "  (simulated recordings)" if outcome.simulated else ""
     for target, expected in outcome.outlooks.items():
-        trusted = outcome.choices[target].trusted
-        console.line(f"{target}: {'' if trusted else 'no trustworthy model; '}{expected.summary}")
+        choice = outcome.choices[target]
+        badge = (
+            "provisional; " if choice.standing == "provisional" else "no trustworthy model; " if choice.caution else ""
+        )
+        console.line(f"{target}: {badge}{expected.summary}")
     for target, result in outcome.results.items():
         _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells)
     for target, training in outcome.training_ids.items():

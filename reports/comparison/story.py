@@ -177,6 +177,7 @@ def interval_label(comparison: dict[str, float], digits: int = 2) -> str:
 
 _CHIPS = {
     "champion": "champion",
+    "provisional": "provisional",
     "former": "former champion",
     "challenger": "challenger",
     "unchanged": "unchanged",
@@ -236,6 +237,11 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
         outcome = "former"
         why = _why_champion(p).replace("it is", "it was", 1).replace("replaces", "it replaced", 1)
         summary = f"Version {p['version']}, {model}, was champion: {score}; {why}. {_champion_now(p)} now."
+    elif outcome == "provisional":
+        summary = (
+            f"Version {p['version']}, {model}, is provisional: {score}; {float(p.get('authority', 0.0)):g} of its "
+            "correction is supported, and `compensate` runs it with the switch `--provisional`."
+        )
     elif outcome == "challenger":
         summary = f"{_champion_now(p)}; version {p['version']}, {model}, is challenger: {score}; {_why_challenger(p)}."
     elif outcome == "unchanged":
@@ -248,9 +254,11 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     why = str(p.get("caution", "")) if p else choice.caution
     why = re.sub(r"\b(zero|mean_curve)\b", lambda m: family_label(m[0]), why)
     short = why.partition(" (")[0]
-    caution = f"No trustworthy model: {short}." if why else ""
-    summary += f" Not trustworthy: {why}." if why != short else ""
-    chip = "no trustworthy model" if why and not p.get("champion_version") else _CHIPS.get(outcome, outcome)
+    provisional = (p.get("standing") if p else choice.standing) == "provisional"
+    lacking, doubt = ("Provisional", "Not beyond doubt") if provisional else ("No trustworthy model", "Not trustworthy")
+    caution = f"{lacking}: {short}." if why else ""
+    summary += f" {doubt}: {why}." if why != short else ""
+    chip = lacking.lower() if (why or provisional) and not p.get("champion_version") else _CHIPS.get(outcome, outcome)
     return Verdict(channel, "untrusted" if why else outcome, chip, summary, caution)
 
 
@@ -260,13 +268,13 @@ def _champion_now(p: dict[str, Any]) -> str:
 
 
 def mark_of(training: Training) -> str:
-    """What the chosen cell's model is now: champion, former champion, challenger, or only chosen."""
+    """What the chosen cell's model is now: champion, former champion, provisional, challenger, or only chosen."""
     p = training.promotion
     if not p:
         return "chosen"
     if p["version"] == p["champion_version"]:
         return "champion"
-    return "former champion" if p["outcome"] == "champion" else "challenger"
+    return {"champion": "former champion", "provisional": "provisional"}.get(p["outcome"], "challenger")
 
 
 def comparison_rows(promotion: dict[str, Any]) -> list[tuple[str, str]]:

@@ -37,10 +37,13 @@ readings: {{z: ns=2;s=Probe}}
 offsets_um: {{z: ns=2;s=Offset, x: "nsu={URI};s=OffsetX"}}
 slopes_um_per_m: {{z: ns=2;s=Slope}}
 states: {{z: ns=2;s=StateZ}}
+reasons: {{z: ns=2;s=ReasonZ}}
 state: ns=2;s=State
 heartbeat: ns=2;s=Beat
 """
-CORRECTION = Correction(100.5, {"z": -12.25, "x": 0.5}, {"z": 3.5}, {"z": "active", "x": "hold"})
+CORRECTION = Correction(
+    100.5, {"z": -12.25, "x": 0.5}, {"z": 3.5}, {"z": "active", "x": "hold"}, {"z": "provisional model"}
+)
 
 
 def serve(port: int, pipe: Any) -> None:
@@ -63,6 +66,7 @@ async def _serve(port: int, pipe: Any) -> None:
         "OffsetX": (0.0, ua.VariantType.Float),
         "Slope": (0.0, ua.VariantType.Double),
         "StateZ": ("", ua.VariantType.String),
+        "ReasonZ": ("", ua.VariantType.String),
         "State": ("", ua.VariantType.String),
         "Beat": (0, ua.VariantType.Byte),
         "ReadOnly": (0.0, ua.VariantType.Double),
@@ -191,6 +195,7 @@ def test_a_correction_is_written_with_the_types_of_its_nodes(control: Control, m
         assert control.read("Beat") == beat
     assert (control.read("Offset"), control.read("OffsetX"), control.read("Slope")) == (-12.25, 0.5, 3.5)
     assert (control.read("StateZ"), control.read("State")) == ("active", "active")
+    assert control.read("ReasonZ") == "provisional model"
     sink.close()
     sink.close()
     assert (control.read("StateZ"), control.read("State")) == ("off", "off")

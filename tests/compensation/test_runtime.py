@@ -63,6 +63,47 @@ def test_what_is_sent_is_the_negative_of_the_prediction(key: str) -> None:
     assert np.abs(np.array(sent) + trust * wanted).max() < 1e-6
 
 
+@pytest.mark.parametrize("share", [1.0, 0.6, 0.05])
+def test_a_share_is_sent_and_every_record_says_why(share: float) -> None:
+    train = make_toy_batches(9, 60)
+    left = train.pop(4)
+    t0 = left.table["t0"]
+    left = replace(left, table=left.table.assign(t0=t0[0] + 3.0 * (t0 - t0[0])))  # leaves the region as it gets warm
+    model = replace(model_of(train), updater=None, share=share, remark=f"provisional model: {share:g}")
+    machine = Compensator("toy", [model], period_s=left.step_s)
+    done = run(machine, samples(left))
+    whole = [model.region.row()(v)[0] for v in _watched(model, left)]
+    outside = np.array([replace(model, share=1.0).authority(d) for d in whole])
+    assert outside.min() < 0.6 < outside.max()
+    wanted = FAMILIES["ridge"]().fit(train, INPUTS, "z").predict(left)
+    sent = np.array([c.offset_um["z"] for c in done])
+    assert np.abs(sent + np.minimum(share, outside) * wanted).max() < 1e-6
+    done.append(machine.silence(1e5, 1e9))
+    assert all(c.reasons["z"].endswith(f"provisional model: {share:g}") for c in done)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.1, math.nan])
+def test_a_share_that_makes_no_sense_is_refused(share: float) -> None:
+    with pytest.raises(InputError, match=r"^axis z: got authority .*, expected above 0 up to 1; train again$"):
+        replace(model_of(make_toy_batches(4, 20)), share=share)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6, 0.2])
+def test_one_reading_brings_the_error_to_zero_at_any_share(share: float) -> None:
+    train = make_toy_batches(9, 60)
+    left = train.pop(4)
+    machine = Compensator("toy", [replace(model_of(train), share=share)], period_s=left.step_s)
+    truth_um = left.table["z"].to_numpy() - left.table["z"][0]
+    sent = []
+    for k, s in enumerate(samples(left)):
+        reading = {"z": float(truth_um[k] + sent[-1])} if k == 30 else {}
+        sent.append(machine.take(replace(s, readings_um=reading), s.time_s - 1e9).offset_um["z"])
+    left_um = truth_um + np.array(sent)
+    assert machine.rejected == 0
+    assert abs(left_um[25:30].mean()) > 0.8 * (1.0 - share) * abs(truth_um[25:30].mean())
+    assert np.abs(left_um[30:36]).max() < 1.0 + 0.1 * (1.0 - share) * abs(truth_um[30])
+
+
 def _watched(model: AxisModel, batch: Batch) -> np.ndarray:
     rows = np.column_stack([batch.masked(c) for c in model.watched.channels])
     return replay(model.watched, rows)

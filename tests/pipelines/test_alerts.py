@@ -30,8 +30,9 @@ def run_of(k: int, S_um: float | None = None, outside: bool = False) -> dict[str
 
 def state_of(*runs: dict[str, Any], **more: Any) -> dict[str, Any]:
     return {
-        "machine": "mill", "channel": "z", "model": "mill-z", "version": 3, "cell": "none|ridge|2", "family": "ridge",
-        "since": "", "trained_at": "2026-10-01T00:00:00+00:00", "reason": "", "simulated": False, "expected_S_um": 2.0,
+        "machine": "mill", "channel": "z", "model": "mill-z", "version": 3, "provisional": None, "cell": "none|ridge|2",
+        "family": "ridge", "since": "", "trained_at": "2026-10-01T00:00:00+00:00", "reason": "", "simulated": False,
+        "expected_S_um": 2.0,
         "bound90_S_um": 4.0, "expected_by": "forward", "n_seen": 6, "last_seen": "2026-09-30T08:00:00",
         "runs": list(runs), "sensors": [], "unknown": "", **more,
     }  # fmt: skip

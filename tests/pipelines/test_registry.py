@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mlflow
 import numpy as np
@@ -11,17 +13,30 @@ from data.errors import InputError
 from models.promotion import Choice, choose, decide
 from models.protocols import PromotionRule
 from models.trust import Region
-from pipelines import registry, tracking
+from pipelines import audit, registry, tracking
+from pipelines.commands.predict import load_model
+from pipelines.commands.registry import _print_overview as printed
+from pipelines.commands.registry import overview
+from pipelines.commands.status import _print_models as print_models
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
-def train(store, machine: str, S_um: list[float], *, batches_given: bool = False, yaml: str = "", force: bool = False):
+def train(
+    store,
+    machine: str,
+    S_um: list[float],
+    *,
+    batches_given: bool = False,
+    yaml: str = "",
+    force: bool = False,
+    **is_: Any,
+):
     """Log and promote a training over len(S_um) batches."""
     batches = toy_batches(machine, len(S_um))
     result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
     training_id = tracking.log_training(result, store)
     model, region = toy_model(batches)
-    choice = choose(result, store.promotion)
+    choice = replace(choose(result, store.promotion), **is_)
     text, known = yaml or machine_yaml(machine), batches if batches_given else ()
     new = registry.Newcomer(result, choice, model, text, training_id, region, known)
     return registry.promote(new, store, force=force)
@@ -210,6 +225,45 @@ def test_a_newcomer_that_is_not_trustworthy_never_replaces_a_champion(store):
     got = registry.promote(new, store)
     assert got.comparison is not None and got.comparison.better and not got.trusted
     assert (got.outcome, got.champion_version) == ("challenger", 1)
+
+
+PROVISIONAL = {"standing": "provisional", "authority": 0.6, "caution": "not shown to be better than zero"}
+
+
+def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
+    client, name = MlflowClient(store.store_uri, registry_uri=store.store_uri), "toy-maybe-z"
+    refused = train(store, "toy-maybe", [5.0] * 6, caution="not shown to be better than zero")
+    assert (refused.outcome, refused.standing) == ("challenger", "refused")
+    first = train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL)  # the same data, judged by another rule
+    assert (first.outcome, first.version, first.champion_version) == ("provisional", 2, None)
+    assert "version 2 is provisional: better than no model, not shown beyond doubt; 0.6 of the" in first.summary
+    assert train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL).outcome == "unchanged"
+    with pytest.raises(InputError, match=r"has no champion: .*; version 2 is provisional: models:/toy-maybe-z@prov"):
+        registry.find_version(client, name, "champion")
+    assert train(store, "toy-maybe", [5.0] * 7, **PROVISIONAL).outcome == "provisional"
+    assert aliases(store, name) == {"challenger": 1, "provisional": 3}
+    info = load_model(f"models:/{name}@provisional", store).info
+    assert (info["standing"], info["authority"]) == ("provisional", 0.6)
+    row = registry.status(store).set_index(["name", "version"]).loc[(name, 3)]
+    assert (row["aliases"], row["standing"]) == ("provisional", "provisional")
+    shown = overview(client, [audit.read(client.get_registered_model(name))])
+    assert (shown["provisional"][0], shown["champion"].isna()[0]) == (3, True)
+    assert train(store, "toy-maybe", [4.0] * 8).outcome == "champion"
+    assert aliases(store, name) == {"champion": 4}
+    late = train(store, "toy-maybe", [5.0] * 9, **PROVISIONAL)
+    assert (late.outcome, late.champion_version) == ("challenger", 4)
+    assert aliases(store, name) == {"champion": 4, "challenger": 5}
+
+
+def test_badges_of_a_provisional_version_are_printed(store, capsys):
+    train(store, "toy-badge", [5.0] * 6, **PROVISIONAL)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    printed(overview(client, [audit.read(client.get_registered_model("toy-badge-z"))]))
+    assert capsys.readouterr().out.startswith("toy-badge-z: no champion; version 1 is provisional")
+    table = registry.status(store)
+    print_models(table[table["name"] == "toy-badge-z"].to_dict("records"))
+    line = capsys.readouterr().out
+    assert "toy-badge-z/1 provisional: " in line and "no trustworthy model" not in line
 
 
 def test_the_error_to_expect_leads_the_tags(story, store):

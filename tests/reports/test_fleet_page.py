@@ -17,8 +17,9 @@ RUN = {"began": "2026-11-24T05:00:00+00:00", "ended": "2026-11-24T05:10:00+00:00
 
 def row_of(machine: str, **more: Any) -> dict[str, Any]:
     return {
-        "machine": machine, "channel": "z", "model": f"{machine}-z", "version": 3, "cell": "none|ridge|2",
-        "family": "ridge", "since": "", "trained_at": "", "reason": "", "simulated": False, "last_seen": "2026-11-01",
+        "machine": machine, "channel": "z", "model": f"{machine}-z", "version": 3, "provisional": None,
+        "cell": "none|ridge|2", "family": "ridge", "since": "", "trained_at": "", "reason": "", "simulated": False,
+        "last_seen": "2026-11-01",
         "expected_S_um": 2.0, "bound90_S_um": 4.0, "expected_by": "forward", "n_seen": 6, "unknown": "",
         "age_days": 3.2, "seen_days_ago": 24.5, "newer_S_um": [], "newer_S_mean_um": None, "drift": None,
         "outside_runs": 0, "of_runs": 5, "outside_why": "", "sensors": [], "next_run": None, "schedule": "",
@@ -49,6 +50,8 @@ def test_values_and_reasons() -> None:
         "not measured", None, "not known", "no run known",
     )  # fmt: skip
     assert lathe.champion.text == "none" and lathe.expected.text == lathe.outside.text == ""
+    (doubted,) = fleet_page([UNKNOWN | {"provisional": 2}], [], [], NOW).rows
+    assert (doubted.state_label, doubted.champion.text) == ("provisional", "v2 provisional")
     assert page.unknown == ("lathe z: the lake has other channels",)
 
 

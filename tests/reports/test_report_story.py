@@ -9,7 +9,7 @@ import pytest
 
 from models.promotion import choose, score_of_choice
 from models.protocols import PromotionRule
-from reports.comparison.story import promoted_cell, verdict
+from reports.comparison.story import mark_of, promoted_cell, verdict
 from tests.snapshots import check_snapshot
 from tests.toys.report_training import COMPARISON, Maker, promotion, results, training
 
@@ -62,6 +62,16 @@ def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
     short = "each batch by the cell that the others chose: 9.44 ± 7.31 µm, no better than mean curve"
     assert (said.caution, said.outcome) == (f"No trustworthy model: {short}.", "untrusted")
     assert said.summary.endswith(f" Not trustworthy: {short} (8.10 µm).")
+
+
+def test_a_provisional_model_has_its_badge_and_its_share(toy_batches: Maker) -> None:
+    result = results(toy_batches)["z"]
+    own = {"outcome": "provisional", "standing": "provisional", "authority": 0.6, "champion_version": None}
+    recorded = promotion(choose(result.cells, RULE).cell, caution="not shown to be better than zero", **own)
+    said = verdict("z", training(result, recorded), choose(result.cells, RULE))
+    assert (said.chip, said.caution) == ("provisional", "Provisional: not shown to be better than no model.")
+    assert "is provisional: " in said.summary and "0.6 of its correction" in said.summary
+    assert mark_of(training(result, recorded)) == "provisional"
 
 
 def test_the_recorded_outcome_counts_not_a_later_doubt(toy_batches: Maker) -> None:
