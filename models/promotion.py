@@ -2,14 +2,15 @@
 
 The expected loss of a cell in a future run is a weighted mean of its S over left-out runs. A run predicted from earlier
 ones counts most, since a future run is predicted so; a season or speed that was left out counts by its number of runs,
-pooled with the others (`PromotionRule.group_runs`). To it comes the cost of choosing: what the best of a family's cells
-loses where the other runs choose it (Varma and Simon 2006, BMC Bioinformatics 7:91).
+pooled with the others (`PromotionRule.group_runs`). To it comes the cost of choosing among the cells of a family
+(`models.race.cost_of_choosing`). Of few runs most differences are chance: the loss is pooled with what the family
+reached on other machines (`models.race.pooled`).
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, Self
 
@@ -22,7 +23,7 @@ from data.arrays import Array
 from data.errors import InputError
 from models.metrics import residual_std_um
 from models.protocols import PromotionRule
-from models.race import BASELINES, paired
+from models.race import BASELINES, cost_of_choosing, paired, pooled
 from models.result import GridResult
 
 Standing = Literal["champion", "provisional", "refused"]
@@ -110,7 +111,8 @@ class Losses:
     """S of the C cells that all of the rule's protocols have scored, in R left-out runs.
 
     `cells` (C rows): the row of `GridResult.cells` under the leading protocol, with the least `tsp_stability`. `S_um`
-    (C, R); `protocol`, `group` (what was left out), `batch_id`, `weight`: of the runs (R,).
+    (C, R); `protocol`, `group` (what was left out), `batch_id`, `weight`: of the runs (R,). `tried`: the
+    most cells of each family in a round of the race.
     """
 
     cells: pd.DataFrame
@@ -120,6 +122,7 @@ class Losses:
     batch_id: NDArray[np.object_]
     weight: Array
     rule: PromotionRule
+    tried: Mapping[str, int]
 
     @classmethod
     def of(cls, result: GridResult, rule: PromotionRule) -> Self:
@@ -151,7 +154,10 @@ class Losses:
         cells = led.assign(tsp_stability=stability.reindex(wide.index)).reset_index()
         protocol, group, ids = (wide.columns.get_level_values(k).to_numpy(object) for k in range(3))
         weight = np.array([rule.protocols[p] for p in protocol])
-        return cls(cells, wide.to_numpy(float), protocol, group, ids, weight, rule)
+        race = result.race
+        counts = race.groupby(["round", "family"]).size() if len(race) else pd.Series(dtype=int)
+        tried = {str(family): int(n) for (_, family), n in counts.sort_values().items()}
+        return cls(cells, wide.to_numpy(float), protocol, group, ids, weight, rule, tried)
 
     def counted(self, without: str | None = None) -> Array:
         """What each run counts (R,), 0 for the batch that is left out; sums up to 1.
@@ -173,35 +179,29 @@ class Losses:
         return ids, self.S_um @ np.column_stack([self.counted(k) for k in ids])
 
     def choosing_um(self) -> Array:
-        """Cost of choosing among the cells of its family (C,): the loss of the family's best cell where each run is
-        predicted by the cell that the others choose, less the loss of the best cell itself; 0 for a single cell."""
-        counted, family = self.counted(), self.cells["family"].to_numpy(str)
-        ids, left_um = self.without_each()
-        place = np.searchsorted(ids, self.batch_id.astype(str), sorter=(order := np.argsort(ids)))
-        at = order[place]
-        out = np.zeros(len(family))
-        if len(ids) > 2:  # of two batches the other one alone chooses
-            for key in np.unique(family):
-                own = np.flatnonzero(family == key)
-                chosen = own[np.argmin(left_um[own], axis=0)][at]
-                best_um = (self.S_um[own] @ counted).min()
-                out[own] = max(0.0, float(self.S_um[chosen, np.arange(len(at))] @ counted - best_um))
-        return out
+        """Cost of choosing among the cells of each family (C,)."""
+        by_batch, share = self.by_batch(self.S_um, self.counted())
+        cells = list(self.cells[KEYS].itertuples(index=False, name=None))
+        return cost_of_choosing(by_batch, cells, self.tried, share)
+
+    def by_batch(self, S_um: Array, counted: Array) -> tuple[Array, Array]:
+        """Means over the scores of a batch (C, K), and what each batch counts (K,)."""
+        ids, place = np.unique(self.batch_id.astype(str), return_inverse=True)
+        share = np.bincount(place, counted, len(ids)).astype(float)
+        out = np.zeros((len(S_um), len(ids)))
+        np.add.at(out.T, place, (S_um * counted).T)
+        return out[:, share > 0] / share[share > 0], share[share > 0]
 
     def behind(self, cell: int, counted: Array) -> tuple[Array, Array]:
         """How far every cell is behind one, with the standard error over batches, (C,) each."""
-        ids, place = np.unique(self.batch_id.astype(str), return_inverse=True)
-        d = (self.S_um - self.S_um[cell]) * counted
-        share = np.bincount(place, counted, len(ids)).astype(float)
-        by_batch = np.zeros((len(d), len(ids)))
-        np.add.at(by_batch.T, place, d.T)
-        some = share > 0
-        return paired(by_batch[:, some] / share[some], np.zeros(int(some.sum())), share[some])
+        by_batch, share = self.by_batch(self.S_um, counted)
+        return paired(by_batch, by_batch[cell], share)
 
 
 def judged(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
     """One row per cell that all of the rule's protocols have scored: its row of `GridResult.cells` under the leading
-    protocol, with `score_um`, the expected loss, of which `choosing_um` is the cost of choosing.
+    protocol, with `own_um`, the loss on this machine's runs, of which `choosing_um` is the cost of choosing, and
+    `score_um`, the expected loss, pooled with the record of the family.
 
     Raises:
         InputError: as `Losses.of`.
@@ -211,8 +211,9 @@ def judged(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
 
 def _scored(losses: Losses) -> pd.DataFrame:
     choosing_um = losses.choosing_um()
-    loss_um = losses.S_um @ losses.counted() + choosing_um
-    return losses.cells.assign(score_um=loss_um, choosing_um=choosing_um)
+    own_um = losses.S_um @ losses.counted() + choosing_um
+    loss_um, _ = pooled(own_um, list(losses.cells["family"]), float(losses.weight.sum()), losses.rule.record_runs)
+    return losses.cells.assign(own_um=own_um, score_um=loss_um, choosing_um=choosing_um)
 
 
 def ranked(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
@@ -242,21 +243,25 @@ def choose(result: GridResult, rule: PromotionRule) -> Choice:
     """
     losses = Losses.of(result, rule)
     table = _scored(losses)
-    at = _least(losses, table["score_um"].to_numpy(float), losses.counted())
+    at = _least(losses, table["own_um"].to_numpy(float), losses.counted())
     return _picked(table, at, rule)
 
 
-def _least(losses: Losses, loss_um: Array, counted: Array) -> int:
-    """The cell of least loss, or the simplest that is not behind it by more than the ties allow."""
-    table = losses.cells
+def _least(losses: Losses, own_um: Array, counted: Array) -> int:
+    """The cell of least loss, or the simplest that is not behind it by more than the ties allow.
+
+    A baseline wins where its own loss `own_um` (C,), not pooled with any record, is the least.
+    """
+    table, runs = losses.cells, float(losses.weight.sum())
     is_baseline = table["family"].isin(BASELINES).to_numpy()
-    best = int(np.argmin(np.where(is_baseline, np.inf, loss_um)))
-    floor_um = float(loss_um[is_baseline].min()) if is_baseline.any() else np.inf
-    if is_baseline[best] or loss_um[best] >= floor_um:
-        return _simplest(table, loss_um, is_baseline & (loss_um <= floor_um))
+    floor_um = float(own_um[is_baseline].min()) if is_baseline.any() else np.inf
+    better = ~is_baseline & (own_um < floor_um)
+    if not better.any():
+        return _simplest(table, own_um, is_baseline & (own_um <= floor_um))
+    loss_um, share = pooled(own_um, list(table["family"]), runs, losses.rule.record_runs)
+    best = int(np.argmin(np.where(better, loss_um, np.inf)))
     _, se_um = losses.behind(best, counted)
-    behind_um = loss_um - loss_um[best]
-    return _simplest(table, loss_um, ~is_baseline & (behind_um <= losses.rule.ties_se * se_um) & (loss_um < floor_um))
+    return _simplest(table, loss_um, better & (loss_um - loss_um[best] <= losses.rule.ties_se * share * se_um))
 
 
 def pick(result: GridResult, rule: PromotionRule, cell: str) -> Choice:
@@ -447,14 +452,14 @@ def _picked(table: pd.DataFrame, at: int, rule: PromotionRule, notes: Sequence[s
     if (best["family"], best["inputs"]) != (row["family"], row["inputs"]) and best["score_um"] < loss and not notes:
         words = _cell_words(best["family"], best["n_tsp"], best["selector"])
         notes.append(f"simpler than the best ({words}, {best['score_um']:.2f} µm) and not shown to be worse")
-    least = table[table["family"].isin(BASELINES)].nsmallest(1, "score_um")
+    least = table[table["family"].isin(BASELINES)].nsmallest(1, "own_um")
     caution = ""
     if len(least) and row["family"] in BASELINES:
-        other = f" (best other: {best['score_um']:.2f} µm)" if len(others) else ""
+        other = f" (best other: {others['own_um'].min():.2f} µm)" if len(others) else ""
         caution = f"nothing beats {row['family']}{other}"
         notes.append(f"{caution}: no trustworthy model")
     elif len(least):
-        notes.append(f"{least.iloc[0]['family']} has {least.iloc[0]['score_um']:.2f} µm")
+        notes.append(f"{least.iloc[0]['family']} has {least.iloc[0]['own_um']:.2f} µm")
     summary = (
         f"{name}: expected loss {loss:.2f} µm; S {mean:.2f} ± {std:.2f} µm, {row['protocol']} over "
         f"{int(row['n_batches'])} batches"

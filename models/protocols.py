@@ -183,6 +183,7 @@ class PromotionRule(BaseModel):
         allow are left out.
     group_runs: a left-out season or speed of so many runs counts half as it is and half as the mean of all runs
         (partial pooling), so that a group of two runs does not decide.
+    record_runs: what the families reached on other machines (`models.RECORDS`) counts like so many runs of this one.
     ties_se: a simpler cell wins where it is behind by so many standard errors of the difference, or less.
     significance: one-sided level of the paired comparison with the champion and with no model.
     min_batches: fewer batches in common: the champion stays.
@@ -194,6 +195,7 @@ class PromotionRule(BaseModel):
         default={"forward": 1.0, "leave-season-out": 0.25, "leave-batch-out": 0.25}, min_length=1
     )
     group_runs: Annotated[float, Field(ge=0)] = 4.0
+    record_runs: Annotated[float, Field(ge=0)] = 8.0
     ties_se: Annotated[float, Field(ge=0)] = 1.0
     significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     min_batches: Annotated[int, Field(ge=2)] = 5

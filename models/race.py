@@ -10,22 +10,25 @@ Four rounds, each on the cells that the one before it left:
 
 After a round a cell is dropped where it is clearly worse than the leader on the same runs, by a one-sided paired t test
 (Maron and Moore 1994, Hoeffding races), and so many remain as the next round can afford (successive halving: Jamieson
-and Talwalkar 2016), the best first, of each family no more than a part of them. The best cells of the four best
-families go on in any case, as runners-up and members of a stack, and so do the baselines.
+and Talwalkar 2016): the best first, by their mean S with the cost of choosing (`cost_of_choosing`), pooled with the
+families' records (`pooled`), of each family no more than a part of them. The best cells of the four best families go on
+in any case, as runners-up and members of a stack, and so do the baselines. The best cell of the twin stays until the
+third round, since a growing error of the twin calls for a diagnosis.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
 from data.arrays import Array
-from models import FAMILIES
+from models import FAMILIES, RECORDS, USUAL_RECORD
 from models.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
 from models.protocols import Fold
 
@@ -38,6 +41,7 @@ _FAMILIES_KEPT, _SELECTORS_KEPT = 12, 4  # after the first and the second round
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
+_RECORD_RUNS = 8.0  # as `PromotionRule.record_runs`
 _POINTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # numbers of points tried: neighbours choose nearly the same
 
 
@@ -198,9 +202,11 @@ def _kept(
     S_mean_um = S_um.mean(axis=1)
     names = list(wide.index)
     is_base = np.array([family in BASELINES for _, family, _ in names])
-    order = np.lexsort(([FAMILIES[f].rank for _, f, _ in names], S_mean_um))
+    cost_um = cost_of_choosing(S_um, names, Counter(f for _, f, _ in names))
+    loss_um, own_share = pooled(S_mean_um + cost_um, [f for _, f, _ in names], S_um.shape[1])
+    order = np.lexsort(([FAMILIES[f].rank for _, f, _ in names], loss_um))
     behind_um, se_um = paired(S_um, S_um[order[0]])
-    clear = behind_um > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * se_um
+    clear = loss_um - loss_um[order[0]] > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * own_share * se_um
     share = most if most is not None else -(-places // _FAMILY_SHARE)
     why, taken, seen = ["" for _ in names], dict[str, int](), set[tuple[str, bytes]]()
     n, through, twin = 0, {"none"}, name != "runs"
@@ -234,6 +240,47 @@ def _kept(
     )
     table.append(own.iloc[order][ROUND_COLUMNS])
     return [names[i] for i in range(len(names)) if kept[i]]
+
+
+def cost_of_choosing(
+    S_um: Array, cells: Sequence[tuple[str, str, int]], tried: Mapping[str, int], weight: Array | None = None
+) -> Array:
+    """What the best of many cells is flattered by, (C,) in µm; S_um (C, R).
+
+    Of m equal cells the best looks better by the expected maximum of m normal deviates (Blom 1958), each with the
+    standard error of the difference to the family's reference, the cell with the most points: that one costs nothing.
+
+    Args:
+        tried: how many cells of each family took part in the search.
+    """
+    families = [family for _, family, _ in cells]
+    out = np.zeros(len(cells))
+    for family in dict.fromkeys(families):
+        own = [i for i, f in enumerate(families) if f == family]
+        reference = max(own, key=lambda i: (cells[i][2], cells[i][0] == "none", np.isfinite(S_um[i]).all()))
+        m = max(tried.get(family, 0), len(own))
+        _, se_um = paired(S_um[own], S_um[reference], weight)
+        out[own] = float(ndtri((m - 0.375) / (m + 0.25))) * np.where(np.isfinite(se_um), se_um, 0.0)
+    return out
+
+
+def pooled(
+    loss_um: Array, families: Sequence[str], runs: float, record_runs: float = _RECORD_RUNS
+) -> tuple[Array, float]:
+    """Losses (C,) on so many runs, pooled with what their families reached on other machines (`models.RECORDS`).
+
+    The logarithms are averaged, the record counting like `record_runs` runs and starting from the least loss here.
+    Hierarchical models of several machines: Gelman et al. (2013), Bayesian Data Analysis, ch. 5.
+
+    Returns:
+        the pooled losses (C,), and the share of this machine's own runs in them.
+    """
+    share = runs / (runs + record_runs)
+    record = np.array([RECORDS.get(f, USUAL_RECORD) for f in families])
+    least_um = float(np.min(loss_um, initial=np.inf))
+    if not (np.isfinite(least_um) and least_um > 0):
+        return loss_um, share
+    return loss_um**share * (least_um * record / min(RECORDS.values())) ** (1.0 - share), share
 
 
 def paired(S_um: Array, leader_um: Array, weight: Array | None = None) -> tuple[Array, Array]:

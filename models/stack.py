@@ -18,12 +18,14 @@ from models.crossing import Crossing, FamilyResult
 from models.judging import KEPT, FamilyScores, score_table
 from models.program import Builder
 from models.protocols import Fold
+from models.race import pooled
 from models.result import CELL_KEYS
 
 MOST_MEMBERS = 5
 STACKED = "stack"  # selector of the cell: its members bring their own
 _DEFAULT: tuple[tuple[str, tuple[str, ...]], ...] = (("ridge", ()), ("distributed_lag", ()))
-_WEIGHT_SD = 0.3  # of a weight about an equal share, before any run is known
+_WEIGHT_SD, _SUM_SD = 0.3, 0.1  # of a weight about its share, and of their sum about 1, before any run is known
+_SHARPNESS = 6.0  # a member that left a tenth more on other machines has half the share
 _ROWS_PER_RUN = 5.0  # neighbouring rows of a thermal run repeat each other; so many count as independent
 
 
@@ -31,7 +33,7 @@ class Stack(Family):
     """error_um = Σ w_i p_i over at most five fitted families, w_i ≥ 0, each with inputs of its own.
 
     The weights are least squares of the recorded error on predictions of runs that the members had not learned from,
-    about equal weights: a normal prior with a standard deviation of 0.3. They need not add up to 1. In a crossing the
+    with a normal prior about shares that follow the members' records on other machines. In a crossing the
     members are the best cells of the best families and the predictions those of its folds (`stacked`); by itself the
     family leaves its training batches out in turn.
 
@@ -82,7 +84,7 @@ class Stack(Family):
             (design.y_um[design.rows(k)], np.column_stack(p))
             for k, p in zip(used, zip(*predicted, strict=True), strict=False)
         ]
-        weights = self.weights if self.weights is not None else weights_of(runs, len(parts))
+        weights = self.weights if self.weights is not None else weights_of(runs, [f for f, _ in self.members])
         fitted = {"weights": np.asarray(weights, float)}
         plain = [p.as_plain() for p in parts]
         about = [json.dumps({k: v for k, v in p.items() if k != "fitted"}) for p in plain]
@@ -114,16 +116,20 @@ class Stack(Family):
         return len(self.fitted["weights"]) + sum(p.n_parameters() for p in self.parts())
 
 
-def weights_of(runs: Sequence[tuple[Array, Array]], m: int) -> Array:
-    """Weights (m,) of m predictions from runs of y (n,) and p (n, m) in µm; equal ones for no run."""
-    equal = np.full(m, 1.0 / m)
+def weights_of(runs: Sequence[tuple[Array, Array]], families: Sequence[str]) -> Array:
+    """Weights (m,) of the predictions of m families from runs of y (n,) and p (n, m) in µm; their shares for no run."""
+    from models import RECORDS, USUAL_RECORD
+
+    share = np.array([RECORDS.get(f, USUAL_RECORD) for f in families]) ** -_SHARPNESS
+    share /= share.sum()
     known = [(y[ok], p[ok]) for y, p in runs if (ok := np.isfinite(y) & np.isfinite(p).all(axis=1)).sum() > 1]
     if not known:
-        return equal
-    variance_um2 = float(np.mean([np.mean((y - p @ equal) ** 2) for y, p in known])) or 1.0
+        return share
+    variance_um2 = float(np.mean([np.mean((y - p @ share) ** 2) for y, p in known])) or 1.0
     scale = [np.sqrt(_ROWS_PER_RUN / (len(y) * variance_um2)) for y, _ in known]
-    rows = np.concatenate([*(s * p for s, (_, p) in zip(scale, known, strict=True)), np.eye(m) / _WEIGHT_SD])
-    right = np.concatenate([*(s * y for s, (y, _) in zip(scale, known, strict=True)), equal / _WEIGHT_SD])
+    prior, right = np.vstack([np.eye(len(share)) / _WEIGHT_SD, np.full(len(share), 1.0 / _SUM_SD)]), share / _WEIGHT_SD
+    rows = np.concatenate([*(s * p for s, (_, p) in zip(scale, known, strict=True)), prior])
+    right = np.concatenate([*(s * y for s, (y, _) in zip(scale, known, strict=True)), right, [1.0 / _SUM_SD]])
     q, r = np.linalg.qr(rows)
     return np.asarray(nnls(r, q.T @ right)[0])
 
@@ -142,7 +148,7 @@ def stacked(crossing: Crossing, result: FamilyResult, led: str) -> tuple[FamilyR
     table = pd.DataFrame(members, columns=["selector", "family", "n_tsp"])
     if len(members) < 2:
         return FamilyResult(pd.DataFrame(), pd.DataFrame(), {}, []), table.iloc[:0].assign(weight=0.0)
-    design, parts = crossing.design, []
+    design, parts, families = crossing.design, [], [family for _, family, _ in members]
     trainings = {crossing.everything, *(f.train for p in KEPT for f in crossing.folds.get(p, ()))}
     for train in trainings:
         used = {i for selector, _, n in members for i in crossing.inputs(selector, train, n)}
@@ -152,25 +158,28 @@ def stacked(crossing: Crossing, result: FamilyResult, led: str) -> tuple[FamilyR
         runs = _left_out(crossing, result, protocol, members)
         if protocol == led:
             table["inputs"] = ["|".join(crossing.inputs(s, crossing.everything, n)) for s, _, n in members]
-            table["weight"] = weights_of([run for own in runs for run in own.values()], len(members))
+            table["weight"] = weights_of([run for own in runs for run in own.values()], families)
         predicted = []
         for i, fold in enumerate(folds):
             known = runs[:i] if protocol == "forward" else [r for r in runs if not set(r) & set(fold.test)]
-            weights = weights_of([run for own in known for run in own.values()], len(members))
+            weights = weights_of([run for own in known for run in own.values()], families)
             predicted.append({k: p @ weights for k, (_, p) in runs[i].items()})
         parts.append(_scored(crossing, folds, predicted, protocol))
     return FamilyResult.joined(parts), table
 
 
 def _members(result: FamilyResult, led: str) -> list[tuple[str, str, int]]:
-    """Of the cells whose predictions are kept the best of each of the best families."""
-    rows = result.cells[result.cells["protocol"] == led].sort_values(["S_mean_um", "rank"], kind="stable")
-    rows = rows.loc[rows["n_tsp"] > 0, CELL_KEYS[1:]]
-    cells = [(str(selector), str(family), int(n)) for selector, family, n in rows.itertuples(index=False)]
-    finalists = [c for c in cells if all(_name(p, c) in result.predictions for p in _kept(result))]
+    """Of the cells whose predictions are kept the best of each of the best families, by the pooled loss."""
+    rows = result.cells[(result.cells["protocol"] == led) & (result.cells["n_tsp"] > 0)].dropna(subset="S_mean_um")
+    if rows.empty:
+        return []
+    loss_um, _ = pooled(rows["S_mean_um"].to_numpy(float), list(rows["family"]), float(rows["n_batches"].max()))
+    rows = rows.assign(loss_um=loss_um).sort_values(["loss_um", "rank"], kind="stable")[CELL_KEYS[1:]]
     best: dict[str, tuple[str, str, int]] = {}
-    for c in finalists:
-        best.setdefault(c[1], c)
+    for selector, family, n in rows.itertuples(index=False):
+        cell = (str(selector), str(family), int(n))
+        if all(_name(p, cell) in result.predictions for p in _kept(result)):
+            best.setdefault(cell[1], cell)
     return list(best.values())[:MOST_MEMBERS]
 
 

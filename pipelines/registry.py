@@ -143,7 +143,7 @@ def promote(new: Newcomer, settings: Settings, *, force: bool = False) -> Promot
         same = [v for v in model_versions(client, name) if v.tags.get("fingerprint") == fingerprint]
         begun = next((v for v in same if _is_unfinished(client, v, new.training_id)), None)
         done = [v for v in same if OUTCOME in v.tags]
-        if begun is None and done and (champion is not None or force or _standing(new.choice) != CHAMPION):
+        if begun is None and done and (champion is not None or force or new.choice.standing != CHAMPION):
             outcome = _keep(client, done[0], champion, new, force)
             known = done[0].tags.get("training_id") == new.training_id and not force  # what became of it is recorded
         else:
@@ -177,7 +177,7 @@ def _keep(
     return Promotion(
         "unchanged", name, int(version), None if stays is None else int(stays.version), choice.cell, choice.caution,
         summary, nested_S_mean_um=choice.nested_S_mean_um, nested_S_std_um=choice.nested_S_std_um, outlook=new.outlook,
-        standing=_standing(choice), authority=choice.authority,
+        standing=choice.standing, authority=choice.authority,
     )  # fmt: skip
 
 
@@ -208,7 +208,7 @@ def _register(
     comparison, obstacle, why = None, "", "first model of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
-    if _standing(choice) == PROVISIONAL:
+    if choice.standing == PROVISIONAL:
         why = f"better than no model, not shown beyond doubt; {choice.authority:g} of the correction is supported"
     elif not choice.trusted:
         why = "no trustworthy model"
@@ -217,7 +217,7 @@ def _register(
     outcome: Outcome = "challenger"
     if settled:
         outcome = one_of(settled, get_args(Outcome), OUTCOME)
-    elif force or (_standing(choice) == CHAMPION and better):
+    elif force or (choice.standing == CHAMPION and better):
         outcome = "champion"
     elif champion is None and choice.standing == PROVISIONAL:
         outcome = "provisional"
@@ -242,13 +242,8 @@ def _register(
         outcome, name, int(version), int(version) if replaces else None if champion is None else int(champion.version),
         choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
-        choice.nested_S_std_um, new.outlook, _standing(choice), choice.authority,
+        choice.nested_S_std_um, new.outlook, choice.standing, choice.authority,
     )  # fmt: skip
-
-
-def _standing(choice: Choice) -> str:
-    """A choice with a caution is no champion."""
-    return "refused" if choice.caution and choice.standing == CHAMPION else choice.standing
 
 
 def _alias_of(champion: ModelVersion | None, begun: ModelVersion) -> str:
@@ -269,7 +264,7 @@ def _info(new: Newcomer) -> dict[str, Any]:
         "leave_batch_out_S_std_um": expected.leave_batch_out_std_um, "expected": expected.summary,
         "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
         "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary, "trained_at": _now(),
-        "trusted": choice.trusted, "caution": choice.caution, "standing": _standing(choice),
+        "trusted": choice.trusted, "caution": choice.caution, "standing": choice.standing,
         "authority": choice.authority,
     }  # fmt: skip
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from itertools import product
 
 import numpy as np
@@ -14,10 +15,10 @@ from models.protocols import PromotionRule
 from models.result import GridResult
 from tests.toys.training import toy_batches, toy_result
 
-RULE = PromotionRule()
+RULE = PromotionRule(record_runs=0)
 
 
-RANKS = {"zero": 0, "mean_curve": 1, "mlr": 10, "ridge": 20, "stack": 60}
+RANKS = {"zero": 0, "mean_curve": 1, "mlr": 10, "ridge": 20, "lag_dictionary": 30, "stack": 60}
 
 
 def scored(
@@ -44,7 +45,8 @@ def scored(
 def by_lbo(**cells: list[float]) -> GridResult:
     """Cells ``none_mlr_4`` with S by leave-batch-out, next to no model with 20 µm."""
     n = len(next(iter(cells.values())))
-    own = {name.replace("_", "|"): {"leave-batch-out": S_um} for name, S_um in cells.items()}
+    own = {re.sub(r"_(?=\d)|(?<=^none)_|(?<=^fcgc)_|(?<=^stack)_", "|", name): {"leave-batch-out": S_um}
+           for name, S_um in cells.items()}  # fmt: skip
     return scored({"none|zero|0": {"leave-batch-out": [20.0] * n}, **own})
 
 
@@ -60,7 +62,7 @@ def test_the_least_expected_loss_wins_and_says_what_no_model_has():
 @pytest.mark.parametrize(
     ("other", "behind_um", "winner"),
     [
-        ("fcgc_ridge_3", 0.1, "fcgc|ridge|3"),  # fewer inputs; 0.1 µm is less than the standard error of 0.2
+        ("fcgc_ridge_3", 0.05, "fcgc|ridge|3"),  # fewer inputs; with the cost of choosing 0.17 µm, standard error 0.19
         ("fcgc_mlr_4", 0.1, "fcgc|mlr|4"),  # same inputs, simpler family
         ("fcgc_ridge_3", 0.3, "none|ridge|4"),
         ("fcgc_stack_4", 0.1, "none|ridge|4"),  # more than the best: no tie in its favour
@@ -72,6 +74,15 @@ def test_ties_within_a_standard_error_go_to_the_simpler(other: str, behind_um: f
     assert choose(by_lbo(**dict(reversed(cells.items()))), RULE).cell == winner
     at_once = choose(by_lbo(**cells), RULE.model_copy(update={"ties_se": 0.0}))
     assert at_once.cell == "none|ridge|4"
+
+
+def test_of_few_runs_the_record_on_other_machines_decides_of_many_the_runs_do():
+    """lag_dictionary left the least on other machines; here it is 10 % behind."""
+    few = by_lbo(none_ridge_4=[4.0] * 4, none_lag_dictionary_4=[4.4] * 4)
+    many = by_lbo(none_ridge_4=[4.0] * 60, none_lag_dictionary_4=[4.4] * 60)
+    rule = PromotionRule(protocols={"leave-batch-out": 1.0}, ties_se=0.0)
+    assert choose(few, rule).family == "lag_dictionary" and choose(many, rule).family == "ridge"
+    assert choose(few, rule.model_copy(update={"record_runs": 0.0})).family == "ridge"
 
 
 def test_a_stack_is_kept_only_where_it_is_better_beyond_a_standard_error():
@@ -134,13 +145,14 @@ def test_a_cell_that_not_all_protocols_scored_is_not_chosen():
 
 
 def test_choosing_among_many_cells_costs_their_family():
-    """Each of eight cells is bad on one run: the others choose it, and it fails there."""
+    """Each of eight cells is bad on one run: the standard error of a difference is large, and so is the cost."""
     lucky = {f"fcgc|mlr|{n}": {"leave-batch-out": [3.0] * (n - 1) + [11.0] + [3.0] * (8 - n)} for n in range(1, 9)}
     steady = {"none|ridge|9": {"leave-batch-out": [5.2] * 8}, "none|zero|0": {"leave-batch-out": [20.0] * 8}}
     result = scored(lucky | steady)
     table = promotion.judged(result, RULE).set_index("family")
-    assert table.loc["ridge", "choosing_um"] == 0.0 and (table.loc["mlr", "choosing_um"] == 7.0).all()
-    assert choose(result, RULE).family == "ridge"
+    cost_um = table.loc["mlr"].set_index("n_tsp")["choosing_um"]
+    assert table.loc["ridge", "choosing_um"] == 0.0 == cost_um[8]  # the reference has all points
+    assert cost_um[1] == pytest.approx(stats.norm.ppf(7.625 / 8.25) * np.std([8.0, -8.0] + [0.0] * 6, ddof=1) / 8**0.5)
 
 
 @pytest.mark.parametrize(
@@ -278,7 +290,7 @@ def _many_lucky_cells(seed: int, cells: int, gain_um: float) -> GridResult:
 def test_the_nested_score_takes_the_flattery_out_of_choosing() -> None:
     rule = PromotionRule(ties_se=0)
     choices = [promotion.decide(_many_lucky_cells(seed, 15, 0.0), rule) for seed in range(30)]
-    assert np.mean([c.S_mean_um for c in choices]) < 9.2  # luck looks like a µm
+    assert np.mean([c.S_mean_um for c in choices]) < 9.4  # luck looks like most of a µm
     assert np.mean([c.nested_S_mean_um for c in choices]) == pytest.approx(10.0, abs=0.4)  # nothing was gained
 
 

@@ -217,7 +217,7 @@ def test_a_newcomer_that_is_not_trustworthy_never_replaces_a_champion(store):
     train(store, "toy-doubt", [5.0] * 6)
     batches = toy_batches("toy-doubt", 7)
     result = toy_result(batches, {"none|zero|0": [4.5] * 7, "none|mlr|2": [1.0] * 3 + [4.6] * 4})
-    choice = decide(result, PromotionRule(score="S_mean"))
+    choice = decide(result, PromotionRule())
     model, region = toy_model(batches)
     new = registry.Newcomer(
         result, choice, model, machine_yaml("toy-doubt"), tracking.log_training(result, store), region
@@ -232,7 +232,7 @@ PROVISIONAL = {"standing": "provisional", "authority": 0.6, "caution": "not show
 
 def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
     client, name = MlflowClient(store.store_uri, registry_uri=store.store_uri), "toy-maybe-z"
-    refused = train(store, "toy-maybe", [5.0] * 6, caution="not shown to be better than zero")
+    refused = train(store, "toy-maybe", [5.0] * 6, standing="refused", caution="not shown to be better than zero")
     assert (refused.outcome, refused.standing) == ("challenger", "refused")
     first = train(store, "toy-maybe", [5.0] * 6, **PROVISIONAL)  # the same data, judged by another rule
     assert (first.outcome, first.version, first.champion_version) == ("provisional", 2, None)

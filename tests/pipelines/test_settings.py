@@ -46,7 +46,7 @@ def test_names_follow_the_patterns(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("promotion: {tie_precent: 3}", "unknown key 'promotion.tie_precent'; did you mean 'tie_percent'?"),
+        ("promotion: {ties_s: 3}", "unknown key 'promotion.ties_s'; did you mean 'ties_se'?"),
         ("promtion: {}", "unknown key 'promtion'; did you mean 'promotion'?"),
         ("promotion: {protocols: {leave-batch-in: 1}}", "did you mean 'leave-batch-out'?"),
         ("promotion: {significance: 2}", "key 'promotion.significance': got 2;"),

@@ -40,7 +40,7 @@ def test_the_outcome_of_a_training_in_one_sentence(toy_batches: Maker) -> None:
 def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     rule_cell = choose(result, RULE)
-    nested = score_of_choice(result, RULE)
+    nested = score_of_choice(result, RULE.only(rule_cell.protocol))
     nested = nested.loc[nested["protocol"] == rule_cell.protocol, "S_um"]
     computed = promoted_cell(training(result), RULE, nested=True)
     assert computed.nested_S_mean_um == pytest.approx(nested.mean())
@@ -67,8 +67,8 @@ def test_a_winner_that_luck_explains_is_not_trusted(toy_batches: Maker) -> None:
 def test_a_provisional_model_has_its_badge_and_its_share(toy_batches: Maker) -> None:
     result = results(toy_batches)["z"]
     own = {"outcome": "provisional", "standing": "provisional", "authority": 0.6, "champion_version": None}
-    recorded = promotion(choose(result.cells, RULE).cell, caution="not shown to be better than zero", **own)
-    said = verdict("z", training(result, recorded), choose(result.cells, RULE))
+    recorded = promotion(choose(result, RULE).cell, caution="not shown to be better than zero", **own)
+    said = verdict("z", training(result, recorded), choose(result, RULE))
     assert (said.chip, said.caution) == ("provisional", "Provisional: not shown to be better than no model.")
     assert "is provisional: " in said.summary and "0.6 of its correction" in said.summary
     assert mark_of(training(result, recorded)) == "provisional"
