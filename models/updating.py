@@ -6,8 +6,8 @@ The residual of a run, recorded less predicted, is
 
 with an offset a that walks at random, a slow drift d per hour and gains g_j of the family's inputs (of its prediction,
 where it has none), which are constant in a run and zero on average. Their variances, q and the noise n of a reading are
-learned from training runs that were predicted out of fold. A row uses the readings of its run before it. Along a feed
-axis the residual is taken as common to all positions.
+what served training runs that were predicted out of fold; no reading and the last residual held are limits of them. A
+row uses the readings of its run before it. Along a feed axis the residual is taken as common to all positions.
 
 Readings that correct a thermal model in process: Blaser et al. (2017), J. Manuf. Syst. 44, 302; filter: Kalman (1960).
 """
@@ -15,7 +15,7 @@ Readings that correct a thermal model in process: Blaser et al. (2017), J. Manuf
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -30,13 +30,15 @@ from models.metrics import SIDE_OF_90, residual_std_um
 from models.solvers.kernels import unit_scale
 
 _HOUR_S = 3600.0
-_PER_RUN = 10  # known rows of a training run that are learned from: neighbours differ by less than a walk of an hour
+_PER_RUN = 60  # known rows of a training run that are learned from
+_READINGS = 24  # of a training run that are learned from, at most
 _LEAST_RUNS = 2
-_LEAST_UM2 = 1e-12  # residuals of rounding alone
-_PRIOR_SPREAD = 2.0  # sd of the logarithm of a variance about its share: a factor of 7 either way
-_FARTHEST = 4.0  # spreads from there that are tried, so that no covariance is singular
+_LEAST_UM = 1e-6  # residuals of rounding alone
+_SHARPNESS = 4.0  # a candidate that doubles the S of one training run weighs exp(−4) of the best
 _FITS_ITERATIVE = 4  # of an iterative family inside a training set
-_SHARES = {"drift": 0.3, "gain": 0.3, "walk": 0.3, "offset": 0.05, "noise": 0.02}  # of the mean square, a priori
+_PARTS = ("drift", "gain", "walk", "offset", "noise")
+# Variances that are tried, in those of an hour's walk; the gain's times the mean square of the inputs.
+_TRIED = np.array([(d, g, 1.0, 3.0, n) for d in (0.01, 0.1, 1) for g in (0.01, 0.1, 1, 10) for n in (0.01, 0.1, 1, 10)])
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,10 @@ class Track:
         return np.asarray(self.recorded_um - self.predicted_um)
 
 
+def _learned_on(track: Track) -> tuple[Readings, ...]:
+    return (SCHEDULES["one a shift"], Readings.evenly(2, float(track.time_s[-1])), SCHEDULES["one reading an hour"])
+
+
 @dataclass(frozen=True)
 class State:
     """Drift, gains and offset (p + 2,) with their covariance after the rows up to `time_s`; `started` after the
@@ -126,46 +132,54 @@ class Updater:
     """The filter of one family, error channel and set of inputs.
 
     n_inputs: p. variance_um2: by part, of the drift (per h²), of the gain of each input (per its squared unit), of the
-    walk (per h), of the offset at the start and of the noise of a reading.
+    walk (per h), of the offset at the start and of the noise of a reading. before: factor of the standard deviation
+    until the first reading.
     """
 
     n_inputs: int
     variance_um2: Mapping[str, float]
+    before: float = 1.0
 
     @classmethod
     def learn(cls, tracks: Sequence[Track]) -> Self:
         """From training runs that were each predicted by a model that did not know it.
 
-        Maximum of the likelihood times weak log-normal priors about a share of the mean square residual.
+        Each candidate of `_TRIED` corrects the training runs with one, two and hourly readings. The variances are the
+        geometric mean of the candidates, weighted by exponentials of their S: few runs leave it near the residual held,
+        many lead it to what serves them. A likelihood trusts drift and gains too much where runs differ in spread.
 
         Raises:
             InputError: fewer than 2 runs with 2 known residuals after their first row.
         """
-        from scipy.optimize import minimize  # takes long to load
-
         sampled = [(track, rows) for track in tracks if len(rows := _sampled(track)) > 1]
         if len(sampled) < _LEAST_RUNS:
             raise InputError(
                 f"updating by readings: got {len(sampled)} run(s) with known residuals, need at least {_LEAST_RUNS}; "
                 "give more batches"
             )
-        runs = [(_parts(track, rows), track.residual_um[rows]) for track, rows in sampled]
-        mean_square = float(np.mean(np.concatenate([r for _, r in runs]) ** 2))
-        moved = float(np.mean(np.concatenate([np.diag(parts[1]) for parts, _ in runs])))
-        stacks = [
-            tuple(np.stack(each) for each in zip(*(run for run in runs if len(run[1]) == n), strict=True))
-            for n in sorted({len(r) for _, r in runs})
-        ]
-        share = np.array([*_SHARES.values()]) / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
-        centre = np.log(max(mean_square, _LEAST_UM2) * share)
+        moved = float(np.mean([np.mean(np.sum(_regressors(t)[rows, 1:-1] ** 2, axis=1)) for t, rows in sampled]))
+        tried = _TRIED / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
+        S_um = np.array([[_tried_S_um(t, rows, r, tried) for r in _learned_on(t)] for t, rows in sampled])
+        lost = np.sum(S_um / np.maximum(S_um.mean(axis=0).min(axis=-1, keepdims=True), _LEAST_UM), axis=0).mean(axis=0)
+        weight = np.exp(-_SHARPNESS * (lost - lost.min()))
+        found = np.exp(weight @ np.log(tried) / weight.sum())
+        return cls(tracks[0].inputs.shape[1], dict(zip(_PARTS, found.tolist(), strict=True)))._scaled(sampled)
 
-        def missed(theta: Array) -> float:
-            off = (theta - centre) / _PRIOR_SPREAD
-            return 0.5 * float(off @ off) + sum(_missed(np.exp(theta), *stack) for stack in stacks)
-
-        reach = _FARTHEST * _PRIOR_SPREAD
-        best = minimize(missed, centre, method="L-BFGS-B", bounds=[(c - reach, c + reach) for c in centre]).x
-        return cls(tracks[0].inputs.shape[1], dict(zip(_SHARES, np.exp(best).tolist(), strict=True)))
+    def _scaled(self, sampled: Sequence[tuple[Track, Index]]) -> Self:
+        """With standard deviations before and after a first reading that hold nine in ten of the training's rows."""
+        ratios: dict[bool, list[Array]] = {False: [], True: []}
+        for track, judged in sampled:
+            for readings in _learned_on(track):
+                rows = readings.rows(track.time_s, np.isfinite(track.residual_um))
+                done = self.run(track, rows, self.begin())
+                ratio = np.abs(track.recorded_um - done.corrected_um)[judged] / done.sd_um[judged]
+                for after, some in ratios.items():
+                    some.append(ratio[(np.searchsorted(rows, judged) > 0) == after])
+        pooled = [np.concatenate(some) for some in ratios.values()]
+        before, after = (max(float(np.quantile(r, 0.9)) / SIDE_OF_90, _LEAST_UM) if len(r) else 1.0 for r in pooled)
+        return replace(
+            self, before=before / after, variance_um2={k: v * after**2 for k, v in self.variance_um2.items()}
+        )
 
     def begin(self) -> State:
         """State before the first row of a run."""
@@ -194,13 +208,14 @@ class Updater:
         if not state.started:
             h[: predicted[0] + 1 if len(predicted) else None] = 0.0
         corrected, sd = track.predicted_um.copy(), np.full(len(h), np.nan)
+        before = 1.0 if state.mean.any() else self.before
         mean, cov, now_s, at = state.mean, state.cov.copy(), state.time_s, 0
         for row in [*rows[np.isfinite(residual_um[rows])].tolist(), len(h)]:
             part = slice(at, row + 1)
             walked = self.variance_um2["walk"] * (track.time_s[part] - now_s) / _HOUR_S
             corrected[part] += h[part] @ mean
             own = np.einsum("ij,jk,ik->i", h[part], cov, h[part]) + h[part, -1] * walked
-            sd[part] = np.sqrt(np.maximum(own, 0.0) + self.variance_um2["noise"])
+            sd[part] = np.sqrt(np.maximum(own, 0.0) + self.variance_um2["noise"]) * before
             if len(walked):
                 cov[-1, -1] += walked[-1]
                 now_s = float(track.time_s[part][-1])
@@ -208,18 +223,20 @@ class Updater:
                 gain = cov @ h[row] / (h[row] @ cov @ h[row] + self.variance_um2["noise"])
                 mean = mean + gain * (residual_um[row] - h[row] @ mean)
                 cov = cov - np.outer(gain, h[row] @ cov)
+                before = 1.0
             at = row + 1
         sd[~np.isfinite(corrected)] = np.nan
         return Updated(corrected, sd, State(mean, cov, now_s, state.started or bool(len(predicted))))
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers."""
-        return {"n_inputs": self.n_inputs, "variance_um2": dict(self.variance_um2)}
+        return {"n_inputs": self.n_inputs, "variance_um2": dict(self.variance_um2), "before": self.before}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`."""
-        return cls(int(plain["n_inputs"]), {part: float(plain["variance_um2"][part]) for part in _SHARES})
+        variance_um2 = {part: float(plain["variance_um2"][part]) for part in _PARTS}
+        return cls(int(plain["n_inputs"]), variance_um2, float(plain.get("before", 1.0)))
 
 
 def _regressors(track: Track) -> Array:
@@ -228,27 +245,29 @@ def _regressors(track: Track) -> Array:
     return np.column_stack([track.time_s / _HOUR_S, inputs, np.ones(len(inputs))])
 
 
-def _parts(track: Track, rows: Index) -> Array:
-    """Covariance (5, n, n) of the residual at some rows by part, each for a variance of 1; order of `_SHARES`."""
-    h = _regressors(track)[rows]
-    time_h, inputs, one = h[:, 0], h[:, 1:-1], h[:, -1]
-    walk = np.minimum.outer(time_h, time_h)
-    return np.array([np.outer(time_h, time_h), inputs @ inputs.T, walk, np.outer(one, one), np.eye(len(rows))])
+def _parts(one: Array, other: Array) -> Array:
+    """Covariance (4, n, m) of drift, gains, walk and offset between rows with these regressors, variances of 1."""
+    walk = np.minimum.outer(one[:, 0], other[:, 0])
+    return np.array([np.outer(one[:, 0], other[:, 0]), one[:, 1:-1] @ other[:, 1:-1].T, walk, np.ones_like(walk)])
 
 
-def _missed(variance_um2: Array, parts: Array, residual_um: Array) -> float:
-    """Negative log-likelihood of the residuals (R, n) of R runs whose covariances have these parts (R, P, n, n)."""
-    runs, n = residual_um.shape
-    cov = (variance_um2 @ parts.reshape(runs, len(variance_um2), -1)).reshape(runs, n, n)
-    factor = np.linalg.cholesky(cov)
-    white = np.linalg.solve(factor, residual_um[:, :, None])
-    return 0.5 * float((white**2).sum()) + float(np.log(np.einsum("rii->ri", factor)).sum())
+def _tried_S_um(track: Track, judged: Index, readings: Readings, tried: Array) -> Array:
+    """S (C,) over the judged rows of a run with readings, by C candidates' variances (C, 5)."""
+    rows = readings.rows(track.time_s, np.isfinite(track.residual_um))[:_READINGS]
+    h, residual_um = _regressors(track), track.residual_um
+    missed_um = np.repeat(residual_um[None, judged], len(tried), axis=0)
+    ahead = np.tensordot(tried[:, :-1], _parts(h[judged], h[rows]), 1)
+    among = np.tensordot(tried[:, :-1], _parts(h[rows], h[rows]), 1) + tried[:, -1, None, None] * np.eye(len(rows))
+    last = np.searchsorted(rows, judged)  # readings before each judged row
+    for n in range(1, len(rows) + 1):
+        weights = np.linalg.solve(among[:, :n, :n], residual_um[rows[:n], None])
+        missed_um[:, last == n] -= (ahead[:, last == n, :n] @ weights)[:, :, 0]
+    return np.asarray(residual_std_um(missed_um.T))
 
 
 def _sampled(track: Track) -> Index:
     """At most so many known rows of a run, evenly, the last one among them and the first row, which is 0, not."""
     known = np.flatnonzero(np.isfinite(track.residual_um))[1:]
-    known = known[np.isfinite(track.inputs[known]).all(axis=1)]
     return known[np.unique(np.linspace(0, len(known) - 1, _PER_RUN + 1).astype(int)[1:])] if len(known) else known
 
 
