@@ -15,7 +15,7 @@ Readings that correct a thermal model in process: Blaser et al. (2017), J. Manuf
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -33,12 +33,14 @@ _HOUR_S = 3600.0
 _PER_RUN = 60  # known rows of a training run that are learned from
 _READINGS = 24  # of a training run that are learned from, at most
 _LEAST_RUNS = 2
+_LATEST = 4  # training runs that the bands hold as well as all: a machine's spread may have grown
 _LEAST_UM = 1e-6  # residuals of rounding alone
 _SHARPNESS = 4.0  # a candidate that doubles the S of one training run weighs exp(−4) of the best
 _FITS_ITERATIVE = 4  # of an iterative family inside a training set
 _PARTS = ("drift", "gain", "walk", "offset", "noise")
+_LEVELS = (0.01, 0.1, 1, 10)
 # Variances that are tried, in those of an hour's walk; the gain's times the mean square of the inputs.
-_TRIED = np.array([(d, g, 1.0, 3.0, n) for d in (0.01, 0.1, 1) for g in (0.01, 0.1, 1, 10) for n in (0.01, 0.1, 1, 10)])
+_TRIED = np.array([(d, g, 1, 3, n) for d in (1e-4, 0.01, 0.1, 1, 100) for g in _LEVELS for n in _LEVELS])
 
 
 @dataclass(frozen=True)
@@ -74,11 +76,13 @@ class Readings:
         return np.unique(found[time_s[found] < due_s[: len(found)] + self.every_s])
 
 
+Schedule = Readings | int  # a number: so many readings evenly over a run
 SCHEDULES: Mapping[str, Readings] = {
     "one reading an hour": Readings(_HOUR_S, _HOUR_S),
     "one a shift": Readings(_HOUR_S),
 }
 COUNTS = (0, 1, 2, 4, 8)  # readings a run of the curve
+_LEARNED_ON: tuple[Schedule, ...] = (Readings(), 2, Readings(every_s=_HOUR_S))
 
 
 @dataclass(frozen=True)
@@ -102,9 +106,10 @@ class Track:
     def residual_um(self) -> Array:
         return np.asarray(self.recorded_um - self.predicted_um)
 
-
-def _learned_on(track: Track) -> tuple[Readings, ...]:
-    return (SCHEDULES["one a shift"], Readings.evenly(2, float(track.time_s[-1])), SCHEDULES["one reading an hour"])
+    def rows(self, schedule: Schedule) -> Index:
+        """Rows read."""
+        readings = schedule if isinstance(schedule, Readings) else Readings.evenly(schedule, float(self.time_s[-1]))
+        return readings.rows(self.time_s, np.isfinite(self.residual_um))
 
 
 @dataclass(frozen=True)
@@ -132,13 +137,11 @@ class Updater:
     """The filter of one family, error channel and set of inputs.
 
     n_inputs: p. variance_um2: by part, of the drift (per h²), of the gain of each input (per its squared unit), of the
-    walk (per h), of the offset at the start and of the noise of a reading. before: factor of the standard deviation
-    until the first reading.
+    walk (per h), of the offset at the start and of the noise of a reading.
     """
 
     n_inputs: int
     variance_um2: Mapping[str, float]
-    before: float = 1.0
 
     @classmethod
     def learn(cls, tracks: Sequence[Track]) -> Self:
@@ -153,33 +156,25 @@ class Updater:
         """
         sampled = [(track, rows) for track in tracks if len(rows := _sampled(track)) > 1]
         if len(sampled) < _LEAST_RUNS:
-            raise InputError(
-                f"updating by readings: got {len(sampled)} run(s) with known residuals, need at least {_LEAST_RUNS}; "
-                "give more batches"
-            )
-        moved = float(np.mean([np.mean(np.sum(_regressors(t)[rows, 1:-1] ** 2, axis=1)) for t, rows in sampled]))
+            got = f"got {len(sampled)} run(s) with known residuals, need at least {_LEAST_RUNS}"
+            raise InputError(f"updating by readings: {got}; give more batches")
+        moved = float(np.mean(np.concatenate([(_regressors(t)[rows, 1:-1] ** 2).sum(axis=1) for t, rows in sampled])))
         tried = _TRIED / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
-        S_um = np.array([[_tried_S_um(t, rows, r, tried) for r in _learned_on(t)] for t, rows in sampled])
+        S_um = np.array([[_tried_S_um(t, rows, s, tried) for s in _LEARNED_ON] for t, rows in sampled])
         lost = np.sum(S_um / np.maximum(S_um.mean(axis=0).min(axis=-1, keepdims=True), _LEAST_UM), axis=0).mean(axis=0)
         weight = np.exp(-_SHARPNESS * (lost - lost.min()))
         found = np.exp(weight @ np.log(tried) / weight.sum())
         return cls(tracks[0].inputs.shape[1], dict(zip(_PARTS, found.tolist(), strict=True)))._scaled(sampled)
 
     def _scaled(self, sampled: Sequence[tuple[Track, Index]]) -> Self:
-        """With standard deviations before and after a first reading that hold nine in ten of the training's rows."""
-        ratios: dict[bool, list[Array]] = {False: [], True: []}
+        """With variances whose bands hold nine in ten of the rows of all runs, and of the latest ones."""
+        ratios = []
         for track, judged in sampled:
-            for readings in _learned_on(track):
-                rows = readings.rows(track.time_s, np.isfinite(track.residual_um))
-                done = self.run(track, rows, self.begin())
-                ratio = np.abs(track.recorded_um - done.corrected_um)[judged] / done.sd_um[judged]
-                for after, some in ratios.items():
-                    some.append(ratio[(np.searchsorted(rows, judged) > 0) == after])
-        pooled = [np.concatenate(some) for some in ratios.values()]
-        before, after = (max(float(np.quantile(r, 0.9)) / SIDE_OF_90, _LEAST_UM) if len(r) else 1.0 for r in pooled)
-        return replace(
-            self, before=before / after, variance_um2={k: v * after**2 for k, v in self.variance_um2.items()}
-        )
+            done = [self.run(track, track.rows(schedule), self.begin()) for schedule in _LEARNED_ON]
+            ratios.append(np.hstack([(np.abs(track.recorded_um - d.corrected_um) / d.sd_um)[judged] for d in done]))
+        needed = max(float(np.quantile(np.hstack(some), 0.9)) for some in (ratios, ratios[-_LATEST:]))
+        scale = max(needed, _LEAST_UM) / SIDE_OF_90
+        return type(self)(self.n_inputs, {part: v * scale**2 for part, v in self.variance_um2.items()})
 
     def begin(self) -> State:
         """State before the first row of a run."""
@@ -199,23 +194,19 @@ class Updater:
         return float(done.corrected_um[0]), float(done.sd_um[0]), done.state
 
     def run(self, track: Track, rows: Index, state: State) -> Updated:
-        """A run, or the next rows of one, with readings of the recorded error at the given rows (rising).
-
-        `state` is that of `begin`, or after the rows before.
-        """
+        """A run, or the next rows of one after those of `state`, with readings of the error at given rows (rising)."""
         h = _regressors(track)
         predicted, residual_um = np.flatnonzero(np.isfinite(track.predicted_um)), track.residual_um
         if not state.started:
             h[: predicted[0] + 1 if len(predicted) else None] = 0.0
         corrected, sd = track.predicted_um.copy(), np.full(len(h), np.nan)
-        before = 1.0 if state.mean.any() else self.before
         mean, cov, now_s, at = state.mean, state.cov.copy(), state.time_s, 0
         for row in [*rows[np.isfinite(residual_um[rows])].tolist(), len(h)]:
             part = slice(at, row + 1)
             walked = self.variance_um2["walk"] * (track.time_s[part] - now_s) / _HOUR_S
             corrected[part] += h[part] @ mean
             own = np.einsum("ij,jk,ik->i", h[part], cov, h[part]) + h[part, -1] * walked
-            sd[part] = np.sqrt(np.maximum(own, 0.0) + self.variance_um2["noise"]) * before
+            sd[part] = np.sqrt(np.maximum(own, 0.0) + self.variance_um2["noise"])
             if len(walked):
                 cov[-1, -1] += walked[-1]
                 now_s = float(track.time_s[part][-1])
@@ -223,20 +214,18 @@ class Updater:
                 gain = cov @ h[row] / (h[row] @ cov @ h[row] + self.variance_um2["noise"])
                 mean = mean + gain * (residual_um[row] - h[row] @ mean)
                 cov = cov - np.outer(gain, h[row] @ cov)
-                before = 1.0
             at = row + 1
         sd[~np.isfinite(corrected)] = np.nan
         return Updated(corrected, sd, State(mean, cov, now_s, state.started or bool(len(predicted))))
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers."""
-        return {"n_inputs": self.n_inputs, "variance_um2": dict(self.variance_um2), "before": self.before}
+        return {"n_inputs": self.n_inputs, "variance_um2": dict(self.variance_um2)}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`."""
-        variance_um2 = {part: float(plain["variance_um2"][part]) for part in _PARTS}
-        return cls(int(plain["n_inputs"]), variance_um2, float(plain.get("before", 1.0)))
+        return cls(int(plain["n_inputs"]), {part: float(plain["variance_um2"][part]) for part in _PARTS})
 
 
 def _regressors(track: Track) -> Array:
@@ -245,19 +234,19 @@ def _regressors(track: Track) -> Array:
     return np.column_stack([track.time_s / _HOUR_S, inputs, np.ones(len(inputs))])
 
 
-def _parts(one: Array, other: Array) -> Array:
-    """Covariance (4, n, m) of drift, gains, walk and offset between rows with these regressors, variances of 1."""
-    walk = np.minimum.outer(one[:, 0], other[:, 0])
-    return np.array([np.outer(one[:, 0], other[:, 0]), one[:, 1:-1] @ other[:, 1:-1].T, walk, np.ones_like(walk)])
-
-
-def _tried_S_um(track: Track, judged: Index, readings: Readings, tried: Array) -> Array:
+def _tried_S_um(track: Track, judged: Index, schedule: Schedule, tried: Array) -> Array:
     """S (C,) over the judged rows of a run with readings, by C candidates' variances (C, 5)."""
-    rows = readings.rows(track.time_s, np.isfinite(track.residual_um))[:_READINGS]
+    rows = track.rows(schedule)[:_READINGS]
     h, residual_um = _regressors(track), track.residual_um
+
+    def covariance(one: Array, other: Array) -> Array:
+        walk = np.minimum.outer(one[:, 0], other[:, 0])
+        parts = np.outer(one[:, 0], other[:, 0]), one[:, 1:-1] @ other[:, 1:-1].T, walk, np.ones_like(walk)
+        return np.tensordot(tried[:, :-1], np.array(parts), 1)
+
+    ahead, among = covariance(h[judged], h[rows]), covariance(h[rows], h[rows])
+    among += tried[:, -1, None, None] * np.eye(len(rows))
     missed_um = np.repeat(residual_um[None, judged], len(tried), axis=0)
-    ahead = np.tensordot(tried[:, :-1], _parts(h[judged], h[rows]), 1)
-    among = np.tensordot(tried[:, :-1], _parts(h[rows], h[rows]), 1) + tried[:, -1, None, None] * np.eye(len(rows))
     last = np.searchsorted(rows, judged)  # readings before each judged row
     for n in range(1, len(rows) + 1):
         weights = np.linalg.solve(among[:, :n, :n], residual_um[rows[:n], None])
@@ -271,11 +260,10 @@ def _sampled(track: Track) -> Index:
     return known[np.unique(np.linspace(0, len(known) - 1, _PER_RUN + 1).astype(int)[1:])] if len(known) else known
 
 
-COLUMNS = [
-    "cell", "protocol", "schedule", "fold", "batch_id", "n_readings", "S_um", "held_S_um", "free_S_um", "coverage90",
-]  # fmt: skip
+COLUMNS = ["cell", "protocol", "schedule", "fold", "batch_id", "n_readings", "S_um", "held_S_um", "free_S_um",
+           "coverage90"]  # fmt: skip
 FORWARD = ("forward", "forward-gap")
-EVERY: Mapping[str, Readings | int] = {**SCHEDULES, **{f"{n} evenly": n for n in COUNTS}}
+EVERY: Mapping[str, Schedule] = {**SCHEDULES, **{f"{n} evenly": n for n in COUNTS}}
 
 
 def updated_scores(
@@ -283,16 +271,15 @@ def updated_scores(
     selector: str,
     family: str,
     n_tsp: int,
-    schedules: Mapping[str, Readings | int] = EVERY,
+    schedules: Mapping[str, Schedule] = EVERY,
     protocols: Sequence[str] = FORWARD,
 ) -> pd.DataFrame:
     """One row per protocol forward in time, schedule, fold and judged batch of a cell, with the columns `COLUMNS`.
 
     cell: "selector|family|n_tsp"; n_readings: of the batch; S_um: with readings, over all rows, a row that was read
-    included with what was predicted before; held_S_um: the same where the residual of the last reading is held, the
-    plain way; free_S_um: of the free-running prediction; coverage90: share of rows within
-    1.645 of the stated standard deviations. A schedule of a number is so many readings evenly over each run. The
-    updater is learned from the fold's training batches. Folds that cannot be fitted are left out.
+    included with what was predicted before; held_S_um: the same where the residual of the last reading is held;
+    free_S_um: of the free-running prediction; coverage90: share of rows within 1.645 of the stated standard deviations.
+    The updater is learned from the fold's training batches. Folds that cannot be fitted are left out.
     """
     rows, cell = [], f"{selector}|{family}|{n_tsp}"
     for protocol in protocols:
@@ -305,9 +292,8 @@ def updated_scores(
                 continue
             for name, schedule in schedules.items():
                 for k, track in zip(fold.test, tracks, strict=True):
-                    rows.append(
-                        (cell, protocol, name, fold.name, design.batch_ids[k], *scores(updater, track, schedule))
-                    )
+                    where = cell, protocol, name, fold.name, design.batch_ids[k]
+                    rows.append((*where, *scores(updater, track, schedule)))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
@@ -319,10 +305,8 @@ def learn_updater(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
     """
     folds = next((crossing.folds[p] for p in FORWARD if crossing.folds.get(p)), [])
     if not folds:
-        raise InputError(
-            f"updating by readings of {crossing.design.target}: no protocol forward in time among the folds; give "
-            "batches with start times, at least 6"
-        )
+        why = "no protocol forward in time among the folds; give batches with start times, at least 6"
+        raise InputError(f"updating by readings of {crossing.design.target}: {why}")
     order = (*folds[-1].train, *folds[-1].test)
     design = crossing.subset(crossing.inputs(selector, crossing.everything, n_tsp))
     return Updater.learn(out_of_fold(design, family, order))
@@ -343,7 +327,7 @@ def out_of_fold(design: Design, family: str, train: Sequence[int]) -> list[Track
         inner = [(tuple(j for j in train if j != k), (k,)) for k in train]
     fitted = FAMILIES[family]().fit_folds(design, [past for past, _ in inner])
     found = fitted[0].predict_folds(design, fitted, [later for _, later in inner])
-    pairs = [(k, p) for (_, later), ps in zip(inner, found, strict=True) for k, p in zip(later, ps, strict=True)]
+    pairs = zip((k for _, later in inner for k in later), (p for some in found for p in some), strict=True)
     return [Track.of(design, k, p) for k, p in pairs]
 
 
@@ -353,16 +337,13 @@ def predicted(design: Design, family: str, train: Sequence[int], test: Sequence[
     return [Track.of(design, k, p) for k, p in zip(test, fitted.predict_design(design, test), strict=True)]
 
 
-def scores(updater: Updater, track: Track, schedule: Readings | int) -> tuple[int, float, float, float, float]:
+def scores(updater: Updater, track: Track, schedule: Schedule) -> tuple[int, float, float, float, float]:
     """Number of readings, S with them, with the last one held and without, and coverage of one run."""
     known = np.isfinite(track.residual_um)
     free_S_um = float(residual_std_um(track.residual_um))
     if schedule == 0 or not known.any():
         return 0, free_S_um, free_S_um, free_S_um, float("nan")
-    if not isinstance(schedule, Readings):
-        schedule = Readings.evenly(schedule, float(track.time_s[-1]))
-    rows = schedule.rows(track.time_s, known)
-    done = updater.run(track, rows, updater.begin())
+    done = updater.run(track, rows := track.rows(schedule), updater.begin())
     missed_um = track.recorded_um - done.corrected_um
     inside = np.abs(missed_um[known]) <= SIDE_OF_90 * done.sd_um[known]
     held_S_um = float(residual_std_um(track.residual_um - held_um(track, rows)))
