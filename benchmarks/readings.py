@@ -5,8 +5,8 @@
 Blocks of later runs (`models.protocols.forward`), all temperature inputs; ridge also with lags of 30 and 120 min. For
 every machine, axis and model the mean and standard deviation over runs of S in µm: free-running, and with one reading a
 shift (the first hour's end) and one an hour, by a random walk of the offset (the last residual is held) and by
-`models.updating`. The second and fourth block are shown apart from the others: the form of the updater was chosen on
-blocks 1, 3 and 5 of the lathe and of the sample year, and on plants. Then S by the number of readings, and seconds.
+`models.updating`. The second and fourth block are shown apart from the others. The form of the updater was chosen on
+the sample year, the spindle and plants, not on the lathe. Then S by the number of readings, and seconds.
 
 The sample year and the sample lathe are simulated; the lathe and the spindle are recordings in `--data`, left out where
 that folder is missing; `--plants` adds three drawn plants.

@@ -17,6 +17,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, closest
 from features.rises import zeroed_error_um
+from models.updating import Readings
 
 HOW = ("lost", "frozen", "stepping")
 STEP_K = 15.0  # of a sensor that steps: a loose plug
@@ -88,7 +89,7 @@ def rehearse(
     exchange: Callable[[Sample], Correction],
     sample_s: float = 10.0,
     failures: Sequence[Failure] = (),
-    reading_every_s: float = math.inf,
+    readings: Readings | None = None,
     done: Callable[[int, int], None] = lambda n, of: None,
 ) -> Rehearsal:
     """Plays batches one after the other, a night apart.
@@ -98,7 +99,7 @@ def rehearse(
 
     Args:
         exchange: sends a sample and returns the answer.
-        reading_every_s: time between two readings; infinite: none.
+        readings: when a probe reads the error of each recording; None: never.
         done: called with rows done and rows in all.
 
     Raises:
@@ -120,7 +121,7 @@ def rehearse(
         columns = {c: np.interp(at_s, batch.time_s, batch.masked(c)) for c in names}
         error_um = {a: np.interp(at_s, batch.time_s, zeroed_error_um(batch, a)) for a in axes}
         starts_s[batch.batch_id] = shown_s
-        acting, due_s = dict.fromkeys(axes, 0.0), reading_every_s
+        acting, due_s = dict.fromkeys(axes, 0.0), readings.first_s if readings else math.inf
         for k, t in enumerate(at_s):
             now_s = shown_s + float(t)
             values = {c: float(v[k]) for c, v in columns.items() if np.isfinite(v[k])}
@@ -128,8 +129,8 @@ def rehearse(
                 f.applied(values, now_s, frozen)
             left = {a: float(error_um[a][k]) + acting[a] for a in axes}
             reading = {}
-            if t >= due_s:
-                due_s += reading_every_s
+            if readings and t >= due_s:
+                due_s += readings.every_s
                 reading = {a: v for a, v in left.items() if np.isfinite(v)}
                 readings_s.append(now_s)
             answer = exchange(Sample(clock_s + float(t), values, reading))
@@ -184,6 +185,24 @@ def failure(text: str) -> Failure:
             "front:lost@3h+45min"
         )
     return Failure(channel, how, start_s, start_s + length_s)
+
+
+def readings_of(text: str) -> Readings:
+    """`1h`: one reading of each recording after an hour; `every 90 min`: one each 90 min.
+
+    Raises:
+        InputError: another form.
+    """
+    every, length = text.strip().startswith("every "), text.strip().removeprefix("every ")
+    try:
+        due_s = _seconds(length)
+    except ValueError:
+        due_s = math.nan
+    if not 0 < due_s < math.inf:
+        raise InputError(
+            f"readings {text!r}: expected a time above 0 for one reading or an interval, e.g. 1h, every 90min"
+        )
+    return Readings(due_s, due_s if every else math.inf)
 
 
 def _seconds(text: str) -> float:

@@ -155,8 +155,8 @@ class Losses:
         protocol, group, ids = (wide.columns.get_level_values(k).to_numpy(object) for k in range(3))
         weight = np.array([rule.protocols[p] for p in protocol])
         race = result.race
-        counts = race.groupby(["round", "family"]).size() if len(race) else pd.Series(dtype=int)
-        tried = {str(family): int(n) for (_, family), n in counts.sort_values().items()}
+        counts = race.groupby(["round", "family"]).size().sort_values() if len(race) else pd.Series(dtype=int)
+        tried = {str(key[-1]): int(n) for key, n in zip(counts.index, counts, strict=True)} if len(race) else {}
         return cls(cells, wide.to_numpy(float), protocol, group, ids, weight, rule, tried)
 
     def counted(self, without: str | None = None) -> Array:

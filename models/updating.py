@@ -6,8 +6,8 @@ The residual of a run, recorded less predicted, is
 
 with an offset a that walks at random, a slow drift d per hour and gains g_j of the family's inputs (of its prediction,
 where it has none), which are constant in a run and zero on average. Their variances, q and the noise n of a reading are
-learned from training runs that were predicted out of fold. A row uses the readings of its run before it. Along a feed
-axis the residual is taken as common to all positions.
+what served training runs that were predicted out of fold; no reading and the last residual held are limits of them. A
+row uses the readings of its run before it. Along a feed axis the residual is taken as common to all positions.
 
 Readings that correct a thermal model in process: Blaser et al. (2017), J. Manuf. Syst. 44, 302; filter: Kalman (1960).
 """
@@ -30,13 +30,17 @@ from models.metrics import SIDE_OF_90, residual_std_um
 from models.solvers.kernels import unit_scale
 
 _HOUR_S = 3600.0
-_PER_RUN = 10  # known rows of a training run that are learned from: neighbours differ by less than a walk of an hour
+_PER_RUN = 60  # known rows of a training run that are learned from
+_READINGS = 24  # of a training run that are learned from, at most
 _LEAST_RUNS = 2
-_LEAST_UM2 = 1e-12  # residuals of rounding alone
-_PRIOR_SPREAD = 2.0  # sd of the logarithm of a variance about its share: a factor of 7 either way
-_FARTHEST = 4.0  # spreads from there that are tried, so that no covariance is singular
+_LATEST = 4  # training runs that the bands hold as well as all: a machine's spread may have grown
+_LEAST_UM = 1e-6  # residuals of rounding alone
+_SHARPNESS = 4.0  # a candidate that doubles the S of one training run weighs exp(−4) of the best
 _FITS_ITERATIVE = 4  # of an iterative family inside a training set
-_SHARES = {"drift": 0.3, "gain": 0.3, "walk": 0.3, "offset": 0.05, "noise": 0.02}  # of the mean square, a priori
+_PARTS = ("drift", "gain", "walk", "offset", "noise")
+_LEVELS = (0.01, 0.1, 1, 10)
+# Variances that are tried, in those of an hour's walk; the gain's times the mean square of the inputs.
+_TRIED = np.array([(d, g, 1, 3, n) for d in (1e-4, 0.01, 0.1, 1, 100) for g in _LEVELS for n in _LEVELS])
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,13 @@ class Readings:
         return np.unique(found[time_s[found] < due_s[: len(found)] + self.every_s])
 
 
+Schedule = Readings | int  # a number: so many readings evenly over a run
 SCHEDULES: Mapping[str, Readings] = {
     "one reading an hour": Readings(_HOUR_S, _HOUR_S),
     "one a shift": Readings(_HOUR_S),
 }
 COUNTS = (0, 1, 2, 4, 8)  # readings a run of the curve
+_LEARNED_ON: tuple[Schedule, ...] = (Readings(), 2, Readings(every_s=_HOUR_S))
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,11 @@ class Track:
     @property
     def residual_um(self) -> Array:
         return np.asarray(self.recorded_um - self.predicted_um)
+
+    def rows(self, schedule: Schedule) -> Index:
+        """Rows read."""
+        readings = schedule if isinstance(schedule, Readings) else Readings.evenly(schedule, float(self.time_s[-1]))
+        return readings.rows(self.time_s, np.isfinite(self.residual_um))
 
 
 @dataclass(frozen=True)
@@ -136,36 +147,34 @@ class Updater:
     def learn(cls, tracks: Sequence[Track]) -> Self:
         """From training runs that were each predicted by a model that did not know it.
 
-        Maximum of the likelihood times weak log-normal priors about a share of the mean square residual.
+        Each candidate of `_TRIED` corrects the training runs with one, two and hourly readings. The variances are the
+        geometric mean of the candidates, weighted by exponentials of their S: few runs leave it near the residual held,
+        many lead it to what serves them. A likelihood trusts drift and gains too much where runs differ in spread.
 
         Raises:
             InputError: fewer than 2 runs with 2 known residuals after their first row.
         """
-        from scipy.optimize import minimize  # takes long to load
-
         sampled = [(track, rows) for track in tracks if len(rows := _sampled(track)) > 1]
         if len(sampled) < _LEAST_RUNS:
-            raise InputError(
-                f"updating by readings: got {len(sampled)} run(s) with known residuals, need at least {_LEAST_RUNS}; "
-                "give more batches"
-            )
-        runs = [(_parts(track, rows), track.residual_um[rows]) for track, rows in sampled]
-        mean_square = float(np.mean(np.concatenate([r for _, r in runs]) ** 2))
-        moved = float(np.mean(np.concatenate([np.diag(parts[1]) for parts, _ in runs])))
-        stacks = [
-            tuple(np.stack(each) for each in zip(*(run for run in runs if len(run[1]) == n), strict=True))
-            for n in sorted({len(r) for _, r in runs})
-        ]
-        share = np.array([*_SHARES.values()]) / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
-        centre = np.log(max(mean_square, _LEAST_UM2) * share)
+            got = f"got {len(sampled)} run(s) with known residuals, need at least {_LEAST_RUNS}"
+            raise InputError(f"updating by readings: {got}; give more batches")
+        moved = float(np.mean(np.concatenate([(_regressors(t)[rows, 1:-1] ** 2).sum(axis=1) for t, rows in sampled])))
+        tried = _TRIED / np.array([1.0, moved or 1.0, 1.0, 1.0, 1.0])
+        S_um = np.array([[_tried_S_um(t, rows, s, tried) for s in _LEARNED_ON] for t, rows in sampled])
+        lost = np.sum(S_um / np.maximum(S_um.mean(axis=0).min(axis=-1, keepdims=True), _LEAST_UM), axis=0).mean(axis=0)
+        weight = np.exp(-_SHARPNESS * (lost - lost.min()))
+        found = np.exp(weight @ np.log(tried) / weight.sum())
+        return cls(tracks[0].inputs.shape[1], dict(zip(_PARTS, found.tolist(), strict=True)))._scaled(sampled)
 
-        def missed(theta: Array) -> float:
-            off = (theta - centre) / _PRIOR_SPREAD
-            return 0.5 * float(off @ off) + sum(_missed(np.exp(theta), *stack) for stack in stacks)
-
-        reach = _FARTHEST * _PRIOR_SPREAD
-        best = minimize(missed, centre, method="L-BFGS-B", bounds=[(c - reach, c + reach) for c in centre]).x
-        return cls(tracks[0].inputs.shape[1], dict(zip(_SHARES, np.exp(best).tolist(), strict=True)))
+    def _scaled(self, sampled: Sequence[tuple[Track, Index]]) -> Self:
+        """With variances whose bands hold nine in ten of the rows of all runs, and of the latest ones."""
+        ratios = []
+        for track, judged in sampled:
+            done = [self.run(track, track.rows(schedule), self.begin()) for schedule in _LEARNED_ON]
+            ratios.append(np.hstack([(np.abs(track.recorded_um - d.corrected_um) / d.sd_um)[judged] for d in done]))
+        needed = max(float(np.quantile(np.hstack(some), 0.9)) for some in (ratios, ratios[-_LATEST:]))
+        scale = max(needed, _LEAST_UM) / SIDE_OF_90
+        return type(self)(self.n_inputs, {part: v * scale**2 for part, v in self.variance_um2.items()})
 
     @property
     def noise_um2(self) -> float:
@@ -190,10 +199,7 @@ class Updater:
         return float(done.corrected_um[0]), float(done.sd_um[0]), done.state
 
     def run(self, track: Track, rows: Index, state: State) -> Updated:
-        """A run, or the next rows of one, with readings of the recorded error at the given rows (rising).
-
-        `state` is that of `begin`, or after the rows before.
-        """
+        """A run, or the next rows of one after those of `state`, with readings of the error at given rows (rising)."""
         h = _regressors(track)
         predicted, residual_um = np.flatnonzero(np.isfinite(track.predicted_um)), track.residual_um
         if not state.started:
@@ -224,7 +230,7 @@ class Updater:
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`."""
-        return cls(int(plain["n_inputs"]), {part: float(plain["variance_um2"][part]) for part in _SHARES})
+        return cls(int(plain["n_inputs"]), {part: float(plain["variance_um2"][part]) for part in _PARTS})
 
 
 def _regressors(track: Track) -> Array:
@@ -233,35 +239,36 @@ def _regressors(track: Track) -> Array:
     return np.column_stack([track.time_s / _HOUR_S, inputs, np.ones(len(inputs))])
 
 
-def _parts(track: Track, rows: Index) -> Array:
-    """Covariance (5, n, n) of the residual at some rows by part, each for a variance of 1; order of `_SHARES`."""
-    h = _regressors(track)[rows]
-    time_h, inputs, one = h[:, 0], h[:, 1:-1], h[:, -1]
-    walk = np.minimum.outer(time_h, time_h)
-    return np.array([np.outer(time_h, time_h), inputs @ inputs.T, walk, np.outer(one, one), np.eye(len(rows))])
+def _tried_S_um(track: Track, judged: Index, schedule: Schedule, tried: Array) -> Array:
+    """S (C,) over the judged rows of a run with readings, by C candidates' variances (C, 5)."""
+    rows = track.rows(schedule)[:_READINGS]
+    h, residual_um = _regressors(track), track.residual_um
 
+    def covariance(one: Array, other: Array) -> Array:
+        walk = np.minimum.outer(one[:, 0], other[:, 0])
+        parts = np.outer(one[:, 0], other[:, 0]), one[:, 1:-1] @ other[:, 1:-1].T, walk, np.ones_like(walk)
+        return np.tensordot(tried[:, :-1], np.array(parts), 1)
 
-def _missed(variance_um2: Array, parts: Array, residual_um: Array) -> float:
-    """Negative log-likelihood of the residuals (R, n) of R runs whose covariances have these parts (R, P, n, n)."""
-    runs, n = residual_um.shape
-    cov = (variance_um2 @ parts.reshape(runs, len(variance_um2), -1)).reshape(runs, n, n)
-    factor = np.linalg.cholesky(cov)
-    white = np.linalg.solve(factor, residual_um[:, :, None])
-    return 0.5 * float((white**2).sum()) + float(np.log(np.einsum("rii->ri", factor)).sum())
+    ahead, among = covariance(h[judged], h[rows]), covariance(h[rows], h[rows])
+    among += tried[:, -1, None, None] * np.eye(len(rows))
+    missed_um = np.repeat(residual_um[None, judged], len(tried), axis=0)
+    last = np.searchsorted(rows, judged)  # readings before each judged row
+    for n in range(1, len(rows) + 1):
+        weights = np.linalg.solve(among[:, :n, :n], residual_um[rows[:n], None])
+        missed_um[:, last == n] -= (ahead[:, last == n, :n] @ weights)[:, :, 0]
+    return np.asarray(residual_std_um(missed_um.T))
 
 
 def _sampled(track: Track) -> Index:
     """At most so many known rows of a run, evenly, the last one among them and the first row, which is 0, not."""
     known = np.flatnonzero(np.isfinite(track.residual_um))[1:]
-    known = known[np.isfinite(track.inputs[known]).all(axis=1)]
     return known[np.unique(np.linspace(0, len(known) - 1, _PER_RUN + 1).astype(int)[1:])] if len(known) else known
 
 
-COLUMNS = [
-    "cell", "protocol", "schedule", "fold", "batch_id", "n_readings", "S_um", "held_S_um", "free_S_um", "coverage90",
-]  # fmt: skip
+COLUMNS = ["cell", "protocol", "schedule", "fold", "batch_id", "n_readings", "S_um", "held_S_um", "free_S_um",
+           "coverage90"]  # fmt: skip
 FORWARD = ("forward", "forward-gap")
-EVERY: Mapping[str, Readings | int] = {**SCHEDULES, **{f"{n} evenly": n for n in COUNTS}}
+EVERY: Mapping[str, Schedule] = {**SCHEDULES, **{f"{n} evenly": n for n in COUNTS}}
 
 
 def updated_scores(
@@ -269,16 +276,15 @@ def updated_scores(
     selector: str,
     family: str,
     n_tsp: int,
-    schedules: Mapping[str, Readings | int] = EVERY,
+    schedules: Mapping[str, Schedule] = EVERY,
     protocols: Sequence[str] = FORWARD,
 ) -> pd.DataFrame:
     """One row per protocol forward in time, schedule, fold and judged batch of a cell, with the columns `COLUMNS`.
 
     cell: "selector|family|n_tsp"; n_readings: of the batch; S_um: with readings, over all rows, a row that was read
-    included with what was predicted before; held_S_um: the same where the residual of the last reading is held, the
-    plain way; free_S_um: of the free-running prediction; coverage90: share of rows within
-    1.645 of the stated standard deviations. A schedule of a number is so many readings evenly over each run. The
-    updater is learned from the fold's training batches. Folds that cannot be fitted are left out.
+    included with what was predicted before; held_S_um: the same where the residual of the last reading is held;
+    free_S_um: of the free-running prediction; coverage90: share of rows within 1.645 of the stated standard deviations.
+    The updater is learned from the fold's training batches. Folds that cannot be fitted are left out.
     """
     rows, cell = [], f"{selector}|{family}|{n_tsp}"
     for protocol in protocols:
@@ -291,9 +297,8 @@ def updated_scores(
                 continue
             for name, schedule in schedules.items():
                 for k, track in zip(fold.test, tracks, strict=True):
-                    rows.append(
-                        (cell, protocol, name, fold.name, design.batch_ids[k], *scores(updater, track, schedule))
-                    )
+                    where = cell, protocol, name, fold.name, design.batch_ids[k]
+                    rows.append((*where, *scores(updater, track, schedule)))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
@@ -305,10 +310,8 @@ def learn_updater(crossing: Crossing, selector: str, family: str, n_tsp: int) ->
     """
     folds = next((crossing.folds[p] for p in FORWARD if crossing.folds.get(p)), [])
     if not folds:
-        raise InputError(
-            f"updating by readings of {crossing.design.target}: no protocol forward in time among the folds; give "
-            "batches with start times, at least 6"
-        )
+        why = "no protocol forward in time among the folds; give batches with start times, at least 6"
+        raise InputError(f"updating by readings of {crossing.design.target}: {why}")
     order = (*folds[-1].train, *folds[-1].test)
     design = crossing.subset(crossing.inputs(selector, crossing.everything, n_tsp))
     return Updater.learn(out_of_fold(design, family, order))
@@ -329,7 +332,7 @@ def out_of_fold(design: Design, family: str, train: Sequence[int]) -> list[Track
         inner = [(tuple(j for j in train if j != k), (k,)) for k in train]
     fitted = FAMILIES[family]().fit_folds(design, [past for past, _ in inner])
     found = fitted[0].predict_folds(design, fitted, [later for _, later in inner])
-    pairs = [(k, p) for (_, later), ps in zip(inner, found, strict=True) for k, p in zip(later, ps, strict=True)]
+    pairs = zip((k for _, later in inner for k in later), (p for some in found for p in some), strict=True)
     return [Track.of(design, k, p) for k, p in pairs]
 
 
@@ -339,16 +342,13 @@ def predicted(design: Design, family: str, train: Sequence[int], test: Sequence[
     return [Track.of(design, k, p) for k, p in zip(test, fitted.predict_design(design, test), strict=True)]
 
 
-def scores(updater: Updater, track: Track, schedule: Readings | int) -> tuple[int, float, float, float, float]:
+def scores(updater: Updater, track: Track, schedule: Schedule) -> tuple[int, float, float, float, float]:
     """Number of readings, S with them, with the last one held and without, and coverage of one run."""
     known = np.isfinite(track.residual_um)
     free_S_um = float(residual_std_um(track.residual_um))
     if schedule == 0 or not known.any():
         return 0, free_S_um, free_S_um, free_S_um, float("nan")
-    if not isinstance(schedule, Readings):
-        schedule = Readings.evenly(schedule, float(track.time_s[-1]))
-    rows = schedule.rows(track.time_s, known)
-    done = updater.run(track, rows, updater.begin())
+    done = updater.run(track, rows := track.rows(schedule), updater.begin())
     missed_um = track.recorded_um - done.corrected_um
     inside = np.abs(missed_um[known]) <= SIDE_OF_90 * done.sd_um[known]
     held_S_um = float(residual_std_um(track.residual_um - held_um(track, rows)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -19,7 +18,7 @@ from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel as ExportedAxis
 from compensation.exports.base import Export
-from compensation.rehearsal import Rehearsal, failure, rehearse
+from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
 from compensation.substitutes import Substitutes
@@ -226,6 +225,7 @@ def rehearse_models(
     *,
     period_s: float = PERIOD_S,
     failures: Sequence[str] = (),
+    readings: str | None = None,
     readings_h: float | None = None,
     through: str | None = None,
     done: Callable[[int, int], None] = lambda n, of: None,
@@ -234,7 +234,8 @@ def rehearse_models(
 
     Args:
         failures: of sensors, as "front:lost@3h+45min".
-        readings_h: hours between two readings of a probe; None: none.
+        readings: of a probe, "1h" after the start of each recording or "every 1h"; None: none.
+        readings_h: hours between two readings, instead.
         through: address of a broker at which a compensation runs; None: it runs here.
 
     Raises:
@@ -242,13 +243,16 @@ def rehearse_models(
     """
     sample_s = given.sample_s or PERIOD_S
     failing = [failure(text) for text in failures]
-    every_s = math.inf if readings_h is None else 3600.0 * readings_h
+    if readings is not None and readings_h is not None:
+        raise InputError("readings: got a text and hours between two; give one of them, e.g. every 1h")
+    given_text = readings if readings_h is None else f"every {readings_h}h"
+    reads = None if given_text is None else readings_of(given_text)
     axes = [m.family.target for m in models]
     if through is None:
         running = compensator(models, given, period_s, lambda line: None)
-        return rehearse(batches, axes, lambda s: running.take(s, s.time_s), sample_s, failing, every_s, done)
+        return rehearse(batches, axes, lambda s: running.take(s, s.time_s), sample_s, failing, reads, done)
     with closing(MqttExchange(through)) as exchange:
-        return rehearse(batches, axes, exchange, sample_s, failing, every_s, done)
+        return rehearse(batches, axes, exchange, sample_s, failing, reads, done)
 
 
 def write_export(

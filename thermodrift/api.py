@@ -245,6 +245,7 @@ def rehearse(
     *,
     sample_s: float = 10.0,
     failures: Sequence[str] = (),
+    readings: str | None = None,
     readings_h: float | None = None,
     max_um: float | None = None,
     rate_um_per_s: float = 0.1,
@@ -257,7 +258,8 @@ def rehearse(
         recordings: files or folders that the models have not seen.
         sample_s: time between two samples.
         failures: of sensors, as "front:lost@3h+45min": how is lost, frozen or stepping, from when on and how long.
-        readings_h: hours between two readings of a probe; None: none.
+        readings: of a probe, "1h" after the start of each recording or "every 1h"; None: none.
+        readings_h: hours between two readings, instead.
         max_um, rate_um_per_s: limits of what is sent; None: a quarter more than the training's largest error.
         out: page of the rehearsal; None: none.
 
@@ -271,7 +273,7 @@ def rehearse(
     known = [load_model(name) for name in names]
     batches = [b for path in _paths(recordings) for b in read_files(known[0].machine, path)]
     given = Given(max_um, rate_um_per_s, sample_s)
-    done = rehearse_models(known, batches, given, failures=failures, readings_h=readings_h)
+    done = rehearse_models(known, batches, given, failures=failures, readings=readings, readings_h=readings_h)
     if out is not None:
         from reports.rehearsal import write_rehearsal
 

@@ -32,8 +32,11 @@ def rehearse(
     fail: Annotated[
         list[str] | None, typer.Option(help="SENSOR:HOW@START+DURATION, HOW lost, frozen or stepping")
     ] = None,
+    readings: Annotated[
+        str | None, typer.Option(help="of a probe: 1h after the start of each recording, or every 1h; default: none")
+    ] = None,
     readings_h: Annotated[
-        float | None, typer.Option(help="hours between two readings of a probe; default: none")
+        float | None, typer.Option(help="hours between two readings, as --readings 'every 1h'")
     ] = None,
     sample_s: Annotated[float, typer.Option(help="time between two samples, s")] = 10.0,
     max_um: MaxOffset = None,
@@ -64,8 +67,8 @@ def rehearse(
     given = Given(max_um, rate_um_per_s, sample_s)
     with console.progress(as_json) as (_, done):
         r = rehearse_models(
-            stored, batches, given, period_s=period_s, failures=fail or (), readings_h=readings_h, through=through,
-            done=lambda n, of: done("rehearse", n, of),
+            stored, batches, given, period_s=period_s, failures=fail or (), readings=readings, readings_h=readings_h,
+            through=through, done=lambda n, of: done("rehearse", n, of),
         )  # fmt: skip
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
     write_rehearsal(page, r, labelled(models, stored))

@@ -139,7 +139,7 @@ def test_two_odd_readings_that_agree_are_a_machine_that_has_changed() -> None:
         reading = {"z": float(truth_um[k] + sent[-1])} if k in (20, 25) else {}
         sent.append(machine.take(replace(s, readings_um=reading), s.time_s - 1e9).offset_um["z"])
     left_um = truth_um + np.array(sent)
-    assert left_um[21:25].mean() > 25.0 and abs(left_um[26:].mean()) < 3.0
+    assert left_um[21:25].mean() > 25.0 and abs(left_um[26:].mean()) < 5.0
     assert machine.rejected == 1 and "the machine has changed" in lines[-1]
 
 

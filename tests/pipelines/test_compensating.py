@@ -152,6 +152,14 @@ def test_a_rehearsal_shows_before_and_after(year: Path, model: Path, tmp_path: P
     assert told["axes"]["z"]["band95_after_um"] < 0.6 * told["axes"]["z"]["band95_before_um"]
     page = (tmp_path / "page.html").read_text()
     assert "SIMULATED" in page and "front" in page and "<script" not in page
+    at = options.index("--readings-h")
+    for text, count in (("1 h", 1), ("every 90min", 4)):
+        other = [*options[:at], "--readings", text, *options[at + 2 : -1]]
+        assert json.loads(CliRunner().invoke(app, other).stdout)["readings"] == count
+    done = CliRunner().invoke(app, [*options[:at], "--readings", "hourly", *options[at + 2 : -1]])
+    assert isinstance(done.exception, InputError) and "readings 'hourly': expected a time above 0" in str(
+        done.exception
+    )
     done = CliRunner().invoke(app, [*options, "nose:lost@2h+1h"])
     assert isinstance(done.exception, InputError) and "no channel 'nose'" in str(done.exception)
     done = CliRunner().invoke(app, [*options, "front:gone"])
