@@ -29,9 +29,10 @@ from data.machine import load_machine
 from data.recording import read_batches
 from features.design import Design
 from features.rises import temperature_inputs
+from models import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import forward
-from models.updating import COUNTS, SCHEDULES, Updater, out_of_fold, predicted, scores
+from models.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores
 from plants.plant import draw
 from plants.sample.sample_axis import write_sample_axis
 
@@ -72,7 +73,9 @@ def judged(batches: list[Batch], target: str, family: str, lags: bool) -> tuple[
     design = Design.build(batches, inputs, target)
     rows, curve, seconds = [], [], 0.0
     for block, fold in enumerate(forward(batches)):
-        learned_on, tracks = out_of_fold(design, family, fold.train), predicted(design, family, fold.train, fold.test)
+        learned_on, fitted = out_of_fold(design, family, fold.train), FAMILIES[family]().fit_design(design, fold.train)
+        predicted = fitted.predict_design(design, fold.test)
+        tracks = [Track.of(design, k, p) for k, p in zip(fold.test, predicted, strict=True)]
         start = time.perf_counter()
         updater = Updater.learn(learned_on)
         for track in tracks:

@@ -24,7 +24,6 @@ from models.protocols import Fold, season, speed, start_ambient_degC
 from models.race import Job, drive
 from models.result import CELL_KEYS, GridResult
 from models.trust import LeftOut, left_out_runs
-from models.updating import COLUMNS, updated_scores
 
 R = TypeVar("R")
 
@@ -74,12 +73,6 @@ class Workers:
         With it come the cell's predictions and, as in `Job`, what its selector chose.
         """
         return self._pool_of(asked[0][2]).submit(_distances, self._crossings, *asked)()
-
-    def readings(self, cell: tuple[str, str, str, int]) -> pd.DataFrame:
-        """`updated_scores` forward in time of the same; empty for iterative families, whose many fits take hours."""
-        if not FAMILIES[cell[2]].closed_form:
-            return pd.DataFrame(columns=COLUMNS)
-        return self._pool_of(cell[2]).submit(_readings, self._crossings, cell)()
 
     def _pool_of(self, family: str) -> Pool:
         return self._sharing if FAMILIES[family].shares_targets else self._pool
@@ -233,7 +226,3 @@ def _distances(
     crossing = crossings.get()[cell[0]]
     crossing.chosen.update(chosen)
     return left_out_runs(crossing, *cell[1:], known)
-
-
-def _readings(crossings: Shared[dict[str, Crossing]], cell: tuple[str, str, str, int]) -> pd.DataFrame:
-    return updated_scores(crossings.get()[cell[0]], *cell[1:], protocols=("forward",))

@@ -30,7 +30,7 @@ Standing = Literal["champion", "provisional", "refused"]
 KEYS = ["selector", "family", "n_tsp"]
 _SIGN_PATTERNS = 2**16  # of up to 16 batches all are counted, of more so many are drawn
 _INTERVAL = 0.90
-_MAJORITY = 2 / 3  # of the runs that a provisional model must improve
+_MAJORITY, _FEWEST = 2 / 3, 3  # share of the runs that a provisional model must improve, and fewest runs
 _GROUPED = ("leave-season-out", "leave-speed-out")
 _SHARES = np.linspace(0.05, 1.0, 20)  # of a correction that are tried as authority
 _UNMEASURED = 0.5  # authority of a provisional model whose left-out predictions are not known
@@ -42,9 +42,9 @@ class Choice:
 
     `score_um` is its expected loss, with the cost of choosing; `protocol` the leading one, `S_mean_um` and `S_std_um`
     are of this protocol. The nested score predicts every run by the cell that the other runs chose, under the same
-    protocol. `standing`: "champion", where it is shown to beat every baseline; "provisional", where it is expected to
-    and better in two of three runs, but not shown beyond doubt; "refused", where it may harm. `caution` is why it is no
-    champion. `authority` is the share of the correction that a provisional model is worth.
+    protocol. `standing`: "champion", where it is shown to be better than no model; "provisional", where it is expected
+    to be, and is in two of three runs, but this is not shown beyond doubt; "refused", where it may harm.
+    `caution` is why it is no champion. `authority` is the share of the correction that a provisional model is worth.
     """
 
     protocol: str
@@ -288,7 +288,7 @@ def pick(result: GridResult, rule: PromotionRule, cell: str) -> Choice:
 def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
     """The rule's choice (or the cell picked by hand), with its nested score, and how far it may be trusted.
 
-    A champion is shown to be better than every baseline by the paired test. The choice's own scores are flattered by
+    A champion is shown to be better than no model by the paired test. The choice's own scores are flattered by
     the search, so each run enters the test with the nested score where there is one.
 
     Raises:
@@ -304,16 +304,11 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
         summary += f"; each run by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
         choice = replace(choice, nested_S_mean_um=mean, nested_S_std_um=std)
         own = nested.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
-    if not choice.caution:
-        for baseline in BASELINES:
-            rest = left_out(result, led, "none", baseline, 0)
-            if len(rest) and not (test := compare_paired(own, rest, led)).better:
-                choice = replace(choice, caution=f"not shown to be better than {baseline} ({test.evidence})")
-                break
-    if choice.caution and choice.standing == "champion":
-        nothing = compare_paired(own, left_out(result, led, "none", "zero", 0), led)
-        helps = nothing.difference_um > 0 and nothing.n_better >= _MAJORITY * nothing.n_batches > 0
-        if helps:
+    nothing = left_out(result, led, "none", "zero", 0)
+    if not choice.caution and len(nothing) and not (test := compare_paired(own, nothing, led)).better:
+        choice = replace(choice, caution=f"not shown to be better than no model ({test.evidence})")
+        clear = test.n_batches >= _FEWEST and test.n_better >= _MAJORITY * test.n_batches
+        if test.difference_um > 0 and clear:
             share = authority(result.curves, choice)
             choice = replace(choice, standing="provisional", authority=share)
             summary += f"; provisional, {share:.2g} of the correction: {choice.caution}"
@@ -484,4 +479,5 @@ def _picked(table: pd.DataFrame, at: int, rule: PromotionRule, notes: Sequence[s
 def _cell_words(family: str, n_tsp: int, selector: str) -> str:
     if family in BASELINES or not n_tsp:
         return family
-    return f"{family} on {n_tsp} point{'s' if n_tsp > 1 else ''} by {selector}"
+    by = "" if selector == family else f" by {selector}"  # a stack's members bring their own points
+    return f"{family} on {n_tsp} point{'s' if n_tsp > 1 else ''}{by}"

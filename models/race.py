@@ -4,7 +4,8 @@ Four rounds, each on the cells that the one before it left:
 
 1. families: every family with all points and with four, fitted once on the first three quarters of the runs and judged
    on the last one (on every fourth run where it is not known which are later);
-2. points: every selector and number of points of the families that are left, on the same fold;
+2. points: every selector and number of points of the families that are left, on the same fold; slow, iterative families
+   with the selectors that served the others best;
 3. runs: all folds of the leading protocol, forward where it is known which run is later, else leave-batch-out;
 4. finalists: all folds of the other protocols.
 
@@ -13,7 +14,7 @@ After a round a cell is dropped where it is clearly worse than the leader on the
 and Talwalkar 2016): the best first, by their mean S with the cost of choosing (`cost_of_choosing`), pooled with the
 families' records (`pooled`), of each family no more than a part of them. The best cells of the four best families go on
 in any case, as runners-up and members of a stack, and so do the baselines. The best cell of the twin stays until the
-third round, since a growing error of the twin calls for a diagnosis.
+third round, since a growing error of the twin calls for a diagnosis; further only if it leads: its folds take minutes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ BASELINES = ("zero", "mean_curve")
 _CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
 _JUDGED_SHARE, _JUDGED_RUNS = 0.25, 4  # judged in the first rounds; of fewer to learn from rich models look worse
 _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all of many sensors is no fair trial
-_FAMILIES_KEPT, _SELECTORS_KEPT = 12, 4  # after the first and the second round
+_SAME = (
+    0.02  # relative difference of S on every run below which two cells are one model: nets that learned a linear map
+)
+_FAMILIES_KEPT, _SELECTORS_KEPT = 10, 4  # after the first and the second round
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
@@ -98,8 +102,15 @@ def rounds(crossing: Crossing) -> Rounds:
     left = _kept(first, "families", _FAMILIES_KEPT, table, most=1)
     kept = {key for _, key, _ in left}
     more = {key: _tried(every[key], crossing) for key in every if key in kept}
-    second = yield _jobs(crossing, "points", more, few, keep=False)
-    left = _kept(second, "points", _CELLS_PER_FINALIST * crossing.plan.finalists, table, selectors=_SELECTORS_KEPT)
+    quick = {key: own for key, own in more.items() if FAMILIES[key].closed_form}
+    second = yield _jobs(crossing, "points", quick, few, keep=False)
+    known = {selector for selector, _, _ in _kept(second, "points", len(every), [], selectors=_SELECTORS_KEPT)}
+    slow = {
+        key: tuple(c for c in more[key] if c[0] in known or c[1] == _most(more[key])) for key in more.keys() - quick
+    }
+    second += yield _jobs(crossing, "points of slow families", slow, few, keep=False)
+    places = _CELLS_PER_FINALIST * crossing.plan.finalists
+    left = _kept(second, "points", places, table, selectors=_SELECTORS_KEPT)
     third = yield _jobs(crossing, "runs", _by_family(left), {led: folds[led]})
     left = _kept(third, "runs", crossing.plan.finalists, table)
     rest = {p: own for p, own in folds.items() if p != led}
@@ -208,24 +219,25 @@ def _kept(
     behind_um, se_um = paired(S_um, S_um[order[0]])
     clear = loss_um - loss_um[order[0]] > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * own_share * se_um
     share = most if most is not None else -(-places // _FAMILY_SHARE)
-    why, taken, seen = ["" for _ in names], dict[str, int](), set[tuple[str, bytes]]()
+    why, taken, seen = ["" for _ in names], dict[str, int](), list[int]()
     n, through, twin = 0, {"none"}, name != "runs"
     for i in order:
         selector, family, _ = names[i]
-        same = (family, np.round(S_um[i], 9).tobytes())
         if is_base[i]:
             continue
         if not np.isfinite(S_mean_um[i]):
             why[i] = "not fitted"
+        elif FAMILIES[family].needs_twin and (family in taken or (name == "runs" and taken)):
+            why[i] = "slow, and not the leader"
+        elif any(np.allclose(S_um[i], S_um[k], rtol=_SAME) for k in seen):
+            why[i] = "the same as a better or simpler cell"
         elif family not in taken and (len(taken) < _RUNNERS_UP or (twin and FAMILIES[family].needs_twin)):
             twin = twin and not FAMILIES[family].needs_twin
             n, taken[family] = n + 1, 1
-            seen.add(same)
+            seen.append(i)
             through.add(selector)
         elif clear[i]:
             why[i] = "clearly worse than the leader"
-        elif same in seen:
-            why[i] = "the same model as another cell"
         elif n >= places or taken.get(family, 0) >= share:
             why[i] = "not among the best"
         elif selectors is not None and selector not in through and len(through) > selectors:
@@ -233,7 +245,7 @@ def _kept(
         else:
             through.add(selector)
             n, taken[family] = n + 1, taken.get(family, 0) + 1
-            seen.add(same)
+            seen.append(i)
     kept = [not w for w in why]
     own = pd.DataFrame(names, columns=keys).assign(
         round=name, n_runs=S_um.shape[1], S_mean_um=S_mean_um, behind_um=behind_um, se_um=se_um, kept=kept, why=why

@@ -15,6 +15,7 @@ Readings that correct a thermal model in process: Blaser et al. (2017), J. Manuf
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -267,7 +268,7 @@ def _sampled(track: Track) -> Index:
 
 COLUMNS = ["cell", "protocol", "schedule", "fold", "batch_id", "n_readings", "S_um", "held_S_um", "free_S_um",
            "coverage90"]  # fmt: skip
-FORWARD = ("forward", "forward-gap")
+_LED_BY = ("forward", "leave-batch-out")
 EVERY: Mapping[str, Schedule] = {**SCHEDULES, **{f"{n} evenly": n for n in COUNTS}}
 
 
@@ -276,45 +277,45 @@ def updated_scores(
     selector: str,
     family: str,
     n_tsp: int,
+    curves: pd.DataFrame,
     schedules: Mapping[str, Schedule] = EVERY,
-    protocols: Sequence[str] = FORWARD,
 ) -> pd.DataFrame:
-    """One row per protocol forward in time, schedule, fold and judged batch of a cell, with the columns `COLUMNS`.
+    """One row per schedule and forward run of a cell, with the columns `COLUMNS`.
 
     cell: "selector|family|n_tsp"; n_readings: of the batch; S_um: with readings, over all rows, a row that was read
     included with what was predicted before; held_S_um: the same where the residual of the last reading is held;
     free_S_um: of the free-running prediction; coverage90: share of rows within 1.645 of the stated standard deviations.
-    The updater is learned from the fold's training batches. Folds that cannot be fitted are left out.
+    The updater of a block is learned from the predictions of the blocks before it, so that the first one has none.
+
+    Args:
+        curves: the cell's left-out predictions, see `GridResult.curves`.
     """
-    rows, cell = [], f"{selector}|{family}|{n_tsp}"
-    for protocol in protocols:
-        for fold in crossing.folds.get(protocol, []):
-            design = crossing.subset(crossing.inputs(selector, fold.train, n_tsp))
-            try:
-                updater = Updater.learn(out_of_fold(design, family, fold.train))
-                tracks = predicted(design, family, fold.train, fold.test)
-            except InputError:
-                continue
+    own = curves[curves["protocol"] == "forward"] if len(curves) else curves
+    predicted = {str(k): g["predicted_um"].to_numpy(float) for k, g in own.groupby("batch_id")} if len(own) else {}
+    rows: list[tuple[object, ...]] = []
+    earlier: list[int] = []
+    cell = f"{selector}|{family}|{n_tsp}"
+    for fold in crossing.folds.get("forward", []) if predicted else []:
+        design = crossing.subset(crossing.inputs(selector, fold.train, n_tsp))
+        tracks = {k: Track.of(design, k, predicted[design.batch_ids[k]]) for k in (*earlier, *fold.test)}
+        with suppress(InputError):
+            updater = Updater.learn([tracks[k] for k in earlier])
             for name, schedule in schedules.items():
-                for k, track in zip(fold.test, tracks, strict=True):
-                    where = cell, protocol, name, fold.name, design.batch_ids[k]
-                    rows.append((*where, *scores(updater, track, schedule)))
+                for k in fold.test:
+                    where = cell, "forward", name, fold.name, design.batch_ids[k]
+                    rows.append((*where, *scores(updater, tracks[k], schedule)))
+        earlier += fold.test
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def learn_updater(crossing: Crossing, selector: str, family: str, n_tsp: int) -> Updater:
-    """The updater of a cell from all batches, for runs to come.
-
-    Raises:
-        InputError: too few batches, or their order in time is not known.
-    """
-    folds = next((crossing.folds[p] for p in FORWARD if crossing.folds.get(p)), [])
-    if not folds:
-        why = "no protocol forward in time among the folds; give batches with start times, at least 6"
-        raise InputError(f"updating by readings of {crossing.design.target}: {why}")
-    order = (*folds[-1].train, *folds[-1].test)
-    design = crossing.subset(crossing.inputs(selector, crossing.everything, n_tsp))
-    return Updater.learn(out_of_fold(design, family, order))
+def left_out_tracks(design: Design, curves: pd.DataFrame) -> list[Track]:
+    """The runs of a design with their left-out predictions: forward where there are such, else leave-batch-out."""
+    run = [p for p in _LED_BY if len(curves) and (curves["protocol"] == p).any()]
+    own = curves[curves["protocol"] == run[0]] if run else curves.iloc[:0]
+    predicted = {str(k): g["predicted_um"].to_numpy(float) for k, g in own.groupby("batch_id")} if run else {}
+    known = ((k, predicted.get(batch_id)) for k, batch_id in enumerate(design.batch_ids))
+    sizes = [design.rows(k).stop - design.rows(k).start for k in range(design.n_batches)]
+    return [Track.of(design, k, p) for k, p in known if p is not None and len(p) == sizes[k]]
 
 
 def out_of_fold(design: Design, family: str, train: Sequence[int]) -> list[Track]:
@@ -334,12 +335,6 @@ def out_of_fold(design: Design, family: str, train: Sequence[int]) -> list[Track
     found = fitted[0].predict_folds(design, fitted, [later for _, later in inner])
     pairs = zip((k for _, later in inner for k in later), (p for some in found for p in some), strict=True)
     return [Track.of(design, k, p) for k, p in pairs]
-
-
-def predicted(design: Design, family: str, train: Sequence[int], test: Sequence[int]) -> list[Track]:
-    """Batches `test` predicted by a model of the batches `train`. Raises: InputError, the model cannot be fitted."""
-    fitted = FAMILIES[family]().fit_design(design, train)
-    return [Track.of(design, k, p) for k, p in zip(test, fitted.predict_design(design, test), strict=True)]
 
 
 def scores(updater: Updater, track: Track, schedule: Schedule) -> tuple[int, float, float, float, float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from compensation.substitutes import Substitutes
 from data.batch import Batch
@@ -18,7 +19,7 @@ from features.rises import zeroed_error_um
 from models.base import Family
 from models.conformal import RunBound
 from models.trust import Region, fit_siblings
-from models.updating import Updater, out_of_fold
+from models.updating import Updater, left_out_tracks, out_of_fold
 from pipelines import model_store
 
 
@@ -30,6 +31,7 @@ def write(
     region: Region | None = None,
     info: Mapping[str, Any] | None = None,
     bound: RunBound | None = None,
+    curves: pd.DataFrame | None = None,
 ) -> model_store.StoredModel:
     """Write the model folder of a family that was fitted on these batches, and read it back.
 
@@ -38,6 +40,8 @@ def write(
         region: where the model was trained; default: from the batches.
         info: what else is kept with the model, plain data.
         bound: the bound of a run's error; without it predictions state none.
+        curves: left-out predictions of the training, see `GridResult.curves`; without them the family is fitted again
+            to learn what readings of a probe are worth.
 
     Raises:
         InputError: a family that is not fitted, or a machine file that cannot be used.
@@ -47,7 +51,7 @@ def write(
         "trained": _trained(family, batches),
         "largest_um": _largest_um(family, batches),
     }
-    updater, substitutes = _at_the_machine(family, machine_yaml, batches)
+    updater, substitutes = _at_the_machine(family, machine_yaml, batches, curves)
     model_store.save(
         folder, family, machine_yaml, region or Region.of(batches, family.inputs), dict(info or {}) | known, bound,
         fit_siblings(family, batches), updater, substitutes,
@@ -77,7 +81,7 @@ def _largest_um(family: Family, batches: Sequence[Batch]) -> float:
 
 
 def _at_the_machine(
-    family: Family, machine_yaml: str, batches: Sequence[Batch]
+    family: Family, machine_yaml: str, batches: Sequence[Batch], curves: pd.DataFrame | None
 ) -> tuple[Updater | None, Substitutes | None]:
     """The filter of readings and the substitutes of sensors.
 
@@ -91,7 +95,8 @@ def _at_the_machine(
     with suppress(InputError):
         machine = parse_machine(machine_yaml, "machine.yml")
         design = Design.build(ordered, family.inputs, family.target, machine)
-        updater = Updater.learn(out_of_fold(design, family.key, range(len(ordered))))
+        tracks = left_out_tracks(design, curves) if curves is not None else []
+        updater = Updater.learn(tracks or out_of_fold(design, family.key, range(len(ordered))))
     with suppress(InputError):
         channels = list(dict.fromkeys(i.partition("@")[0] for i in family.inputs))
         substitutes = Substitutes.learn(ordered, channels)

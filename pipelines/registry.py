@@ -469,7 +469,9 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
     bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        stored = fitted_model.write(folder, new.family, new.machine_yaml, new.batches, new.region, info, bound)
+        stored = fitted_model.write(
+            folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves
+        )
         served = write_served(stored, folder, stored.info["step_s"])
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]

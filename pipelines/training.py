@@ -28,6 +28,7 @@ from models.outlook import Outlook, outlook
 from models.race import Job, Raced, drive
 from models.result import GridResult, Training
 from models.trust import Region
+from models.updating import updated_scores
 from pipelines import registry, spool, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint
@@ -298,8 +299,7 @@ def _judge(
         if outcome.choices[t].standing == "provisional":  # its authority comes from the curves
             outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
         outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
-    chosen_cells = [cell for cell, _, _ in asked]
-    for t, readings in zip(targets, caller.map("readings", workers.readings, chosen_cells), strict=True):
+        readings = updated_scores(crossings[t], *asked[targets.index(t)][0][1:], left_out.curves)
         outcome.results[t] = replace(outcome.results[t], readings=readings)
 
 
@@ -319,7 +319,8 @@ def _kept(checkpoint: Checkpoint) -> Iterator[None]:
 def _record(
     outcome: TrainOutcome, plan: Plan, settings: Settings, target: str, record_id: str, started_ms: int
 ) -> Record:
-    params = {k: v if isinstance(v, str) else ", ".join(map(str, v or ("all",))) for k, v in asdict(plan).items()}
+    plain = {k: v if isinstance(v, tuple) else (v,) for k, v in asdict(plan).items()}
+    params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()}
     return tracking.training_record(
         outcome.results[target], settings.promotion, params, choice=outcome.choices.get(target), record_id=record_id,
         started_ms=started_ms,

@@ -38,7 +38,7 @@ def cell_label(selector: str, family: str, n_tsp: int) -> str:
     """A cell's label: ``ridge on 4 points by FCGC``."""
     if not n_tsp:
         return family_label(family)
-    if selector == "none":
+    if selector in ("none", family):  # a stack's members bring their own points
         return f"{family_label(family)} on all {n_tsp} points"
     return f"{family_label(family)} on {count(n_tsp, 'point')} by {selector_label(selector)}"
 

@@ -15,6 +15,7 @@ from reports.comparison import figures, tables
 from reports.comparison import story as records
 from reports.comparison.certainty import bound_panel, bound_table, certainty_table, diagnostics_table
 from reports.comparison.headline import Headline, headline
+from reports.comparison.race import race_table, why_panel
 from reports.comparison.readings import readings_panel, readings_table
 from reports.comparison.story import Verdict, comparison_rows, mark_of
 from reports.comparison.tables import (
@@ -53,6 +54,8 @@ class Channel:
     verdict: Verdict
     headline: Headline
     inputs: str
+    why: Panel | None
+    race: Table | None
     boards: tuple[Table, ...]
     certainty: Table | None
     heat: Table | None
@@ -106,6 +109,8 @@ def channel_part(
         verdict=outcome,
         headline=headline(name, group[0], choice, outcome, digits),
         inputs=", ".join(choice.inputs),
+        why=why_panel(name, result, choice, rule, digits),
+        race=race_table(name, result, digits),
         boards=boards,
         certainty=certainty_table(name, result, cells, choice, digits, mark),
         heat=tables.heat_map(name, result, cells, digits),

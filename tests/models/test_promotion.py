@@ -234,7 +234,7 @@ def test_of_several_protocols_a_batch_counts_once_with_their_weighted_mean():
 def test_four_batches_show_nothing():
     result = toy_result(toy_batches("toy-trust", 4), {"none|zero|0": [9.0] * 4, "none|mlr|2": [1.0] * 4})
     assert promotion.decide(result, RULE).caution == (
-        "not shown to be better than zero (4 batches in common, need at least 5)"
+        "not shown to be better than no model (4 batches in common, need at least 5)"
     )
 
 

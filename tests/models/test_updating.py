@@ -9,6 +9,7 @@ import pytest
 from data.errors import InputError
 from features.design import Design
 from models.crossing import Plan, cross_family, prepare
+from models.trust import left_out_runs
 from models.updating import (
     COLUMNS,
     COUNTS,
@@ -18,7 +19,7 @@ from models.updating import (
     Track,
     Updater,
     held_um,
-    learn_updater,
+    left_out_tracks,
     out_of_fold,
     scores,
     updated_scores,
@@ -176,7 +177,8 @@ def test_scores_of_a_cell_by_schedule(toy_batches) -> None:
     crossing = prepare(
         drifting(toy_batches, 10), "z", Plan(("correlation",), ("ridge", "zero"), ("forward",), n_tsps=(3,))
     )
-    found = updated_scores(crossing, "correlation", "ridge", 3)
+    curves = left_out_runs(crossing, "correlation", "ridge", 3).curves
+    found = updated_scores(crossing, "correlation", "ridge", 3, curves)
     assert list(found) == COLUMNS and set(found["schedule"]) == {*SCHEDULES, *(f"{n} evenly" for n in COUNTS)}
     curve = found[~found["schedule"].isin(SCHEDULES)].groupby("n_readings")["S_um"].mean()
     assert curve.index.tolist() == [0, 1, 2, 4, 8] and (np.diff(curve) < 0).all()
@@ -210,12 +212,12 @@ def test_what_cannot_be_learned_is_refused_in_one_line(toy_batches) -> None:
         Updater.learn(tracks(1, 1))
     with pytest.raises(InputError, match=r"readings: got first_s=0\.0"):
         Readings(0.0)
-    crossing = prepare(toy_batches(4), "z", Plan(("correlation",), ("ridge",), ("leave-batch-out",)))
-    with pytest.raises(InputError, match="updating by readings of z: no protocol forward in time"):
-        learn_updater(crossing, "correlation", "ridge", 2)
 
 
-def test_the_updater_for_runs_to_come_knows_all_batches(toy_batches) -> None:
+def test_the_updater_for_runs_to_come_knows_all_left_out_runs(toy_batches) -> None:
     crossing = prepare(drifting(toy_batches, 8), "z", Plan(("correlation",), ("ridge",), ("forward",), n_tsps=(3,)))
-    updater = learn_updater(crossing, "correlation", "ridge", 3)
+    curves = left_out_runs(crossing, "correlation", "ridge", 3).curves
+    known = left_out_tracks(crossing.subset(crossing.inputs("correlation", crossing.everything, 3)), curves)
+    assert len(known) == sum(len(f.test) for f in crossing.folds["forward"])
+    updater = Updater.learn(known)
     assert updater.variance_um2["drift"] > updater.variance_um2["noise"] and updater.n_inputs == 3

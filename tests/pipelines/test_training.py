@@ -214,7 +214,7 @@ def test_two_batches_train_and_one_does_not(home: Path, store: Any, tmp_path: Pa
     outcome = train(TrainRequest(machine, (files[1],), ("z",), plan), store, DirectCaller())
     promotion = outcome.promotions["z"]
     assert (promotion.outcome, promotion.champion_version) == ("challenger", None)
-    assert promotion.caution == "not shown to be better than zero (2 batches in common, need at least 5)"
+    assert promotion.caution == "not shown to be better than no model (2 batches in common, need at least 5)"
 
 
 def test_a_batch_without_a_usable_target_does_not_train_for_ever(home: Path, store: Any, tmp_path: Path) -> None:
