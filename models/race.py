@@ -133,7 +133,7 @@ def drive(crossings: Mapping[str, Crossing], cross: Callable[[list[Job]], list[F
     waiting = {target: next(race) for target, race in races.items()}
     done = {}
     while waiting:
-        jobs = [job for own in waiting.values() for job in own]
+        jobs = in_order([job for own in waiting.values() for job in own])
         scored = dict(zip((job.label for job in jobs), cross(jobs), strict=True))
         for target, own in list(waiting.items()):
             try:
@@ -144,6 +144,16 @@ def drive(crossings: Mapping[str, Crossing], cross: Callable[[list[Job]], list[F
     return {target: done[target] for target in crossings}
 
 
+def in_order(jobs: Sequence[Job]) -> list[Job]:
+    """The slow, iterative families first, so that none of them is alone at the end.
+
+    Of families that share work over the error channels one goes before all others; those that wait for it come last.
+    """
+    sharing = [j for j in jobs if FAMILIES[j.family].shares_targets]
+    rest = sorted((j for j in jobs if j not in sharing), key=lambda j: FAMILIES[j.family].closed_form)
+    return [*sharing[:1], *rest, *sharing[1:]]
+
+
 def _jobs(
     crossing: Crossing,
     name: str,
@@ -151,11 +161,9 @@ def _jobs(
     folds: Mapping[str, Sequence[Fold]],
     keep: bool = True,
 ) -> list[Job]:
-    """A job per family, those that share work over the error channels first, then the slow, iterative ones."""
     trained = [f for own in folds.values() for f in own]
-    by_cost = sorted(cells, key=lambda key: (not FAMILIES[key].shares_targets, FAMILIES[key].closed_form))
     jobs = []
-    for key in by_cost:
+    for key in cells:
         selectors = dict.fromkeys(selector for selector, n in cells[key] if n)
         chosen = crossing.select(selectors, trained)
         jobs.append(Job(crossing.design.target, key, name, tuple(cells[key]), folds, keep, chosen))

@@ -67,6 +67,12 @@ class Stack(Family):
 
     def fit_design(self, design: Design, train: Sequence[int]) -> Self:
         """Every member on the same batches. Raises: InputError, a member cannot be fitted."""
+        try:
+            return self._fitted(design, train)
+        except InputError as error:
+            raise InputError(f"{self.key}: {error}") from None
+
+    def _fitted(self, design: Design, train: Sequence[int]) -> Self:
         from models import FAMILIES
 
         used = [k for k in sorted(train) if np.isfinite(design.y_um[design.rows(k)]).sum() > 1]

@@ -31,7 +31,7 @@ def why_panel(name: str, result: GridResult, choice: Choice, rule: PromotionRule
     others = table[~table["is_own"] & ~table["family"].isin(BASELINES)]
     plot = Plot(_losses(table, own_um, result.simulated), f"{name}: expected loss of every family", "full")
     notes = [
-        "Mean S over left-out runs with the cost of choosing, pooled with what the family reached on other machines. The "
+        "Mean S over left-out runs with the cost of choosing, pooled with what the family reached on other machines. A "
         "bar is one standard error of the difference to the least of them, over runs."
     ]
     if len(others):

@@ -15,7 +15,7 @@ from features.design import Design
 from models import FAMILIES
 from models.base import Family, family_from_plain
 from models.crossing import Plan, cross_family, prepare
-from models.grid import jobs_of
+from models.race import Job, in_order
 from models.solvers.twin_folds import Calibrations, TwinRun, _thinned
 from models.twin import Twin
 from models.twin_kalman import TwinKalman
@@ -242,9 +242,11 @@ def test_a_plan_takes_the_twin_where_the_machine_file_has_one():
 
 
 def test_the_grid_starts_with_one_job_of_the_twin_and_ends_with_those_that_share_its_work():
-    jobs = jobs_of(Plan(families=("zero", "twin", "bp", "twin_residual")), ("z", "x"))
-    assert jobs[0] == ("z", "twin") and set(jobs[1:5]) == {(t, f) for t in "zx" for f in ("bp", "zero")}
-    assert jobs[5:] == [("x", "twin"), ("z", "twin_residual"), ("x", "twin_residual")]
+    families = ("zero", "twin", "bp", "twin_residual")
+    jobs = in_order([Job(t, f, "", (), {}, False) for f in families for t in ("z", "x")])
+    named = [(j.target, j.family) for j in jobs]
+    assert named[:5] == [("z", "twin"), ("z", "bp"), ("x", "bp"), ("z", "zero"), ("x", "zero")]
+    assert named[5:] == [("x", "twin"), ("z", "twin_residual"), ("x", "twin_residual")]
 
 
 def test_the_grid_crosses_them():

@@ -166,7 +166,7 @@ def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches:
     expected = outlook(both["z"], choose(both["z"], RULE))
     own = dict(zip((c.title for c in page.overview.columns), page.overview.rows[0].cells, strict=True))
     digits = len(str(own["expected S"]).split(".")[1])
-    assert own["status"] == "not promoted" and [r.mark for r in page.overview.rows] == ["", ""]
+    assert own["status"] == "provisional" and [r.mark for r in page.overview.rows] == ["", ""]
     assert own["expected S"] == f"{expected.S_um:.{digits}f}" and own["90 % bound"] == f"{expected.bound_um:.{digits}f}"
     assert [label for label, _ in page.facts] == ["Recordings", "Start ambient", "Spindle", "Trained"]
     assert page.channels[0].headline.figures[0][1] == f"{expected.S_um:.{digits}f} µm"
@@ -238,7 +238,7 @@ def test_the_heat_maps_show_the_least_score_of_each_pair_and_how_often_a_point_i
     heat, chosen = heat_map("z", result, cells, 2), point_frequency("z", result, cells, LBO)
     assert heat is not None and chosen is not None
     pairs = cells[~cells["family"].isin(["zero", "mean_curve"]) & (cells["n_tsp"] > 0)]
-    least = pairs.loc[pairs.groupby(["family", "selector"])["score_um"].idxmin()]
+    least = pairs.loc[pairs.groupby(["family", "selector"])["S_mean_um"].idxmin()]
     want = {(family_label(r.family), selector_label(r.selector)): (f"{r.S_mean_um:.2f}", f"n = {r.n_tsp}") for r in
             least.itertuples()}  # fmt: skip
     selectors = [c.title for c in heat.columns[1:]]
