@@ -68,8 +68,9 @@ class RunBound:
     that is farther out or less agreed upon is never expected to be better.
 
     expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement. unusual: the factor that
-    nine left-out runs in ten stay below. tested: the greatest distance of a left-out run. level: the quantile that
-    the bound is, 0.9 or more. n_runs: how many runs were left out.
+    nine left-out runs in ten stay below. tested, outside: the greatest distance of a left-out run, and the greatest share
+    of the rows of one beyond the region. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were
+    left out.
     """
 
     expected_um: float
@@ -81,6 +82,7 @@ class RunBound:
     tested: float
     level: float
     n_runs: int
+    outside: float = 1.0
 
     @classmethod
     def of(cls, table: pd.DataFrame) -> Self:
@@ -112,6 +114,7 @@ class RunBound:
         return cls(
             expected_um, bound_um, (float(slopes[0]), float(slopes[1])), typical_um, floor_um,
             _quantile(factor, weight, LEVEL), float(np.nanmax(distance, initial=0.0)), level, n,
+            float(table["outside"].max()) if "outside" in table else 1.0,
         )  # fmt: skip
 
     @classmethod

@@ -13,8 +13,9 @@ After a round a cell is dropped where it is clearly worse than the leader on the
 (Maron and Moore 1994, Hoeffding races), and so many remain as the next round can afford (successive halving: Jamieson
 and Talwalkar 2016): the best first, by their mean S with the cost of choosing (`cost_of_choosing`), pooled with the
 families' records (`pooled`), of each family no more than a part of them. The best cells of the four best families go on
-in any case, as runners-up and members of a stack, and so do the baselines. The best cell of the twin stays until the
-third round, since a growing error of the twin calls for a diagnosis; further only if it leads: its folds take minutes.
+in any case, as runners-up and members of a stack, and so do the baselines. Unless the effort is
+"quick", the best cell of the twin stays until the third round, since a growing error of the twin calls for a diagnosis;
+further only if it leads: its folds take minutes.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all o
 _SAME = (
     0.02  # relative difference of S on every run below which two cells are one model: nets that learned a linear map
 )
-_FAMILIES_KEPT, _SELECTORS_KEPT = 10, 4  # after the first and the second round
+_FAMILIES_KEPT, _SELECTORS_KEPT = 8, 4  # after the first and the second round
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
@@ -98,21 +99,22 @@ def rounds(crossing: Crossing) -> Rounds:
     table: list[pd.DataFrame] = []
     few = {"last": [_last(crossing, folds.get("forward", ()))]}
     cells = {key: _first(own) for key, own in every.items()}
+    twin = crossing.plan.effort != "quick"
     first = yield _jobs(crossing, "families", cells, few, keep=False)
-    left = _kept(first, "families", _FAMILIES_KEPT, table, most=1)
+    left = _kept(first, "families", _FAMILIES_KEPT, table, twin, most=1)
     kept = {key for _, key, _ in left}
     more = {key: _tried(every[key], crossing) for key in every if key in kept}
     quick = {key: own for key, own in more.items() if FAMILIES[key].closed_form}
     second = yield _jobs(crossing, "points", quick, few, keep=False)
-    known = {selector for selector, _, _ in _kept(second, "points", len(every), [], selectors=_SELECTORS_KEPT)}
+    known = {selector for selector, _, _ in _kept(second, "points", len(every), [], False, selectors=_SELECTORS_KEPT)}
     slow = {
         key: tuple(c for c in more[key] if c[0] in known or c[1] == _most(more[key])) for key in more.keys() - quick
     }
     second += yield _jobs(crossing, "points of slow families", slow, few, keep=False)
     places = _CELLS_PER_FINALIST * crossing.plan.finalists
-    left = _kept(second, "points", places, table, selectors=_SELECTORS_KEPT)
+    left = _kept(second, "points", places, table, twin, selectors=_SELECTORS_KEPT)
     third = yield _jobs(crossing, "runs", _by_family(left), {led: folds[led]})
-    left = _kept(third, "runs", crossing.plan.finalists, table)
+    left = _kept(third, "runs", crossing.plan.finalists, table, False)
     rest = {p: own for p, own in folds.items() if p != led}
     last = yield _jobs(crossing, "finalists", _by_family(left), rest) if rest else []
     return _with_stack(crossing, FamilyResult.joined([*third, *last]), pd.concat(table, ignore_index=True), led)
@@ -205,12 +207,14 @@ def _kept(
     name: str,
     places: int,
     table: list[pd.DataFrame],
+    twin: bool,
     most: int | None = None,
     selectors: int | None = None,
 ) -> list[tuple[str, str, int]]:
     """The cells that go on, and a row for each in `table`.
 
     Args:
+        twin: whether the best cell of the twin goes on in any case.
         most: of a family; None: its share of the places.
         selectors: how many may go on, those of the best cells, next to "none"; None: all.
     """
@@ -228,7 +232,7 @@ def _kept(
     clear = loss_um - loss_um[order[0]] > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * own_share * se_um
     share = most if most is not None else -(-places // _FAMILY_SHARE)
     why, taken, seen = ["" for _ in names], dict[str, int](), list[int]()
-    n, through, twin = 0, {"none"}, name != "runs"
+    n, through = 0, {"none"}
     for i in order:
         selector, family, _ = names[i]
         if is_base[i]:

@@ -102,6 +102,11 @@ class Region:
         known = np.array([np.isfinite(far) for far in every]).any(axis=0)
         return np.where(known, np.max([np.nan_to_num(far, nan=0.0) for far in every], axis=0), np.nan)
 
+    def outside_share(self, values: Watched) -> float:
+        """Share of the rows beyond the region by more than 5 % of its width, 0 to 1."""
+        far = self.distance(values)
+        return float(np.mean(far[np.isfinite(far)] > SLACK)) if np.isfinite(far).any() else 0.0
+
     def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
         """The watched quantities (q,) row by row, in the order of `ranges`, see `row`."""
         b = Builder(channels, step_s)
@@ -190,7 +195,7 @@ def _excess(values: Array, low: Array | float, high: Array | float) -> Array:
 
 
 SIBLINGS = ("ridge", "distributed_lag")  # linear in the present and in the past of the inputs: cheap, small, unlike
-COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "predicted_rms_um",
+COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "outside", "predicted_rms_um",
            "disagreement_um", "S_um"]  # fmt: skip
 _BOUNDED = ("forward", "leave-season-out", "leave-speed-out", "leave-batch-out")  # protocols that a bound is made of
 
@@ -214,7 +219,8 @@ def left_out_runs(
 
     cell: "selector|family|n_tsp"; start: of the batch (NaT where unknown); distance: how far it went beyond the region
     of the fold's training batches, in trained widths (`Region.distance`; the 95 % quantile over its rows); farthest:
-    in which quantity; predicted_rms_um: of the prediction; disagreement_um: see `disagreement_um`, NaN without
+    in which quantity; outside: share of its rows beyond the region; predicted_rms_um: of the prediction;
+    disagreement_um: see `disagreement_um`, NaN without
     siblings; S_um: the fold's error. Folds that cannot be fitted are left out, and protocols of studies where there are
     others.
 
@@ -247,7 +253,8 @@ def left_out_runs(
                     apart_um = disagreement_um(error_um, [s[i][j] for s in siblings])
                     S_um = float(residual_std_um(recorded_um - error_um))
                     runs.append((cell, protocol, fold.name, batch.batch_id, batch.start,
-                                 *farthest(region.beyond(values[k])), _rms(error_um), apart_um, S_um))  # fmt: skip
+                                 *farthest(region.beyond(values[k])), region.outside_share(values[k]), _rms(error_um),
+                                 apart_um, S_um))  # fmt: skip
                     if protocol in KEPT:
                         at = {"position_mm": design.position_mm(design.along)[design.rows(k)]} if design.along else {}
                         curves.append(pd.DataFrame({

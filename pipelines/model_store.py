@@ -142,6 +142,9 @@ class StoredModel:
         factor, reasons = bound.factor(apart_um, distance), []
         if distance > max(bound.tested, SLACK):
             reasons.append(self.region.excess(quantity, values))
+        if (share := self.region.outside_share(values)) > bound.outside:
+            far = f"; {self.region.excess(quantity, values)}" if distance > 0 else ""
+            reasons.append(f"{100 * share:.0f} % of the rows are outside the trained region{far}")
         if factor > bound.unusual:
             disagree = f"similar models differ by {apart_um:.2g} µm, usually {bound.typical_um:.2g}"
             by_distance = bound.factor(math.nan, distance) ** 2 > factor
