@@ -222,20 +222,26 @@ def selectors_and_families_page() -> str:
     from models import FAMILIES
 
     lines = ["# Selectors and model families", "", NOTE, ""]
-    lines += ["`effort` is the smallest `thermodrift train --effort` that includes the member.", ""]
+    lines += ["All compete in every `thermodrift train --effort`, but for what is marked *on request*.", ""]
     lines += ["## Selectors of temperature-sensitive points", ""]
-    lines += ["| key | method | effort | source |", "|---|---|---|---|"]
+    lines += ["| key | method | source |", "|---|---|---|"]
     for key in SELECTORS:
         s = SELECTORS[key]
-        lines.append(f"| `{key}` | {_cell(s.summary)} | {s.effort} | {_cell(s.source)} |")
+        lines.append(f"| `{key}` | {_cell(s.summary)} | {_cell(s.source)} |")
     lines += ["", "## Model families", ""]
     lines += ["*Export*: the family is a program that runs at the control. *SD*: it states a standard deviation.", ""]
-    lines += ["| key | method | effort | export | SD | needs | source |", "|---|---|---|---|---|---|---|"]
+    lines += ["| key | method | export | SD | needs | source |", "|---|---|---|---|---|---|"]
     for key in FAMILIES:
         f = FAMILIES[key]
         needs = ", ".join(w for w, on in (("twin part", f.needs_twin), ("position", f.needs_position)) if on)
         marks = ["yes" if on else "–" for on in (f.has_program(), f.has_sd)]
-        cells = (f"`{key}`", _cell(f.summary), f.effort, *marks, needs or "–", _cell(f.source))
+        cells = (
+            f"`{key}`",
+            _cell(f.summary) + (", on request" if f.on_request else ""),
+            *marks,
+            needs or "–",
+            _cell(f.source),
+        )
         lines.append(f"| {' | '.join(cells)} |")
     return _text(lines)
 

@@ -68,9 +68,9 @@ class RunBound:
     that is farther out or less agreed upon is never expected to be better.
 
     expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement. unusual: the factor that
-    nine left-out runs in ten stay below. tested, outside: the greatest distance of a left-out run, and the greatest share
-    of the rows of one beyond the region. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were
-    left out.
+    nine left-out runs in ten stay below. tested: the greatest distance of a left-out run. level: the quantile that the
+    bound is, 0.9 or more. n_runs: how many runs were left out. outside: the greatest share of the rows of one beyond
+    the region.
     """
 
     expected_um: float

@@ -3,8 +3,8 @@
 The expected loss of a cell in a future run is a weighted mean of its S over left-out runs. A run predicted from earlier
 ones counts most, since a future run is predicted so; a season or speed that was left out counts by its number of runs,
 pooled with the others (`PromotionRule.group_runs`). To it comes the cost of choosing among the cells of a family
-(`models.race.cost_of_choosing`). Of few runs most differences are chance: the loss is pooled with what the family
-reached on other machines (`models.race.pooled`).
+(`models.loss.cost_of_choosing`). Of few runs most differences are chance: the loss is pooled with what the family
+reached on other machines (`models.loss.pooled`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from scipy.special import stdtrit
 
 from data.arrays import Array
 from data.errors import InputError
+from models.loss import BASELINES, cost_of_choosing, paired, pooled
 from models.metrics import residual_std_um
 from models.protocols import PromotionRule
-from models.race import BASELINES, cost_of_choosing, paired, pooled
 from models.result import GridResult
 
 Standing = Literal["champion", "provisional", "refused"]

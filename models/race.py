@@ -11,8 +11,8 @@ Four rounds, each on the cells that the one before it left:
 
 After a round a cell is dropped where it is clearly worse than the leader on the same runs, by a one-sided paired t test
 (Maron and Moore 1994, Hoeffding races), and so many remain as the next round can afford (successive halving: Jamieson
-and Talwalkar 2016): the best first, by their mean S with the cost of choosing (`cost_of_choosing`), pooled with the
-families' records (`pooled`), of each family no more than a part of them. The best cells of the four best families go on
+and Talwalkar 2016): the best first, by their mean S with the cost of choosing, pooled with the families' records
+(`models.loss`), of each family no more than a part of them. The best cells of the four best families go on
 in any case, as runners-up and members of a stack, and so do the baselines. Unless the effort is
 "quick", the best cell of the twin stays until the third round, since a growing error of the twin calls for a diagnosis;
 further only if it leads: its folds take minutes.
@@ -27,15 +27,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
-from data.arrays import Array
-from models import FAMILIES, RECORDS, USUAL_RECORD
+from models import FAMILIES
 from models.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
+from models.loss import BASELINES, cost_of_choosing, paired, pooled
 from models.protocols import Fold
+from models.stack import stacked
 
 ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", "behind_um", "se_um", "kept", "why"]
-BASELINES = ("zero", "mean_curve")
 _CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
 _JUDGED_SHARE, _JUDGED_RUNS = 0.25, 4  # judged in the first rounds; of fewer to learn from rich models look worse
 _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all of many sensors is no fair trial
@@ -46,7 +46,6 @@ _FAMILIES_KEPT, _SELECTORS_KEPT = 8, 4  # after the first and the second round
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round
 _FAMILY_SHARE = 4  # a family has a quarter of the places at most: a stack needs unlike members
-_RECORD_RUNS = 8.0  # as `PromotionRule.record_runs`
 _POINTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # numbers of points tried: neighbours choose nearly the same
 
 
@@ -123,8 +122,6 @@ def rounds(crossing: Crossing) -> Rounds:
 def _with_stack(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, led: str) -> Raced:
     if not any(FAMILIES[key].combines for key in crossing.plan.families):
         return Raced(result, race, pd.DataFrame())
-    from models.stack import stacked
-
     more, members = stacked(crossing, result, led)
     return Raced(FamilyResult.joined([result, more]), race, members)
 
@@ -264,59 +261,3 @@ def _kept(
     )
     table.append(own.iloc[order][ROUND_COLUMNS])
     return [names[i] for i in range(len(names)) if kept[i]]
-
-
-def cost_of_choosing(
-    S_um: Array, cells: Sequence[tuple[str, str, int]], tried: Mapping[str, int], weight: Array | None = None
-) -> Array:
-    """What the best of many cells is flattered by, (C,) in µm; S_um (C, R).
-
-    Of m equal cells the best looks better by the expected maximum of m normal deviates (Blom 1958), each with the
-    standard error of the difference to the family's reference, the cell with the most points: that one costs nothing.
-
-    Args:
-        tried: how many cells of each family took part in the search.
-    """
-    families = [family for _, family, _ in cells]
-    out = np.zeros(len(cells))
-    for family in dict.fromkeys(families):
-        own = [i for i, f in enumerate(families) if f == family]
-        reference = max(own, key=lambda i: (cells[i][2], cells[i][0] == "none", np.isfinite(S_um[i]).all()))
-        m = max(tried.get(family, 0), len(own))
-        _, se_um = paired(S_um[own], S_um[reference], weight)
-        out[own] = float(ndtri((m - 0.375) / (m + 0.25))) * np.where(np.isfinite(se_um), se_um, 0.0)
-    return out
-
-
-def pooled(
-    loss_um: Array, families: Sequence[str], runs: float, record_runs: float = _RECORD_RUNS
-) -> tuple[Array, float]:
-    """Losses (C,) on so many runs, pooled with what their families reached on other machines (`models.RECORDS`).
-
-    The logarithms are averaged, the record counting like `record_runs` runs and starting from the least loss here.
-    Hierarchical models of several machines: Gelman et al. (2013), Bayesian Data Analysis, ch. 5.
-
-    Returns:
-        the pooled losses (C,), and the share of this machine's own runs in them.
-    """
-    share = runs / (runs + record_runs)
-    record = np.array([RECORDS.get(f, USUAL_RECORD) for f in families])
-    least_um = float(np.min(loss_um, initial=np.inf))
-    if not (np.isfinite(least_um) and least_um > 0):
-        return loss_um, share
-    return loss_um**share * (least_um * record / min(RECORDS.values())) ** (1.0 - share), share
-
-
-def paired(S_um: Array, leader_um: Array, weight: Array | None = None) -> tuple[Array, Array]:
-    """Mean difference of S (C, R) to that of the leader (R,) on the same runs, and its standard error, (C,) each.
-
-    Args:
-        weight: of the runs (R,); None: equal.
-    """
-    w = np.ones(S_um.shape[1]) if weight is None else weight
-    with np.errstate(invalid="ignore"):
-        d = S_um - leader_um
-        mean = d @ w / w.sum()
-        n = len(w)
-        spread = np.sqrt(((w * (d - mean[:, None])) ** 2).sum(axis=1) * n / max(n - 1, 1)) / w.sum()
-    return mean, np.where(np.isfinite(spread) & (n > 1), spread, np.inf)

@@ -16,9 +16,9 @@ from features.design import Design
 from models.base import Family
 from models.crossing import Crossing, FamilyResult
 from models.judging import KEPT, FamilyScores, score_table
+from models.loss import pooled
 from models.program import Builder
 from models.protocols import Fold
-from models.race import pooled
 from models.result import CELL_KEYS
 
 MOST_MEMBERS = 5

@@ -24,7 +24,6 @@ from data.errors import InputError, closest
 from data.yaml_file import load_yaml
 from features.selectors import SELECTORS
 from models import FAMILIES
-from models.crossing import FINALISTS
 
 CRON = "0 5 * * 1"
 SEASON_DAYS = 92.0
@@ -125,6 +124,8 @@ class _Training(_Part):
     @field_validator("effort")
     @classmethod
     def _known_effort(cls, value: str) -> str:
+        from models.crossing import FINALISTS  # what only waits loads no numpy
+
         return _known((value,), tuple(FINALISTS))[0]
 
     @field_validator("families")

@@ -25,6 +25,7 @@ from models import promotion
 from models.crossing import Crossing, FamilyResult, Plan, prepare, refit, unfitted, with_target
 from models.grid import Pools, Workers, assemble, local_pools, workers_for
 from models.outlook import Outlook, outlook
+from models.protocols import PROTOCOLS
 from models.race import Job, Raced, drive
 from models.result import GridResult, Training
 from models.trust import Region
@@ -72,9 +73,10 @@ def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, t
     if request.report is not None:
         check_suffix("report", request.report, REPORT_SUFFIXES)
     rule = settings.promotion
-    if request.promote and not rule.offered(request.plan.protocols):
+    protocols = request.plan.protocols or tuple(PROTOCOLS)
+    if request.promote and not rule.offered(protocols):
         raise InputError(
-            f"protocols: got {', '.join(request.plan.protocols)}, but promotion judges by {', '.join(rule.protocols)}; "
+            f"protocols: got {', '.join(protocols)}, but promotion judges by {', '.join(rule.protocols)}; "
             "add one of them, or train without promotion (--no-promote)"
         )
     if request.plan.families:

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from models.loss import BASELINES
 from models.promotion import Choice, ranked
 from models.protocols import PromotionRule
-from models.race import BASELINES
 from models.result import GridResult
 from reports.comparison.figures import say_simulated
 from reports.drawing import GREY, MUTED, panel

@@ -15,7 +15,8 @@ import pytest
 
 from data.errors import InputError, WorkError, one_of
 from models.crossing import FamilyResult, Plan, prepare
-from models.grid import Workers, jobs_of
+from models.grid import Workers
+from models.race import rounds
 from pipelines.caller import DirectCaller
 from pipelines.engine import ENGINES, DirectEngine, open_engine
 from pipelines.training import TrainOutcome, TrainRequest, train
@@ -76,7 +77,7 @@ def test_the_cluster_listens_on_this_computer_alone(cluster: Any) -> None:
 def test_the_grid_on_workers_gives_the_same_numbers(cluster: Any) -> None:
     batches = make_toy_batches(4, 30)
     crossings = {"z": prepare(batches, "z", PLAN)}
-    jobs = jobs_of(PLAN, ("z",))
+    jobs = next(rounds(crossings["z"]))
     with Workers(crossings, 1) as here, Workers(crossings, 1, cluster.pools) as workers:
         for job in jobs:
             assert_same(workers.cross(job), here.cross(job))
@@ -86,7 +87,7 @@ def test_the_grid_on_workers_gives_the_same_numbers(cluster: Any) -> None:
 def test_the_grid_goes_on_after_all_workers_ended(cluster: Any) -> None:
     """Then nobody holds the crossings any more."""
     crossings = {"z": prepare(make_toy_batches(4, 30), "z", PLAN)}
-    jobs = jobs_of(PLAN, ("z",))
+    jobs = next(rounds(crossings["z"]))
     with Workers(crossings, 1) as here, Workers(crossings, 1, cluster.pools) as workers:
         assert_same(workers.cross(jobs[0]), here.cross(jobs[0]))
         for pid in cluster.client.run(os.getpid).values():

@@ -78,7 +78,7 @@ def test_a_step_that_keeps_failing_ends_in_our_words(
     monkeypatch.setattr(training, "_track", broken)
     with pytest.raises(
         WorkError,
-        match=r"^tracking store: database is locked; 2 of 2 families are kept in .*; run the same command to go on$",
+        match=r"^tracking store: database is locked; 2 finished parts .* kept in .*; run the same command to go on$",
     ):
         flows.train_in_flow(request_for(year, "flow-broken"), store)
     assert len(calls) == 1 + RETRIES

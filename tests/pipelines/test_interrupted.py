@@ -202,7 +202,7 @@ def test_after_a_killed_promotion_nothing_is_crossed_or_tracked_again(
     (tracked,) = tracking.trainings("small-killed", None, store)["training_id"]
     said: list[str] = []
     outcome = train(request, store, DirectCaller(), said.append)
-    assert any(line.startswith("resumes: 2 of 2 families") for line in said)
+    assert any(line.startswith("resumes: 2 finished parts") for line in said)
     assert outcome.training_ids == {"z": tracked}
     assert (outcome.promotions["z"].outcome, outcome.promotions["z"].version) == ("champion", 1)
     assert tracking.trainings("small-killed", None, store)["training_id"].tolist() == [tracked]
