@@ -216,17 +216,21 @@ def _scored(losses: Losses) -> pd.DataFrame:
     return losses.cells.assign(own_um=own_um, score_um=loss_um, choosing_um=choosing_um)
 
 
-def ranked(result: GridResult, rule: PromotionRule) -> pd.DataFrame:
+def ranked(result: GridResult, rule: PromotionRule, than: str = "") -> pd.DataFrame:
     """The best cell of every family, the smallest expected loss first; columns as `judged`, and `behind_um` the loss
-    against the first that is no baseline with its standard error `se_um`, without the cost of choosing.
+    on this machine's runs against a cell with its standard error `se_um`, without the cost of choosing.
+
+    Args:
+        than: the cell, as ``selector|family|n_tsp``; default: the first that is no baseline.
 
     Raises:
         InputError: as `judged`.
     """
     losses = Losses.of(result, rule)
     table = _scored(losses)
-    models = np.flatnonzero(~table["family"].isin(BASELINES))
-    at = int(models[np.argmin(table["score_um"].to_numpy()[models])]) if len(models) else 0
+    labels = table["selector"] + "|" + table["family"] + "|" + table["n_tsp"].astype(str)
+    known = np.flatnonzero(labels == than) if than else np.flatnonzero(~table["family"].isin(BASELINES))
+    at = int(known[np.argmin(table["score_um"].to_numpy()[known])]) if len(known) else 0
     behind_um, se_um = losses.behind(at, losses.counted())
     order = table.assign(behind_um=behind_um, se_um=se_um).sort_values(["score_um", "rank", "n_tsp"], kind="stable")
     return order.drop_duplicates("family").reset_index(drop=True)

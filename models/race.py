@@ -224,7 +224,7 @@ def _kept(
     is_base = np.array([family in BASELINES for _, family, _ in names])
     cost_um = cost_of_choosing(S_um, names, Counter(f for _, f, _ in names))
     loss_um, own_share = pooled(S_mean_um + cost_um, [f for _, f, _ in names], S_um.shape[1])
-    order = np.lexsort(([FAMILIES[f].rank for _, f, _ in names], loss_um))
+    order = np.lexsort(([s != "none" for s, _, _ in names], [FAMILIES[f].rank for _, f, _ in names], loss_um))
     behind_um, se_um = paired(S_um, S_um[order[0]])
     clear = loss_um - loss_um[order[0]] > stdtrit(max(S_um.shape[1] - 1, 1), _CLEARLY) * own_share * se_um
     share = most if most is not None else -(-places // _FAMILY_SHARE)

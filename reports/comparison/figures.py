@@ -53,7 +53,7 @@ def say_simulated(ax: Axes, simulated: bool) -> None:
         ax.set_title("SIMULATED", loc="right", fontsize=7.5, color=ORANGE, fontweight="bold", pad=3)
 
 
-def _logarithmic(ax: Axes, scale: Scale, axis: str = "y") -> None:
+def logarithmic(ax: Axes, scale: Scale, axis: str = "y") -> None:
     """A logarithmic axis with round ticks, at most as many as it holds."""
     ticks = [float(label) for _, label in scale.ticks]
     ax.set(**{f"{axis}scale": "log", f"{axis}lim": (scale.low_um, scale.high_um)})
@@ -109,7 +109,7 @@ def against_points(
     ax.set_xlim(0.6, n_max + 0.4)
     ax.xaxis.set_major_locator(MaxNLocator(12, integer=True, min_n_ticks=1))
     top = float(flat[column].max()) if len(flat) else math.inf
-    _logarithmic(ax, Scale.over([*lines[column], *flat[column]], 1.2 * top))
+    logarithmic(ax, Scale.over([*lines[column], *flat[column]], 1.2 * top))
     say_simulated(ax, simulated)
     return fig
 
@@ -134,7 +134,7 @@ def S_against_S(clouds: Sequence[Cloud], lines: Sequence[tuple[float, str]], x: 
     ax = axes_in(fig, 0.25, HALF_IN * 0.8 - 0.7, f"{y}, µm", f"{x}, µm")
     scale = Scale.over([v for c in clouds for v in (*c.x_um, *c.y_um)], math.inf)
     for axis in "xy":
-        _logarithmic(ax, scale, axis)
+        logarithmic(ax, scale, axis)
     for c in clouds:
         at = [np.maximum(v, scale.low_um) for v in (c.x_um, c.y_um)]
         ax.plot(*at, color=c.key.color, marker=MARKS[c.key.symbol], ls="", ms=4.5, mec="white", mew=0.4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -10,10 +12,10 @@ from models.loss import BASELINES
 from models.promotion import Choice, ranked
 from models.protocols import PromotionRule
 from models.result import GridResult
-from reports.comparison.figures import say_simulated
+from reports.comparison.figures import logarithmic, say_simulated
 from reports.drawing import GREY, MUTED, panel
 from reports.labels import BLUE, INK, NOTHING, cell_label, family_label, number, plus_minus
-from reports.layout import Column, Key, Panel, Plot, Row, Table
+from reports.layout import Column, Key, Panel, Plot, Row, Scale, Table
 
 _SHOWN = 9  # families in the figure
 _ROUNDS = {"families": "1 families", "points": "2 points", "runs": "3 runs"}  # of `models.race`
@@ -26,13 +28,13 @@ def why_panel(name: str, result: GridResult, choice: Choice, rule: PromotionRule
     """
     if not rule.offered(set(result.cells["protocol"])):
         return None
-    table = _with_champion(ranked(result, rule), choice).head(_SHOWN)
+    table = _with_champion(ranked(result, rule, choice.cell), choice).head(_SHOWN)
     own_um = float(table.loc[table["is_own"], "score_um"].iloc[0]) if table["is_own"].any() else choice.score_um
     others = table[~table["is_own"] & ~table["family"].isin(BASELINES)]
     plot = Plot(_losses(table, own_um, result.simulated), f"{name}: expected loss of every family", "full")
     notes = [
         "Mean S over left-out runs with the cost of choosing, pooled with what the family reached on other machines. A "
-        "bar is one standard error of the difference to the least of them, over runs."
+        "bar is one standard error of the difference to the chosen cell, over runs."
     ]
     if len(others):
         second = others.iloc[0]
@@ -90,7 +92,7 @@ def _with_champion(table: pd.DataFrame, choice: Choice) -> pd.DataFrame:
 
 
 def _losses(table: pd.DataFrame, own_um: float, simulated: bool) -> Figure:
-    tall_in = 0.28 * len(table)
+    tall_in = 0.3 * len(table)
     fig = Figure(figsize=(7.0, tall_in + 0.8))
     ax = panel(fig, 2.8, 0.3, 4.0, tall_in)
     names = [cell_label(r["selector"], r["family"], int(r["n_tsp"])) for r in table.to_dict("records")]
@@ -101,7 +103,8 @@ def _losses(table: pd.DataFrame, own_um: float, simulated: bool) -> Figure:
         ax.annotate(f"{r['score_um'] - own_um:+.2f}" if not r["is_own"] else f"{own_um:.2f} µm", (r["score_um"], i),
                     (0, 5), textcoords="offset points", ha="center", fontsize=7, color=MUTED)  # fmt: skip
     ax.axvline(own_um, color=BLUE, lw=0.8, ls=":")
-    ax.set_xscale("log")
+    values = table["score_um"].to_numpy(float)
+    logarithmic(ax, Scale.over([*(values / 1.1), *(values * 1.1)], math.inf), "x")
     ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.set_ylim(len(names) - 0.5, -0.6)
     ax.set_xlabel("expected loss in a future run, µm", fontsize=8, color=MUTED)
