@@ -2,13 +2,15 @@
 
     python -m benchmarks.forward [--recordings FOLDER] [--families ridge,lag_dictionary]
                                  [--machines lathe,spindle,year,volumes,elements] [--protocols forward,leave-batch-out]
+    python -m benchmarks.forward --records
 
 All temperatures and ambients that every run has are inputs; drivers are there for the families that use them. Per
 machine, error channel, protocol and family: mean S ± std over the predicted runs and the worst run, in µm, the time of
 all folds, and for `forward` the mean S over the odd blocks (on which settings of families may be chosen) and over the
 even blocks (on which they are confirmed). `step` is `forward` with blocks of one run: the last twelve runs of a
 machine with at least 24, each predicted by a model of all runs before it. FOLDER holds lathe_gv1203 and spindle_fl;
-what is missing is skipped. Nothing is asserted.
+what is missing is skipped. Nothing is asserted. `--records` prints for every family its mean S of later runs over that
+of the best one, the geometric mean over the kinds of machine but the lathe: what `models.RECORDS` holds.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -114,15 +117,44 @@ def table(name: str, machine: Machine, batches: Sequence[Batch], families: Itera
             print(f"{line}{shown} {time.perf_counter() - start:6.1f}", flush=True)
 
 
+def records(known: dict[str, Callable[[], Runs]]) -> None:
+    """Mean S forward of every family over that of the best, by kind of machine and altogether."""
+    ratios: dict[str, dict[str, float]] = {}
+    for name in ("spindle", "year", *_PLANTS):
+        machine, batches = known[name]()
+        batches = in_time(batches)
+        thermal = [n for n in batches[0].names("temperature", "ambient") if all(n in b.table for b in batches)]
+        inputs = [n for n in thermal if all(np.isfinite(b.masked(n)).any() for b in batches)]
+        logs: dict[str, list[float]] = {}
+        for target in batches[0].names("error"):
+            design, own = Design.build(batches, inputs, target, machine), {}
+            for key, family in FAMILIES.items():
+                if family.needs_position or family.needs_twin or family.combines:
+                    continue
+                with suppress(InputError):
+                    own[key] = float(np.concatenate(block_scores(key, design, folds("forward", batches))).mean())
+            for key, S_um in own.items():
+                logs.setdefault(key, []).append(float(np.log(S_um / min(own.values()))))
+        for key, values in logs.items():
+            ratios.setdefault(key, {})[name] = float(np.exp(np.mean(values)))
+    for key, own in sorted(ratios.items(), key=lambda item: float(np.mean(np.log(list(item[1].values()))))):
+        overall = float(np.exp(np.mean(np.log(list(own.values())))))
+        print(f"{key:24} {overall:5.2f}   {', '.join(f'{k} {v:.2f}' for k, v in own.items())}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--families", default=",".join(FAMILIES_SHOWN))
     parser.add_argument("--machines", default="lathe,spindle,year,volumes,elements")
     parser.add_argument("--protocols", default=",".join(PROTOCOLS_SHOWN), help=f"{STEP}, {', '.join(PROTOCOLS)}")
+    parser.add_argument("--records", action="store_true", help="what every family reaches next to the best")
     args = parser.parse_args()
     with threadpool_limits(limits=1):
         known = machines(args.recordings)
+        if args.records:
+            records(known)
+            return
         for name in args.machines.split(","):
             try:
                 machine, batches = known[name]()

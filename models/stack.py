@@ -25,6 +25,7 @@ MOST_MEMBERS = 5
 STACKED = "stack"  # selector of the cell: its members bring their own
 _DEFAULT: tuple[tuple[str, tuple[str, ...]], ...] = (("ridge", ()), ("distributed_lag", ()))
 _WEIGHT_SD, _SUM_SD = 0.3, 0.1  # of a weight about its share, and of their sum about 1, before any run is known
+_PASSES = 2  # the noise is what the weights of the pass before leave
 _SHARPNESS = 6.0  # a member that left a tenth more on other machines has half the share
 _ROWS_PER_RUN = 5.0  # neighbouring rows of a thermal run repeat each other; so many count as independent
 
@@ -131,13 +132,17 @@ def weights_of(runs: Sequence[tuple[Array, Array]], families: Sequence[str]) -> 
     known = [(y[ok], p[ok]) for y, p in runs if (ok := np.isfinite(y) & np.isfinite(p).all(axis=1)).sum() > 1]
     if not known:
         return share
-    variance_um2 = float(np.mean([np.mean((y - p @ share) ** 2) for y, p in known])) or 1.0
-    scale = [np.sqrt(_ROWS_PER_RUN / (len(y) * variance_um2)) for y, _ in known]
-    prior, right = np.vstack([np.eye(len(share)) / _WEIGHT_SD, np.full(len(share), 1.0 / _SUM_SD)]), share / _WEIGHT_SD
-    rows = np.concatenate([*(s * p for s, (_, p) in zip(scale, known, strict=True)), prior])
-    right = np.concatenate([*(s * y for s, (y, _) in zip(scale, known, strict=True)), right, [1.0 / _SUM_SD]])
-    q, r = np.linalg.qr(rows)
-    return np.asarray(nnls(r, q.T @ right)[0])
+    m = len(share)
+    prior = np.vstack([np.eye(m) / _WEIGHT_SD, np.full(m, 1.0 / _SUM_SD)])
+    weights, wanted = share, np.append(share / _WEIGHT_SD, 1.0 / _SUM_SD)
+    for _ in range(_PASSES):
+        variance_um2 = float(np.mean([np.mean((y - p @ weights) ** 2) for y, p in known])) or 1.0
+        scale = [np.sqrt(_ROWS_PER_RUN / (len(y) * variance_um2)) for y, _ in known]
+        rows = np.concatenate([*(s * p for s, (_, p) in zip(scale, known, strict=True)), prior])
+        right = np.concatenate([*(s * y for s, (y, _) in zip(scale, known, strict=True)), wanted])
+        q, r = np.linalg.qr(rows)
+        weights = np.asarray(nnls(r, q.T @ right)[0])
+    return weights
 
 
 def stacked(crossing: Crossing, result: FamilyResult, led: str) -> tuple[FamilyResult, pd.DataFrame]:
