@@ -45,10 +45,9 @@ class DistributedLag(Family):
 
     Lags are `lag_min` minutes apart (at least a step), whatever the sampling step, q at most `max_lags`. Before a batch
     starts inputs have their first value (0 for a rise), drivers rest. A ridge penalty, k times the mean variance
-    of the columns, keeps lags of collinear sensors apart. Order or decay, and k, are chosen by `order_by`:
-    `leave_batch_out` inside the training batches (contiguous quarters of one or two), `aic` or `bic`. Residuals of
-    a thermal run are autocorrelated: the criteria count `effective_rows`, n (1 − ρ)/(1 + ρ) with ρ the lag-one
-    autocorrelation of the residuals, and `fitted` has both.
+    of the columns, keeps lags of collinear sensors apart. Order or decay, and k, are chosen by `order_by`: `forward`
+    or `leave_batch_out` inside the training batches (`models.linear.Tuned`), `aic` or `bic`. Residuals of a thermal
+    run are autocorrelated: the criteria count `effective_rows`, n (1 − ρ)/(1 + ρ) with ρ their lag-one autocorrelation.
 
     Source: S. Almon, Econometrica 33 (1965); L. Koyck, Distributed lags and investment analysis (1954);
     effective rows: Bartlett (1935); criteria: Akaike (1974), Schwarz (1978).
@@ -66,7 +65,7 @@ class DistributedLag(Family):
         lag_min: float = 30.0,
         max_lags: int = 6,
         degree: int = 3,
-        order_by: str = "leave_batch_out",
+        order_by: str = "forward",
     ) -> None:
         super().__init__()
         for name, got, allowed in (("lags", lags, LAGS), ("order_by", order_by, CRITERIA)):

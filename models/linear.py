@@ -21,11 +21,12 @@ from features.design import Design
 from models.base import Family
 from models.metrics import SIDE_OF_90
 from models.program import Builder
+from models.protocols import forward_obstacle, in_time
 from models.solvers.batches import fold_masks
 from models.solvers.kernels import unit_scale
-from models.solvers.pooled_sums import AT_ONCE, Blocks, Pool, inner_sets, leave_block_out
+from models.solvers.pooled_sums import AT_ONCE, Blocks, Pool, inner_sets, left_out_mean_S_um
 
-_ENOUGH_BATCHES = 3
+_ENOUGH_BATCHES, _ENOUGH_FOR_FORWARD = 3, 6
 _MOST_ROWS = 120  # of a batch that residuals are taken at
 _LEAST_SHARE = 0.01  # of the mean square residual, that a keeps: no recorded value is free of noise
 
@@ -293,21 +294,29 @@ class Linear(Family):
 
 
 class Tuned(Linear):
-    """A linear family with one setting, chosen in every fold by leave-batch-out inside the fold's training batches.
+    """A linear family with one setting, chosen in every fold inside the fold's training batches.
 
-    The score is the mean S over the batches left out; for fewer than 3 batches contiguous quarters of them stand in
-    for batches (`models.base.inner_groups`).
+    The score is the mean S over batches left out: by `order_by` "leave_batch_out" each in turn; by "forward" every one
+    from the third in time on, predicted from those before it. Fewer than 6 batches, or undated ones, are left out in
+    turn; of fewer than 3 contiguous quarters (`models.base.inner_groups`).
     """
 
+    order_by = "leave_batch_out"
+
     def _solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
-        chosen = np.zeros(len(task.masks), np.int64)
-        many = task.masks.sum(axis=1) >= 3
-        if many.any():
-            chosen[many] = leave_block_out(task.blocks, task.masks[many], task.scaled, self._path)
-        if not many.all():
+        chosen, n = np.zeros(len(task.masks), np.int64), task.masks.sum(axis=1)
+        known = task.design.batches  # of a design made by hand batches are in order as they come
+        place = np.argsort(in_time(known)) if known else np.arange(task.design.n_batches)
+        forward = self.order_by == "forward" and not (known and forward_obstacle(known))
+        ahead, few = forward & (n >= _ENOUGH_FOR_FORWARD), n < _ENOUGH_BATCHES
+        for some, order in ((ahead, place), (~ahead & ~few, None)):
+            if some.any():
+                S_um = left_out_mean_S_um(task.blocks, task.masks[some], task.scaled, self._path, order)
+                chosen[some] = np.argmin(S_um, axis=1)
+        if few.any():
             quarters = Blocks.of(task.design.quarters)
-            masks = np.repeat(task.masks[~many], 4, axis=1) & (quarters.count > 0)
-            chosen[~many] = leave_block_out(quarters, masks, task.scaled, self._path)
+            masks = np.repeat(task.masks[few], 4, axis=1) & (quarters.count > 0)
+            chosen[few] = np.argmin(left_out_mean_S_um(quarters, masks, task.scaled, self._path), axis=1)
         coef, setting = self._refit(task, chosen)
         return coef, setting | self._spread(task, self._path, chosen)
 

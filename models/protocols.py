@@ -66,7 +66,7 @@ def forward_gap(batches: Sequence[Batch]) -> list[Fold]:
 
 
 def _forward(batches: Sequence[Batch], gap_days: float) -> list[Fold]:
-    order = _in_time(batches)
+    order = in_time(batches)
     first = max(_LEAST_PAST, min(len(order) // 2, len(order) - FORWARD_BLOCKS))
     length = (len(order) - first) // FORWARD_BLOCKS
     cuts = range(first, len(order), length)
@@ -94,7 +94,7 @@ def forward_obstacle(batches: Sequence[Batch]) -> str:
     return ""
 
 
-def _in_time(batches: Sequence[Batch]) -> list[int]:
+def in_time(batches: Sequence[Batch]) -> list[int]:
     """Indices in order of time; parts of one undated recording are in order as they come."""
     order = list(range(len(batches)))
     if any(b.start is None for b in batches):

@@ -13,7 +13,7 @@ All are 0 at the first row of a batch, as the error is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -198,31 +198,18 @@ def _starts(design: Design) -> list[_Column]:
 
 def _lagged_by_batch(design: Design, values: Array, *, at_rest: bool) -> list[Array]:
     """Values (n, c) behind a first-order lag of each time constant; before a batch they are 0 or its first ones."""
-    out = [np.empty(values.shape) for _ in _LAGS_MIN]
-    for k in range(design.n_batches):
+    out, steps = [np.empty(values.shape) for _ in _LAGS_MIN], steps_s(design)
+    for k in np.flatnonzero(np.diff(design.offsets)).tolist():
         own = values[design.rows(k)]
-        step_s = _step_s(design, design.rows(k))
+        before = np.zeros(own.shape[1]) if at_rest else own[0]
         for lagged, lag_min in zip(out, _LAGS_MIN, strict=True):
-            if len(own) and not (lag_min and step_s):
-                lagged[design.rows(k)] = own
-            elif len(own):
-                before = np.zeros(own.shape[1]) if at_rest else own[0]
-                lagged[design.rows(k)] = _lagged(own, before, 60.0 * lag_min / step_s)
+            lagged[design.rows(k)] = _lagged(own, before, 60.0 * lag_min / steps[k])
     return out
 
 
 def _gone(design: Design, gone_min: float) -> Array:
-    return _by_batch(design, lambda rows: -np.expm1(-(design.time_s[rows] - design.time_s[rows][0]) / (60 * gone_min)))
-
-
-def _by_batch(design: Design, values: Callable[[slice], Array]) -> Array:
-    rows = [design.rows(k) for k in range(design.n_batches)]
-    return np.concatenate([np.empty(0), *(values(r) for r in rows if r.stop > r.start)])
-
-
-def _step_s(design: Design, rows: slice) -> float:
-    time_s = design.time_s[rows]
-    return float((time_s[-1] - time_s[0]) / (len(time_s) - 1)) if len(time_s) > 1 else 0.0
+    since_s = design.time_s - design.time_s[design.offsets[design.group]]
+    return np.asarray(-np.expm1(-since_s / (60 * gone_min)))
 
 
 Response = tuple[float, float]  # delay in s, time constant in s
@@ -270,7 +257,7 @@ def _delayed(x: Array, before: Array, delay: float) -> Array:
     return (1.0 - part) * earlier[1:] + part * earlier[:-1]
 
 
-CRITERIA = ("leave_batch_out", "aic", "bic")
+CRITERIA = ("forward", "leave_batch_out", "aic", "bic")
 RIDGES = (1e-2, 1e-4, 1e-6, 1e-8)  # of the mean variance of the columns, strongest first
 _ORDERS = (0, 1, 2, 3, 4, 6, 9, 12, 18, 24, 36, 48)
 
@@ -321,9 +308,9 @@ class LagRegression(Tuned):
 
     def solve(self, task: Task) -> tuple[Array, dict[str, NDArray[Any]]]:
         """Coefficients (F, m p), and per fold the index of the shape and the penalty k."""
-        if self.order_by == "leave_batch_out":
-            return self._solve(task)
-        return self._refit(task, np.argmin(self._criterion(task), axis=1))
+        if self.order_by in ("aic", "bic"):
+            return self._refit(task, np.argmin(self._criterion(task), axis=1))
+        return self._solve(task)
 
     def _path(self, pool: Pool) -> Array:
         return self._fits(pool)[0]

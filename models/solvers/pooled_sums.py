@@ -110,18 +110,15 @@ class Blocks:
         return np.sqrt(np.maximum(sse, 0.0) / np.maximum(n - 1.0, 1.0))
 
 
-def leave_block_out(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> NDArray[np.int64]:
-    """For every training set, masks (F, B), the setting of least mean S over its blocks, each left out once; (F,)."""
-    return np.asarray(np.argmin(left_out_mean_S_um(blocks, masks, scaled, path), axis=1))
-
-
-def left_out_mean_S_um(blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array]) -> Array:
+def left_out_mean_S_um(
+    blocks: Blocks, masks: Mask, scaled: bool, path: Callable[[Pool], Array], place: NDArray[np.int64] | None = None
+) -> Array:
     """For every training set, masks (F, B), the mean S over its blocks, each left out once, by setting; (F, G) in µm.
 
     `path` fits all G settings on every set of a pool: coefficients (S, p, G) per unit of the inputs. Equal
-    training sets are fitted once.
+    training sets are fitted once. `place`: as for `inner_sets`.
     """
-    outer, left, sets, which = inner_sets(masks)
+    outer, left, sets, which = inner_sets(masks, place)
     step = max(1, AT_ONCE // blocks.mean_x.shape[1] ** 2)
     S_um: Array | None = None
     for start in range(0, len(sets), step):
@@ -133,11 +130,15 @@ def left_out_mean_S_um(blocks: Blocks, masks: Mask, scaled: bool, path: Callable
     assert S_um is not None
     border = np.searchsorted(outer, np.arange(len(masks)))
     total = np.add.reduceat(S_um, border, axis=0)
-    return np.asarray(total / masks.sum(axis=1, keepdims=True))
+    return np.asarray(total / np.bincount(outer, minlength=len(masks))[:, None])
 
 
-def inner_sets(masks: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask, NDArray[np.int64]]:
+def inner_sets(
+    masks: Mask, place: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask, NDArray[np.int64]]:
     """Every training set, masks (F, B), without each of its blocks in turn; V in all.
+
+    With the blocks' `place` (B,) in time the set keeps only what is earlier than the block, at least two blocks.
 
     Returns:
         outer set (V,) and block left out (V,), the distinct inner sets, and which of these it is (V,).
@@ -145,6 +146,10 @@ def inner_sets(masks: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask,
     outer, left = np.nonzero(masks)
     inner = masks[outer]
     inner[np.arange(len(left)), left] = False
+    if place is not None:
+        inner &= place < place[left][:, None]
+        some = inner.sum(axis=1) >= 2
+        outer, left, inner = outer[some], left[some], inner[some]
     packed = np.packbits(inner, axis=1)
     key = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[1])))[:, 0]
     _, first, which = np.unique(key, return_index=True, return_inverse=True)

@@ -1,14 +1,19 @@
 """Distributed lags against sums written out, planted laws, brute-force choices, and other sampling steps."""
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 
+from data.batch import Batch, Channel
 from data.errors import InputError
 from features.design import Design
 from features.rises import first_order_lag
 from models.distributed_lag import KOYCK_TAUS_S, DistributedLag
 from models.linear import Blocks, Task
 from models.solvers.lags import (
+    CRITERIA,
     RIDGES,
     LagRegression,
     effective_rows,
@@ -262,3 +267,55 @@ def test_shapes():
 def test_impossible_options_are_told(options, words):
     with pytest.raises(InputError, match=words):
         DistributedLag(**options)
+
+
+def drifting_runs(n_runs=9, n=48, step_s=300.0) -> list[Batch]:
+    """Dated runs whose relation drifts: the second sensor takes over from a lag of the first, run by run."""
+    rng = np.random.default_rng(12)
+    channels = {name: Channel(name, "temperature", "degC", 0.1) for name in ("a", "b")}
+    channels |= {"z": Channel("z", "error", "um")}
+    runs = []
+    for k in range(n_runs):
+        x = rises(n, 2, rng, step_s)
+        late = k / (n_runs - 1)
+        z = (1 - late) * shifted(x[:, 0], 6) + 2 * late * x[:, 1] + rng.normal(0, 0.3, n)
+        table = pd.DataFrame({"time_s": np.arange(n) * step_s, "a": 20 + x[:, 0], "b": 20 + x[:, 1], "z": z - z[0]})
+        runs.append(Batch("vmc", f"K{k}", table, channels, start=pd.Timestamp("2026-01-01") + pd.Timedelta(days=k)))
+    return runs
+
+
+def test_the_choice_looks_forward_whatever_the_order_of_the_batches():
+    runs = drifting_runs()
+    design = Design.build(runs, ("a", "b"), "z")
+    family = DistributedLag("free", lag_min=15, max_lags=3).as_published()
+    fitted = family.fit_design(design, range(9)).fitted
+    parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in range(9)]
+    S_um = {}
+    for q in (0, 1, 2, 3):
+        table = table_of(design, [3 * lag for lag in range(q + 1)])
+        for k in RIDGES:
+            left = []
+            for now in range(2, 9):
+                past = np.concatenate(parts[:now])
+                beta, constant = ridge(table[past], design.y_um[past], k)
+                e = design.y_um[parts[now]] - table[parts[now]] @ beta - constant
+                left.append(np.sqrt(e @ e / (len(e) - 1)))
+            S_um[q, k] = np.mean(left)
+    assert (len(fitted["delays_s"]) - 1, fitted["k"]) == min(S_um, key=S_um.get)
+    order = np.random.default_rng(3).permutation(9)
+    shuffled = Design.build([runs[k] for k in order], ("a", "b"), "z")
+    again = family.fit_design(shuffled, range(9)).fitted
+    np.testing.assert_allclose(again["weights_um_per_K"], fitted["weights_um_per_K"], atol=1e-9)
+    mixed = DistributedLag("free", lag_min=15, max_lags=3, order_by="leave_batch_out").as_published()
+    interpolated = mixed.fit_design(design, range(9)).fitted
+    assert (len(interpolated["delays_s"]), interpolated["k"]) != (len(fitted["delays_s"]), fitted["k"])
+
+
+def test_undated_or_few_batches_are_left_out_in_turn():
+    runs = drifting_runs()
+    undated = [replace(b, start=None, source=f"{k}.csv") for k, b in enumerate(runs)]
+    for some in (undated, runs[:5]):
+        design = Design.build(some, ("a", "b"), "z")
+        ahead, in_turn = (DistributedLag(order_by=o).fit_design(design, range(len(some))) for o in CRITERIA[:2])
+        assert ahead.fitted["k"] == in_turn.fitted["k"]
+        np.testing.assert_array_equal(ahead.fitted["weights_um_per_K"], in_turn.fitted["weights_um_per_K"])
