@@ -101,7 +101,7 @@ def test_the_page_is_shown_without_a_script_and_without_an_error(page: Path, scr
 def test_every_picture_is_readable_and_nothing_overflows_the_page(width_px: int, page: Path, scratch: Path) -> None:
     found = measured(page, width_px, scratch)
     assert found["page"] <= width_px
-    assert len(found["pictures"]) == 2 * 6 + 1
+    assert len(found["pictures"]) == 2 * 7 + 1
     for p in found["pictures"]:
         assert p["right"] <= width_px and p["width"] >= 300 and p["texts"] > 8, p
         assert p["cut"] == [] and p["covered"] == [], p
