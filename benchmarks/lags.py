@@ -42,8 +42,8 @@ from models.solvers.lags import PROMPT, UNDRIVEN, Columns
 FAMILIES: dict[str, Family] = {
     "mlr": MLR(),
     "ridge": Ridge(),
-    "distributed_lag, leave_batch_out": DistributedLag(order_by="leave_batch_out"),
-    "distributed_lag, forward (base)": DistributedLag(),
+    "distributed_lag, leave_batch_out": DistributedLag(),
+    "distributed_lag, forward (base)": DistributedLag(order_by="forward"),
     "lag_dictionary": LagDictionary(),
 }
 SETTINGS = [(level, steady) for level in (0.1, 10.0, 1000.0) for steady in (1.0, 100.0)]

@@ -65,7 +65,7 @@ class DistributedLag(Family):
         lag_min: float = 30.0,
         max_lags: int = 6,
         degree: int = 3,
-        order_by: str = "forward",
+        order_by: str = "leave_batch_out",
     ) -> None:
         super().__init__()
         for name, got, allowed in (("lags", lags, LAGS), ("order_by", order_by, CRITERIA)):

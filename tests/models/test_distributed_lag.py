@@ -287,7 +287,7 @@ def drifting_runs(n_runs=9, n=48, step_s=300.0) -> list[Batch]:
 def test_the_choice_looks_forward_whatever_the_order_of_the_batches():
     runs = drifting_runs()
     design = Design.build(runs, ("a", "b"), "z")
-    family = DistributedLag("free", lag_min=15, max_lags=3).as_published()
+    family = DistributedLag("free", lag_min=15, max_lags=3, order_by="forward").as_published()
     fitted = family.fit_design(design, range(9)).fitted
     parts = [np.arange(design.offsets[k], design.offsets[k + 1]) for k in range(9)]
     S_um = {}
