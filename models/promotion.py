@@ -180,21 +180,21 @@ class Losses:
 
     def choosing_um(self) -> Array:
         """Cost of choosing among the cells of each family (C,)."""
-        by_batch, share = self.by_batch(self.S_um, self.counted())
+        by_batch, share = self.by_batch(self.counted())
         cells = list(self.cells[KEYS].itertuples(index=False, name=None))
         return cost_of_choosing(by_batch, cells, self.tried, share)
 
-    def by_batch(self, S_um: Array, counted: Array) -> tuple[Array, Array]:
+    def by_batch(self, counted: Array) -> tuple[Array, Array]:
         """Means over the scores of a batch (C, K), and what each batch counts (K,)."""
         ids, place = np.unique(self.batch_id.astype(str), return_inverse=True)
         share = np.bincount(place, counted, len(ids)).astype(float)
-        out = np.zeros((len(S_um), len(ids)))
-        np.add.at(out.T, place, (S_um * counted).T)
+        out = np.zeros((len(self.S_um), len(ids)))
+        np.add.at(out.T, place, (self.S_um * counted).T)
         return out[:, share > 0] / share[share > 0], share[share > 0]
 
     def behind(self, cell: int, counted: Array) -> tuple[Array, Array]:
         """How far every cell is behind one, with the standard error over batches, (C,) each."""
-        by_batch, share = self.by_batch(self.S_um, counted)
+        by_batch, share = self.by_batch(counted)
         return paired(by_batch, by_batch[cell], share)
 
 

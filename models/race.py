@@ -107,7 +107,9 @@ def rounds(crossing: Crossing) -> Rounds:
     second = yield _jobs(crossing, "points", quick, few, keep=False)
     known = {selector for selector, _, _ in _kept(second, "points", len(every), [], False, selectors=_SELECTORS_KEPT)}
     slow = {
-        key: tuple(c for c in more[key] if c[0] in known or c[1] == _most(more[key])) for key in more.keys() - quick
+        key: tuple(c for c in own if c[0] in known or c[1] == _most(own))
+        for key, own in more.items()
+        if key not in quick
     }
     second += yield _jobs(crossing, "points of slow families", slow, few, keep=False)
     places = _CELLS_PER_FINALIST * crossing.plan.finalists

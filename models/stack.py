@@ -187,15 +187,12 @@ def _members(result: FamilyResult, led: str) -> list[tuple[str, str, int]]:
     loss_um, _ = pooled(rows["S_mean_um"].to_numpy(float), list(rows["family"]), float(rows["n_batches"].max()))
     rows = rows.assign(loss_um=loss_um).sort_values(["loss_um", "rank"], kind="stable")[CELL_KEYS[1:]]
     best: dict[str, tuple[str, str, int]] = {}
+    protocols = {name.partition("|")[0] for name in result.predictions}
     for selector, family, n in rows.itertuples(index=False):
         cell = (str(selector), str(family), int(n))
-        if all(_name(p, cell) in result.predictions for p in _kept(result)):
+        if all(_name(p, cell) in result.predictions for p in protocols):
             best.setdefault(cell[1], cell)
     return list(best.values())[:MOST_MEMBERS]
-
-
-def _kept(result: FamilyResult) -> set[str]:
-    return {name.partition("|")[0] for name in result.predictions}
 
 
 def _name(protocol: str, cell: tuple[str, str, int]) -> str:
