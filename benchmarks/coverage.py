@@ -2,8 +2,8 @@
 
     python -m benchmarks.coverage [--machines lathe,spindle,year,elements,volumes] [--cells none|ridge,…] [--out FILE]
 
-Every block of later runs is bounded as `predict` does it: from all earlier runs a crossing, the bound of its left-out
-runs, the model with its siblings. Columns, over all error channels and cells of a machine:
+Every block of later runs is bounded as `predict` does it: from all earlier runs a crossing of the cells, the bound of
+the left-out runs of each, and their disagreement. Columns, over all error channels and cells of a machine:
 - runs: bounded runs (a run counts once per channel and cell; they are not independent);
 - below: share of S below the run's bound, with a Wilson 95 % interval; bound/S: mean bound over mean S;
 - next: the same for the bound of `expected_next`; naive: for the 90 % quantile of leave-batch-out;
@@ -32,10 +32,12 @@ from data.machine import Machine, load_machine
 from data.recording import read_batches
 from features.rises import zeroed_error_um
 from models.conformal import RunBound, expected_next
-from models.crossing import Plan, prepare, refit, with_target
+from models.crossing import FamilyResult, Plan, cross_family, prepare, refit, with_target
 from models.metrics import residual_std_um
 from models.protocols import forward
-from models.trust import Region, fit_siblings, left_out_runs
+from models.result import CELL_KEYS
+from models.stack import stacked
+from models.trust import Region, left_out_runs
 from pipelines.model_store import StoredModel
 from plants.plant import draw
 from plants.sample.sample_year import write_sample_year
@@ -73,35 +75,41 @@ def machines(data: Path) -> dict[str, Callable[[], list[Recorded]]]:
     }
 
 
-def bounded(machine: Machine, batches: Sequence[Batch], target: str, cell: str) -> Iterator[dict[str, object]]:
-    """A row per later run of a cell."""
-    selector, family, *points = cell.split("|")
-    plan = Plan((selector,), (family,), PROTOCOLS, tuple(map(int, points)) or None)
-    kept = with_target(batches, target)
+def bounded(
+    machine: Machine, batches: Sequence[Batch], target: str, cells: Sequence[str]
+) -> Iterator[dict[str, object]]:
+    """A row per later run and cell."""
+    kept, named = with_target(batches, target), [cell.split("|") for cell in cells]
+    selectors, families = (tuple(dict.fromkeys(c[k] for c in named)) for k in (0, 1))
     for block in forward(kept):
         try:
-            crossing = prepare([kept[k] for k in block.train], target, plan, machine)
-            n_tsp = int(points[0]) if points else len(crossing.design.inputs)
-            runs = left_out_runs(crossing, selector, family, n_tsp).runs
-            fitted = refit(crossing, selector, family, n_tsp)
-        except InputError:  # too few runs to fit the cell
+            crossing = prepare([kept[k] for k in block.train], target, Plan(selectors, families, PROTOCOLS), machine)
+        except InputError:  # too few runs
             continue
-        bound, promised = RunBound.of(runs), expected_next(runs)
-        near = runs.loc[runs["protocol"] == "leave-batch-out", "S_um"].dropna()
-        if near.empty:
-            continue
-        region, siblings = Region.of(crossing.batches, fitted.inputs), fit_siblings(fitted, crossing.batches)
-        model = StoredModel(fitted, machine, region, {}, bound, siblings)
-        for k in block.test:
-            predicted_um = fitted.predict(kept[k])
-            S_um = float(residual_std_um(zeroed_error_um(kept[k], target) - predicted_um))
-            if not np.isfinite(S_um):  # an input is masked throughout
-                continue
-            yield {
-                "target": target, "cell": cell, "block": block.name, "batch_id": kept[k].batch_id, "S_um": S_um,
-                **model.run_error(kept[k], predicted_um)._asdict(), "next_S_um": promised.S_um,
-                "next_bound_um": promised.bound_um, "naive_um": float(np.quantile(near, 0.9)),
-            }  # fmt: skip
+        every = len(crossing.design.inputs)
+        wanted = [(s, f, int(points[0]) if points else every) for s, f, *points in named]
+        result = FamilyResult.joined([cross_family(crossing, f, [(s, n)], crossing.folds) for s, f, n in wanted])
+        _, peers = stacked(crossing, result, "forward" if crossing.folds.get("forward") else "leave-batch-out")
+        models = {
+            c: refit(crossing, *c) for c in wanted if f"leave-batch-out|{'|'.join(map(str, c))}" in result.predictions
+        }
+        for cell, fitted in models.items():
+            runs = left_out_runs(crossing, cell, result.predictions, peers).runs
+            near = runs.loc[runs["protocol"] == "leave-batch-out", "S_um"].dropna()
+            bound, promised = RunBound.of(runs), expected_next(runs)
+            siblings = [models[c] for c in peers[CELL_KEYS[1:]].itertuples(index=False, name=None) if c[1] != cell[1]]
+            model = StoredModel(fitted, machine, Region.of(crossing.batches, fitted.inputs), {}, bound, tuple(siblings))
+            for k in block.test:
+                predicted_um = fitted.predict(kept[k])
+                S_um = float(residual_std_um(zeroed_error_um(kept[k], target) - predicted_um))
+                if not np.isfinite(S_um):  # an input is masked throughout
+                    continue
+                yield {
+                    "target": target, "cell": "|".join(map(str, cell)), "block": block.name,
+                    "batch_id": kept[k].batch_id, "S_um": S_um,
+                    **model.run_error(kept[k], predicted_um)._asdict(), "next_S_um": promised.S_um,
+                    "next_bound_um": promised.bound_um, "naive_um": float(np.quantile(near, 0.9)),
+                }  # fmt: skip
 
 
 def summary(rows: pd.DataFrame) -> dict[str, str]:
@@ -137,8 +145,7 @@ def main() -> None:
             for machine, batches in every[name]():
                 known = check_machine(batches, machine)
                 for target in known[0].names("error"):
-                    for cell in args.cells.split(","):
-                        rows += [{"machine": name, **row} for row in bounded(machine, known, target, cell)]
+                    rows += [{"machine": name, **r} for r in bounded(machine, known, target, args.cells.split(","))]
             print(pd.DataFrame({name: summary(pd.DataFrame(rows).query("machine == @name"))}).T.to_string(), flush=True)
     table = pd.DataFrame(rows)
     parts = {**dict(list(table.groupby("machine", sort=False))), "all": table}

@@ -194,6 +194,10 @@ class Family(ABC):
         those = [key for key, family in FAMILIES.items() if family.has_program()]
         raise InputError(f"family {self.key} cannot be written as a program; those that can: {', '.join(those)}")
 
+    def parts(self) -> list[Family]:
+        """The fitted families that it is a sum of; none of most."""
+        return []
+
     def n_parameters(self) -> int:
         """How many numbers were learned."""
         return int(sum(np.size(v) for v in self.fitted.values() if not isinstance(v, str)))

@@ -23,7 +23,6 @@ from models.crossing import Crossing, FamilyResult, Plan, prepare
 from models.protocols import Fold, season, speed, start_ambient_degC
 from models.race import Job, drive
 from models.result import CELL_KEYS, GridResult
-from models.trust import LeftOut, left_out_runs
 
 R = TypeVar("R")
 
@@ -65,17 +64,8 @@ class Workers:
 
     def cross(self, job: Job) -> FamilyResult:
         """The scores of a job; waits for them."""
-        return self._pool_of(job.family).submit(_cross, self._crossings, job)()
-
-    def distances(self, asked: tuple[tuple[str, str, str, int], Mapping[str, Any], Mapping[Any, Any]]) -> LeftOut:
-        """`left_out_runs` of (error channel, selector, family, n_tsp), where the crossing left its results.
-
-        With it come the cell's predictions and, as in `Job`, what its selector chose.
-        """
-        return self._pool_of(asked[0][2]).submit(_distances, self._crossings, *asked)()
-
-    def _pool_of(self, family: str) -> Pool:
-        return self._sharing if FAMILIES[family].shares_targets else self._pool
+        pool = self._sharing if FAMILIES[job.family].shares_targets else self._pool
+        return pool.submit(_cross, self._crossings, job)()
 
     def __enter__(self) -> Self:
         self._pool.__enter__()
@@ -215,14 +205,3 @@ def _start() -> None:
 
 def _cross(crossings: Shared[dict[str, Crossing]], job: Job) -> FamilyResult:
     return job.run(crossings.get()[job.target])
-
-
-def _distances(
-    crossings: Shared[dict[str, Crossing]],
-    cell: tuple[str, str, str, int],
-    known: Mapping[str, Any],
-    chosen: Mapping[Any, Any],
-) -> LeftOut:
-    crossing = crossings.get()[cell[0]]
-    crossing.chosen.update(chosen)
-    return left_out_runs(crossing, *cell[1:], known)

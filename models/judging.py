@@ -19,7 +19,7 @@ from models.protocols import Fold
 from models.result import CERTAINTY, SCORES
 
 Inputs = tuple[str, ...]
-KEPT = ("forward", "leave-batch-out", "leave-season-out")  # protocols whose predictions are kept
+KEPT = ("forward", "leave-batch-out", "leave-season-out", "leave-speed-out")  # protocols whose predictions are kept
 _AT_ONCE_BYTES = 128 * 2**20
 _FITTED_ON, _FITTED_ON_ITERATIVE = 100, 4  # training batches, evenly chosen, that fitting accuracy is taken from
 
@@ -198,6 +198,24 @@ def _columns(
 
 def _stacked(pending: Sequence[_Column], columns: Sequence[int], k: int) -> Array:
     return np.column_stack([pending[c].predicted_um[k] for c in columns])
+
+
+def left_out_by_fold(
+    design: Design, folds: Sequence[Fold], predicted_um: Array
+) -> list[dict[int, tuple[Array, Array]]]:
+    """Kept predictions (rows, m) of m cells, cut into what was recorded (n,) and predicted (n, m) of every batch.
+
+    Returns:
+        per fold the batches that it tests.
+    """
+    found, at = [], 0
+    for fold in folds:
+        own = {}
+        for k in fold.test:
+            y_um = design.y_um[design.rows(k)]
+            own[k], at = (y_um, predicted_um[at : at + len(y_um)]), at + len(y_um)
+        found.append(own)
+    return found
 
 
 def score_table(

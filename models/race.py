@@ -122,10 +122,9 @@ def rounds(crossing: Crossing) -> Rounds:
 
 
 def _with_stack(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, led: str) -> Raced:
-    if not any(FAMILIES[key].combines for key in crossing.plan.families):
-        return Raced(result, race, pd.DataFrame())
     more, members = stacked(crossing, result, led)
-    return Raced(FamilyResult.joined([result, more]), race, members)
+    wanted = any(FAMILIES[key].combines for key in crossing.plan.families)
+    return Raced(FamilyResult.joined([result, more]) if wanted else result, race, members)
 
 
 def drive(crossings: Mapping[str, Crossing], cross: Callable[[list[Job]], list[FamilyResult]]) -> dict[str, Raced]:

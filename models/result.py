@@ -44,7 +44,8 @@ class GridResult:
       in older files.
     - `race`: which cells were dropped in which round and why, see `models.race.rounds`; empty without a race. A cell of
       the last rounds is in `scores` by the leading protocol alone, a finalist by all of them.
-    - `stack`: selector, family, n_tsp, inputs and weight of the members of the cell stack; empty without one.
+    - `stack`: selector, family, n_tsp and inputs of the best cells of up to five families, whose disagreement about a
+      run tells of its error; weight: in the cell stack, whose members they are. Empty for fewer than two.
     """
 
     machine: str

@@ -15,7 +15,7 @@ from data.errors import InputError
 from features.design import Design
 from models.base import Family
 from models.crossing import Crossing, FamilyResult
-from models.judging import KEPT, FamilyScores, score_table
+from models.judging import KEPT, FamilyScores, left_out_by_fold, score_table
 from models.loss import pooled
 from models.program import Builder
 from models.protocols import Fold
@@ -99,7 +99,7 @@ class Stack(Family):
         return self._learned(design, {"members": about, **fitted})
 
     def parts(self) -> list[Family]:
-        """The fitted members."""
+        """The fitted members, built from plain data by each call."""
         from models.base import family_from_plain
 
         found = []
@@ -166,7 +166,8 @@ def stacked(crossing: Crossing, result: FamilyResult, led: str) -> tuple[FamilyR
         crossing.chosen[STACKED, train] = {len(design.inputs): tuple(i for i in design.inputs if i in used)}
     for protocol in [p for p in KEPT if all(_name(p, m) in result.predictions for m in members)]:
         folds = crossing.folds[protocol]
-        runs = _left_out(crossing, result, protocol, members)
+        given = np.column_stack([result.predictions[_name(protocol, m)] for m in members]).astype(float)
+        runs = left_out_by_fold(design, folds, given)
         if protocol == led:
             table["inputs"] = ["|".join(crossing.inputs(s, crossing.everything, n)) for s, _, n in members]
             table["weight"] = weights_of([run for own in runs for run in own.values()], families)
@@ -197,21 +198,6 @@ def _members(result: FamilyResult, led: str) -> list[tuple[str, str, int]]:
 
 def _name(protocol: str, cell: tuple[str, str, int]) -> str:
     return "|".join([protocol, *map(str, cell)])
-
-
-def _left_out(
-    crossing: Crossing, result: FamilyResult, protocol: str, members: Sequence[tuple[str, str, int]]
-) -> list[dict[int, tuple[Array, Array]]]:
-    """Per fold and tested batch what was recorded (n,) and what the members predict (n, m)."""
-    design, at, found = crossing.design, 0, []
-    each = np.column_stack([result.predictions[_name(protocol, m)] for m in members]).astype(float)
-    for fold in crossing.folds[protocol]:
-        own = {}
-        for k in fold.test:
-            y_um = design.y_um[design.rows(k)]
-            own[k], at = (y_um, each[at : at + len(y_um)]), at + len(y_um)
-        found.append(own)
-    return found
 
 
 def _scored(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, Self
@@ -14,16 +13,11 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.batch import Batch, Channel
-from data.errors import InputError
-from features.design import Design
 from features.rises import feature, feature_unit
-from models import FAMILIES
-from models.base import Family
-from models.crossing import Crossing, with_target
-from models.judging import KEPT
+from models.crossing import Crossing
+from models.judging import left_out_by_fold
 from models.metrics import residual_std_um
 from models.program import Builder, Program
-from models.protocols import Fold
 
 Watched = Mapping[str, Array]  # quantity -> (n,) of one batch
 
@@ -101,11 +95,6 @@ class Region:
         every = list(self.beyond(values).values())
         known = np.array([np.isfinite(far) for far in every]).any(axis=0)
         return np.where(known, np.max([np.nan_to_num(far, nan=0.0) for far in every], axis=0), np.nan)
-
-    def outside_share(self, values: Watched) -> float:
-        """Share of the rows beyond the region by more than 5 % of its width, 0 to 1."""
-        far = self.distance(values)
-        return float(np.mean(far[np.isfinite(far)] > SLACK)) if np.isfinite(far).any() else 0.0
 
     def program(self, channels: Mapping[str, Channel], step_s: float) -> Program:
         """The watched quantities (q,) row by row, in the order of `ranges`, see `row`."""
@@ -194,15 +183,13 @@ def _excess(values: Array, low: Array | float, high: Array | float) -> Array:
     return np.maximum(np.maximum(low - values, values - high), 0.0)
 
 
-SIBLINGS = ("ridge", "distributed_lag")  # linear in the present and in the past of the inputs: cheap, small, unlike
-COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "outside", "predicted_rms_um",
+COLUMNS = ["cell", "protocol", "fold", "batch_id", "start", "distance", "farthest", "predicted_rms_um",
            "disagreement_um", "S_um"]  # fmt: skip
-_BOUNDED = ("forward", "leave-season-out", "leave-speed-out", "leave-batch-out")  # protocols that a bound is made of
 
 
 class LeftOut(NamedTuple):
-    """`runs`: a row per protocol, fold and left-out batch with the columns `COLUMNS`. `curves`: of the protocols
-    `models.judging.KEPT` protocol, fold, batch_id, time_s, along an axis position_mm, recorded_um and predicted_um."""
+    """`runs`: a row per protocol, fold and left-out batch with the columns `COLUMNS`. `curves`: protocol, fold,
+    batch_id, time_s, along an axis position_mm, recorded_um and predicted_um."""
 
     runs: pd.DataFrame
     curves: pd.DataFrame
@@ -210,105 +197,58 @@ class LeftOut(NamedTuple):
 
 def left_out_runs(
     crossing: Crossing,
-    selector: str,
-    family: str,
-    n_tsp: int,
-    predictions: Mapping[str, Array] | None = None,
+    cell: tuple[str, str, int],
+    predictions: Mapping[str, NDArray[Any]],
+    peers: pd.DataFrame | None = None,
 ) -> LeftOut:
-    """Every left-out batch of a cell with what was known of it before its error.
+    """Every left-out batch of a cell (selector, family, n_tsp) with what was known of it before its error.
 
     cell: "selector|family|n_tsp"; start: of the batch (NaT where unknown); distance: how far it went beyond the region
     of the fold's training batches, in trained widths (`Region.distance`; the 95 % quantile over its rows); farthest:
-    in which quantity; outside: share of its rows beyond the region; predicted_rms_um: of the prediction;
-    disagreement_um: see `disagreement_um`, NaN without
-    siblings; S_um: the fold's error. Folds that cannot be fitted are left out, and protocols of studies where there are
-    others.
+    in which quantity; predicted_rms_um: of the prediction; disagreement_um: see `disagreement_um`, NaN without
+    peers; S_um: the fold's error.
 
     Args:
-        predictions: of the crossing, see `FamilyResult.predictions`; what they lack is fitted again.
+        predictions: of the crossing, see `FamilyResult.predictions`; protocols without the cell's are left out.
+        peers: see `GridResult.stack`; those of the cell's own family are not used.
     """
-    runs, curves, cell = [], [], f"{selector}|{family}|{n_tsp}"
+    selector, family, n_tsp = cell
+    own = pd.DataFrame([cell], columns=["selector", "family", "n_tsp"])
+    others = own if peers is None or peers.empty else pd.concat([own, peers[peers["family"] != family][own.columns]])
+    labels = ["|".join(map(str, c)) for c in others.itertuples(index=False)]
+    label = labels[0]
+    runs, curves = [], []
     known = cache(lambda k, name: feature(crossing.batches[k], name))  # sets of inputs have most quantities in common
-    bounded = {p: folds for p, folds in crossing.folds.items() if p in _BOUNDED and folds} or crossing.folds
-    for protocol, folds in bounded.items():
-        given = _by_fold(crossing.design, folds, (predictions or {}).get(f"{protocol}|{cell}"))
-        if given is None and FAMILIES[family].combines:
-            continue
+    for protocol in [p for p in crossing.folds if f"{p}|{label}" in predictions]:
+        folds = crossing.folds[protocol]
+        given = [predictions[name] for c in labels if (name := f"{protocol}|{c}") in predictions]
+        by_fold = left_out_by_fold(crossing.design, folds, np.column_stack(given).astype(float))
         for design, which in crossing.needed(folds, [(selector, n_tsp)]):
-            own = [folds[i] for i in which]
-            try:
-                predicted = [given[i] for i in which] if given is not None else _predicted(design, family, own)
-            except InputError:
-                continue
-            siblings = [p for key in siblings_of(family, design.inputs) if (p := _sibling(design, key, own))]
             values = [
                 {name: known(k, name) for name in _watched_names(b, design.inputs)}
                 for k, b in enumerate(crossing.batches)
             ]
             units = {name: feature_unit(b, name) for b, v in zip(crossing.batches, values, strict=True) for name in v}
-            for i, fold in enumerate(own):
-                region = Region.of_values([values[k] for k in fold.train], design.inputs, units)
-                for j, k in enumerate(fold.test):
-                    batch, error_um, recorded_um = crossing.batches[k], predicted[i][j], design.y_um[design.rows(k)]
-                    apart_um = disagreement_um(error_um, [s[i][j] for s in siblings])
-                    S_um = float(residual_std_um(recorded_um - error_um))
-                    runs.append((cell, protocol, fold.name, batch.batch_id, batch.start,
-                                 *farthest(region.beyond(values[k])), region.outside_share(values[k]), _rms(error_um),
-                                 apart_um, S_um))  # fmt: skip
-                    if protocol in KEPT:
-                        at = {"position_mm": design.position_mm(design.along)[design.rows(k)]} if design.along else {}
-                        curves.append(pd.DataFrame({
-                            "protocol": protocol, "fold": fold.name, "batch_id": batch.batch_id,
-                            "time_s": batch.time_s, **at, "recorded_um": recorded_um, "predicted_um": error_um,
-                        }))  # fmt: skip
+            for i in which:
+                region = Region.of_values([values[k] for k in folds[i].train], design.inputs, units)
+                for k, (recorded_um, every_um) in by_fold[i].items():
+                    batch, own_um = crossing.batches[k], every_um[:, 0]
+                    apart_um = disagreement_um(own_um, list(every_um[:, 1:].T))
+                    S_um = float(residual_std_um(recorded_um - own_um))
+                    runs.append((label, protocol, folds[i].name, batch.batch_id, batch.start,
+                                 *farthest(region.beyond(values[k])), _rms(own_um), apart_um, S_um))  # fmt: skip
+                    at = {"position_mm": design.position_mm(design.along)[design.rows(k)]} if design.along else {}
+                    curves.append(pd.DataFrame({
+                        "protocol": protocol, "fold": folds[i].name, "batch_id": batch.batch_id,
+                        "time_s": batch.time_s, **at, "recorded_um": recorded_um, "predicted_um": own_um,
+                    }))  # fmt: skip
     table = pd.DataFrame(runs, columns=COLUMNS).astype({"start": "datetime64[ns]"})
     return LeftOut(table, pd.concat(curves, ignore_index=True) if curves else pd.DataFrame())
 
 
-def _by_fold(design: Design, folds: Sequence[Fold], predicted: Array | None) -> list[list[Array]] | None:
-    """Predictions of a protocol, one after the other, by fold and tested batch."""
-    if predicted is None:
-        return None
-    sizes = [[design.rows(k).stop - design.rows(k).start for k in f.test] for f in folds]
-    cut = np.split(np.asarray(predicted, float), np.cumsum([n for own in sizes for n in own])[:-1])
-    return [[cut.pop(0) for _ in own] for own in sizes]
-
-
-def siblings_of(family: str, inputs: Sequence[str]) -> tuple[str, ...]:
-    """The families whose disagreement with a family is a measure of its error; none without inputs to learn from."""
-    return tuple(key for key in SIBLINGS if inputs and key != family)
-
-
-def fit_siblings(family: Family, batches: Sequence[Batch]) -> tuple[Family, ...]:
-    """The siblings of a fitted family on the batches that it was fitted on; those that cannot be fitted are left out.
-
-    A batch without a usable error is not learned from.
-    """
-    batches = with_target(batches, family.target) if batches else []
-    fitted = []
-    for key in siblings_of(family.key, family.inputs) if batches else ():
-        with suppress(InputError):
-            fitted.append(FAMILIES[key]().fit(batches, family.inputs, family.target))
-    return tuple(fitted)
-
-
-def disagreement_um(predicted_um: Array, siblings_um: Sequence[Array]) -> float:
-    """Root mean square difference (µm) of a prediction (n,) and those of its siblings; NaN without any."""
-    return _rms(np.concatenate([s - predicted_um for s in siblings_um])) if siblings_um else float("nan")
-
-
-def _predicted(design: Design, family: str, folds: Sequence[Fold]) -> list[list[Array]]:
-    fitted = FAMILIES[family]().fit_folds(design, [f.train for f in folds])
-    predicted: list[list[Array]] = fitted[0].predict_folds(design, fitted, [f.test for f in folds])
-    return predicted
-
-
-def _sibling(design: Design, key: str, folds: Sequence[Fold]) -> list[list[Array]]:
-    """The same, empty where one of the folds cannot be fitted."""
-    try:
-        return _predicted(design, key, folds)
-    except InputError:
-        return []
+def disagreement_um(predicted_um: Array, peers_um: Sequence[Array]) -> float:
+    """Root mean square difference (µm) of a prediction (n,) and a peer's, the median over peers; NaN without any."""
+    return float(np.median([_rms(p - predicted_um) for p in peers_um])) if peers_um else float("nan")
 
 
 def _rms(values_um: Array) -> float:

@@ -18,7 +18,8 @@ from features.design import Design
 from features.rises import zeroed_error_um
 from models.base import Family
 from models.conformal import RunBound
-from models.trust import Region, fit_siblings
+from models.crossing import unfitted, with_target
+from models.trust import Region
 from models.updating import Updater, left_out_tracks, out_of_fold
 from pipelines import model_store
 
@@ -32,6 +33,7 @@ def write(
     info: Mapping[str, Any] | None = None,
     bound: RunBound | None = None,
     curves: pd.DataFrame | None = None,
+    peers: pd.DataFrame | None = None,
 ) -> model_store.StoredModel:
     """Write the model folder of a family that was fitted on these batches, and read it back.
 
@@ -42,6 +44,7 @@ def write(
         bound: the bound of a run's error; without it predictions state none.
         curves: left-out predictions of the training, see `GridResult.curves`; without them the family is fitted again
             to learn what readings of a probe are worth.
+        peers: other families, see `GridResult.stack`; without them nobody disagrees with the model.
 
     Raises:
         InputError: a family that is not fitted, or a machine file that cannot be used.
@@ -54,9 +57,24 @@ def write(
     updater, substitutes = _at_the_machine(family, machine_yaml, batches, curves)
     model_store.save(
         folder, family, machine_yaml, region or Region.of(batches, family.inputs), dict(info or {}) | known, bound,
-        fit_siblings(family, batches), updater, substitutes,
+        _siblings(family, machine_yaml, batches, peers), updater, substitutes,
     )  # fmt: skip
     return model_store.load(folder)
+
+
+def _siblings(
+    family: Family, machine_yaml: str, batches: Sequence[Batch], peers: pd.DataFrame | None
+) -> tuple[Family, ...]:
+    """The peers fitted on the same batches, without the family itself; a sum of them holds them already."""
+    if peers is None or family.combines or not batches:
+        return ()
+    machine = parse_machine(machine_yaml, "machine.yml")
+    fitted = []
+    for key, inputs in zip(peers["family"], peers["inputs"].str.split("|"), strict=True):
+        if key != family.key:
+            with suppress(InputError):
+                fitted.append(unfitted(key).fit(with_target(batches, family.target), inputs, family.target, machine))
+    return tuple(fitted)
 
 
 def step_s(batches: Sequence[Batch]) -> float:

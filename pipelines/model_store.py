@@ -57,7 +57,7 @@ class StoredModel:
     region: Region
     info: dict[str, Any] = field(default_factory=dict)  # training_id, cell, n_batches, simulated, …
     bound: RunBound | None = None  # of the error of a run
-    siblings: tuple[Family, ...] = ()  # whose disagreement with `family` the bound follows
+    siblings: tuple[Family, ...] = ()  # the best of other families, without those that `family` is made of
     updater: Updater | None = None  # of readings of a probe
     substitutes: Substitutes | None = None  # of failed sensors
 
@@ -134,7 +134,8 @@ class StoredModel:
     def run_error(self, batch: Batch, predicted_um: Array) -> RunError:
         """The error to expect of a run from its inputs and its prediction (n,)."""
         distance, quantity = farthest(self.region.beyond(values := watched(batch, self.family.inputs)))
-        apart_um = disagreement_um(predicted_um, [s.predict(batch) for s in self.siblings])
+        peers = self.family.parts() or self.siblings
+        apart_um = disagreement_um(predicted_um, [p.predict(batch) for p in peers])
         bound = self.bound
         if bound is None:
             expected_um, most_um = (float(self.info.get(f"expected_S_{k}um", math.nan)) for k in ("", "bound90_"))
@@ -142,14 +143,9 @@ class StoredModel:
         factor, reasons = bound.factor(apart_um, distance), []
         if distance > max(bound.tested, SLACK):
             reasons.append(self.region.excess(quantity, values))
-        if (share := self.region.outside_share(values)) > bound.outside:
-            far = f"; {self.region.excess(quantity, values)}" if distance > 0 else ""
-            reasons.append(f"{100 * share:.0f} % of the rows are outside the trained region{far}")
-        if factor > bound.unusual:
-            disagree = f"similar models differ by {apart_um:.2g} µm, usually {bound.typical_um:.2g}"
-            by_distance = bound.factor(math.nan, distance) ** 2 > factor
-            reasons.append(self.region.excess(quantity, values) if by_distance else disagree)
-        return RunError(bound.expected_um * factor, bound.bound_um * factor, "; ".join(dict.fromkeys(reasons)))
+        if bound.unusual(apart_um):
+            reasons.append(f"other models differ by {apart_um:.2g} µm, usually {bound.typical_um:.2g}")
+        return RunError(bound.expected_um * factor, bound.bound_um * factor, "; ".join(reasons))
 
     def _column(self, channel: str) -> str | int:
         part = self.machine.channels.get(channel)

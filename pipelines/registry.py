@@ -470,7 +470,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         stored = fitted_model.write(
-            folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves
+            folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves, result.stack
         )
         served = write_served(stored, folder, stored.info["step_s"])
         channels = stored.channels()

@@ -28,7 +28,7 @@ from models.outlook import Outlook, outlook
 from models.protocols import PROTOCOLS
 from models.race import Job, Raced, drive
 from models.result import GridResult, Training
-from models.trust import Region
+from models.trust import Region, left_out_runs
 from models.updating import updated_scores
 from pipelines import registry, spool, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
@@ -183,7 +183,7 @@ def train(
             clock("grid")
             if all(settings.promotion.offered(set(r.cells["protocol"])) for r in outcome.results.values()):
                 say("trust")
-                _judge(outcome, crossings, raced, workers, caller, settings)
+                _judge(outcome, crossings, raced, settings)
                 clock("trust")
         say("track")
         token = checkpoint.token()
@@ -284,24 +284,18 @@ def _judge(
     outcome: TrainOutcome,
     crossings: dict[str, Crossing],
     raced: dict[str, Raced],
-    workers: Workers,
-    caller: Caller,
     settings: Settings,
 ) -> None:
     """The chosen cells, the error to expect of them, and how far they may be trusted."""
-    targets = list(outcome.results)
-    asked = []
-    for t in targets:
-        choice = outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
-        known = {k: v for k, v in raced[t].result.predictions.items() if k.endswith(f"|{choice.cell}")}
-        chosen = {key: own for key, own in crossings[t].chosen.items() if key[0] == choice.selector}
-        asked.append(((t, choice.selector, choice.family, choice.n_tsp), known, chosen))
-    for t, left_out in zip(targets, caller.map("trust", workers.distances, asked), strict=True):
-        outcome.results[t] = replace(outcome.results[t], distances=left_out.runs, curves=left_out.curves)
+    for t, result in list(outcome.results.items()):
+        choice = outcome.choices[t] = promotion.decide(result, settings.promotion)
+        cell = (choice.selector, choice.family, choice.n_tsp)
+        left_out = left_out_runs(crossings[t], cell, raced[t].result.predictions, result.stack)
+        outcome.results[t] = replace(result, distances=left_out.runs, curves=left_out.curves)
         if outcome.choices[t].standing == "provisional":  # its authority comes from the curves
             outcome.choices[t] = promotion.decide(outcome.results[t], settings.promotion)
         outcome.outlooks[t] = outlook(outcome.results[t], outcome.choices[t])
-        readings = updated_scores(crossings[t], *asked[targets.index(t)][0][1:], left_out.curves)
+        readings = updated_scores(crossings[t], *cell, left_out.curves)
         outcome.results[t] = replace(outcome.results[t], readings=readings)
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pandas as pd
 
-from models.conformal import RunBound
+from models.conformal import UNUSUAL, RunBound
 from models.promotion import Choice
 from models.result import CELL_KEYS, GridResult
 from models.trust import SLACK
@@ -140,7 +140,7 @@ def bound_panel(name: str, left_out: pd.DataFrame, simulated: bool) -> Panel | N
     figure = S_against_S(clouds, lines, "expected S", "S", simulated)
     keys = [c.key for c in reversed(clouds)] + [Key("as expected", GREEN), Key("90 % bound", INK)]
     notes = (
-        "The expected S rises with the disagreement of similar models about the run and with its distance from the "
+        "The expected S rises with the disagreement of the best of other families and with the distance from the "
         "trained region, as far as the left-out runs show it. Runs above the upper line are worse than their bound.",
     )
     return Panel(f"{name}: S of left-out runs against the S expected from their inputs", (Plot(figure, name, "half"),),
@@ -169,10 +169,10 @@ def bound_table(name: str, left_out: pd.DataFrame, digits: int, simulated: bool)
         Column("below the bound", "", "number"),
     )
     notes = [
-        f"S grows with the disagreement of similar models to the power {number(bound.slopes[0], 2)} and with "
-        f"(1 + distance from the trained region) to the power {number(bound.slopes[1], 2)}; a run whose factor is "
-        f"above {number(bound.unusual, 2)} or whose distance is above {number(bound.tested, 2)} trained widths is "
-        "flagged. The bound comes from these runs: its share below is no test of it."
+        f"S grows with the disagreement of the best of other families to the power {number(bound.slopes[0], 2)} and "
+        f"with (1 + distance from the trained region) to the power {number(bound.slopes[1], 2)}. A run is flagged "
+        f"where they disagree by more than {number(UNUSUAL, 1)} times the expected S, or its distance is above "
+        f"{number(bound.tested, 2)} trained widths. The bound comes from these runs: its share below is no test of it."
     ]
     far = left_out.loc[(left_out["protocol"] == "forward") & (left_out["distance"] > SLACK), "farthest"].value_counts()
     if len(far):

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.conformal import LEVEL, RunBound, expected_next
+from models.conformal import LEVEL, UNUSUAL, RunBound, expected_next
 
 
 def left_out(S_um: np.ndarray, protocol: str = "forward", **columns: np.ndarray) -> pd.DataFrame:
@@ -61,6 +61,12 @@ def test_a_run_that_is_farther_out_is_never_expected_to_be_better() -> None:
     assert bound.tested == pytest.approx(distance.max())
 
 
+def test_a_run_that_the_peers_disagree_about_by_more_than_its_error_is_unusual() -> None:
+    bound = RunBound.of(left_out(np.full(40, 5.0)))
+    least_um = UNUSUAL * bound.expected_um
+    assert not bound.unusual(0.99 * least_um) and bound.unusual(1.01 * least_um) and not bound.unusual(np.nan)
+
+
 def test_few_runs_give_a_wide_bound_and_never_none() -> None:
     one, same = RunBound.of(left_out(np.array([5.0]))), RunBound.of(left_out(np.full(40, 5.0)))
     assert one.bound_um > 1.5 * 5.0 and 5.0 <= same.expected_um <= same.bound_um < 1.2 * 5.0
@@ -86,7 +92,8 @@ def test_the_next_season_is_led_by_later_runs() -> None:
 
 def test_plain_and_back() -> None:
     bound = RunBound.of(drawn(np.random.default_rng(3), 20, 0.5))
-    assert RunBound.from_plain(json.loads(json.dumps(bound.as_plain(), allow_nan=False))) == bound
+    plain = json.loads(json.dumps(bound.as_plain(), allow_nan=False))
+    assert RunBound.from_plain(plain) == bound == RunBound.from_plain(plain | {"unusual": 1.2, "outside": 1.0})
 
 
 def test_another_cells_bound_comes_from_its_scores() -> None:

@@ -22,7 +22,7 @@ from models.base import Family
 from models.conformal import RunBound
 from models.mlr import MLR
 from models.promotion import choose
-from models.trust import Region, fit_siblings
+from models.trust import Region
 from pipelines import model_store, registry, tracking
 from pipelines.cli import app
 from pipelines.commands.predict import load_model, predict_batches, predict_file, summary
@@ -148,12 +148,12 @@ def test_rows_beyond_the_training_are_marked_with_what(stored):
 
 @pytest.fixture
 def bounded(tmp_path) -> model_store.StoredModel:
-    """A stored model with siblings, whose left-out runs had S = 5 µm and a disagreement of 0.1 µm."""
+    """A stored model with two of other families, whose left-out runs had S = 5 µm and a disagreement of 0.1 µm."""
     batches = toy_batches("toy-bound", 8)
     model, region = toy_model(batches)
     runs = pd.DataFrame({"protocol": "leave-batch-out", "fold": "", "batch_id": [b.batch_id for b in batches],
                          "S_um": 5.0, "disagreement_um": 0.1, "distance": 0.0})  # fmt: skip
-    siblings = fit_siblings(model, batches)
+    siblings = [FAMILIES[key]().fit(batches, model.inputs, "z") for key in ("ridge", "distributed_lag")]
     model_store.save(tmp_path, model, machine_yaml("toy-bound"), region, {}, RunBound.of(runs), siblings)
     loaded = model_store.load(tmp_path)
     assert [s.key for s in loaded.siblings] == ["ridge", "distributed_lag"]
@@ -182,13 +182,13 @@ def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be
     assert "60 of 120 rows are outside the trained range (front@start, bed@start" in line
 
 
-def test_a_run_that_similar_models_disagree_about_is_flagged(bounded):
+def test_a_run_that_other_models_disagree_about_is_flagged(bounded):
     batches = toy_batches("toy-bound", 4)
     double = MLR().fit([replace(b, table=b.table.assign(z=2 * b.table["z"])) for b in batches], ("front", "bed"), "z")
     agreed, doubted = (model.run_error(batches[1], model.predict(batches[1]))
                        for model in (bounded, replace(bounded, siblings=(double,))))  # fmt: skip
     assert agreed.flagged == ""
-    assert re.fullmatch(r"similar models differ by \d+ µm, usually 0\.1", doubted.flagged)
+    assert re.fullmatch(r"other models differ by \d+ µm, usually 0\.1", doubted.flagged)
     assert doubted.bound90_S_um > 2 * agreed.bound90_S_um
 
 

@@ -10,9 +10,9 @@ def left_out() -> pd.DataFrame:
     """Twelve runs left out one by one, and each twice as bad as a later run that is half a width out."""
     start, rows = pd.Timestamp("2026-01-01"), []
     for k in range(12):
-        rows.append(("c", "leave-batch-out", f"b{k}", f"b{k}", start, 0.0, "", 0.0, 9.0, 1.0, 2.0 + k))
-        rows.append(("c", "forward", "autumn", f"b{k}", start, 0.5, "room@start", 0.5, 9.0, 2.0, 4.0 + 2 * k))
-        rows.append(("c", "train-on-one", "b0", f"b{k}", start, 3.0, "bed@start", 1.0, 9.0, 3.0, 90.0))
+        rows.append(("c", "leave-batch-out", f"b{k}", f"b{k}", start, 0.0, "", 9.0, 1.0, 2.0 + k))
+        rows.append(("c", "forward", "autumn", f"b{k}", start, 0.5, "room@start", 9.0, 2.0, 4.0 + 2 * k))
+        rows.append(("c", "train-on-one", "b0", f"b{k}", start, 3.0, "bed@start", 9.0, 3.0, 90.0))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from data.batch import Batch, Finding
-from models.crossing import Crossing, Plan
+from models.crossing import Crossing, Plan, cross_family
 from models.grid import run_grid
 from models.promotion import choose
 from models.protocols import PromotionRule
@@ -50,7 +50,8 @@ def results(make: Maker, k: int = 6, simulated: bool = True, findings: bool = Fa
 def judged(crossing: Crossing, result: GridResult) -> GridResult:
     """With the left-out runs and curves of the cell that the rule takes, as a training keeps them."""
     cell = choose(result, PromotionRule())
-    kept = left_out_runs(crossing, cell.selector, cell.family, cell.n_tsp)
+    known = cross_family(crossing, cell.family, [(cell.selector, cell.n_tsp)]).predictions
+    kept = left_out_runs(crossing, (cell.selector, cell.family, cell.n_tsp), known)
     return replace(result, distances=kept.runs, curves=kept.curves)
 
 
