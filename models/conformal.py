@@ -8,6 +8,7 @@ follows the misses of the forward blocks (adaptive conformal inference: Gibbs & 
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple, Self
 
@@ -18,10 +19,6 @@ from scipy.special import ndtri
 from data.arrays import Array
 
 LEVEL = 0.90  # of later runs stay below the bound
-# Disagreement of the peers over the expected S above which a run is flagged. Conformal risk control (Angelopoulos et
-# al., ICLR 2024) of false flags at 10 %: later runs of two simulated years and three plants that stayed below twice the
-# expected S; chosen without the shared recordings.
-UNUSUAL = 1.5
 LED_BY = ("forward", "leave-season-out", "leave-batch-out")  # nearest to the next season first
 # How far a left-out run counts for a later one: a forward run is one, the others were predicted under other conditions.
 _WEIGHTS = {"forward": 1.0, "leave-season-out": 0.5, "leave-speed-out": 0.5, "leave-batch-out": 0.5}
@@ -71,8 +68,10 @@ class RunBound:
     trained region in widths. The slopes are a ridge regression of ln S about a weak prior and never negative: a run
     that is farther out or less agreed upon is never expected to be better.
 
-    expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement. tested: the greatest distance
-    of a left-out run. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were left out.
+    expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement; usual_um: above it a run
+    is flagged, one in ten of the left-out runs with less than twice the expected S (conformal risk control of false
+    flags: Angelopoulos et al., ICLR 2024). tested: the greatest distance of a left-out
+    run. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were left out.
     """
 
     expected_um: float
@@ -80,6 +79,7 @@ class RunBound:
     slopes: tuple[float, float]
     typical_um: float
     floor_um: float
+    usual_um: float
     tested: float
     level: float
     n_runs: int
@@ -96,7 +96,7 @@ class RunBound:
         n = table["batch_id"].nunique()
         if not n:
             nan = float("nan")
-            return cls(nan, nan, (0.0, 0.0), nan, nan, nan, LEVEL, 0)
+            return cls(nan, nan, (0.0, 0.0), nan, nan, nan, nan, LEVEL, 0)
         counts = table["protocol"].map(_WEIGHTS).fillna(1.0).to_numpy(float)
         weight = np.asarray(counts * (n / counts.sum()), float)  # a run that several protocols left out is one run
         S_um = np.maximum(table["S_um"].to_numpy(float), _LEAST_UM)
@@ -110,8 +110,10 @@ class RunBound:
         values, mass = _with_prior(score, weight)
         expected_um = float(np.average(np.exp(values), weights=mass))
         bound_um = max(expected_um, float(np.exp(_quantile(values, mass, level))))
+        fine = np.isfinite(disagreement_um) & (S_um <= 2.0 * expected_um)
         return cls(
             expected_um, bound_um, (float(slopes[0]), float(slopes[1])), typical_um, floor_um,
+            _quantile(disagreement_um[fine], weight[fine], LEVEL) if fine.any() else 0.0,
             float(np.nanmax(distance, initial=0.0)), level, n,
         )  # fmt: skip
 
@@ -126,10 +128,6 @@ class RunBound:
         own = (scores["selector"] == selector) & (scores["family"] == family) & (scores["n_tsp"] == n_tsp)
         return cls.of(scores[own]) if scores.loc[own, "S_um"].notna().any() else None
 
-    def unusual(self, disagreement_um: float) -> bool:
-        """Whether the peers disagree about a run by so much that its S may be far above the expected one."""
-        return bool(disagreement_um > UNUSUAL * self.expected_um)
-
     def factor(self, disagreement_um: float, distance: float) -> float:
         """How many times an ordinary run's S; 1 where both are unknown (NaN)."""
         seen = _visible(np.array([disagreement_um]), np.array([distance]), self.typical_um, self.floor_um)
@@ -141,7 +139,7 @@ class RunBound:
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> Self:
         """The inverse of `as_plain`; what other versions of the program kept besides is not read."""
-        own = {f.name: plain[f.name] for f in fields(cls)}
+        own = {f.name: plain.get(f.name, math.inf) for f in fields(cls)}
         return cls(**{**own, "slopes": (float(plain["slopes"][0]), float(plain["slopes"][1]))})
 
 

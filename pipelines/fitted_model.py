@@ -66,7 +66,7 @@ def _siblings(
     family: Family, machine_yaml: str, batches: Sequence[Batch], peers: pd.DataFrame | None
 ) -> tuple[Family, ...]:
     """The peers fitted on the same batches, without the family itself; a sum of them holds them already."""
-    if peers is None or family.combines or not batches:
+    if peers is None or peers.empty or family.combines or not batches:
         return ()
     machine = parse_machine(machine_yaml, "machine.yml")
     fitted = []

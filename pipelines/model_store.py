@@ -143,7 +143,7 @@ class StoredModel:
         factor, reasons = bound.factor(apart_um, distance), []
         if distance > max(bound.tested, SLACK):
             reasons.append(self.region.excess(quantity, values))
-        if bound.unusual(apart_um):
+        if apart_um > bound.usual_um:
             reasons.append(f"other models differ by {apart_um:.2g} µm, usually {bound.typical_um:.2g}")
         return RunError(bound.expected_um * factor, bound.bound_um * factor, "; ".join(reasons))
 

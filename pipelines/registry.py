@@ -237,6 +237,8 @@ def _register(
             _crown(client, name, version, reason, new.training_id, force)
         else:
             client.set_registered_model_alias(name, outcome, version)
+            if choice.standing == "refused":  # on more runs than an older provisional version was judged by
+                _drop(client, name, PROVISIONAL)
     client.set_model_version_tag(name, version, OUTCOME, outcome)
     return Promotion(
         outcome, name, int(version), int(version) if replaces else None if champion is None else int(champion.version),
@@ -435,8 +437,11 @@ def _crown(client: MlflowClient, name: str, version: str, why: str, training_id:
         client, name, version, action="promote", why=why, training_id=training_id, code_version=code_version(),
         forced=forced,
     )  # fmt: skip
-    # A challenger lost to an older champion, and a provisional version stands in for one.
-    for alias in {CHALLENGER, PROVISIONAL} & client.get_registered_model(name).aliases.keys():
+    _drop(client, name, CHALLENGER, PROVISIONAL)  # lost to an older champion, and stood in for one
+
+
+def _drop(client: MlflowClient, name: str, *aliases: str) -> None:
+    for alias in set(aliases) & client.get_registered_model(name).aliases.keys():
         client.delete_registered_model_alias(name, alias)
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pandas as pd
 
-from models.conformal import UNUSUAL, RunBound
+from models.conformal import RunBound
 from models.promotion import Choice
 from models.result import CELL_KEYS, GridResult
 from models.trust import SLACK
@@ -171,7 +171,7 @@ def bound_table(name: str, left_out: pd.DataFrame, digits: int, simulated: bool)
     notes = [
         f"S grows with the disagreement of the best of other families to the power {number(bound.slopes[0], 2)} and "
         f"with (1 + distance from the trained region) to the power {number(bound.slopes[1], 2)}. A run is flagged "
-        f"where they disagree by more than {number(UNUSUAL, 1)} times the expected S, or its distance is above "
+        f"where they disagree by more than {number(bound.usual_um, digits)} µm, or its distance is above "
         f"{number(bound.tested, 2)} trained widths. The bound comes from these runs: its share below is no test of it."
     ]
     far = left_out.loc[(left_out["protocol"] == "forward") & (left_out["distance"] > SLACK), "farthest"].value_counts()

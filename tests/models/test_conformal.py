@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.conformal import LEVEL, UNUSUAL, RunBound, expected_next
+from models.conformal import LEVEL, RunBound, expected_next
 
 
 def left_out(S_um: np.ndarray, protocol: str = "forward", **columns: np.ndarray) -> pd.DataFrame:
@@ -61,10 +61,11 @@ def test_a_run_that_is_farther_out_is_never_expected_to_be_better() -> None:
     assert bound.tested == pytest.approx(distance.max())
 
 
-def test_a_run_that_the_peers_disagree_about_by_more_than_its_error_is_unusual() -> None:
-    bound = RunBound.of(left_out(np.full(40, 5.0)))
-    least_um = UNUSUAL * bound.expected_um
-    assert not bound.unusual(0.99 * least_um) and bound.unusual(1.01 * least_um) and not bound.unusual(np.nan)
+def test_one_in_ten_of_the_runs_that_kept_the_promise_is_flagged() -> None:
+    apart_um = np.arange(1.0, 41.0)
+    S_um = np.where(apart_um > 30, 50.0, 5.0)  # of the others the peers agree well
+    assert RunBound.of(left_out(S_um, disagreement_um=apart_um)).usual_um == 27.0
+    assert RunBound.of(left_out(S_um)).usual_um == 0.0
 
 
 def test_few_runs_give_a_wide_bound_and_never_none() -> None:
@@ -93,7 +94,9 @@ def test_the_next_season_is_led_by_later_runs() -> None:
 def test_plain_and_back() -> None:
     bound = RunBound.of(drawn(np.random.default_rng(3), 20, 0.5))
     plain = json.loads(json.dumps(bound.as_plain(), allow_nan=False))
-    assert RunBound.from_plain(plain) == bound == RunBound.from_plain(plain | {"unusual": 1.2, "outside": 1.0})
+    assert RunBound.from_plain(plain) == bound == RunBound.from_plain(plain | {"unusual": 1.2})
+    del plain["usual_um"]  # a model of an earlier program: nobody disagrees enough
+    assert np.isinf(RunBound.from_plain(plain).usual_um)
 
 
 def test_another_cells_bound_comes_from_its_scores() -> None:

@@ -255,6 +255,13 @@ def test_a_provisional_version_stands_in_until_there_is_a_champion(store):
     assert aliases(store, name) == {"champion": 4, "challenger": 5}
 
 
+def test_a_training_that_refuses_every_model_ends_the_provisional_one(store):
+    refused = {"standing": "refused", "caution": "not shown to be better than zero"}
+    assert train(store, "toy-ends", [5.0] * 6, **PROVISIONAL).outcome == "provisional"
+    assert train(store, "toy-ends", [5.0] * 7, **refused).outcome == "challenger"
+    assert aliases(store, "toy-ends-z") == {"challenger": 2}
+
+
 def test_badges_of_a_provisional_version_are_printed(store, capsys):
     train(store, "toy-badge", [5.0] * 6, **PROVISIONAL)
     client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
