@@ -13,9 +13,9 @@ After a round a cell is dropped where it is clearly worse than the leader on the
 (Maron and Moore 1994, Hoeffding races), and so many remain as the next round can afford (successive halving: Jamieson
 and Talwalkar 2016): the best first, by their mean S with the cost of choosing, pooled with the families' records
 (`models.loss`), of each family no more than a part of them. The best cells of the four best families go on
-in any case, as runners-up and members of a stack, and so do the baselines. Unless the effort is
-"quick", the best cell of the twin stays until the third round, since a growing error of the twin calls for a diagnosis;
-further only if it leads: its folds take minutes.
+in any case, as runners-up and members of a stack, and so do the baselines. Of the families that simulate the twin one
+goes on only if it leads, since its folds take minutes. Unless the effort is "quick", the best cell of the twin stays
+until the third round: a growing error of the twin calls for a diagnosis.
 """
 
 from __future__ import annotations
@@ -237,11 +237,11 @@ def _kept(
             continue
         if not np.isfinite(S_mean_um[i]):
             why[i] = "not fitted"
-        elif FAMILIES[family].needs_twin and (family in taken or (name == "runs" and taken)):
+        elif FAMILIES[family].needs_twin and taken and not twin:
             why[i] = "slow, and not the leader"
         elif any(np.allclose(S_um[i], S_um[k], rtol=_SAME) for k in seen):
             why[i] = "the same as a better or simpler cell"
-        elif family not in taken and (len(taken) < _RUNNERS_UP or (twin and FAMILIES[family].needs_twin)):
+        elif family not in taken and (len(taken) < _RUNNERS_UP or FAMILIES[family].needs_twin):
             twin = twin and not FAMILIES[family].needs_twin
             n, taken[family] = n + 1, 1
             seen.append(i)
