@@ -24,7 +24,6 @@ from diagnosis.findings import report_data as made
 from diagnosis.findings.conclude import (
     caps,
     found_of,
-    residual_ratio,
     residual_remarks,
     rms_of,
     slow_residual_ratio,
@@ -43,7 +42,8 @@ from diagnosis.findings.schema import (
 )
 from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, settle
+from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, rows_as_given, worsened
+from diagnosis.localisation.balance import impossible
 from diagnosis.localisation.where_when import Located, locate
 from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run, settling_run
 from diagnosis.policy import POLICY
@@ -52,7 +52,7 @@ from diagnosis.screening.screen import alone, limits
 from diagnosis.search.decision import Round
 from diagnosis.search.refits import Progress
 from diagnosis.search.residual import UnlistedEffect, in_place_of_listed, unlisted_effect
-from diagnosis.search.search import Search, search, start_worker
+from diagnosis.search.search import Search, search, settled, start_worker
 from twin.calibration.identifiability import intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
@@ -96,8 +96,8 @@ def diagnose(
         batches, more = enough_batches(batches)
         remarks += more
         done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
-        final = settle(done.final) if done.accepted else done.final
-        done = replace(done, final=final)
+        if done.accepted:
+            done = replace(done, final=settled(done.final))
         tell("left out", 0, 0)
         location = workers.submit(partial(_located, done.baseline, batches))
         left = unlisted_effect(done, seed)
@@ -155,6 +155,15 @@ def _diagnosis(
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
+    drafted, units = machine.twin is None, {r.channel: r.unit for r in rms}
+    remarks += tuple(i.words for i in impossible(done.baseline))
+    refused = next((r for r in reversed(done.rounds) if r.raised and not r.accepted), None)
+    if refused is not None and refused.best is not None:
+        label = refused.best.candidate.label
+        remarks += (f"{label} is not accepted: it gains score, but raises {made.rises(refused.raised, units)}",)
+    worse = {} if drafted else worsened(rows_as_given(done.baseline), after)
+    if worse:
+        remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
     run = settling_run(named)
     separates = run.label if run is not None else ""
     found = []
@@ -164,12 +173,12 @@ def _diagnosis(
     if left is not None:
         found.append(left.found(part_after, intervals, rms, caps(final.runs)))
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
-    rest, slow = residual_ratio(done), slow_residual_ratio(rms, final)
+    slow = slow_residual_ratio(rms, final)
     listed = [f for f in found if not f.kind.is_unlisted]
-    verdict = verdict_of(listed, left is not None, rest, slow, final.runs)
+    verdict = verdict_of(listed, left is not None, rms, slow, final.runs)
     if run is None and verdict != "explained":
         run = revealing_run(done)
-    remarks += residual_remarks(rest, slow, final.runs)
+    remarks += residual_remarks(slow, final.runs)
     last = done.rounds[-1]
     table = limits(last.before, last.screen, last.threshold)
     detection_limits = _detection_limits(table)
@@ -195,7 +204,7 @@ def _diagnosis(
         "null": made.null_table(last.null),
         **located,
     }
-    simulated, drafted = any(b.simulated for b in final.batches), machine.twin is None
+    simulated = any(b.simulated for b in final.batches)
     return Diagnosis(
         machine=machine,
         findings=Findings(
@@ -223,10 +232,10 @@ def _diagnosis(
         remarks=remarks,
         tables=everything,
         network=final.problem.network,
-        values={i.name: i.value for i in intervals.values()},
-        intervals=tuple(intervals.values()),
-        added=changed_parts(part, part_after),
-        notes=_notes(findings, len(batches)),
+        values={} if worse else {i.name: i.value for i in intervals.values()},
+        intervals=() if worse else tuple(intervals.values()),
+        added={} if worse else changed_parts(part, part_after),
+        notes={} if worse else _notes(findings, len(batches)),
         plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
     )

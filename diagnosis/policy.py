@@ -158,6 +158,8 @@ class Policy:
     second_pass_min_finalist_gain_nats: float = development(40.0, "nats", "one step may gain a tenth of the optimum")
 
     # Acceptance
+    impossible_min_noises: float = analytic(5.0, "given noises", "by chance one row in two million is so far off")
+    impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     max_worse_share: float = development(0.25, "of the left-out batches", "an effect makes few runs worse")
     claim_min_gain_share: float = development(0.5, "of the highest gain", "what improves most batches comes first")
     alternatives_judged: int = cost(2, "finalists", "after one whose own null speaks against it")
@@ -338,8 +340,7 @@ class Policy:
     plain_probability: float = convention(0.9, "probability", "above it a claim is stated plainly")
     likely_probability: float = convention(0.6, "probability", "above it a claim is most likely, below it perhaps")
     fallen_max_share: float = convention(0.98, "of the error before", "an error that keeps more has not fallen")
-    noise_max_ratio: float = convention(2.0, "times the given noise", "a median channel up to it is noise")
-    channel_noise_max_ratio: float = convention(3.0, "times the given noise", "a single channel up to it is noise")
+    noise_max_ratio: float = convention(1.5, "times the given noise", "a channel up to it is noise")
     limit_power_sd: float = analytic(1.64, "sd", "an effect at its limit is seen in 95 of 100 such sets of runs")
     limit_absorbed_share: float = convention(0.3, "of a signature", "from it on the hiding parameter is named")
 

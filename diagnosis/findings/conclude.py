@@ -11,12 +11,10 @@ import pandas as pd
 from data.arrays import Array
 from diagnosis.contracts import Candidate, Fitted
 from diagnosis.export.machine_file import deviations
-from diagnosis.findings.report_data import Estimate, Found, Other, Rms, context_label, place_label
+from diagnosis.findings.report_data import Estimate, Found, Other, Rms, beyond_noise, context_label, place_label
 from diagnosis.findings.schema import Verdict
 from diagnosis.policy import POLICY, Policy
-from diagnosis.screening.screen import alone
 from diagnosis.screening.unseen import unseen
-from diagnosis.search.acceptance import trust
 from diagnosis.search.decision import Round
 from diagnosis.search.probability import Explanation, explanations, probability_cap, reported
 from diagnosis.search.search import Search
@@ -152,7 +150,7 @@ def found_of(
     assert best is not None
     c = best.candidate
     _, nothing, unlisted = explanations(done)
-    trusted = trust(best)
+    trusted = done.trust
     parameters, was = reported_parameters(final, c, intervals, done.scatter)
     regime, windows = activity(final, c)
     return replace(
@@ -187,7 +185,7 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     c = best.tried.candidate
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
-    trusted = trust(best.tried)
+    trusted = done.trust
     return Found(
         mechanism=c.mechanism,
         where=c.where,
@@ -289,18 +287,6 @@ def caps(n: int) -> tuple[str, ...]:
     return () if n >= POLICY.few_runs else (f"{n} runs only",)
 
 
-def residual_ratio(search: Search) -> float:
-    """Left-out errors after all that was found over those of structure alone; the median over channels.
-
-    Rows are filtered by their memory, so that a slow misfit counts little; `slow_residual_ratio` shows that.
-    """
-    final, null = search.final, search.rounds[-1].null
-    left = alone(final, final.memory)
-    seen = left.mean_squares(left.left_out())[0]
-    structure = np.median(null.mean_squares[:, POLICY.null_own_scale], axis=0)
-    return float(np.nanmedian(np.sqrt(seen / np.maximum(structure, 1.0))))
-
-
 def slow_residual_ratio(rms: Sequence[Rms], fitted: Fitted) -> float:
     """Left-out errors of unfiltered rows, less noise, over what a network of castings usually leaves; the median.
 
@@ -328,21 +314,20 @@ def moved_rms(fitted: Fitted) -> dict[str, float]:
 
 
 def verdict_of(
-    found: Sequence[Found], more: bool, rest: float, slow: float, runs: int, policy: Policy = POLICY
+    found: Sequence[Found], more: bool, rms: Sequence[Rms], slow: float, runs: int, policy: Policy = POLICY
 ) -> Verdict:
-    """The verdict on all effects of listed mechanisms.
+    """The verdict on all effects of listed mechanisms: they explain the difference where they leave noise alone.
 
     Args:
         more: whether the residual follows something that no listed mechanism does.
-        rest: `residual_ratio`. It counts only next to a finding, since it judges the shape of a residual, and a coarse
-            network leaves residuals of every shape.
+        rms: of batches left out, after all that was found.
         slow: `slow_residual_ratio`.
     """
     if not found:
         return "unlisted" if more else "undecidable" if slow > max_residual_ratio(runs, policy) else "consistent"
     if found[0].probability < POLICY.stands_alone_probability and found[0].tied:
         return "undecidable"
-    return "partly_explained" if more or max(rest, slow) > max_residual_ratio(runs, policy) else "explained"
+    return "partly_explained" if more or (policy.checks_residual and beyond_noise(rms)) else "explained"
 
 
 def max_residual_ratio(runs: int, policy: Policy = POLICY) -> float:
@@ -352,16 +337,12 @@ def max_residual_ratio(runs: int, policy: Policy = POLICY) -> float:
     return POLICY.few_runs_residual_max_units if runs < POLICY.few_runs else POLICY.residual_max_units
 
 
-def residual_remarks(rest: float, slow: float, runs: int) -> tuple[str, ...]:
-    """Remarks on the residual ratios that exceed the limit for so many runs; the larger first."""
+def residual_remarks(slow: float, runs: int) -> tuple[str, ...]:
+    """A remark on a residual ratio that exceeds the limit for so many runs."""
     bound, unit = max_residual_ratio(runs), 100 * POLICY.structure_error_share
-    of_moves = (
+    if slow <= bound:
+        return ()
+    return (
         f"left-out errors are {unit * slow:.0f} % of what their channels move (median over channels); up to "
-        f"{unit * bound:.0f} % may be the coarse network's"
+        f"{unit * bound:.0f} % may be the coarse network's",
     )
-    of_memory = (
-        f"left-out errors filtered by their memory are {rest:.1f} times what a coarse network makes of them (median "
-        f"over channels); up to {bound:.0f} times may be its"
-    )
-    said = sorted(((slow, of_moves), (rest, of_memory)), reverse=True)
-    return tuple(remark for ratio, remark in said if ratio > bound)

@@ -182,6 +182,11 @@ class Found:
         return tuple(o for o in self.others if o.alike and o.probability >= least)
 
 
+def beyond_noise(rms: Sequence[Rms]) -> list[Rms]:
+    """Channels whose left-out errors after all that was found are no noise, the worst first."""
+    return sorted((r for r in rms if r.times_noise > POLICY.noise_max_ratio), key=lambda r: -r.times_noise)
+
+
 def times_noise(rms: Sequence[Rms]) -> float:
     """Left-out errors after all that was found over the given noise, the median over channels; 0 where none is."""
     return float(np.nanmedian([r.times_noise for r in rms if r.noise > 0] or [0.0]))
@@ -231,6 +236,14 @@ ACF_LAGS = 40
 
 def empty_tables() -> dict[str, pd.DataFrame]:
     return {name: pd.DataFrame(columns=list(columns)) for name, columns in COLUMNS.items()}
+
+
+def rises(worse: Mapping[str, tuple[float, float]], units: Mapping[str, str]) -> str:
+    """``the left-out error of T1 from 1.4 to 4.5 K``, of every channel that got worse, the largest ratio first."""
+    first = sorted(worse, key=lambda c: worse[c][0] / worse[c][1])
+    kelvin = {c: "K" if units.get(c) == "degC" else units.get(c, "") for c in first}
+    said = [f"{c} from {few(worse[c][0])} to {with_unit(few(worse[c][1]), kelvin[c])}" for c in first]
+    return f"the left-out error of {listed(said)}"
 
 
 def rms_table(before: LeftOutRows, after: LeftOutRows, fitted: Fitted) -> pd.DataFrame:

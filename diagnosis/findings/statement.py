@@ -8,8 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from data.units import unit_label
 from diagnosis.contracts import CandidateKind, Where
 from diagnosis.findings.report_data import (
@@ -19,6 +17,7 @@ from diagnosis.findings.report_data import (
     Rms,
     amount,
     as_given,
+    beyond_noise,
     few,
     listed,
     percent,
@@ -198,10 +197,13 @@ def verdict_statement(
         return f"{text}: {said}{f'; with it {fall}' if fall else ''}."
     if verdict == "partly_explained":
         text = _capital(f"{hedge} part of the difference is {said}".strip())
-        more = f"{text}{f'; with it {fall}' if fall else ''}. Something else is still missing."
+        still = [f"{r.channel} still at {few(r.times_noise)} times its noise" for r in beyond_noise(rms)[:_MAX_NAMED]]
+        more = f"{text}{f'; with it {fall}' if fall else ''}. Not explained: {listed(still) or 'what remains'}."
         return more + _open_question(separates, possible)
     text = _capital(f"{hedge} the difference is {said}".strip())
-    return f"{text}{f'; with it {fall}' if fall else ''}. Nothing else is missing that these runs could show."
+    them = "it" if len(found) == 1 else "them"
+    noise_alone = f"With {them} every channel is within {few(POLICY.noise_max_ratio)} times its noise on runs left out"
+    return f"{text}{f'; with it {fall}' if fall else ''}. {noise_alone}."
 
 
 def _open_question(run: str, possible: Sequence[str]) -> str:
@@ -212,18 +214,13 @@ def _open_question(run: str, possible: Sequence[str]) -> str:
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
     left = [f"{r.channel} {with_unit(few(r.after), 'K' if r.unit == 'degC' else r.unit)}"
             + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
-    times, worst = times_noise(rms), max(rms, key=lambda r: np.nan_to_num(r.times_noise), default=None)
-    most = worst.times_noise if worst is not None else 0.0
-    of_one = (
-        f" and {few(most)} times in {worst.channel}"
-        if worst is not None and most > POLICY.channel_noise_max_ratio
-        else ""
-    )
+    worst = beyond_noise(rms)
     text = "Nothing is missing: the remaining error is the noise"
-    if times > POLICY.noise_max_ratio or of_one:
+    if worst:
         text = (
-            f"No missing effect is supported by these runs; the remaining error, {few(times)} times the noise in the "
-            f"median channel{of_one}, is not explained: a network this coarse may leave as much"
+            f"No missing effect is supported by these runs; the remaining error, {few(times_noise(rms))} times the "
+            f"noise in the median channel and {few(worst[0].times_noise)} times in {worst[0].channel}, is not "
+            "explained: a network this coarse may leave as much"
         )
     text += f" ({', '.join(left)})" if left else ""
     seen = []

@@ -251,16 +251,53 @@ def left_out_rows(fitted: Fitted) -> LeftOutRows:
     information, total = np.sum(own, axis=0) + np.eye(len(state.z)), np.sum(to, axis=0)
     low, high = z_bounds(problem.unknowns)
     spread = np.array([u.spread for u in problem.unknowns])
+    every_z = [
+        np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high) for k in range(len(blocks))
+    ]
+    nuisance = []
+    for k, (block, w, z) in enumerate(zip(blocks, rows, every_z, strict=True)):
+        moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
+        nuisance.append(_least_squares(*((part.T * w.scale).T for part in (block.nuisance, moved))))
+    return _rows_left(problem, every_z, nuisance)
+
+
+def rows_as_given(fitted: Fitted) -> LeftOutRows:
+    """Every batch predicted by the machine file's own values; its starts and zeros alone are fitted."""
+    problem = fitted.problem
+    z = np.zeros(len(problem.unknowns))
+    nuisance = [np.zeros_like(own) for own in fitted.state.nuisance]
+    for _ in range(2):  # starts enter the temperatures linearly, through laws nearly so
+        blocks = problem.linearise(x_of(problem.unknowns, z), nuisance)
+        nuisance = [
+            _least_squares(b.nuisance, b.residual + b.nuisance @ own) for b, own in zip(blocks, nuisance, strict=True)
+        ]
+    return _rows_left(problem, [z] * len(nuisance), nuisance)
+
+
+def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, float]]:
+    """Channels whose left-out rms rises, with the mean over runs before and after in the channel's unit.
+
+    A rise counts that is larger than its standard error over runs, each run a sample of its own. So small a rise as
+    that may come from other runs.
+    """
+    old, new = (r.rms.pivot(index="batch", columns="channel", values="rms") for r in (before, after))
+    rise, n = new.mean() - old.mean(), len(old)
+    se = np.sqrt((old.var(ddof=min(1, n - 1)) + new.var(ddof=min(1, n - 1))) / n)
+    return {str(c): (float(old[c].mean()), float(new[c].mean())) for c in rise.index[rise > se]}
+
+
+def _least_squares(jacobian: Array, aim: Array) -> Array:
+    """Unknowns of unit prior spread (q,) by regularised least squares."""
+    normal = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
+    return np.asarray(np.linalg.solve(normal, jacobian.T @ aim), float)
+
+
+def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:
+    """What each batch leaves, predicted by parameters and starts of its own."""
     errors = []
     table = []
-    for k, (block, w) in enumerate(zip(blocks, rows, strict=True)):
-        z = np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high)
-        moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
-        known, aim = ((part.T * w.scale).T for part in (block.nuisance, moved))
-        normal = known.T @ known + np.eye(known.shape[1])
-        nuisance: Array = np.asarray(np.linalg.solve(normal, known.T @ aim), float)
-        one = problem.only([k])
-        residual = one.residuals(x_of(problem.unknowns, z), [nuisance])[0]
+    for k, (z, own) in enumerate(zip(every_z, nuisance, strict=True)):
+        residual = problem.only([k]).residuals(x_of(problem.unknowns, z), [own])[0]
         m = problem.measured[k]
         errors.append(residual * problem.noise[m.channel])
         for c in m.usable.tolist():

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted, Tried
+from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, worsened
+from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import Screen, alone
-from diagnosis.search.acceptance import few_worse, flipped_gains, flipped_threshold, least_gain, sign_p, stands_out
+from diagnosis.search.acceptance import (
+    few_worse,
+    flipped_gains,
+    flipped_threshold,
+    least_gain,
+    sign_p,
+    stands_out,
+    trust,
+)
 from diagnosis.search.null import Null, null_with
 from diagnosis.search.refits import common_memory, optimised, refit
 
@@ -33,6 +43,8 @@ class Round:
     own_null: Null | None = None  # at the fit with the best
     density: float = 0.0  # of batches left out at that fit, in nats
     seed: int = 0  # of the signs and of the null
+    raised: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # channels by which the best was refused
+    resolved: frozenset[str] = frozenset()  # channels that show what is impossible without the best
 
     @property
     def scatter(self) -> float:
@@ -44,6 +56,11 @@ class Round:
     @property
     def best(self) -> Tried | None:
         return self.tried[0] if self.tried else None
+
+    @property
+    def trust(self) -> float:
+        """The probability that the best is no chance."""
+        return 1.0 if self.resolved or self.best is None else trust(self.best)
 
 
 @dataclass(frozen=True)
@@ -59,6 +76,22 @@ class Criteria:
     columns: Mapping[str, int]
     seed: int
     policy: Policy = POLICY
+
+    @cached_property
+    def left(self) -> LeftOutRows:
+        """What the fit before leaves of batches left out."""
+        return left_out_rows(self.now)
+
+    @cached_property
+    def impossible(self) -> frozenset[str]:
+        """Channels that show what the fit before cannot do whatever its values."""
+        return frozenset(i.channel for i in impossible(self.now))
+
+    def resolved(self, t: Tried) -> frozenset[str]:
+        """Those of them that an effect makes possible."""
+        if not self.impossible or t.fitted is None or not t.candidate.kind.is_physics:
+            return frozenset()
+        return self.impossible - {i.channel for i in impossible(t.fitted)}
 
     @cached_property
     def density(self) -> float:
@@ -86,6 +119,9 @@ def decided(criteria: Criteria, tried: Sequence[Tried]) -> Round:
         return Round(
             now, criteria.seen, tuple(tried), least, criteria.null, np.zeros((0, 0)), False, seed=criteria.seed
         )
+    for needed in (t for t in tried if criteria.resolved(t)):
+        if (done := evaluated(criteria, tried, needed)).accepted:
+            return done
     best = first_claimable(tried, n)
     if best.gain > least_gain(best) and best.candidate.kind.is_physics:  # agreed on or not
         finer = _independent_refinement(criteria, best, tried)
@@ -122,8 +158,11 @@ def evaluated(criteria: Criteria, tried: Sequence[Tried], best: Tried) -> Round:
             structure = own.threshold(density, name=best.candidate.name)
     which = names.index(best.candidate.name) if best.candidate.name in names else None
     least = least_gain(best if agreed else replace(best, worse=0))  # as of one that no batch speaks against
-    threshold = max(structure, flipped_threshold(flipped, n, which), least)
-    accepted = best.gain > threshold and agreed and not _less_likely_than_nothing(best, threshold, null.temperature)
+    resolved = criteria.resolved(best)  # without it nothing explains the recording: there is no chance to rule out
+    threshold = 0.0 if resolved else max(structure, flipped_threshold(flipped, n, which), least)
+    unlikely = not resolved and _less_likely_than_nothing(best, threshold, null.temperature)
+    accepted = best.gain > threshold and agreed and not unlikely
+    raised = worsened(criteria.left, left_out_rows(best.fitted)) if accepted else {}
     tried = (best, *(t for t in tried if t is not best))
     return Round(
         now,
@@ -132,11 +171,13 @@ def evaluated(criteria: Criteria, tried: Sequence[Tried], best: Tried) -> Round:
         threshold,
         null,
         flipped,
-        accepted,
+        accepted and not raised,
         sign_p(best.improved, n),
         own,
         density,
         criteria.seed,
+        raised,
+        resolved,
     )
 
 

@@ -33,7 +33,8 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
 
     A tempered posterior over left-out scores (pseudo-Bayes, Geisser and Eddy 1979): differences below what structure
     alone makes decide nothing, and what makes many batches worse explains nothing. Nothing is as likely as what is
-    accepted and only just reaches the threshold; what is not listed as one in fifty of the best that is.
+    accepted and only just reaches the threshold, and impossible where a channel shows what the twin cannot do; what is
+    not listed as one in fifty of the best that is.
     """
     t = done.null.temperature
     batches = len(done.before.batches)
@@ -45,6 +46,8 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}
     scores = np.array([x.standing(t) if agrees(x) and x.cluster not in barred else -np.inf for x in done.tried])
     nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
+    if done.resolved:
+        nothing = -np.inf
     unlisted = (scores.max(initial=nothing)) - np.log(POLICY.unlisted_odds)
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())

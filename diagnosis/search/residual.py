@@ -14,6 +14,7 @@ from diagnosis.candidates.library import own_bodies
 from diagnosis.contracts import Candidate, Fitted, Scored, Tried
 from diagnosis.findings.conclude import activity, usual_size
 from diagnosis.findings.report_data import Estimate, Found, Rms, listed, place_label
+from diagnosis.fitting.fitted import left_out_rows, worsened
 from diagnosis.fitting.regression import Memory, whiter
 from diagnosis.localisation.where_when import Located
 from diagnosis.policy import POLICY
@@ -145,6 +146,8 @@ def _left(
     if not verdict.accepted:
         return None
     whole = completed(now, best, every)
+    if worsened(left_out_rows(now), left_out_rows(whole.fitted)):
+        whole = best
     return UnlistedEffect(whole.forms, whole.tried, verdict.threshold)
 
 

@@ -17,7 +17,7 @@ from diagnosis.candidates.alternatives import coarse_candidates
 from diagnosis.candidates.discretisation import never_reported
 from diagnosis.candidates.priors import start_values
 from diagnosis.contracts import Candidate, CandidateKind, Fitted, Scored, Tried, with_parts
-from diagnosis.fitting.fitted import refitted, settle
+from diagnosis.fitting.fitted import left_out_rows, refitted, settle, worsened
 from diagnosis.fitting.regression import Memory
 from diagnosis.policy import POLICY
 from diagnosis.screening.exchanged import suspected_swaps
@@ -315,7 +315,7 @@ def _forward(baseline: Fitted, seed: int, workers: Processes, tell: Progress, ca
         if not done.accepted or done.best is None or done.best.fitted is None:
             return Search(baseline, done.before, tuple(rounds))
         tell("settle", len(rounds), POLICY.max_effects)
-        now = settle(done.best.fitted)
+        now = settled(done.best.fitted)
         effects += done.best.candidate.kind.is_physics
         if effects >= POLICY.max_effects or len(rounds) >= POLICY.max_rounds_per_effect * POLICY.max_effects:
             return Search(baseline, now, tuple(rounds))
@@ -343,7 +343,9 @@ def revised(done: Search, workers: Processes, tell: Progress) -> Search:
         if change is None:
             return done
         at = rounds[change.effect]
-        final = settle(change.fitted)
+        final = settled(change.fitted)
+        if worsened(left_out_rows(done.final), left_out_rows(final)):
+            return done
         if change.alternative is None:
             done = replace(done, final=final, dropped=(*done.dropped, at))
             continue
@@ -383,11 +385,19 @@ def _round_with_fair_baseline(now: Fitted, seed: int, workers: Processes, tell: 
         if more < POLICY.baseline_restart_min_gain_nats:
             return done
         fair = replace(done.best, gain=done.best.gain - more)
-        done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=fair.gain > done.threshold)
+        raised = worsened(left_out_rows(back), left_out_rows(done.best.fitted))
+        accepted = fair.gain > done.threshold and not raised
+        done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=accepted, raised=raised)
         if done.accepted and more < POLICY.baseline_restart_min_gain_share * fair.gain:
             return done
         now = back
     return done
+
+
+def settled(fitted: Fitted) -> Fitted:
+    """The fit at its optimum, or where it is if a channel is predicted worse there."""
+    done = settle(fitted)
+    return fitted if worsened(left_out_rows(fitted), left_out_rows(done)) else done
 
 
 def start_worker() -> None:

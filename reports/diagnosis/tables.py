@@ -86,9 +86,8 @@ def headline(verdict: str, probabilities: Sequence[float]) -> str:
     effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
     return {
         "consistent": "Consistent: no missing effect is supported by these runs.",
-        "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} nothing else is "
-        "missing that these runs could show.",
-        "partly_explained": f"{the} simulation left out {effects}; something else is still missing.",
+        "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} noise alone is left.",
+        "partly_explained": f"{the} simulation left out {effects}; more than noise is left.",
         "unlisted": "Something is missing that no listed mechanism explains.",
         "undecidable": "Something is missing, but these recordings do not show what.",
     }[verdict]

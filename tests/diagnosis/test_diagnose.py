@@ -18,6 +18,7 @@ from data.machine import Machine
 from diagnosis.contracts import COLUMNS
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import Findings
+from diagnosis.fitting.fitted import left_out_rows, rows_as_given, worsened
 from diagnosis.result import Diagnosis
 from tests.diagnosis.small_cases import DRIFT, runs, two_bodies
 from tests.twin.machines import TWO_BODIES, machine
@@ -88,6 +89,15 @@ def test_every_table_is_there_and_of_its_columns(verdict: str) -> None:
     assert done.simulated and not done.drafted
     probability = done.tables["candidates"]["probability"]
     assert ((probability >= 0) & (probability <= 0.99)).all()
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_no_channel_is_predicted_worse_than_before_or_than_by_the_file_as_given(verdict: str) -> None:
+    done = diagnosed(verdict)
+    assert done.search is not None
+    after = left_out_rows(done.search.final)
+    assert worsened(left_out_rows(done.search.baseline), after) == {}
+    assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}
 
 
 @pytest.mark.parametrize("verdict", ["explained", "unlisted", LONGEST])

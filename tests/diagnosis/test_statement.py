@@ -210,7 +210,7 @@ def test_verdicts() -> None:
     more = "Too weak for a claim: heat to the floor: bed. A night switched off would show more."
     open_question = {"separates": "a night switched off", "possible": ["heat to the floor: bed"]}
     assert verdict_statement("consistent", **open_question).endswith(f"the noise. {more}")
-    assert verdict_statement("partly_explained", [SINK], [Z], **open_question).endswith(f"still missing. {more}")
+    assert verdict_statement("partly_explained", [SINK], [Z], **open_question).endswith(f"what remains. {more}")
     assert verdict_statement("undecidable", **open_question).endswith(f"do not show what. {more}")
     assert "Too weak" not in verdict_statement("consistent", separates="a night switched off")
     coarse = (Rms("z", "um", 13.0, 13.0, 1.2), Rms("x", "um", 6.0, 6.0, 1.2), Rms("y", "um", 30.0, 30.0, 1.2))
@@ -226,11 +226,15 @@ def test_verdicts() -> None:
     )
     assert verdict_statement("explained", [SINK], [Z]) == (
         "The difference is heat to the floor at the bed, 10 W/K (90 %: 9–12); with it the z error of runs left out of "
-        "the fit falls from 9.1 to 1.4 µm (noise 1.2). Nothing else is missing that these runs could show."
+        "the fit falls from 9.1 to 1.4 µm (noise 1.2). With it every channel is within 1.5 times its noise on runs "
+        "left out."
     )
     partly = verdict_statement("partly_explained", [replace(SINK, probability=0.7)], [Z])
     assert partly.startswith("Most likely (70 %) part of the difference is heat to the floor")
-    assert partly.endswith("Something else is still missing.")
+    assert partly.endswith("Not explained: what remains.")
+    rear = Rms("T_rear", "degC", 0.9, 0.36, 0.03, sensor=True)
+    partly = verdict_statement("partly_explained", [SINK], [Z, rear])
+    assert partly.endswith("Not explained: T_rear still at 12 times its noise.")
     flux = Found("free_flux", Where("node", "column_back"), "the column back", {}, 0.95, regime="coolant on, no lag",
                  size=Estimate(60, "W"))  # fmt: skip
     assert verdict_statement("unlisted", [flux]) == (
@@ -245,7 +249,7 @@ def test_verdicts() -> None:
     assert verdict_statement("explained", [flux, tied, replace(SINK, probability=0.7, others=())]) == (
         "The difference is 60 W into the column back (when: coolant on, no lag), heat to the floor at the bed, 10 W/K "
         "(90 %: 9–12) (50 %; or radiation to walls or from a hot neighbour at the bed, 40 %) and heat to the floor at "
-        "the bed, 10 W/K (90 %: 9–12) (70 %). Nothing else is missing that these runs could show."
+        "the bed, 10 W/K (90 %: 9–12) (70 %). With them every channel is within 1.5 times its noise on runs left out."
     )
     unsure = replace(SINK, probability=0.4, others=())
     assert verdict_statement("undecidable", [unsure]).startswith(

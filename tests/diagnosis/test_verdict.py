@@ -59,26 +59,22 @@ def test_finer_sensors_are_no_reason_to_doubt_the_same_misfit() -> None:
     ],
 )
 def test_where_nothing_is_found_and_much_is_left_nothing_is_decided(slow: float, runs: int, verdict: str) -> None:
-    rest = 2.0 * POLICY.residual_max_units
-    assert verdict_of([], False, rest, slow, runs) == verdict  # filtered rows alone are no claim
-    assert verdict_of([], True, 0.0, slow, runs) == "unlisted"
+    assert verdict_of([], False, (), slow, runs) == verdict
+    assert verdict_of([], True, (), slow, runs) == "unlisted"
 
 
-@pytest.mark.parametrize(
-    ("rest", "slow", "verdict"),
-    [
-        (0.9, 0.9, "explained"), (1.1, 0.9, "partly_explained"), (0.9, 1.1, "partly_explained"),
-    ],
-)  # fmt: skip
-def test_beside_what_was_found_either_is_more(rest: float, slow: float, verdict: str) -> None:
+@pytest.mark.parametrize(("after", "verdict"), [(1.4, "explained"), (1.6, "partly_explained")])
+def test_what_was_found_explains_the_difference_where_it_leaves_noise_alone(after: float, verdict: str) -> None:
     sink = Found("floor_sink", Where("node", "bed"), "the bed", {}, 0.95)
-    assert verdict_of([sink], False, rest * POLICY.residual_max_units, slow * POLICY.residual_max_units, 12) == verdict
+    rms = (Rms("z", "um", 9.0, 1.0, 1.0), Rms("t_rear", "K", 9.0, 0.1 * after, 0.1, sensor=True))
+    assert verdict_of([sink], False, rms, 0.0, 12) == verdict
+    assert verdict_of([sink], True, rms, 0.0, 12) == "partly_explained"
 
 
 def test_what_is_left_is_told_with_what_it_is_compared_with() -> None:
     share = "left-out errors are 20 % of what their channels move (median over channels); up to 15 % may be the coarse"
-    assert residual_remarks(0.0, 0.20 / POLICY.structure_error_share, 12) == (f"{share} network's",)
-    both = residual_remarks(9.0, 0.20 / POLICY.structure_error_share, 4)
-    assert both[0].startswith("left-out errors filtered by their memory are 9.0 times what a coarse network makes")
-    assert both[1].endswith("up to 10 % may be the coarse network's")
-    assert residual_remarks(POLICY.residual_max_units, POLICY.residual_max_units, 12) == ()
+    assert residual_remarks(0.20 / POLICY.structure_error_share, 12) == (f"{share} network's",)
+    assert residual_remarks(0.20 / POLICY.structure_error_share, 4)[0].endswith(
+        "up to 10 % may be the coarse network's"
+    )
+    assert residual_remarks(POLICY.residual_max_units, 12) == ()

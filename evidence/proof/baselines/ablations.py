@@ -13,9 +13,9 @@ from functools import cached_property
 
 from diagnosis.candidates.discretisation import never_reported
 from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
-from diagnosis.findings.conclude import claimed, residual_ratio, rms_of, slow_residual_ratio, verdict_of
-from diagnosis.findings.report_data import rms_table
-from diagnosis.findings.schema import Findings
+from diagnosis.findings.conclude import claimed, rms_of, slow_residual_ratio, verdict_of
+from diagnosis.findings.report_data import Found, rms_table
+from diagnosis.findings.schema import Findings, Verdict
 from diagnosis.fitting.fitted import left_out_rows
 from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.screen import proposed, screens
@@ -91,23 +91,22 @@ class Stage:
     def reply(self, done: Round, policy: Policy = POLICY) -> Reply:
         """What a diagnosis reports if this round is the last."""
         if not done.accepted or done.best is None or done.best.fitted is None:
-            return Reply(verdict_of([], False, *self._residual(done.before), done.before.runs, policy))
+            return Reply(self._verdict([], done.before, policy))
         if not done.best.candidate.kind.is_physics:
             return Reply("consistent")  # a refinement is no finding
         best, fitted = done.best.candidate, done.best.fitted
         found = claimed(done, fitted.part, fitted)
-        verdict = verdict_of([found], False, *self._residual(fitted), fitted.runs, policy)
+        verdict = self._verdict([found], fitted, policy)
         every = [(e.tried.candidate, e.probability) for e in explanations(done)[0]]
         others = [(c, p) for c, p in every if (c.mechanism, c.where) != (best.mechanism, best.where)]
         own = sum(p for _, p in every) - sum(p for _, p in others)
         alike = tuple(c for c, p in others if p >= MIN_ALIKE_SHARE * own)
         return Reply(verdict, (Claim(best, found.probability, alike),))
 
-    def _residual(self, fitted: Fitted) -> tuple[float, float]:
-        """The residual of a fit in units of the structural null: of filtered rows, and of unfiltered rows."""
+    def _verdict(self, found: Sequence[Found], fitted: Fitted, policy: Policy) -> Verdict:
         left = left_out_rows(fitted)
-        slow = slow_residual_ratio(rms_of(rms_table(left, left, fitted), fitted), fitted)
-        return residual_ratio(replace(self.done, final=fitted)), slow
+        rms = rms_of(rms_table(left, left, fitted), fitted)
+        return verdict_of(found, False, rms, slow_residual_ratio(rms, fitted), fitted.runs, policy)
 
 
 def reference(stage: Stage) -> Reply:
