@@ -97,7 +97,7 @@ def test_no_channel_is_predicted_worse_than_before_or_than_by_the_file_as_given(
     assert done.search is not None
     after = left_out_rows(done.search.final)
     assert worsened(left_out_rows(done.search.baseline), after) == {}
-    assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}
+    assert not done.values or worsened(rows_as_given(done.search.baseline), after) == {}  # noqa: PD011 - no frame
 
 
 @pytest.mark.parametrize("verdict", ["explained", "unlisted", LONGEST])
