@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from uuid import uuid4
 
@@ -29,6 +31,17 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         scratch.replace(path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+@cache
+def source_digest(*rooms: str) -> str:
+    """SHA-256 (hex) of the program's source in these rooms (`data`, `twin`, …), for results that are kept."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parent.parent
+    for room in rooms:
+        for path in sorted((root / room).rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def check_folder(folder: Path, files: Sequence[Path], overwrite: bool) -> None:

@@ -9,19 +9,18 @@ import tempfile
 import uuid
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from data.files import write_atomic
+from data.files import source_digest, write_atomic
 from models.crossing import Crossing, FamilyResult
 from models.race import Job
 from pipelines.caller import Say
 
-_SOURCES = ("data", "features", "models", "twin")
+SOURCES = ("data", "features", "models", "twin")
 LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "pandas")  # that decide the numbers, too
 _TOKEN = "token"
 _SUMS = "sums.json"  # the digest of every other file of a kept job
@@ -124,7 +123,7 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _digest(crossings: Mapping[str, Crossing]) -> str:
-    digest = hashlib.sha256(f"{source_digest()} {[library_version(name) for name in LIBRARIES]}".encode())
+    digest = hashlib.sha256(f"{source_digest(*SOURCES)} {[library_version(name) for name in LIBRARIES]}".encode())
     for target, crossing in sorted(crossings.items()):
         d = crossing.design
         twin = d.machine.model_dump_json() if d.machine is not None else ""
@@ -141,14 +140,3 @@ def library_version(library: str) -> str:
         return version(library)
     except PackageNotFoundError:  # torch may be missing
         return ""
-
-
-@cache
-def source_digest() -> str:
-    """SHA-256 (hex) of the program's source that decides the numbers."""
-    digest = hashlib.sha256()
-    root = Path(__file__).parent.parent
-    for folder in _SOURCES:
-        for path in sorted((root / folder).rglob("*.py")):
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()

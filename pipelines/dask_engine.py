@@ -17,10 +17,11 @@ from typing import Any, Self, TypeVar
 
 from data.endings import ending, without_interrupt
 from data.errors import InputError, WorkError
+from data.files import source_digest
 from data.processes import Shared, one_thread
 from models.grid import Pool
 from pipelines.caller import LANES, Done, Say
-from pipelines.checkpoint import LIBRARIES, library_version, source_digest
+from pipelines.checkpoint import LIBRARIES, SOURCES, library_version
 from pipelines.settings import Settings, masked
 
 try:
@@ -197,7 +198,7 @@ class _Scattered:
 @cache
 def _program() -> dict[str, str]:
     """What decides the numbers besides the data."""
-    return {"thermodrift": source_digest(), **{n: library_version(n).partition("+")[0] for n in LIBRARIES}}
+    return {"thermodrift": source_digest(*SOURCES), **{n: library_version(n).partition("+")[0] for n in LIBRARIES}}
 
 
 def _alone(program: dict[str, str], work: Callable[..., R], *args: Any) -> R:

@@ -6,7 +6,6 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.errors import InputError, WorkError
-from data.files import write_atomic
+from data.files import source_digest, write_atomic
 from diagnosis.candidates.discretisation import never_reported
 from diagnosis.contracts import Candidate, Fitted
 from diagnosis.policy import POLICY, Policy
@@ -316,12 +315,9 @@ def _key(fitted: Fitted, evidence: Evidence, counts: Mapping[str, int], seed: in
 
 
 def _words(fitted: Fitted, counts: Mapping[str, int], seed: int) -> Iterator[str]:
-    try:
-        yield version("thermodrift")
-    except PackageNotFoundError:  # run from its sources alone
-        yield ""
+    yield source_digest("data", "twin", "diagnosis")
     yield np.__version__
-    yield f"{seed} {POLICY.null_machines} {POLICY.null_scales}"
+    yield f"{seed} {POLICY}"
     yield fitted.machine.machine
     yield fitted.part.model_dump_json()
     yield from (f"{name} {column}" for name, column in counts.items())

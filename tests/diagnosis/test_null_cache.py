@@ -11,6 +11,7 @@ import pytest
 
 import diagnosis.search.null as null_cache
 from diagnosis.contracts import Fitted
+from diagnosis.policy import POLICY
 from diagnosis.screening.evidence import Evidence
 from diagnosis.screening.screen import proposed, screen
 from diagnosis.search.null import CACHED_NULLS, Null, cached_null, structural_null
@@ -76,6 +77,17 @@ def test_another_seed_fit_recording_or_list_of_candidates_is_another_null(tmp_pa
     part = fitted.part.model_copy(update={"mechanisms": {}})
     cached_null(tmp_path, replace(fitted, part=part), evidence, counts)
     assert len(calls) == 6
+
+
+def test_another_policy_or_program_is_another_null(
+    tmp_path: Path, calls: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cached_null(tmp_path, *seen())
+    monkeypatch.setattr(null_cache, "POLICY", replace(POLICY, null_cells=POLICY.null_cells + 1))
+    cached_null(tmp_path, *seen())
+    monkeypatch.setattr(null_cache, "source_digest", lambda *rooms: "another")
+    cached_null(tmp_path, *seen())
+    assert len(calls) == 3
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 torn", b"no archive at all"], ids=["empty", "torn", "text"])
