@@ -1,8 +1,9 @@
 """Assignment of findings to true terms, and the false claims.
 
-A finding matches a term if the mechanism is the same (`names`) and the place is the true one or adjacent. One finding
-matches one term: a second name for the same effect is a false claim. Under the verdict "undecidable" a finding claims
-its whole reported set; in confounded cases a partner is as true as the term. Alternatives and faults are claims too.
+A finding matches a term if the mechanism is the same (`names`) and the place is the true one or adjacent. A term takes
+one finding at each place that it acts on; a second name for the same effect is a false claim. Under the verdict
+"undecidable" a finding claims its whole reported set; in confounded cases a partner is as true as the term.
+Alternatives and faults are claims too.
 """
 
 from __future__ import annotations
@@ -126,7 +127,13 @@ def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str
     take([[means(f.mechanism, t) and exact(spot(f), t) for t in key.terms] for f in given])
     take([[names_term(f.mechanism, spot(f), t, body_of) for t in key.terms] for f in given])
     undecidable = findings is not None and findings.verdict == "undecidable"
-    true_too = {n for n in free if _partner(given[n], key.terms) or (undecidable and _ties(given[n], key, body_of))}
+    true_too = {
+        n
+        for n in free
+        if _elsewhere(given[n], key, [None if own is None else spot(given[own]) for own in of_term])
+        or _partner(given[n], key.terms)
+        or (undecidable and _ties(given[n], key, body_of))
+    }
     left = sorted(free)
     instead: list[int | None] = []
     for t, own in zip(key.terms, of_term, strict=True):
@@ -135,6 +142,14 @@ def matches(findings: Findings | None, key: AnswerKey, body_of: Mapping[str, str
         instead.append(stead)
         left = [n for n in left if n != stead]
     return Matches(given, tuple(of_term), tuple(instead), tuple(sorted(free - true_too)))
+
+
+def _elsewhere(finding: Finding, key: AnswerKey, found_at: Sequence[Spot | None]) -> bool:
+    """Whether it names a term that another finding matches, at another place that the term acts on."""
+    return any(
+        at is not None and not same_place(at, spot(finding)) and means(finding.mechanism, t) and exact(spot(finding), t)
+        for t, at in zip(key.terms, found_at, strict=True)
+    )
 
 
 def _partner(finding: Finding, terms: Sequence[TrueTerm]) -> bool:

@@ -129,6 +129,17 @@ def test_two_effects_are_named_each_once() -> None:
     assert (case["all_named"], case["right"], case["visible_terms"]) == (True, True, 1)
 
 
+def test_one_effect_is_found_at_every_place_that_it_acts_on() -> None:
+    y, z = ({"kind": "error", "name": name} for name in "yz")
+    key = answer("one", term("column_bending", where=y, also=[z], neighbours=[], parameters={}))
+    at = {name: finding("column_bending", name, "error", parameters={}) for name in "xyz"}
+    case, _ = scored(key, stored("explained", at["z"], at["y"]), truth(True))
+    assert (case["right"], case["false_claims"]) == (True, 0)
+    for wrong in (at["x"], at["y"]):  # another error, and the same place twice
+        case, _ = scored(key, stored("explained", at["y"], wrong), truth(True))
+        assert case["false_claims"] == 1
+
+
 def test_a_confounded_pair_wants_the_truth_in_the_set_and_a_run_that_settles_it() -> None:
     partner = {"mechanism": "sun", "where": {"kind": "node", "name": "column"}}
     key = answer("confounded", term(same_as=[partner]))
