@@ -220,11 +220,6 @@ class Linear(Family):
             for f in range(len(folds))
         ]
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """NaN at a row where any input is missing."""
-        coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
-        return [design.x[design.rows(k)] @ coef + intercept for k in batches]
-
     def operations(self, b: Builder) -> Sequence[int]:
         x = b.features(self.inputs)
         return [b.affine(x, self.fitted["coef_um_per_K"][None], self.fitted["intercept_um"])]
@@ -232,6 +227,7 @@ class Linear(Family):
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
+        """NaN at a row where any input is missing."""
         coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
         intercept = np.array([f.fitted["intercept_um"] for f in fitted])
         copies: dict[int, list[int]] = {}
