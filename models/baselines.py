@@ -12,7 +12,7 @@ from data.arrays import Array
 from data.errors import InputError
 from data.sweeps import position_bins
 from features.design import Design
-from models.base import Family
+from models.base import Family, Plain
 from models.program import Builder
 
 _NEED = 1  # rows
@@ -48,7 +48,7 @@ class MeanCurve(Family):
             bins = position_bins(position_mm[rows])
             at, which = np.unique(bins + 1j * time_s[rows], return_inverse=True)  # by position, then by time
             count = np.bincount(which)
-            learned = {"time_s": at.imag, "error_um": np.bincount(which, design.y_um[rows]) / count}
+            learned: Plain = {"time_s": at.imag, "error_um": np.bincount(which, design.y_um[rows]) / count}
             if design.along:
                 places, first = np.unique(at.real, return_index=True)
                 place = np.searchsorted(places, bins)
