@@ -25,8 +25,9 @@ from compensation.safety import Limits
 from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, WorkError
+from data.files import write_atomic
 from features.rises import feature_unit
-from pipelines.model_store import FILES, StoredModel, is_champion, load
+from pipelines.model_store import FILES, StoredModel, inner_folder, is_champion, load
 from pipelines.settings import home
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
@@ -161,11 +162,9 @@ class StateFile:
 
     def save(self, plain: Mapping[str, Any]) -> None:
         """Replaces the file. Raises: WorkError, it cannot be written."""
-        scratch = self.path.with_suffix(".new")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            scratch.write_text(json.dumps(plain), encoding="utf-8")
-            scratch.replace(self.path)
+            write_atomic(self.path, json.dumps(plain))
         except OSError as error:
             raise WorkError(f"state file {self.path}: cannot be written ({error}); give another --state") from None
 
@@ -292,9 +291,8 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
     running = compensator(list(models.values()), limits, period_s)
     digest = hashlib.sha256()
     for folder in folders.values():
-        inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
         for name in FILES:
-            digest.update((inner / name).read_bytes())
+            digest.update((inner_folder(folder) / name).read_bytes())
     axes = []
     for stored, made in zip(models.values(), running.axes, strict=True):
         trained = {c: (low, high) for c, (low, high) in stored.info.get("trained", {}).items()}
