@@ -22,7 +22,6 @@ from compensation.exports.base import Export
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
-from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.files import write_atomic
@@ -105,8 +104,9 @@ def compensator(
             "expected one machine and one model for each axis"
         )
     known = [m.substitutes for m in models if m.substitutes is not None]
+    widest = max(known, key=lambda s: len(s.names), default=None)  # of the most sensors: the most neighbours of each
     made = [axis_model(m, limits.of(m), period_s) for m in models]
-    return Compensator(machines[0], made, _widest(known), period_s, log)
+    return Compensator(machines[0], made, widest, period_s, log)
 
 
 @dataclass(frozen=True)
@@ -133,11 +133,6 @@ class Given:
             rate_um_per_s=self.rate_um_per_s,
             stale_s=max(default.stale_s, _LOST_SAMPLES * (every_s or 0.0)),
         )
-
-
-def _widest(known: Sequence[Substitutes]) -> Substitutes | None:
-    """Of several models' substitutes those of the most sensors: they know the most neighbours of each."""
-    return max(known, key=lambda s: len(s.names), default=None)
 
 
 class StateFile:

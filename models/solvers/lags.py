@@ -44,7 +44,8 @@ class Columns:
     """Columns x (n, m) of a design, their names, and what sets their prior spread.
 
     `prior_K` (m,) is the size that a column's coefficient is expected to have, relative to one per K; where `source`
-    (m,) is not −1, it is per full scale of that column of `raw`, to the `power` (m,): the largest size in training.
+    (m,) is not −1, it is per full scale of that raw signal (inputs that are not in K, then the drivers), to the `power`
+    (m,): the largest size in training.
     """
 
     x: Array
@@ -65,7 +66,7 @@ class Columns:
     @classmethod
     def of(cls, design: Design) -> Columns:
         parts = [*_inputs(design), *_drivers(design), *_starts(design)]
-        raw = _raw_signals(design)
+        raw = np.column_stack([design.x[:, _scaled_inputs(design)], _driver_values(design)])  # what has a full scale
         held = np.nan_to_num(np.abs(raw))
         largest = np.array([held[design.rows(k)].max(axis=0, initial=0.0) for k in range(design.n_batches)])
         x = np.column_stack([p.values for p in parts]) if parts else np.empty((len(design.time_s), 0))
@@ -125,11 +126,6 @@ class _Column:
     source: int = -1
     power: int = 1
     reach: int = UNDRIVEN
-
-
-def _raw_signals(design: Design) -> Array:
-    """Inputs that are not in K, then the drivers: what has a full scale."""
-    return np.column_stack([design.x[:, _scaled_inputs(design)], _driver_values(design)])
 
 
 def _scaled_inputs(design: Design) -> list[int]:

@@ -339,15 +339,12 @@ def _print_lineage(found: Lineage) -> None:
     table = console.table("batches", *found.batches, left={"batch_id", "start", "digest", "source", "masked"},
                           wrap=("source", "masked"))  # fmt: skip
     for b in _rows(found.batches):
-        shown = {**b, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN], "masked": _channels(b["masked"])}
+        masked = ", ".join("all channels" if c == "*" else c for c in b["masked"].split("|"))
+        shown = {**b, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN], "masked": masked}
         table.add_row(*("" if value is None else str(value) for value in shown.values()))
     console.out.print(table)
     console.line(f"findings: {len(found.findings)}; --json has all of them, and whole digests")
     print_findings(found.findings)
-
-
-def _channels(masked: str) -> str:
-    return ", ".join("all channels" if c == "*" else c for c in masked.split("|"))
 
 
 def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:
