@@ -67,6 +67,23 @@ def check_folder(folder: Path, files: Sequence[Path], overwrite: bool) -> None:
 
 
 @contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A scratch folder next to `folder`, which gets its name when the block ends well: all or nothing.
+
+    Raises:
+        OSError: it cannot be written, or `folder` is there.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    scratch = folder.with_name(f".{folder.name}.{uuid4().hex}.part")
+    scratch.mkdir()
+    try:
+        yield scratch
+        scratch.rename(folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
 def staged(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """A scratch folder inside `folder`; when the block ends well, what it holds takes the place of `names` there.
 

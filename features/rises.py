@@ -90,14 +90,19 @@ def first_order_lag(values: Array, tau_s: float, step_s: float, start: float | N
     """
     if tau_s == 0 or len(values) == 0:
         return values.copy()
+    held = hold_last(values)
+    out = lagged(held, held[0] if start is None else start, float(np.exp(-step_s / tau_s)))
+    out[~np.isfinite(values)] = np.nan
+    return out
+
+
+def lagged(values: Array, start: Array | float, keep: float) -> Array:
+    """v(k) = keep v(k−1) + (1 − keep) u(k) along rows (n, …) without holes, v = `start` in the first row."""
     from scipy.signal import lfilter  # takes long to load
 
-    held = hold_last(values)
-    keep = float(np.exp(-step_s / tau_s))
-    out = np.empty_like(held)
-    out[0] = held[0] if start is None else start
-    out[1:], _ = lfilter([1.0 - keep], [1.0, -keep], held[1:], zi=[keep * out[0]])
-    out[~np.isfinite(values)] = np.nan
+    out = np.empty_like(values)
+    out[:1] = start
+    out[1:], _ = lfilter([1.0 - keep], [1.0, -keep], values[1:], axis=0, zi=keep * out[:1])
     return out
 
 

@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data.arrays import Array, Index, Mask
+from data.arrays import Array
 from data.batch import Channel
 from data.errors import InputError
-from features.design import Design, Moments
+from features.design import Design
+from features.selectors.left_out import Blocks, LeftOut
 from models.base import Family
 from models.program import Builder, Program
 from models.solvers.batches import fold_masks
 
-_NEW = 1e-8  # a term is independent if at least this share of its square is not explained by the chosen terms
 _ROUNDING = 1e-6  # of what no model leaves
-_BEYOND = (
-    0.0,
-    1.0,
-    0.25,
-    0.5,
-    0.75,
-    -0.25,
-    -0.5,
-    1.25,
-    1.5,
-)  # of the travel, from its low end; of equal ones the first
+# Places of P0 that are tried, as shares of the travel from its low end; of equal ones the first.
+_BEYOND = (0.0, 1.0, 0.25, 0.5, 0.75, -0.25, -0.5, 1.25, 1.5)
 
 
 @dataclass(frozen=True)
@@ -77,191 +68,70 @@ def _slope_name(name: str) -> str:
     return f"P·{name}"
 
 
-@dataclass(frozen=True)
-class RawSums:
-    """Sums over B blocks of rows about zero: count (B,), xx (B, q, q), xy (B, q), yy (B,)."""
-
-    count: Array
-    xx: Array
-    xy: Array
-    yy: Array
-
-    @classmethod
-    def of(cls, m: Moments) -> RawSums:
-        across = m.sum_x[:, :, None] * m.shift_x
-        shift_xx = m.shift_x[:, None] * m.shift_x
-        xx = m.xx + across + across.transpose(0, 2, 1) + m.count[:, None, None] * shift_xx
-        xy = m.xy + m.sum_x * m.shift_y + m.shift_x * (m.sum_y + m.count * m.shift_y)[:, None]
-        yy = m.yy + 2 * m.sum_y * m.shift_y + m.count * m.shift_y**2
-        return cls(m.count, xx, xy, np.maximum(yy, 0.0))
-
-    def total(self, masks: Mask) -> RawSums:
-        """Sums over sets of blocks, masks (S, B)."""
-        take = masks.astype(float)
-        xx = (take @ self.xx.reshape(len(self.xx), -1)).reshape(len(masks), *self.xx.shape[1:])
-        return RawSums(take @ self.count, xx, take @ self.xy, take @ self.yy)
-
-    def at(self, which: Index | Mask) -> RawSums:
-        """Some of the blocks."""
-        return RawSums(self.count[which], self.xx[which], self.xy[which], self.yy[which])
-
-    def less(self, other: RawSums) -> RawSums:
-        """Block by block without the other's rows."""
-        return RawSums(self.count - other.count, self.xx - other.xx, self.xy - other.xy, self.yy - other.yy)
-
-    def from_end(self, fixed_end_mm: Array) -> RawSums:
-        """With (P − P0) x_i in the place of P x_i, P0 (B,) in mm."""
-        p = self.xy.shape[1] // 2
-        turn = np.tile(np.eye(2 * p), (len(self.xy), 1, 1))
-        turn[:, np.arange(p, 2 * p), np.arange(p)] = -fixed_end_mm[:, None]
-        xx = turn @ self.xx @ turn.transpose(0, 2, 1)
-        return RawSums(self.count, xx, (turn @ self.xy[:, :, None])[:, :, 0], self.yy)
-
-
 def fixed_ends_mm(low_mm: Array, high_mm: Array) -> Array:
     """Candidates of P0 (S, 9) for travels from low to high (S,)."""
     travel_mm = np.maximum(high_mm - low_mm, 1.0)
     return low_mm[:, None] + travel_mm[:, None] * np.array(_BEYOND)
 
 
-def choose_terms(blocks: RawSums, masks: Mask, ends_mm: Array, max_terms: int, worth: float) -> list[Chosen]:
-    """The model of each training set, masks (S, B) over the blocks, with P0 among its candidates `ends_mm` (S, C).
+def choose_terms(blocks: Blocks, ends_mm: Array, max_terms: int, worth: float) -> Chosen:
+    """The model of a training set, of whose blocks sums about zero are given, with P0 among its candidates (C,).
 
-    The score is the mean over a set's blocks of S in µm with that block left out of the fit. Of the P0 whose scores are
+    The score is the mean over the blocks of S in µm with that block left out of the fit. Of the P0 whose scores are
     within the share `worth` of the least, the one that needs the fewest terms is taken, then the first.
     """
-    outer, left = np.nonzero(masks)
-    whole = blocks.total(masks)
-    found: list[list[Chosen]] = [[] for _ in masks]
-    for end_mm in ends_mm.T:
-        turned, tested = whole.from_end(end_mm), blocks.at(left).from_end(end_mm[outer])
-        search = _Search(turned.at(outer).less(tested), tested, outer)
-        for s, (terms, S_um) in enumerate(search.run(max_terms, worth)):
-            t = np.array(terms, np.int64)
-            coef = _solved(turned.xx[s][np.ix_(t, t)], turned.xy[s][t][:, None])[:, 0]
-            found[s].append(Chosen(terms, coef, float(end_mm[s]), S_um, int(whole.count[s])))
-    return [_simplest(of_set, worth) for of_set in found]
+    found = [_best_terms(blocks, float(end_mm), max_terms, worth) for end_mm in ends_mm]
+    limit_um = (1.0 + worth) * min(m.inner_S_um for m in found)
+    return min((m for m in found if m.inner_S_um <= limit_um), key=lambda m: len(m.terms))
 
 
-def _simplest(models: Sequence[Chosen], worth: float) -> Chosen:
-    limit_um = (1.0 + worth) * min(m.inner_S_um for m in models)
-    return min((m for m in models if m.inner_S_um <= limit_um), key=lambda m: len(m.terms))
+def _best_terms(blocks: Blocks, end_mm: float, max_terms: int, worth: float) -> Chosen:
+    """The model for one P0.
 
-
-class _Search:
-    """Choice of terms for S training sets at once. `fit` and `tested` hold the sums of the fits and of the blocks left
-    out of them (V,), `outer` the set of each, rising.
-
-    It begins with the best pair of one offset and one slope, goes on with the best term more to the end (one alone may
-    be worth nothing where another is missing), takes the best it met and drops what there is not worth it.
+    The search begins with the best pair of one offset and one slope, goes on with the best term more to the end (one
+    alone may be worth nothing where another is missing), takes the best it met and drops what there is not worth it.
     """
-
-    def __init__(self, fit: RawSums, tested: RawSums, outer: Index) -> None:
-        self.fit, self.tested = fit, tested
-        self.border = np.searchsorted(outer, np.arange(int(outer[-1]) + 2))
-        self.floor_um = np.zeros(len(self.border) - 1)
-        everything = np.arange(len(self.floor_um))
-        self.nothing_um = self._scores(everything, np.zeros((len(everything), 0), np.int64))
-        self.floor_um = _ROUNDING * self.nothing_um  # below, scores differ by rounding alone
-
-    def run(self, max_terms: int, worth: float) -> list[tuple[tuple[int, ...], float]]:
-        """Terms and score of each set."""
-        sets = np.arange(len(self.floor_um))
-        terms = [np.zeros(0, np.int64) for _ in sets]
-        best = self.nothing_um.copy()
-        going = sets
-        path, S_um = self._best_pairs(sets)
-        while True:
-            for s in np.flatnonzero(S_um < best[going]):
-                terms[going[s]], best[going[s]] = path[s], S_um[s]
-            on = np.isfinite(S_um)  # else no term is left that is new
-            going, path = going[on], path[on]
-            if path.shape[1] >= min(max_terms, self.fit.xy.shape[1]) or not len(going):
-                break
-            more = self._with_one_more(going, path)
-            path, S_um = np.column_stack([path, more.argmin(axis=1)]), more.min(axis=1)
-        return [self._pruned(s, t, float(best[s]), 1.0 - worth) for s, t in enumerate(terms)]
-
-    def _pruned(self, s: int, terms: Index, S_um: float, keep: float) -> tuple[tuple[int, ...], float]:
-        """Without the terms that lower the score of set s to no less than the share `keep` of what it is without."""
-        while len(terms):
-            fewer = np.array([np.delete(terms, j) for j in range(len(terms))], np.int64)
-            without = self._scores(np.full(len(fewer), s), fewer)
-            least = int(without.argmin())
-            if S_um < keep * without[least]:
-                break
-            terms, S_um = fewer[least], float(without[least])
-        return tuple(terms.tolist()), S_um
-
-    def _best_pairs(self, sets: Index) -> tuple[Index, Array]:
-        """The offset and the slope (S, 2) that are best together, and their score (S,)."""
-        p = self.fit.xy.shape[1] // 2
-        found = self._with_one_more(np.repeat(sets, p), np.tile(np.arange(p), len(sets))[:, None])
-        slopes = found.reshape(len(sets), p, 2 * p)[:, :, p:].reshape(len(sets), -1)
-        offset, slope = np.divmod(slopes.argmin(axis=1), p)
-        return np.column_stack([offset, p + slope]), slopes.min(axis=1)
-
-    def _with_one_more(self, sets: Index, chosen: Index) -> Array:
-        """Scores (s, q) of sets with the terms chosen (s, m) and one more; infinite where that is nothing new.
-
-        Next to the chosen T a further term c has in every fit a part that T does not explain: W_c = xx_TT⁻¹ xx_Tc, the
-        part's square d_c and its product r_c with what T leaves of the error. With b_c = r_c / d_c as its coefficient
-        the left-out sum of squares is that of T less 2 b_c g_c − b_c² h_c, where g_c and h_c are the same product and
-        square in the block left out.
-        """
-        entry, row = self._rows(sets)
-        T, v = chosen[entry], row[:, None]
-        xx_TT, out_TT = (of.xx[v[:, :, None], T[:, :, None], T[:, None, :]] for of in (self.fit, self.tested))
-        xx_Tc, out_Tc, xy = self.fit.xx[v, T], self.tested.xx[v, T], self.fit.xy[row]
-        W = _solved(xx_TT, xx_Tc)
-        b_T = _solved(xx_TT, self.fit.xy[v, T][:, :, None])[:, :, 0]
-        square = np.einsum("vqq->vq", self.fit.xx)[row]
-        d = square - np.einsum("vmq,vmq->vq", W, xx_Tc)
-        r = xy - np.einsum("vmq,vm->vq", W, self.fit.xy[v, T])
-        new = d > _NEW * square
-        np.put_along_axis(new, T, False, axis=1)
-        b = np.where(new, r / np.where(new, d, 1.0), 0.0)
-        rest = self.tested.xy[row] - np.einsum("vm,vmq->vq", b_T, out_Tc)
-        rest_T = np.take_along_axis(rest, T, axis=1)
-        g = rest - np.einsum("vmq,vm->vq", W, rest_T)
-        h = np.einsum("vqq->vq", self.tested.xx)[row] - 2 * np.einsum("vmq,vmq->vq", W, out_Tc)
-        h += np.einsum("vmq,vmq->vq", W, out_TT @ W)
-        left_by_T = self.tested.yy[row] - np.einsum("vm,vm->v", b_T, self.tested.xy[v, T] + rest_T)
-        sse = np.where(new, left_by_T[:, None] - 2 * b * g + b**2 * h, np.inf)
-        return self._mean_S(sets, entry, row, sse)
-
-    def _scores(self, sets: Index, chosen: Index) -> Array:
-        """Scores (s,) of sets with the terms chosen (s, m)."""
-        entry, row = self._rows(sets)
-        T, v = chosen[entry], row[:, None]
-        xx_TT, out_TT = (of.xx[v[:, :, None], T[:, :, None], T[:, None, :]] for of in (self.fit, self.tested))
-        b = _solved(xx_TT, self.fit.xy[v, T][:, :, None])
-        explained = 2 * self.tested.xy[v, T][:, None, :] @ b - b.transpose(0, 2, 1) @ out_TT @ b
-        return self._mean_S(sets, entry, row, self.tested.yy[row] - explained[:, 0, 0])
-
-    def _rows(self, sets: Index) -> tuple[Index, Index]:
-        """For each of the sets, one after the other, its fits: place in `sets` (u,) and place in `fit` (u,)."""
-        count = self.border[sets + 1] - self.border[sets]
-        entry = np.repeat(np.arange(len(sets)), count)
-        return entry, np.arange(len(entry)) + (self.border[sets] - np.cumsum(count) + count)[entry]
-
-    def _mean_S(self, sets: Index, entry: Index, row: Index, sse: Array) -> Array:
-        """Mean S in µm (s, …) over the blocks of each of the sets, from sums of squares (u, …)."""
-        wide = (-1, *[1] * (sse.ndim - 1))
-        freedom = np.maximum(self.tested.count[row] - 1.0, 1.0).reshape(wide)
-        S_um = np.sqrt(np.maximum(sse, 0.0) / freedom)
-        total = np.add.reduceat(S_um, np.searchsorted(entry, np.arange(len(sets))), axis=0)
-        out: Array = np.maximum(total / np.bincount(entry).reshape(wide), self.floor_um[sets].reshape(wide))
-        return out
+    p, zz = blocks.zz.shape[1] // 2, blocks.zz.copy()
+    zz[:, 1 + p :] -= end_mm * zz[:, 1 : 1 + p]  # (P − P0) x_i in the place of P x_i
+    zz[:, :, 1 + p :] -= end_mm * zz[:, :, 1 : 1 + p]
+    state = nothing = LeftOut.of_blocks(Blocks(blocks.count, np.zeros_like(blocks.sum_z), zz))
+    terms, best = list[int](), float(nothing.error()[0])
+    floor = _ROUNDING * best  # below, scores differ by rounding alone
+    pairs = np.maximum(nothing.error_with_two()[0, :p, p:], floor)
+    offset, slope = np.divmod(int(pairs.argmin()), p)
+    path, comes, error = list[int](), [int(offset), p + int(slope)], float(pairs.min())
+    while True:
+        path += comes
+        for j in comes:
+            state = state.taking(np.zeros(1, np.int64), np.array([j]))
+        if error < best:
+            terms, best = path.copy(), error
+        if len(path) >= min(max_terms, 2 * p):
+            break
+        more = np.maximum(state.error_with()[0], floor)
+        more[path] = np.inf
+        comes, error = [int(more.argmin())], float(more.min())
+    while terms:
+        without = np.maximum(_errors_without_each(nothing, terms), floor)
+        if best < (1.0 - worth) * without.min():
+            break
+        best = float(without.min())
+        del terms[int(without.argmin())]
+    whole, at = zz.sum(axis=0), np.array(terms, np.int64) + 1
+    size = np.sqrt(np.diag(whole)[at])
+    coef = np.linalg.solve(whole[np.ix_(at, at)] / np.outer(size, size), whole[at, 0] / size) / size
+    n_rows = blocks.count.sum()
+    return Chosen(tuple(terms), coef, end_mm, best * float(np.sqrt(whole[0, 0] / n_rows)), int(n_rows))
 
 
-def _solved(xx: Array, right: Array) -> Array:
-    """xx⁻¹ right (…, m, k) of positive definite xx (…, m, m), scaled to a unit diagonal."""
-    if not xx.shape[-1]:
-        return np.zeros_like(right)
-    scale = np.sqrt(np.einsum("...mm->...m", xx))[..., None]
-    out: Array = np.linalg.solve(xx / (scale * np.swapaxes(scale, -1, -2)), right / scale) / scale
-    return out
+def _errors_without_each(nothing: LeftOut, terms: Sequence[int]) -> Array:
+    """Left-out error of the model with all of the terms but one, for each of them (m,)."""
+    m, at = len(terms), [0, *(t + 1 for t in terms)]
+    learned, left = (np.repeat(v[..., at, :][..., at], m, axis=0) for v in (nothing.learned, nothing.left))
+    state = LeftOut(learned, left, nothing.rows)
+    for others in np.array([np.delete(np.arange(m), j) for j in range(m)]).T:
+        state = state.taking(np.arange(m), others)
+    return state.error()
 
 
 _LEAST_ROWS = 4
@@ -317,18 +187,18 @@ class AxisCoupled(Family):
             )
         if not design.inputs:
             raise InputError(f"axis_coupled: no inputs given for {design.target}; name at least one channel")
-        terms = self.started(expanded(design))
-        batches = RawSums.of(terms.moments)
-        masks = fold_masks(self.key, design, folds, batches.count, _LEAST_ROWS)
-        ends_mm = self._ends_mm(design, masks)
-        few = masks.sum(axis=1) < 3  # then contiguous quarters of the batches are left out, as in other families
-        chosen: dict[int, Chosen] = {}
-        for which, blocks, n in ((~few, batches, 1), (few, RawSums.of(terms.quarters) if few.any() else batches, 4)):
-            if which.any():
-                sets = np.repeat(masks[which], n, axis=1) & (blocks.count > 0)
-                found = choose_terms(blocks, sets, ends_mm[which], self.max_terms, self.worth)
-                chosen |= dict(zip(np.flatnonzero(which).tolist(), found, strict=True))
-        return [self._learned(design, self._plain(design, chosen[f])) for f in range(len(folds))]
+        terms = expanded(design)  # its sums are taken about zero
+        terms = terms.started if self.zero_start else replace(terms, about_start=True, _columns=None, _parent=None)
+        masks = fold_masks(self.key, design, folds, terms.moments.count, _LEAST_ROWS)
+        out = []
+        for mask, ends_mm in zip(masks, self._ends_mm(design, masks), strict=True):
+            few = mask.sum() < 3  # then contiguous quarters of the batches are left out, as in other families
+            sums = terms.quarters if few else terms.moments
+            inside = np.repeat(mask, 4 if few else 1) & (sums.count > 0)
+            blocks = Blocks.of_moments(sums, np.flatnonzero(inside), np.arange(len(terms.inputs)))
+            chosen = choose_terms(blocks, ends_mm, self.max_terms, self.worth)
+            out.append(self._learned(design, self._plain(design, chosen)))
+        return out
 
     def _ends_mm(self, design: Design, masks: NDArray[np.bool_]) -> Array:
         """Candidates of P0 for each training set, masks (F, K): (F, 1) where it is given, else (F, C)."""

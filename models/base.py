@@ -1,14 +1,14 @@
 """Base class of the model families.
 
 To add one: a class below `Family` in a file of its own and a line in `models/__init__.py`. It needs
-`fit_design` and `respond`; `fit_folds` and `respond_folds` only where many folds share work. Predictions are 0 at a
+`fit_design` and `respond`, or `fit_folds` and `respond_folds` where many folds share work. Predictions are 0 at a
 batch's start whatever `respond` gives there; `started` is the design that such a model is to be fitted on.
 """
 
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Self, final
@@ -73,12 +73,12 @@ class Family(ABC):
         """
         return self.fit_folds(design, [train])[0]
 
-    @abstractmethod
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         """The model's output in µm (n_k,) for each batch, from the design's inputs (never its target), at any level.
 
-        NaN where an input is missing, unless the family can bridge it.
+        NaN where an input is missing, unless the family can bridge it. Override this or `respond_folds`.
         """
+        return self.respond_folds(design, [self], [batches])[0]
 
     @final
     def predict_design(self, design: Design, batches: Sequence[int]) -> list[Array]:

@@ -12,7 +12,7 @@ from data.arrays import Array
 from data.errors import InputError
 from data.sweeps import position_bins
 from features.design import Design
-from models.base import Family
+from models.base import Family, Plain
 from models.program import Builder
 
 _NEED = 1  # rows
@@ -38,46 +38,24 @@ class MeanCurve(Family):
         Raises:
             InputError: no recorded error in a fold.
         """
-        if design.along:
-            return [self._along_axis(design, sorted(set(fold))) for fold in folds]
-        ok = np.isfinite(design.y_um)
-        grid_s, place = np.unique(np.round(design.time_s[ok], 6), return_inverse=True)
-        count = np.zeros((design.n_batches, len(grid_s)))
-        total_um = np.zeros_like(count)
-        np.add.at(count, (design.group[ok], place), 1.0)
-        np.add.at(total_um, (design.group[ok], place), design.y_um[ok])
-        out = []
+        position_mm = design.position_mm(design.along) if design.along else np.zeros(len(design.y_um))
+        known = np.isfinite(design.y_um) & np.isfinite(position_mm)
+        time_s, out = np.round(design.time_s, 6), []
         for fold in folds:
-            train = sorted(set(fold))
-            n = count[train].sum(axis=0)
-            seen = n > 0
-            if seen.sum() < _NEED:
-                raise _nothing_recorded(design, train)
-            mean_um = total_um[train].sum(axis=0)[seen] / n[seen]
-            out.append(self._learned(design, {"time_s": grid_s[seen], "error_um": mean_um}))
+            rows = np.flatnonzero(known & np.isin(design.group, list(fold)))
+            if len(rows) < _NEED:
+                raise _nothing_recorded(design, sorted(set(fold)))
+            bins = position_bins(position_mm[rows])
+            at, which = np.unique(bins + 1j * time_s[rows], return_inverse=True)  # by position, then by time
+            count = np.bincount(which)
+            learned: Plain = {"time_s": at.imag, "error_um": np.bincount(which, design.y_um[rows]) / count}
+            if design.along:
+                places, first = np.unique(at.real, return_index=True)
+                place = np.searchsorted(places, bins)
+                mean_mm = np.bincount(place, position_mm[rows]) / np.bincount(place)
+                learned |= {"along": design.along, "position_mm": mean_mm, "first": np.append(first, len(count))}
+            out.append(self._learned(design, learned))
         return out
-
-    def _along_axis(self, design: Design, train: Sequence[int]) -> Self:
-        position_mm = design.position_mm(design.along)
-        rows = np.flatnonzero(np.isfinite(design.y_um) & np.isfinite(position_mm) & np.isin(design.group, train))
-        if len(rows) < _NEED:
-            raise _nothing_recorded(design, train)
-        bins = position_bins(position_mm[rows])
-        at, which = np.unique(np.stack([bins, np.round(design.time_s[rows], 6)]), axis=1, return_inverse=True)
-        count = np.bincount(which)
-        places, first = np.unique(at[0], return_index=True)
-        place = np.searchsorted(places, bins)
-        mean_mm = np.bincount(place, position_mm[rows]) / np.bincount(place)
-        return self._learned(
-            design,
-            {
-                "along": design.along,
-                "position_mm": mean_mm,
-                "first": np.append(first, len(count)),
-                "time_s": at[1],
-                "error_um": np.bincount(which, design.y_um[rows]) / count,
-            },
-        )
 
     def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
         time_s, error_um = self.fitted["time_s"], self.fitted["error_um"]

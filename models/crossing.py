@@ -226,9 +226,10 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
         if b not in kept
     ]
     if len(kept) < 2:
+        first = f"; {lost[0][1]}" if lost else ""
         raise InputError(
             f"{batches[0].machine if batches else 'training'}: got {len(kept)} batch(es) with a usable {target}, "
-            f"need at least 2; ingest more recordings or overrule a check in the machine file{_first_lost(lost)}"
+            f"need at least 2; ingest more recordings or overrule a check in the machine file{first}"
         )
     if not any(suits(f, kept[0].channels[target]) for f in plan.families):
         raise _not_along_an_axis(plan.families[0], target)
@@ -248,10 +249,6 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
                 group.remove(fold)
                 lost.append((target, f"{protocol} without fold {fold.name}: {error}"))
     return Crossing(kept[0].machine, tuple(kept), design, plan, folds, (*excluded, *lost, *plan.left_out))
-
-
-def _first_lost(lost: Sequence[tuple[str, str]]) -> str:
-    return f"; {lost[0][1]}" if lost else ""
 
 
 def cross_family(

@@ -114,14 +114,10 @@ class DistributedLag(Family):
             out.append(self._learned(design, fitted))
         return out
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Error_um (n_k,) per batch; inputs that are missing for a while are bridged by the last value."""
-        return self.respond_folds(design, [self], [batches])[0]
-
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
-        """Copies share the responses of the inputs."""
+        """Copies share the responses of the inputs; inputs missing for a while are bridged by the last value."""
         own = [list(zip(m.fitted["delays_s"].tolist(), m.fitted["taus_s"].tolist(), strict=True)) for m in fitted]
         place = {response: i for i, response in enumerate(dict.fromkeys(r for some in own for r in some))}
         weights = np.zeros((len(fitted), len(place), len(design.inputs)))

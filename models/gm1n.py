@@ -69,19 +69,14 @@ class GM1N(Family):
         """
         columns = len(design.inputs) + 2
         factors, counts = np.zeros((design.n_batches, columns, columns)), np.zeros(design.n_batches, int)
-        for k in sorted({k for fold in folds for k in fold}):
+        used = sorted({k for fold in folds for k in fold})
+        for k in used:
             rows = equations(design, k, self.recent_rows)
             counts[k] = len(rows)
             r = np.linalg.qr(rows, mode="r")
             factors[k, : len(r)] = r
-        member = np.zeros((len(folds), design.n_batches))
-        for f, fold in enumerate(folds):
-            member[f, list(fold)] = 1.0
-        if len(folds) == 1:  # a single fold needs its own batches only
-            factors, member_used = factors[list(folds[0])], np.ones((1, len(folds[0])))
-        else:
-            member_used = member
-        stacked = (member_used[:, :, None, None] * factors).reshape(len(folds), -1, columns)
+        member = np.array([np.isin(used, list(fold)) for fold in folds], float)
+        stacked = (member[:, :, None, None] * factors[used]).reshape(len(folds), -1, columns)
         triangles = np.linalg.qr(stacked, mode="r")
         steps = steps_s(design)
         out = []
@@ -93,20 +88,29 @@ class GM1N(Family):
             out.append(self._learned(design, self._solve(triangles[f], step_s) | {"n_rows": got}))
         return out
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Error_um (n_k,) per batch, from a zero error at its start.
+    def respond_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        """Error_um (n_k,) per copy and batch, from a zero error at its start.
 
         Raises:
             InputError: a batch of another step than the model learned from.
         """
-        rows = self._respond(design, [self], batches)[:, 0]
-        return [rows[design.rows(k)] for k in batches]
-
-    def respond_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
-    ) -> list[list[Array]]:
-        every = sorted({k for batches in wanted for k in batches})
-        return by_batch(design, self._respond(design, fitted, every), wanted)
+        steps = steps_s(design)
+        for k in sorted({k for batches in wanted for k in batches}):
+            for m in fitted:
+                learned_s = m.fitted["step_s"]
+                if abs(steps[k] - learned_s) > 1e-3 * learned_s:
+                    raise InputError(
+                        f"family gm1n: batch {design.batch_ids[k]} has a step of {steps[k]:g} s, the model learned "
+                        f"from {learned_s:g} s and its sums count rows; resample the batch to {learned_s:g} s"
+                    )
+        held = bridged(design, design.x)
+        out = np.empty((len(design.time_s), len(fitted)))
+        for f, m in enumerate(fitted):
+            drive = padded(design, held @ m.fitted["b"])
+            out[:, f] = unpadded(design, response(drive, m.fitted["a"], self.response))
+        return by_batch(design, out, wanted)
 
     def operations(self, b: Builder) -> Sequence[int]:
         """A first-order lag of the drive, at the step that was learned from.
@@ -139,24 +143,6 @@ class GM1N(Family):
         if bound != "none":
             fit = least_squares(triangle, a=float(np.clip(fit.a, lowest, _A_HIGHEST)))
         return {"a": fit.a, "b": fit.b, "step_s": step_s, "bound": bound, "condition": fit.condition}
-
-    def _respond(self, design: Design, models: Sequence[Self], batches: Sequence[int]) -> Array:
-        """Free run of every model on the given batches, (n, F); other rows are not to be read."""
-        steps = steps_s(design)
-        for k in batches:
-            for m in models:
-                learned_s = m.fitted["step_s"]
-                if abs(steps[k] - learned_s) > 1e-3 * learned_s:
-                    raise InputError(
-                        f"family gm1n: batch {design.batch_ids[k]} has a step of {steps[k]:g} s, the model learned "
-                        f"from {learned_s:g} s and its sums count rows; resample the batch to {learned_s:g} s"
-                    )
-        held = bridged(design, design.x)
-        out = np.empty((len(design.time_s), len(models)))
-        for f, m in enumerate(models):
-            drive = padded(design, held @ m.fitted["b"])
-            out[:, f] = unpadded(design, response(drive, m.fitted["a"], self.response))
-        return out
 
 
 def response(drive: Array, a: float, kind: str = "difference", first_um: float = 0.0) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
-from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
@@ -32,9 +31,7 @@ class Pool(Protocol):
 
     def __enter__(self) -> object: ...
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    def __exit__(self, *error: Any) -> None: ...
 
     def shared(self, value: Any) -> Any:
         """A handle on state that every worker loads once; a job receives it as a `data.processes.Shared`."""
@@ -73,9 +70,9 @@ class Workers:
         self._crossings = self._pool.shared(self._crossings)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._sharing.__exit__(kind, error, at)
-        self._pool.__exit__(kind, error, at)
+    def __exit__(self, *error: Any) -> None:
+        self._sharing.__exit__(*error)
+        self._pool.__exit__(*error)
 
 
 def workers_for(families: Sequence[str]) -> int:

@@ -113,18 +113,14 @@ class LagDictionary(Family):
             for fold, pooled in zip(folds, learned, strict=True)
         ]  # fmt: skip
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """NaN at a row where an input is missing.
+    def respond_folds(
+        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
+    ) -> list[list[Array]]:
+        """Copies share the columns; NaN at a row where an input is missing.
 
         Raises:
             InputError: the design lacks the drivers or whole batches that the model was fitted with.
         """
-        return self.respond_folds(design, [self], [batches])[0]
-
-    def respond_folds(
-        self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
-    ) -> list[list[Array]]:
-        """Copies share the columns."""
         columns = Columns.of(design)
         for model in fitted:
             lost = [name for name in model.fitted["columns"] if name not in columns.names]

@@ -19,7 +19,7 @@ from data.arrays import Array, Mask
 from data.errors import InputError
 from features.design import Design
 from models.base import Family
-from models.metrics import SIDE_OF_90
+from models.metrics import SIDE_OF_90, row_quantiles
 from models.program import Builder
 from models.protocols import forward_obstacle, in_time
 from models.solvers.batches import fold_masks
@@ -34,6 +34,16 @@ _LEAST_SHARE = 0.01  # of the mean square residual, that a keeps: no recorded va
 def mean_square(x: Array, design: Design) -> Array:
     """Mean over the inputs of their square (n,), each over the scale of its unit (10 K, 1000 rpm, …)."""
     return np.asarray(((x / unit_scale(design)) ** 2).mean(axis=1))
+
+
+def stated_sd_um(family: Family, design: Design, batches: Sequence[int]) -> list[Array]:
+    """Predictive standard deviation (n_k,) from the (a, b) of `left_out_spread` that a fitted family holds.
+
+    NaN throughout where fewer than three batches were learned from.
+    """
+    a, b = (family.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
+    x = family.started(design).x
+    return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
 
 
 def left_out_spread(
@@ -113,17 +123,8 @@ def _fitted(squared: Array, grows: Array) -> tuple[Array, Array]:
         a, b = np.where(low, _LEAST_SHARE * mean, a), np.where(low, np.maximum(sq - _LEAST_SHARE * mean * q, 0) / qq, b)
         a, b = np.where(flat, mean, a), np.where(flat, 0.0, b)
         ratio = squared / (a[:, None] + b[:, None] * grows)
-        size = np.maximum(np.where(known, ratio, 0.0).sum(axis=1) / n, _quantile90(ratio, n) / SIDE_OF_90**2)
+        size = np.maximum(np.where(known, ratio, 0.0).sum(axis=1) / n, row_quantiles(ratio, 0.9) / SIDE_OF_90**2)
         return np.where(s == 0, 0.0, a * size), np.where(s == 0, 0.0, b * size)
-
-
-def _quantile90(values: Array, count: Array) -> Array:
-    """Linear 90 % quantile (F,) of the `count` (F,) numbers of each row; NaN elsewhere."""
-    ranked = np.sort(values, axis=1)  # NaN comes last
-    place = 0.9 * (count - 1.0)
-    low, every = place.astype(int), np.arange(len(values))
-    high = np.minimum(low + 1, count.astype(int) - 1)
-    return np.asarray(ranked[every, low] + (place - low) * (ranked[every, high] - ranked[every, low]))
 
 
 EPS = float(np.finfo(float).eps)
@@ -220,11 +221,6 @@ class Linear(Family):
             for f in range(len(folds))
         ]
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """NaN at a row where any input is missing."""
-        coef, intercept = self.fitted["coef_um_per_K"], self.fitted["intercept_um"]
-        return [design.x[design.rows(k)] @ coef + intercept for k in batches]
-
     def operations(self, b: Builder) -> Sequence[int]:
         x = b.features(self.inputs)
         return [b.affine(x, self.fitted["coef_um_per_K"][None], self.fitted["intercept_um"])]
@@ -232,6 +228,7 @@ class Linear(Family):
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:
+        """NaN at a row where any input is missing."""
         coef = np.column_stack([f.fitted["coef_um_per_K"] for f in fitted])
         intercept = np.array([f.fitted["intercept_um"] for f in fitted])
         copies: dict[int, list[int]] = {}
@@ -250,31 +247,21 @@ class Linear(Family):
         blocks = Blocks.of(moments)
         block = np.concatenate([np.asarray(batches, np.int64) for batches in trained])
         which = np.repeat(np.arange(len(fitted)), [len(batches) for batches in trained])
+        coef = np.stack([f.fitted["coef_um_per_K"] for f in fitted])[:, :, None]
+        at_zero_um = np.array([f.fitted["intercept_um"] for f in fitted]) - moments.shift_y
         S_um = np.empty(len(block))
         step = max(1, AT_ONCE // len(design.inputs) ** 2)
         for start in range(0, len(block), step):
             some = slice(start, start + step)
-            k, beta = block[some], np.stack([fitted[f].fitted["coef_um_per_K"] for f in which[some]])
-            offset = np.array([fitted[f].fitted["intercept_um"] for f in which[some]])
-            bias = blocks.mean_y[k] + moments.shift_y - offset
-            bias = bias - np.einsum("vj,vj->v", blocks.mean_x[k] + moments.shift_x, beta)
-            sse = blocks.yy[k] - 2.0 * np.einsum("vj,vj->v", blocks.xy[k], beta)
-            sse += np.einsum("vj,vj->v", beta, (blocks.xx[k] @ beta[:, :, None])[..., 0]) + blocks.count[k] * bias**2
-            S_um[some] = np.sqrt(np.maximum(sse, 0.0) / np.maximum(blocks.count[k] - 1.0, 1.0))
+            zero = np.tile(-moments.shift_x, (len(block[some]), 1))
+            S_um[some] = blocks.S_um(block[some], zero, at_zero_um[which[some]], coef[which[some]])[:, 0]
         usable = np.bincount(which, moments.count[block] > 1, len(fitted))
         total = np.bincount(which, np.where(moments.count[block] > 1, S_um, 0.0), len(fitted))
         return np.asarray(total / np.maximum(usable, 1.0))
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value, see `models.linear`.
-
-        NaN throughout where fewer than three batches were learned from.
-        """
-        if not self.has_sd:
-            return super().sd_um(design, batches)
-        a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
-        x = self.started(design).x
-        return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
+        """Predictive standard deviation (n_k,) of a recorded value, see `stated_sd_um`."""
+        return stated_sd_um(self, design, batches) if self.has_sd else super().sd_um(design, batches)
 
     def n_parameters(self) -> int:
         """Coefficients, and the intercept where the level is free."""

@@ -94,6 +94,16 @@ def _quantile95(values: Array) -> Array:
     return part[low] + (position - low) * (part[high] - part[low])
 
 
+def row_quantiles(values: Array, share: float) -> Array:
+    """Linear quantile (F,) of the numbers of each row (F, m), NaN left out; NaN of none."""
+    ranked = np.sort(values, axis=1)  # NaN comes last
+    most = (~np.isnan(ranked)).sum(axis=1) - 1
+    place = share * most
+    low, every = place.astype(int), np.arange(len(ranked))
+    at_low, at_high = ranked[every, low], ranked[every, np.minimum(low + 1, most)]
+    return np.asarray(at_low + (place - low) * (at_high - at_low))
+
+
 def residual_std_um(error_um: Array) -> Any:
     """S of a residual series (n,), or of C of them (n, C) → (C,); NaN left out, and NaN below 2 rows."""
     known = np.isfinite(error_um)

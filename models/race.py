@@ -39,9 +39,8 @@ ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", 
 _CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
 _JUDGED_SHARE, _JUDGED_RUNS = 0.25, 4  # judged in the first rounds; of fewer to learn from rich models look worse
 _FIRST_POINTS = ("correlation", 4)  # next to all points: least squares on all of many sensors is no fair trial
-_SAME = (
-    0.02  # relative difference of S on every run below which two cells are one model: nets that learned a linear map
-)
+# Relative difference of S on every run below which two cells are one model: nets that learned a linear map.
+_SAME = 0.02
 _FAMILIES_KEPT, _SELECTORS_KEPT = 8, 4  # after the first and the second round
 _CELLS_PER_FINALIST = 4  # cells of the third round for every finalist
 _RUNNERS_UP = 4  # families that are in every round

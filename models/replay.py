@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import cycle
 from typing import Any, Literal
 
 import numpy as np
@@ -203,7 +204,7 @@ def arrivals(batch_ids: Sequence[str], seed: int | None = None) -> tuple[Arrival
     """
     rng = np.random.default_rng(0 if seed is None else seed)
     changed = dict(zip(rng.permutation(len(batch_ids)), _changes(len(batch_ids)), strict=False))
-    faults = _endless(rng.permutation(np.array(FAULTS)).tolist())
+    faults = cycle(rng.permutation(np.array(FAULTS)).tolist())
     at: list[tuple[float, Arrival]] = []
     for k, name in enumerate(batch_ids):
         how: How = "as recorded" if seed is None else changed.get(k, "as recorded")
@@ -234,11 +235,6 @@ def _changes(n: int) -> list[How]:
     each = max(1, round(n / 7))
     kinds: tuple[How, ...] = ("late", "out of order", "again", "faulty")
     return [how for _ in range(each) for how in kinds][:n]
-
-
-def _endless(values: Sequence[str]) -> Iterator[str]:
-    while True:
-        yield from values
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -11,10 +11,9 @@ from scipy.signal import lfilter
 
 from data.arrays import Array
 from features.design import Design
-from features.rises import hold_last
 from models.base import Family, Plain
 from models.program import Builder
-from models.solvers.batches import padded, steps_s, too_few_rows, unpadded
+from models.solvers.batches import bridged, padded, steps_s, too_few_rows, unpadded
 
 EXPONENTS = (1.0, 0.5, 0.75, 1.25, 1.5, 1.75, 2.0)  # 1 first: it is kept where there is one speed
 _TAU_GRID_S = np.geomspace(120.0, 43200.0, 25)
@@ -240,7 +239,4 @@ def _held(design: Design, name: str) -> Array:
     """A driver with holes held, (K, longest); NaN throughout where a batch has none of it."""
     if name not in design.driver_names:
         return np.full((design.n_batches, int(np.diff(design.offsets).max(initial=0))), np.nan)
-    column = design.drivers[:, design.driver_names.index(name)].copy()
-    for k in range(design.n_batches):
-        column[design.rows(k)] = hold_last(column[design.rows(k)])
-    return padded(design, column)
+    return padded(design, bridged(design, design.drivers[:, [design.driver_names.index(name)]])[:, 0])

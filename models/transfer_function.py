@@ -11,7 +11,7 @@ from data.arrays import Array, Mask
 from data.errors import InputError
 from features.design import Design
 from models.base import Family
-from models.linear import left_out_spread, mean_square
+from models.linear import left_out_spread, mean_square, stated_sd_um
 from models.program import Builder
 from models.solvers.batches import fold_masks
 from models.solvers.poles import (
@@ -116,13 +116,8 @@ class TransferFunction(Family):
         return [b.affine(b.join(signals, *lagged), weights[None], f["intercept_um"])]
 
     def sd_um(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        """Predictive standard deviation (n_k,) of a recorded value, see `models.linear`.
-
-        NaN throughout where fewer than three batches were learned from.
-        """
-        a, b = (self.fitted.get(name, np.nan) for name in ("variance_um2", "variance_growth_um2"))
-        x = self.started(design).x
-        return [np.sqrt(a + b * mean_square(x[design.rows(k)], design)) for k in batches]
+        """Predictive standard deviation (n_k,) of a recorded value, see `models.linear.stated_sd_um`."""
+        return stated_sd_um(self, design, batches)
 
     def n_parameters(self) -> int:
         """Gains, time constants, and the intercept where the level is free."""

@@ -16,7 +16,7 @@ from data.batch import Batch, Channel
 from features.rises import feature, feature_unit
 from models.crossing import Crossing
 from models.judging import left_out_by_fold
-from models.metrics import residual_std_um
+from models.metrics import residual_std_um, row_quantiles
 from models.program import Builder, Program
 
 Watched = Mapping[str, Array]  # quantity -> (n,) of one batch
@@ -260,11 +260,6 @@ def farthest(beyond: Mapping[str, Array]) -> tuple[float, str]:
     """How far a batch went (95 % quantile over the rows), and in which quantity; ("", 0) inside everywhere."""
     if not beyond:
         return 0.0, ""
-    ranked = np.sort(np.stack(list(beyond.values())), axis=1)  # NaN comes last
-    most = (~np.isnan(ranked)).sum(axis=1) - 1
-    place = 0.95 * most
-    low, every = place.astype(int), np.arange(len(ranked))
-    at_low, at_high = ranked[every, low], ranked[every, np.minimum(low + 1, most)]
-    far = np.nan_to_num(at_low + (place - low) * (at_high - at_low), nan=0.0)
+    far = np.nan_to_num(row_quantiles(np.stack(list(beyond.values())), 0.95), nan=0.0)
     first = int(np.argmax(far))
     return (float(far[first]), list(beyond)[first]) if far[first] > 0 else (0.0, "")

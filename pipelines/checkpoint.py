@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import tempfile
 import uuid
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from data.files import source_digest, write_atomic
+from data.files import source_digest, whole_folder, write_atomic
 from models.crossing import Crossing, FamilyResult
 from models.race import Job
 from pipelines.caller import Say
@@ -86,25 +85,17 @@ def _count(n: int) -> str:
 
 
 def _write(result: FamilyResult, held: Path) -> None:
-    """All or nothing: a scratch folder is renamed once it is complete."""
-    held.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(dir=held.parent, prefix=".writing-"))
+    """All or nothing."""
     try:
-        _fill(scratch, result)
-        scratch.rename(held)
+        with whole_folder(held) as scratch:
+            result.scores.to_parquet(scratch / "scores.parquet", index=False)
+            result.cells.to_parquet(scratch / "cells.parquet", index=False)
+            np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
+            (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
+            (scratch / _SUMS).write_text(json.dumps(_sums(scratch)), encoding="utf-8")
     except OSError:
         if not held.is_dir():  # else another process was quicker
             raise
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _fill(scratch: Path, result: FamilyResult) -> None:
-    result.scores.to_parquet(scratch / "scores.parquet", index=False)
-    result.cells.to_parquet(scratch / "cells.parquet", index=False)
-    np.savez(scratch / "predictions.npz", allow_pickle=False, **result.predictions)
-    (scratch / "failures.json").write_text(json.dumps(result.failures, ensure_ascii=False), encoding="utf-8")
-    (scratch / _SUMS).write_text(json.dumps(_sums(scratch)), encoding="utf-8")
 
 
 def _read(held: Path) -> FamilyResult:

@@ -22,11 +22,11 @@ from compensation.exports.base import Export
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
-from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError, WorkError
+from data.files import write_atomic
 from features.rises import feature_unit
-from pipelines.model_store import FILES, StoredModel, is_champion, load
+from pipelines.model_store import FILES, StoredModel, inner_folder, is_champion, load
 from pipelines.settings import home
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
@@ -104,8 +104,9 @@ def compensator(
             "expected one machine and one model for each axis"
         )
     known = [m.substitutes for m in models if m.substitutes is not None]
+    widest = max(known, key=lambda s: len(s.names), default=None)  # of the most sensors: the most neighbours of each
     made = [axis_model(m, limits.of(m), period_s) for m in models]
-    return Compensator(machines[0], made, _widest(known), period_s, log)
+    return Compensator(machines[0], made, widest, period_s, log)
 
 
 @dataclass(frozen=True)
@@ -134,11 +135,6 @@ class Given:
         )
 
 
-def _widest(known: Sequence[Substitutes]) -> Substitutes | None:
-    """Of several models' substitutes those of the most sensors: they know the most neighbours of each."""
-    return max(known, key=lambda s: len(s.names), default=None)
-
-
 class StateFile:
     """The state of a compensation on disk, replaced atomically."""
 
@@ -161,11 +157,9 @@ class StateFile:
 
     def save(self, plain: Mapping[str, Any]) -> None:
         """Replaces the file. Raises: WorkError, it cannot be written."""
-        scratch = self.path.with_suffix(".new")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            scratch.write_text(json.dumps(plain), encoding="utf-8")
-            scratch.replace(self.path)
+            write_atomic(self.path, json.dumps(plain))
         except OSError as error:
             raise WorkError(f"state file {self.path}: cannot be written ({error}); give another --state") from None
 
@@ -292,9 +286,8 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
     running = compensator(list(models.values()), limits, period_s)
     digest = hashlib.sha256()
     for folder in folders.values():
-        inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
         for name in FILES:
-            digest.update((inner / name).read_bytes())
+            digest.update((inner_folder(folder) / name).read_bytes())
     axes = []
     for stored, made in zip(models.values(), running.axes, strict=True):
         trained = {c: (low, high) for c, (low, high) in stored.info.get("trained", {}).items()}

@@ -12,7 +12,6 @@ import logging
 import threading
 from collections.abc import Callable
 from functools import cache, partial
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from data.endings import ending, without_interrupt
@@ -99,15 +98,13 @@ class Cluster:
         try:
             self.client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise WorkError(
                 f"Dask cluster {self.name}: no worker came within {WORKERS_S:g} s; start some (dask worker {self.name})"
             ) from None
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         self.client.close()
         if self._local is not None:
             self._local.close()
@@ -137,9 +134,7 @@ class ClusterPool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         pass
 
     def shared(self, value: Any) -> _Scattered:

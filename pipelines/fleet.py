@@ -7,10 +7,9 @@ process of its own, because the process that waits should stay small.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -18,7 +17,7 @@ from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo, available_timezones
 
 from cronsim import CronSim, CronSimError
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from data.errors import InputError, closest
 from data.yaml_file import load_yaml
@@ -183,14 +182,13 @@ class FleetMachine:
         return {"machine_file": self.file, "effort": self.effort, **lists}
 
     def as_plain(self) -> dict[str, Any]:
-        plain = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {**plain, "when": self.when.model_dump(exclude_unset=True)}
+        plain: dict[str, Any] = TypeAdapter(FleetMachine).dump_python(self, mode="json", exclude_unset=True)
+        return plain
 
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> Self:
+    @staticmethod
+    def from_plain(plain: dict[str, Any]) -> FleetMachine:
         """The inverse of `as_plain`, also after JSON."""
-        lists = {k: tuple(v) for k, v in plain.items() if isinstance(v, list)}
-        return cls(**{**plain, **lists, "when": When(**plain["when"])})
+        return TypeAdapter(FleetMachine).validate_python(plain)
 
 
 @dataclass(frozen=True)
@@ -219,14 +217,11 @@ class Fleet:
         return ZoneInfo(self.timezone)
 
     def as_json(self) -> str:
-        kept = {**asdict(self), "alerts": self.alerts.model_dump(), "machines": [m.as_plain() for m in self.machines]}
-        return json.dumps(kept)
+        return TypeAdapter(Fleet).dump_json(self, exclude_unset=True).decode()
 
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        plain = json.loads(text)
-        machines = tuple(FleetMachine.from_plain(m) for m in plain.pop("machines"))
-        return cls(**{**plain, "alerts": AlertRules(**plain["alerts"]), "machines": machines})
+    @staticmethod
+    def from_json(text: str) -> Fleet:
+        return TypeAdapter(Fleet).validate_json(text)
 
 
 def load_fleet(path: Path, timezone: str) -> Fleet:

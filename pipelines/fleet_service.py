@@ -62,17 +62,14 @@ def alone(home: Path, fleet: Fleet) -> Iterator[None]:
     Raises:
         InputError: another process serves this fleet.
     """
-    lock = FileLock(fleet_state.lock_file(home, fleet.key), timeout=0)
     try:
-        lock.acquire()
+        held = FileLock(fleet_state.lock_file(home, fleet.key), timeout=0).acquire()
     except Timeout:
         raise InputError(
             f"{fleet.source}: another `thermodrift schedule` serves it with home {home}; end that one first"
         ) from None
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -> None:

@@ -81,13 +81,11 @@ def schedules(home: Path) -> Iterator[tuple[dict[str, Any], bool]]:
 
 
 def _served(path: Path) -> bool:
-    lock = FileLock(path, timeout=0)
     try:
-        lock.acquire()
+        with FileLock(path, timeout=0):
+            return False
     except Timeout:
         return True
-    lock.release()
-    return False
 
 
 def _schedule(home: Path, key: str) -> dict[str, Any]:

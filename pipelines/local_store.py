@@ -32,7 +32,7 @@ def is_made(file: Path) -> bool:
             tables = {str(name) for (name,) in db.execute("select name from sqlite_master where type = 'table'")}
         except sqlite3.DatabaseError:  # no database, or locked: MLflow reports it
             return True
-        return "alembic_version" in tables or "runs" not in tables or bool(_count(db, "runs"))
+        return "alembic_version" in tables or "runs" not in tables or bool(db.execute("select 1 from runs").fetchone())
 
 
 def make(file: Path, fill: Callable[[Path], object]) -> None:
@@ -104,7 +104,3 @@ def _rewrite(db: sqlite3.Connection, experiment: int, was: str, now: str) -> Non
         " where substr(storage_location, 1, ?) = ?",
         (now, len(was) + 1, len(was) + 1, f"{was}/"),
     )
-
-
-def _count(db: sqlite3.Connection, table: str) -> int:
-    return int(db.execute(f"select count(*) from {table}").fetchone()[0])

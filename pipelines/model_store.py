@@ -214,7 +214,7 @@ def load(folder: Path) -> StoredModel:
     Raises:
         InputError: no model there, a file damaged or other than it was stored, or a model of another version.
     """
-    inner = folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
+    inner = inner_folder(folder)
     try:
         document = json.loads((inner / "model.json").read_text(encoding="utf-8"))
         _check_document(document, folder)
@@ -234,6 +234,11 @@ def load(folder: Path) -> StoredModel:
         raise InputError(
             f"model folder {folder}: model.json is damaged ({type(error).__name__}: {error}); {_AGAIN}"
         ) from None
+
+
+def inner_folder(folder: Path) -> Path:
+    """Where the files of a stored model are: the folder itself, or that of the MLflow model around it."""
+    return folder / "artifacts" if (folder / "artifacts" / "model.json").exists() else folder
 
 
 def _check_document(document: Any, folder: Path) -> None:

@@ -66,9 +66,9 @@ def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> No
         ("changed", sorted({f"{n} ({c[n]} → {now[n]})" for c in then for n in c if n in now and c[n] != now[n]})),
     ]
     what = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in changes if names)
-    name = machine.machine
+    name, few = machine.machine, ", ".join(unfit if len(unfit) <= 4 else [*unfit[:3], "…"])
     raise InputError(
-        f"machine file {name}: {len(unfit)} of {len(batches)} batches in the lake ({_few(unfit)}) have other channels; "
+        f"machine file {name}: {len(unfit)} of {len(batches)} batches in the lake ({few}) have other channels; "
         f"{what}; ingest their recordings again with this machine file, or where these are gone their copies in the "
         f"lake (`thermodrift ingest {lake.name}/machine={name} --machine FILE`; a renamed channel is empty then), "
         f"or withdraw them (`thermodrift lake withdraw {name} BATCH... --reason TEXT`)"
@@ -78,10 +78,6 @@ def check_channels(batches: Sequence[Batch], machine: Machine, lake: Lake) -> No
 def _meaning(channel: Channel) -> str:
     along = f" along {channel.position}" if channel.position else ""
     return f"{channel.role} in {channel.unit}{along}"
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names if len(names) <= 4 else [*names[:3], "…"])
 
 
 def read_files(machine: Machine, path: Path, need_error: bool = True) -> Iterator[Batch]:

@@ -200,11 +200,13 @@ def _register(
         champion: what the alias names now, which may be `begun` itself.
     """
     choice = new.choice
-    settled = begun is not None and (begun.tags.get(OUTCOME) or _alias_of(champion, begun))
+    crowned = begun is not None and champion is not None and champion.version == begun.version
+    settled = begun is not None and (begun.tags.get(OUTCOME) or (CHAMPION if crowned else ""))
     if force and settled != CHAMPION:
         settled = ""
     if begun is not None and settled:  # compare with what it was compared with
-        champion = _version(client, name, begun.tags.get("against", begun.tags.get("replaces", "")))
+        number = begun.tags.get("against", begun.tags.get("replaces", ""))
+        champion = client.get_model_version(name, number) if number else None
     comparison, obstacle, why = None, "", "first model of this machine and channel"
     if champion is not None:
         comparison, obstacle, why = _against(champion, new.result, choice, settings, new.batches)
@@ -248,15 +250,6 @@ def _register(
     )  # fmt: skip
 
 
-def _alias_of(champion: ModelVersion | None, begun: ModelVersion) -> str:
-    """``champion`` where a version that lacks its outcome is it already, else empty."""
-    return CHAMPION if champion is not None and champion.version == begun.version else ""
-
-
-def _version(client: MlflowClient, name: str, number: str) -> ModelVersion | None:
-    return client.get_model_version(name, number) if number else None
-
-
 def _info(new: Newcomer) -> dict[str, Any]:
     """What is stored with the model: the error to expect first."""
     choice, result, expected = new.choice, new.result, new.outlook
@@ -265,7 +258,8 @@ def _info(new: Newcomer) -> dict[str, Any]:
         "leave_batch_out_S_mean_um": expected.leave_batch_out_um,
         "leave_batch_out_S_std_um": expected.leave_batch_out_std_um, "expected": expected.summary,
         "training_id": new.training_id, "cell": choice.cell, "n_batches": len(result.batches),
-        "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary, "trained_at": _now(),
+        "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary,
+        "trained_at": audit.now().isoformat(timespec="seconds"),
         "trusted": choice.trusted, "caution": choice.caution, "standing": choice.standing,
         "authority": choice.authority,
     }  # fmt: skip
@@ -452,10 +446,6 @@ def _by_alias(client: MlflowClient, name: str, alias: str) -> ModelVersion | Non
         if error.error_code in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
             return None
         raise
-
-
-def _now() -> str:
-    return pd.Timestamp.now("UTC").isoformat(timespec="seconds")
 
 
 def _text(value: Any) -> str:

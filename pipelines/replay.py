@@ -24,6 +24,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from data.batch import Batch
 from data.checks import check_machine, checked
@@ -229,20 +230,16 @@ class Progress:
                     f"--out {request.out}: holds a replay with other {', '.join(other).replace('_', ' ')}; give the "
                     "same to go on with it, or another folder"
                 )
-            return cls._read(file) if file.is_file() else cls(file)
+            if not file.is_file():
+                return cls(file)
+            kept = json.loads(file.read_text(encoding="utf-8"))
+            return TypeAdapter(Progress).validate_python({**kept, "file": file})
         if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):
             raise InputError(f"--out {request.out}: holds something else than a replay; give another folder")
         for folder in (request.home, request.inbox):
             folder.mkdir(parents=True, exist_ok=True)
         write_atomic(noted, text)
         return cls(file)
-
-    @classmethod
-    def _read(cls, file: Path) -> Progress:
-        plain = json.loads(file.read_text(encoding="utf-8"))
-        retrainings = [Retraining(**r) for r in plain.pop("retrainings")]
-        runs = [Run(**r) for r in plain.pop("runs")]
-        return cls(file, **plain, retrainings=retrainings, runs=runs)
 
     def write(self) -> None:
         plain = asdict(self)

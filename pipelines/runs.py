@@ -15,7 +15,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -254,19 +254,15 @@ def yes_or_no(value: bool) -> str:
     return "true" if value else "false"
 
 
-class _closing:
+@contextmanager
+def _closing(client: MlflowClient, run_id: str) -> Iterator[None]:
     """A run that fails is closed as FAILED, as far as the store still answers; what is raised stays the cause."""
-
-    def __init__(self, client: MlflowClient, run_id: str) -> None:
-        self._client, self._run_id = client, run_id
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if kind is not None:
-            with suppress(Exception):
-                self._client.set_terminated(self._run_id, "FAILED")
+    try:
+        yield
+    except BaseException:
+        with suppress(Exception):
+            client.set_terminated(run_id, "FAILED")
+        raise
 
 
 def _log(client: MlflowClient, run_id: str, what: Entity, at_ms: int) -> None:

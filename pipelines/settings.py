@@ -30,16 +30,17 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _only_home_and_environment(value: str | None) -> str | None:
+    return None if value is None else _placeholders(value, {"home", "env"}, set())
+
+
 class TrackingPart(_Part):
     """Where runs and their files go; `{home}` stands for `home()`, `{env:NAME}` for a variable of the environment."""
 
     store: str = "sqlite:///{home}/mlflow.db"
     artifacts: str | None = "{home}/artifacts"
 
-    @field_validator("store", "artifacts")
-    @classmethod
-    def _only_home_and_environment(cls, value: str | None) -> str | None:
-        return None if value is None else _placeholders(value, {"home", "env"}, set())
+    _addresses = field_validator("store", "artifacts")(_only_home_and_environment)
 
 
 class NamesPart(_Part):
@@ -74,10 +75,7 @@ class _File(_Part):
     promotion: PromotionRule = PromotionRule()
     diagnose: DiagnoseRule = DiagnoseRule()
 
-    @field_validator("lake")
-    @classmethod
-    def _only_home_and_environment(cls, value: str) -> str:
-        return _placeholders(value, {"home", "env"}, set())
+    _address = field_validator("lake")(_only_home_and_environment)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ lake refuses for good is moved to `refused/`, with the reason, so that it blocks
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, Protocol
@@ -18,6 +17,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
 from data.errors import InputError, WorkError
+from data.files import whole_folder
 from data.lakefile import safe_name
 from pipelines.caller import Say
 from pipelines.runs import Record, find_record
@@ -97,7 +97,7 @@ def deliver(settings: Settings, promote: Promote, say: Say = lambda text: None) 
 
 
 def _keep(settings: Settings, kind: Kind, record: Record, fill: Fill, whole: Record | None = None) -> None:
-    """All or nothing: a scratch folder gets its name once it is complete. What waits already is not kept again."""
+    """All or nothing. What waits already is not kept again."""
     item = _Item(kind=kind, record_id=record.id, machine=record.machine, target=record.target, record=whole)
     base = folder(settings)
     base.mkdir(parents=True, exist_ok=True)
@@ -106,14 +106,11 @@ def _keep(settings: Settings, kind: Kind, record: Record, fill: Fill, whole: Rec
         if any((i.kind, i.record_id) == (kind, record.id) for i in map(_read, held)):
             return
         number = 1 + max((int(p.name.partition("-")[0]) for p in held), default=0)
-        scratch = Path(tempfile.mkdtemp(dir=base, prefix=".keeping-"))
-        try:
+        name = f"{number:06d}-{kind}-{safe_name(record.machine)}-{safe_name(record.target)}"
+        with whole_folder(base / name) as scratch:
             (scratch / _FILES).mkdir()
             fill(scratch / _FILES)
             (scratch / _ITEM).write_text(item.model_dump_json(indent=1), encoding="utf-8")
-            scratch.rename(base / f"{number:06d}-{kind}-{safe_name(record.machine)}-{safe_name(record.target)}")
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _read(path: Path) -> _Item:

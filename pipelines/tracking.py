@@ -138,25 +138,6 @@ def _brief(text: str) -> str:
     return text
 
 
-def log_training(
-    result: GridResult,
-    settings: Settings,
-    *,
-    figures: dict[str, bytes] | None = None,
-    params: dict[str, Any] | None = None,
-    say: Say = lambda text: None,
-) -> str:
-    """Track one training; returns its id (the parent run's), see `training_record` and `training_files`.
-
-    Raises:
-        WorkError: the store does not answer.
-    """
-    record = training_record(result, settings.promotion, params)
-    with tempfile.TemporaryDirectory() as scratch:
-        training_files(Path(scratch), result, figures or {})
-        return log_record(record, Path(scratch), settings, say)
-
-
 def log_record(record: Record, files: Path, settings: Settings, say: Say = lambda text: None) -> str:
     """Track a record with its files; returns the id of its run, of which there is one however often this is called.
 

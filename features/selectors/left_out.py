@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
-from features.design import Design
+from features.design import Design, Moments
 from features.selectors.statistics import DIGITS
 
 _FEWEST_BATCHES = 3
@@ -44,16 +44,20 @@ class Blocks:
         m = design.moments
         if np.count_nonzero(m.count[batches]) < _FEWEST_BATCHES:
             m, batches = design.quarters, (4 * batches[:, None] + np.arange(4)).ravel()
-        batches = batches[m.count[batches] > 0]
-        sum_z = np.column_stack([m.sum_y[batches], m.sum_x[np.ix_(batches, columns)]])
-        zz = np.empty((len(batches), len(columns) + 1, len(columns) + 1))
-        zz[:, 0, 0] = m.yy[batches]
-        zz[:, 0, 1:] = zz[:, 1:, 0] = m.xy[np.ix_(batches, columns)]
-        zz[:, 1:, 1:] = m.xx[np.ix_(batches, columns, columns)]
-        count = m.count[batches]
-        energy = np.einsum("bjj->bj", zz) - sum_z**2 / count[:, None]
+        own = cls.of_moments(m, batches[m.count[batches] > 0], columns)
+        energy = np.einsum("bjj->bj", own.zz) - own.sum_z**2 / own.count[:, None]
         order = np.lexsort((np.log(np.maximum(energy[:, 1:], 1e-300)).sum(axis=1), energy[:, 0]))
-        return cls(count[order], sum_z[order], zz[order])
+        return cls(own.count[order], own.sum_z[order], own.zz[order])
+
+    @classmethod
+    def of_moments(cls, m: Moments, blocks: NDArray[np.int64], columns: NDArray[np.int64]) -> Blocks:
+        """Some blocks of a design's moments, in the order given."""
+        sum_z = np.column_stack([m.sum_y[blocks], m.sum_x[np.ix_(blocks, columns)]])
+        zz = np.empty((len(blocks), len(columns) + 1, len(columns) + 1))
+        zz[:, 0, 0] = m.yy[blocks]
+        zz[:, 0, 1:] = zz[:, 1:, 0] = m.xy[np.ix_(blocks, columns)]
+        zz[:, 1:, 1:] = m.xx[np.ix_(blocks, columns, columns)]
+        return cls(m.count[blocks], sum_z, zz)
 
     def pooled(self, sets: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Of S sets of blocks (S, B): rows (S,), means (S, p + 1), centred products (S, p + 1, p + 1)."""
@@ -83,7 +87,11 @@ class LeftOut:
     @classmethod
     def of(cls, design: Design, train: Sequence[int], columns: NDArray[np.int64]) -> LeftOut:
         """One model that has taken nothing."""
-        blocks = Blocks.of(design, train, columns)
+        return cls.of_blocks(Blocks.of(design, train, columns))
+
+    @classmethod
+    def of_blocks(cls, blocks: Blocks) -> LeftOut:
+        """The same from sums over blocks."""
         n_blocks = len(blocks.count)
         _, mean, learned = blocks.pooled(~np.eye(n_blocks, dtype=bool))
         crossed = mean[:, :, None] * (blocks.sum_z - 0.5 * blocks.count[:, None] * mean)[:, None, :]
@@ -104,6 +112,19 @@ class LeftOut:
         gain = _share(self.learned[..., 0, 1:], np.einsum("sbjj->sbj", self.learned)[..., 1:])
         own = np.einsum("sbjj->sbj", self.left)
         return self._mean_S(own[..., :1] - 2.0 * gain * self.left[..., 0, 1:] + gain**2 * own[..., 1:])
+
+    def error_with_two(self) -> Array:
+        """The same after taking two inputs more, for each first and second one (S, p, p)."""
+        learned, left = self.learned, self.left
+        along, across = learned[..., 1:, :], left[..., 1:, :]
+        own, size = np.einsum("sbjj->sbj", learned)[..., None, :], np.einsum("sbjj->sbj", left)[..., None, :]
+        gain = _share(along, np.swapaxes(own, -1, -2)[..., 1:, :])
+        squares = size - 2.0 * gain * across + gain**2 * np.swapaxes(size, -1, -2)[..., 1:, :]
+        first, rest = gain[..., :1], gain[..., 1:]
+        more = _share(learned[..., :1, 1:] - first * along[..., 1:], (own - gain * along)[..., 1:])
+        crossed = left[..., :1, 1:] - first * across[..., 1:] - rest * across[..., :1]
+        crossed += first * rest * np.swapaxes(size, -1, -2)[..., 1:, :]
+        return self._mean_S(squares[..., :1] - 2.0 * more * crossed + more**2 * squares[..., 1:])
 
     def taking(self, model: NDArray[np.int64], column: NDArray[np.int64]) -> LeftOut:
         """Models `model` (N,), each with its input `column` (N,) taken: row and column of it become 0."""

@@ -241,7 +241,11 @@ class ByRows(BatchProcess):
         return np.asarray(whole - self.variance * (w.x.T @ (inverse[:, a : a + n] @ self._alone_um[without, :n])))
 
     def left_um(self, without: int | None = None) -> Array:
-        return self._alone_um if without is None else self._pairs_um[without]
+        if without is None:
+            return self._alone_um
+        if without not in self._left_um:
+            self._left_um[without] = self._parts.without(without)[0]
+        return self._left_um[without]
 
     @cached_property
     def _inverse(self) -> tuple[Array, Array]:
@@ -253,49 +257,31 @@ class ByRows(BatchProcess):
         return inverse, inverse @ w.y_um
 
     @cached_property
-    def _parts(self) -> tuple[Array, Array]:
-        return _blocks(self.windows, *self._inverse)
+    def _parts(self) -> LeftOut:
+        """Batch by batch, padded with unity."""
+        w, (inverse, weights) = self.windows, self._inverse
+        at = np.repeat(np.arange(len(w.ids)), w.counts)
+        place = np.arange(len(at)) - w.borders[at]
+        n_batches, q = len(w.ids), int(w.counts.max(initial=0))
+        blocks, alpha = np.zeros((n_batches, n_batches, q, q)), np.zeros((n_batches, q))
+        behind, own = np.nonzero(np.arange(q) >= w.counts[:, None])
+        blocks[behind, behind, own, own] = 1.0
+        blocks[at[:, None], at, place[:, None], place] = inverse
+        alpha[at, place] = weights
+        return LeftOut(blocks, alpha)
 
     @cached_property
     def _alone_um(self) -> Array:
-        inverse, weights = self._parts
-        every = range(len(weights))
-        return _solved(inverse[every, every], weights)
+        return self._parts.alone()[0]
 
     @cached_property
-    def _pairs_um(self) -> Array:
-        return _pairs(*self._parts)
-
-
-def _blocks(w: Windows, inverse: Array, weights: Array) -> tuple[Array, Array]:
-    """Inverse covariance cut into batch by batch (B, B, q, q), and weights (B, q), padded with unity."""
-    n_batches, q = len(w.ids), int(w.counts.max(initial=0))
-    padded, short = np.zeros((n_batches, n_batches, q, q)), np.zeros((n_batches, q))
-    for i, (a, n) in enumerate(zip(w.borders, w.counts, strict=False)):
-        short[i, :n] = weights[a : a + n]
-        for j, (b, m) in enumerate(zip(w.borders, w.counts, strict=False)):
-            padded[i, j, :n, :m] = inverse[a : a + n, b : b + m]
-        padded[i, i, range(n, q), range(n, q)] = 1.0
-    return padded, short
-
-
-def _pairs(inverse: Array, weights: Array) -> Array:
-    k, i = np.triu_indices(len(weights), 1)
-    both = np.block([[inverse[k, k], inverse[k, i]], [inverse[i, k], inverse[i, i]]])
-    left = _solved(both, np.hstack([weights[k], weights[i]]))
-    q = weights.shape[1]
-    out = np.zeros((len(weights), *weights.shape))
-    out[i, k], out[k, i] = left[:, :q], left[:, q:]
-    return out
-
-
-def _solved(blocks: Array, right: Array) -> Array:
-    return np.asarray(np.linalg.solve(blocks, right[:, :, None])[:, :, 0])
+    def _left_um(self) -> dict[int, Array]:
+        return {}
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """C = (K + I)⁻¹ and α = C y over G groups of m rows; K and y are 0 on padding.
+    """C, the inverse of a covariance, and α = C y over G groups of m rows; on padding C is that of unity, α is 0.
 
     Leaving out the rows g: the residual is C_gg⁻¹ α_g, its covariance C_gg⁻¹. With f left out too, C and α are first
     rid of f by elimination. Source: S. Sundararajan and S. Keerthi, Neural Computation 13 (2001), for single rows; C.

@@ -1,10 +1,9 @@
 """Grey models as the first layer of a corrected model: out-of-sample outputs for training, and the published one-batch
 form.
 
-The one-batch functions work on arrays, rows numbered from 0: early rows train, later ones correct, the rest test. The
+The one-batch function works on arrays, rows numbered from 0: early rows train, later ones correct, the rest test. The
 study of a THM6380 machining centre (136 rows of 2 min) fitted GM(1,6) of the 25, 30, 35 and 40 rows that end with row
-55, the LS-SVM on rows 56–65, and tested on 66–116, counted from 1: `outputs_um = sequence_outputs(x, y, range(15,
-55))`, `corrected(outputs_um, y, range(55, 65))`.
+55, `sequence_outputs(x, y, range(15, 55))`, then an LS-SVM on rows 56–65, and tested on 66–116, counted from 1.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from data.errors import InputError
 from features.design import Design
 from models.base import inner_groups
 from models.gm1n import GM1N, response
-from models.lssvm import LSSVM
 
 _FEW = 3  # batches: with fewer, quarters of them are left out
 _STEP_S = 120.0  # nominal step of a sequence; its length does not enter the results
@@ -120,21 +118,6 @@ def sequence_outputs(
         else:
             out[start:, g] = response(drive[None], a, kind, float(y_um[start]))[0]
     return out
-
-
-def corrected(outputs_um: Array, y_um: Array, fit: range, tuning: str = "particle_swarm", seed: int = 0) -> Array:
-    """Error_um (n,) by an LS-SVM trained on rows `fit` with the outputs (n, G) as inputs; NaN where they are NaN.
-
-    γ and σ by leaving out contiguous quarters of those rows.
-
-    Raises:
-        InputError: fewer than 2 usable rows, or an unknown tuning.
-    """
-    known = np.full(len(y_um), np.nan)
-    known[list(fit)] = y_um[list(fit)]
-    design = layer_design(_batch(outputs_um, known), outputs_um)
-    family = LSSVM(max_rows=len(fit), tuning=tuning, seed=seed).as_published()
-    return family.fit_design(design, [0]).predict_design(design, [0])[0]
 
 
 def _batch(x: Array, y_um: Array) -> Design:

@@ -34,19 +34,6 @@ class KernelExpansion(Family):
     closed_form = False
     linear: bool
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        f, x = self.fitted, self.started(design).x
-        scale, support, alpha = (np.asarray(f[k], float) for k in ("scale", "support", "alpha"))
-        out = []
-        for k in batches:
-            u = x[design.rows(k)] / scale
-            parts = [
-                kernel(u[i : i + _ROWS_AT_ONCE], support, f["sigma"], self.linear) @ alpha
-                for i in range(0, len(u), _ROWS_AT_ONCE)
-            ]
-            out.append(np.concatenate([*parts, np.empty(0)]) + f["bias"])
-        return out
-
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from data.arrays import Array
 from data.errors import InputError
 from features.design import Design
-from features.rises import first_finite
+from features.rises import first_finite, lagged
 from models.linear import Pool, Task, Tuned
 from models.program import Builder
 from models.solvers.batches import bridged, steps_s
@@ -44,7 +44,8 @@ class Columns:
     """Columns x (n, m) of a design, their names, and what sets their prior spread.
 
     `prior_K` (m,) is the size that a column's coefficient is expected to have, relative to one per K; where `source`
-    (m,) is not −1, it is per full scale of that column of `raw`, to the `power` (m,): the largest size in training.
+    (m,) is not −1, it is per full scale of that raw signal (inputs that are not in K, then the drivers), to the `power`
+    (m,): the largest size in training.
     """
 
     x: Array
@@ -65,7 +66,7 @@ class Columns:
     @classmethod
     def of(cls, design: Design) -> Columns:
         parts = [*_inputs(design), *_drivers(design), *_starts(design)]
-        raw = _raw_signals(design)
+        raw = np.column_stack([design.x[:, _scaled_inputs(design)], _driver_values(design)])  # what has a full scale
         held = np.nan_to_num(np.abs(raw))
         largest = np.array([held[design.rows(k)].max(axis=0, initial=0.0) for k in range(design.n_batches)])
         x = np.column_stack([p.values for p in parts]) if parts else np.empty((len(design.time_s), 0))
@@ -127,11 +128,6 @@ class _Column:
     reach: int = UNDRIVEN
 
 
-def _raw_signals(design: Design) -> Array:
-    """Inputs that are not in K, then the drivers: what has a full scale."""
-    return np.column_stack([design.x[:, _scaled_inputs(design)], _driver_values(design)])
-
-
 def _scaled_inputs(design: Design) -> list[int]:
     return [c for c, unit in enumerate(design.input_units) if unit not in _KELVIN]
 
@@ -143,7 +139,7 @@ def _driver_values(design: Design) -> Array:
 def _inputs(design: Design) -> list[_Column]:
     held = bridged(design, design.x)
     source = {c: i for i, c in enumerate(_scaled_inputs(design))}
-    lagged = _lagged_by_batch(design, held, at_rest=False)
+    delayed = _lagged_by_batch(design, held, at_rest=False)
     return [
         _Column(
             f"{name} after {lag_min:g} min",
@@ -152,7 +148,7 @@ def _inputs(design: Design) -> list[_Column]:
             source.get(c, -1),
             reach=PROMPT if lag_min <= _PROMPT_MIN else UNDRIVEN,
         )
-        for lag_min, values in zip(_LAGS_MIN, lagged, strict=True)
+        for lag_min, values in zip(_LAGS_MIN, delayed, strict=True)
         for c, name in enumerate(design.inputs)
     ]
 
@@ -162,11 +158,11 @@ def _drivers(design: Design) -> list[_Column]:
     first = len(_scaled_inputs(design))
     powers = [(d, power) for d, unit in enumerate(design.driver_units) for power in _powers(unit)]
     loads = np.abs(held)[:, [d for d, _ in powers]] ** np.array([float(power) for _, power in powers])
-    lagged = _lagged_by_batch(design, loads, at_rest=True)
+    delayed = _lagged_by_batch(design, loads, at_rest=True)
     out = []
     for c, (d, power) in enumerate(powers):
         label = f"{design.driver_names[d]}^{power}" if power > 1 else design.driver_names[d]
-        for lag_min, values in zip(_LAGS_MIN, lagged, strict=True):
+        for lag_min, values in zip(_LAGS_MIN, delayed, strict=True):
             out.append(_Column(f"{label} after {lag_min:g} min", values[:, c], _FULL_SCALE_K, first + d, power, DRIVEN))
     return out
 
@@ -202,8 +198,8 @@ def _lagged_by_batch(design: Design, values: Array, *, at_rest: bool) -> list[Ar
     for k in np.flatnonzero(np.diff(design.offsets)).tolist():
         own = values[design.rows(k)]
         before = np.zeros(own.shape[1]) if at_rest else own[0]
-        for lagged, lag_min in zip(out, _LAGS_MIN, strict=True):
-            lagged[design.rows(k)] = _lagged(own, before, 60.0 * lag_min / steps[k])
+        for behind, lag_min in zip(out, _LAGS_MIN, strict=True):
+            behind[design.rows(k)] = _lagged(own, before, 60.0 * lag_min / steps[k])
     return out
 
 
@@ -238,13 +234,7 @@ def lag_responses(design: Design, responses: Sequence[Response]) -> Array:
 
 def _lagged(x: Array, before: Array, tau: float) -> Array:
     """τ dv/dt + v = x (n, p) from v = `before` in the first row, exact for x held over each step; τ in steps."""
-    if tau == 0 or len(x) < 2:
-        return x
-    keep = float(np.exp(-1.0 / tau))
-    from scipy.signal import lfilter  # takes long to load
-
-    rest, _ = lfilter([1.0 - keep], [1.0, -keep], x[1:], axis=0, zi=keep * before[None])
-    return np.vstack([before, rest])
+    return x if tau == 0 or len(x) < 2 else lagged(x, before, float(np.exp(-1.0 / tau)))
 
 
 def _delayed(x: Array, before: Array, delay: float) -> Array:

@@ -19,7 +19,7 @@ from features.design import Design, Moments
 from features.rises import hold_last
 from models.linear import EPS
 from models.program import Builder
-from models.solvers.batches import padded, steps_s, unpadded
+from models.solvers.batches import bridged, padded, steps_s, unpadded
 from models.solvers.pooled_sums import Blocks, Pool, left_out_mean_S_um
 from models.thermal_exponential import lag_response
 
@@ -54,13 +54,13 @@ class Source:
     def signal(self, design: Design) -> Array:
         """Its values (n,), holes held; NaN throughout a batch that has none of it."""
         if self.kind == "input":
-            return _held(design, design.x[:, design.inputs.index(self.name)])
+            return bridged(design, design.x[:, [design.inputs.index(self.name)]])[:, 0]
         if self.kind in ("speed", "load"):
             column = design.driver_names.index(self.name) if self.name in design.driver_names else None
             if column is None:
                 return np.full(len(design.time_s), np.nan)
             scale = _LIKE_1_K.get(design.driver_units[column], 1.0)
-            return np.asarray((np.abs(_held(design, design.drivers[:, column])) / scale) ** self.exponent)
+            return np.asarray((np.abs(bridged(design, design.drivers[:, [column]])[:, 0]) / scale) ** self.exponent)
         if self.kind == "room":
             return _temperature(design, self.name) - _first(design, self.name)
         return _first(design, self.name) - _first(design, ambient_of(design))
@@ -202,11 +202,6 @@ def ambient_of(design: Design) -> str:
     """The first ambient channel; "" where the design has no batches or they have none."""
     names = design.batches[0].names("ambient") if design.batches else ()
     return names[0] if names else ""
-
-
-def _held(design: Design, values: Array) -> Array:
-    parts = [hold_last(values[design.rows(k)]) for k in range(design.n_batches)]
-    return np.concatenate([*parts, np.empty(0)])
 
 
 def _temperature(design: Design, name: str) -> Array:

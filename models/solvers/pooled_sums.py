@@ -100,11 +100,14 @@ class Blocks:
 
     def left_out_S_um(self, block: NDArray[np.int64], pool: Pool, which: NDArray[np.int64], coef: Array) -> Array:
         """S (V, G) in µm of left-out blocks (V,) under the models coef (S, p, G) fitted on pool[which]."""
-        beta = coef[which]
+        return self.S_um(block, pool.mean_x[which], pool.mean_y[which], coef[which])
+
+    def S_um(self, block: NDArray[np.int64], at_x: Array, at_y: Array, beta: Array) -> Array:
+        """S (V, G) in µm of blocks (V,) under slopes beta (V, p, G), by which at_x (V, p) has the error at_y (V,)."""
         square = np.einsum("vjg,vjg->vg", beta, self.xx[block] @ beta)
         cross = (self.xy[block][:, None, :] @ beta)[:, 0]
-        away = (self.mean_x[block] - pool.mean_x[which])[:, None, :] @ beta
-        bias = (self.mean_y[block] - pool.mean_y[which])[:, None] - away[:, 0]
+        away = (self.mean_x[block] - at_x)[:, None, :] @ beta
+        bias = (self.mean_y[block] - at_y)[:, None] - away[:, 0]
         n = self.count[block][:, None]
         sse = self.yy[block][:, None] - 2.0 * cross + square + n * bias**2
         return np.sqrt(np.maximum(sse, 0.0) / np.maximum(n - 1.0, 1.0))

@@ -136,9 +136,6 @@ class SequenceNet(Family):
                     yield errors.get(done) or [self._learned(designs[done], net) for net in nets]
                 lessons, first = [], d + 1
 
-    def respond(self, design: Design, batches: Sequence[int]) -> list[Array]:
-        return self.respond_folds(design, [self], [batches])[0]
-
     def respond_folds(
         self, design: Design, fitted: Sequence[Self], wanted: Sequence[Sequence[int]]
     ) -> list[list[Array]]:

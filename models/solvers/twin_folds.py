@@ -243,12 +243,9 @@ def _arrived(problem: CalibrationProblem, point: _Point) -> tuple[_Point, Noise,
         small = gain <= CLOSE
         if small and noise.change(before) < SETTLED and way <= FAR:
             return replace(point, blocks=blocks), noise, number, f"arrived after {number} rounds"
-        if (way > FAR and (small or number % 3 == 0)) or (stalled and way > NEAR and not small):
-            point = replace(point, blocks=_linearised(problem, point.z, point.nuisance), taken_at=point.z)
-            stalled = False
-            continue
-        moved = _step(problem, point, arrow, dz, blocks, noise, cost)
-        if moved is None and way > 0:
+        due = (way > FAR and (small or number % 3 == 0)) or (stalled and way > NEAR and not small)
+        moved = None if due else _step(problem, point, arrow, dz, blocks, noise, cost)
+        if moved is None and (due or way > 0):
             point = replace(point, blocks=_linearised(problem, point.z, point.nuisance), taken_at=point.z)
             stalled = False
             continue

@@ -33,7 +33,7 @@ def list_(
     lake = home_lake()
     rows = [_machine_row(lake, m) for m in lake.machines(withdrawn=True)]
     if machine is not None:
-        rows = [_batch_row(i, versions) for i, versions in lake.contents(machine).items()]
+        rows = [{"batch": i, **_version_row(versions[-1])} for i, versions in lake.contents(machine).items()]
     if as_json:
         console.print_json(rows)
     elif not rows:
@@ -205,10 +205,6 @@ def _machine_row(lake: Lake, machine: str) -> dict[str, Any]:
         "versions": sum(map(len, contents.values())), "quarantined": len(lake.quarantined(machine)),
         "size_MB": round(sum(map(lake.size, files)) / 1e6, 2),
     }  # fmt: skip
-
-
-def _batch_row(batch_id: str, versions: Sequence[Version]) -> dict[str, Any]:
-    return {"batch": batch_id, **_version_row(versions[-1])}
 
 
 def _version_row(v: Version) -> dict[str, Any]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from mlflow.tracking import MlflowClient
 
-    from pipelines.audit import Log, Reign, When
+    from pipelines.audit import Log, When
     from pipelines.settings import Settings
 
 _MODEL = re.compile(r"^(?:models:/)?(?P<name>[^/@]+)(?:[/@](?P<which>[^/@]+))?$")
@@ -115,8 +115,7 @@ def history(log: Log) -> pd.DataFrame:
     for entry, done in zip(log.entries, log.carried_out, strict=True):
         reign = by_entry.get(id(entry))
         note = reign.note if reign else "interrupted, or still running: the champion did not change"
-        until = reign.until if reign else None
-        rows.append({**entry.model_dump(), "until": until, "carried_out": done, "note": note})
+        rows.append({**entry.model_dump(), "until": reign and reign.until, "carried_out": done, "note": note})
     return _typed(pd.DataFrame(rows, columns=[*Entry.model_fields, "until", "carried_out", "note"]))
 
 
@@ -140,9 +139,10 @@ def champions(logs: Sequence[Log], at: When) -> pd.DataFrame:
     for log in logs:
         own = {"model": log.model, "machine": log.machine, "target": log.target}
         reigns = log.champions(span)
-        rows += [{**own, **_reign_row(r)} for r in reigns]
-        if not reigns:
-            rows.append({**own, "note": log.silence()})
+        rows += [
+            {**r.entry.model_dump(), **own, "version": r.version, "since": r.since, "until": r.until, "note": r.note}
+            for r in reigns
+        ] or [{**own, "note": log.silence()}]
     if rows and all("version" not in r for r in rows):
         name, note = rows[0]["model"], rows[0]["note"]
         what = f"model {name!r} had no recorded champion {span}"
@@ -160,7 +160,6 @@ def lineage_of(client: MlflowClient, log: Log, which: str, settings: Settings) -
     Raises:
         InputError: unknown version or alias, or a training that the store has no longer.
     """
-    import pandas as pd
 
     from pipelines.registry import find_version
     from pipelines.tracking import load_training
@@ -173,14 +172,9 @@ def lineage_of(client: MlflowClient, log: Log, which: str, settings: Settings) -
         columns=list(dict.fromkeys([*result.findings, "channel", "masks", "overruled", "words"]))
     )
     hits = findings[findings["masks"].eq(True) & ~findings["overruled"].fillna("").astype(bool)]
-    masked: dict[str, list[str]] = {}
-    for batch_id, channel in hits[["batch_id", "channel"]].itertuples(index=False):
-        of = masked.setdefault(str(batch_id), [])
-        text = "*" if pd.isna(channel) else str(channel)
-        if text not in of:
-            of.append(text)
+    channels = hits["channel"].astype(object).fillna("*").astype(str).groupby(hits["batch_id"].astype(str)).unique()
     batches = result.batches.copy()
-    batches["masked"] = ["|".join(masked.get(str(b), ())) for b in batches["batch_id"]]
+    batches["masked"] = ["|".join(channels.get(str(b), ())) for b in batches["batch_id"]]
     columns = ["batch_id", "start", "digest", "version", "source", "n_rows", "masked"]
     return Lineage(
         {
@@ -203,16 +197,12 @@ def _logs(client: MlflowClient, name: str | None, machine: str | None) -> list[L
     """The log of a model, or those of all models (of one machine) that thermodrift registered, by name."""
     from pipelines.audit import read
     from pipelines.registry import find_model
+    from pipelines.runs import registered_models
 
     if name is not None:
         return [read(find_model(client, name))]
-    models: list[Any] = []
-    token: str | None = ""
-    while token is not None:
-        page = client.search_registered_models(max_results=1000, page_token=token or None)
-        models += [m for m in page if "machine" in m.tags]  # a shared server has models of other programs
-        token = page.token or None
-    logs = sorted((read(m) for m in models), key=lambda log: log.model)
+    own = (m for m in registered_models(client) if "machine" in m.tags)  # a shared server has those of other programs
+    logs = sorted(map(read, own), key=lambda log: log.model)
     if machine is None:
         return logs
     known = sorted({log.machine for log in logs})
@@ -232,14 +222,6 @@ def _only_champion(log: Log, at: When) -> str:
             f"{', '.join(map(str, versions))}; give a time such as 2026-03-03T10:00, or {log.model}/{versions[0]}"
         )
     return str(versions[0])
-
-
-def _reign_row(reign: Reign) -> dict[str, Any]:
-    e = reign.entry
-    return {
-        "version": reign.version, "since": reign.since, "until": reign.until, "action": e.action, "who": e.who,
-        "why": e.why, "training_id": e.training_id, "code_version": e.code_version, "note": reign.note,
-    }  # fmt: skip
 
 
 def _typed(table: pd.DataFrame) -> pd.DataFrame:
@@ -357,15 +339,12 @@ def _print_lineage(found: Lineage) -> None:
     table = console.table("batches", *found.batches, left={"batch_id", "start", "digest", "source", "masked"},
                           wrap=("source", "masked"))  # fmt: skip
     for b in _rows(found.batches):
-        shown = {**b, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN], "masked": _channels(b["masked"])}
+        masked = ", ".join("all channels" if c == "*" else c for c in b["masked"].split("|"))
+        shown = {**b, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN], "masked": masked}
         table.add_row(*("" if value is None else str(value) for value in shown.values()))
     console.out.print(table)
     console.line(f"findings: {len(found.findings)}; --json has all of them, and whole digests")
     print_findings(found.findings)
-
-
-def _channels(masked: str) -> str:
-    return ", ".join("all channels" if c == "*" else c for c in masked.split("|"))
 
 
 def _rows(table: pd.DataFrame) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from data.errors import InputError
 from features.design import Design
 from models.gm1n import GM1N, response
 from models.gm_lssvm import GMLSSVM
-from models.solvers.grey_models import corrected, grey_layers, layer_design, sequence_outputs
+from models.solvers.grey_models import grey_layers, layer_design, sequence_outputs
 
 SIZES = (70, 55, 62, 58, 66)
 
@@ -171,18 +171,6 @@ def test_one_step_ahead_leans_on_measured_errors_and_a_free_run_does_not():
         before = sequence_outputs(x, y, range(15, 55), one_step=one_step)
         after = sequence_outputs(x, drifted, range(15, 55), one_step=one_step)
         assert np.allclose(before, after, equal_nan=True) != one_step
-
-
-def test_the_corrector_learns_on_its_rows_alone():
-    x, y = one_batch(bend=0.02)
-    outputs = sequence_outputs(x, y, range(15, 55))
-    told = corrected(outputs, y, range(55, 65))
-    assert np.isnan(told[:30]).all() and np.isfinite(told[30:]).all()
-    spoiled = y.copy()
-    spoiled[np.r_[:55, 65:116]] = 1e3
-    np.testing.assert_array_equal(corrected(outputs, spoiled, range(55, 65)), told)
-    left = outputs[65:, 3] - y[65:]
-    assert np.sqrt(np.mean((told[65:] - y[65:]) ** 2)) < 0.5 * np.sqrt(np.mean(left**2))
 
 
 @pytest.mark.parametrize("lengths", [(41,), (6,)])

@@ -23,9 +23,10 @@ import pandas as pd
 import pytest
 
 from models.promotion import choose
-from pipelines import registry, tracking
+from pipelines import registry
 from pipelines.commands.predict import load_model
 from pipelines.model_store import predict_frame
+from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
 pytestmark = pytest.mark.slow
@@ -48,7 +49,7 @@ def name(store: Any) -> str:
     batches = toy_batches("toy-clean", 6)
     result = toy_result(batches, {"none|mlr|2": [1.0] * 6})
     model, region = toy_model(batches)
-    training_id = tracking.log_training(result, store)
+    training_id = log_training(result, store)
     choice = choose(result, store.promotion)
     new = registry.Newcomer(result, choice, model, machine_yaml("toy-clean"), training_id, region, batches)
     return registry.promote(new, store).name

@@ -17,12 +17,13 @@ from data.machine import load_machine
 from models.crossing import Plan
 from models.protocols import PromotionRule
 from models.result import GridResult
-from pipelines import tracking, training
+from pipelines import training
 from pipelines.caller import DirectCaller
 from pipelines.diagnosing import diagnose_if_grown, greatest_growth, growth
 from pipelines.settings import DiagnoseRule, Settings
 from pipelines.training import TrainRequest
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
+from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
 
 RULE = PromotionRule()
@@ -61,16 +62,16 @@ def test_a_family_that_was_not_trained_before_has_not_grown() -> None:
 
 def test_each_family_of_the_twin_counts_for_itself_and_no_other(home: Path, store: Settings) -> None:
     """What is learned from the residual hides what the physics lacks."""
-    tracking.log_training(trained("grown-families", twin=[1.0, 1.0], twin_residual=[0.5, 0.5], zero=[1.0, 1.0]), store)
+    log_training(trained("grown-families", twin=[1.0, 1.0], twin_residual=[0.5, 0.5], zero=[1.0, 1.0]), store)
     now = trained("grown-families", twin=[1.0, 1.0, 1.6], twin_residual=[0.5, 0.5, 0.5], zero=[1.0, 1.0, 9.0])
-    ids = {"z": tracking.log_training(now, store)}  # tracked already, and not what it is compared with
+    ids = {"z": log_training(now, store)}  # tracked already, and not what it is compared with
     got = greatest_growth({"z": now}, store, ids)
     assert got is not None and (got.family, got.share) == ("twin", pytest.approx(0.6))
 
 
 def test_the_first_training_has_nothing_to_grow_from(home: Path, store: Settings) -> None:
     now = trained("grown-first", twin=[5.0, 9.0])
-    assert greatest_growth({"z": now}, store, {"z": tracking.log_training(now, store)}) is None
+    assert greatest_growth({"z": now}, store, {"z": log_training(now, store)}) is None
 
 
 @pytest.fixture
@@ -80,9 +81,9 @@ def grown(home: Path, store: Settings, tmp_path: Path, monkeypatch: pytest.Monke
     name = f"grown-{zlib.crc32(str(tmp_path).encode()):x}"
     file = write_machine(tmp_path / "m.yml", name)
     ingest([write_recordings(tmp_path / "in")], load_machine(file), Lake(home / "lake"))
-    tracking.log_training(trained(name, twin=[1.0, 1.0]), store)
+    log_training(trained(name, twin=[1.0, 1.0]), store)
     now = trained(name, twin=[1.0, 1.0, 1.4])
-    ids = {"z": tracking.log_training(now, store)}
+    ids = {"z": log_training(now, store)}
 
     def run(limit: float | None, toy: Toy) -> Any:
         settings = replace(store, diagnose=DiagnoseRule(when_error_grows_by=limit))

@@ -28,6 +28,7 @@ from pipelines.settings import NamesPart, Settings
 from pipelines.training import TrainRequest, train
 from tests.toys.command import in_process
 from tests.toys.small_year import write_machine, write_year
+from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
 S_UM = {"none|zero|0": [50.0, 51.0, 52.0], "none|mlr|2": [1.0, 2.0, 1.5]}
@@ -118,7 +119,7 @@ def test_a_disk_that_is_full_while_a_training_is_tracked_is_one_line(
 ) -> None:
     monkeypatch.setattr(MlflowClient, "log_artifacts", full)
     with pytest.raises(WorkError, match=r"artifacts: cannot be written or read \(No space left on device\)$"):
-        tracking.log_training(toy_result(toy_batches("toy-full", 3), S_UM), store)
+        log_training(toy_result(toy_batches("toy-full", 3), S_UM), store)
     assert tracking.trainings("toy-full", None, store).empty
 
 
@@ -162,7 +163,7 @@ def test_a_home_that_moved_or_was_copied_has_its_files(store: Any, tmp_path: Pat
     local_store.make(first.store_file, lambda made: shutil.copy(store.store_file, made))
     batches = toy_batches("toy_moved-50", 3)
     result = toy_result(batches, S_UM)
-    training_id = tracking.log_training(result, first)
+    training_id = log_training(result, first)
     model, region = toy_model(batches)
     new = registry.Newcomer(
         result, choose(result, first.promotion), model, machine_yaml("toy-moved"), training_id, region
@@ -178,7 +179,7 @@ def test_a_home_that_moved_or_was_copied_has_its_files(store: Any, tmp_path: Pat
         assert tracking.load_training(training_id, moved).result.batches.equals(result.batches)
         folder = Path(registry.local_folder(promoted.model_uri, moved))
         assert folder.is_relative_to(tmp_path / name) and model_store.load(folder)
-        later = tracking.log_training(result, moved)
+        later = log_training(result, moved)
         assert list((tmp_path / name / "artifacts").rglob(f"{later}/artifacts/grid/result.json"))
         tracking.open_store(moved, said.append)
         assert len(said) == 1
@@ -189,7 +190,7 @@ def test_other_artifacts_in_the_settings_move_nothing(store: Any, tmp_path: Path
     """Without the files there, the earlier runs keep their addresses."""
     own = at_home(store, tmp_path)
     local_store.make(own.store_file, lambda made: shutil.copy(store.store_file, made))
-    training_id = tracking.log_training(toy_result(toy_batches("toy-elsewhere", 3), S_UM), own)
+    training_id = log_training(toy_result(toy_batches("toy-elsewhere", 3), S_UM), own)
     assert local_store.follow(own.store_file, (tmp_path / "elsewhere").as_uri()) == []
     assert local_store.follow(own.store_file, "s3://bucket/artifacts") == []
     assert tracking.load_training(training_id, own)

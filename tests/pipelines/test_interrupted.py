@@ -23,6 +23,7 @@ from pipelines import registry, runs, tracking
 from pipelines.caller import DirectCaller
 from pipelines.training import TrainRequest, train
 from tests.toys.small_year import write_machine, write_year
+from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
 pytestmark = pytest.mark.slow
@@ -33,10 +34,11 @@ S_UM = [5.0, 6.0, 5.5, 6.5, 5.0, 6.0]
 KILLED_IN_THE_MIDDLE = """
 import os, signal
 from mlflow.tracking import MlflowClient
-from pipelines import settings, tracking
+from pipelines import settings
+from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
 MlflowClient.log_artifacts = lambda *args: os.kill(os.getpid(), signal.SIGKILL)
-tracking.log_training(toy_result(toy_batches("toy-killed", 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), settings.load())
+log_training(toy_result(toy_batches("toy-killed", 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), settings.load())
 """
 
 
@@ -77,7 +79,7 @@ def newcomer(store: Any, machine: str, S_um: list[float]) -> registry.Newcomer:
     batches = toy_batches(machine, len(S_um))
     result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
     model, region = toy_model(batches)
-    training_id, choice = tracking.log_training(result, store), decide(result, store.promotion)
+    training_id, choice = log_training(result, store), decide(result, store.promotion)
     return registry.Newcomer(result, choice, model, machine_yaml(machine), training_id, region)
 
 
@@ -90,7 +92,7 @@ def test_a_killed_training_is_closed_by_the_next_one(store: Any, store_home: Pat
     experiment = client.get_experiment_by_name("toy-killed z")
     (left,) = client.search_runs([experiment.experiment_id])
     assert left.info.status == "RUNNING" and json.loads(left.data.tags["process"])["host"] == platform.node()
-    tracking.log_training(toy_result(toy_batches("toy-other", 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), store)
+    log_training(toy_result(toy_batches("toy-other", 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), store)
     closed = client.get_run(left.info.run_id)
     assert closed.info.status == "KILLED" and closed.info.end_time
     assert closed.data.tags["interrupted"] == "its process ended before the run did"

@@ -21,6 +21,7 @@ from pipelines import settings, store, tracking
 from tests.toys.command import Call, in_process
 from tests.toys.postgres import PASSWORD, Server, free_port, postgres
 from tests.toys.small_year import write_machine, write_year
+from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +59,7 @@ def test_a_training_is_tracked_in_postgresql(server: Server, call: Call, tmp_pat
         f"first use: making the tables of the tracking store {loaded.store_name} (takes some seconds, once)"
     ]
     result = toy_result(toy_batches("pg-toy", 3), {"none|zero|0": [9.0, 8.0, 10.0], "none|mlr|2": [1.0, 2.0, 1.5]})
-    training_id = tracking.log_training(result, loaded, say=said.append)
+    training_id = log_training(result, loaded, say=said.append)
     assert len(said) == 1
     listed = tracking.trainings("pg-toy", settings=loaded)
     assert listed["training_id"].tolist() == [training_id] and listed["n_batches"].tolist() == [3]

@@ -23,10 +23,11 @@ from models.conformal import RunBound
 from models.mlr import MLR
 from models.promotion import choose
 from models.trust import Region
-from pipelines import model_store, registry, tracking
+from pipelines import model_store, registry
 from pipelines.cli import app
 from pipelines.commands.predict import load_model, predict_batches, predict_file, summary
 from tests.models.twin_year import recording, two_errors
+from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
@@ -35,7 +36,7 @@ def promoted(store):
     batches = toy_batches("toy-predict", 6)
     result = toy_result(batches, {"none|mlr|2": [1.0] * 6})
     model, region = toy_model(batches)
-    training_id = tracking.log_training(result, store)
+    training_id = log_training(result, store)
     choice = choose(result, store.promotion)
     new = registry.Newcomer(result, choice, model, machine_yaml("toy-predict"), training_id, region)
     return registry.promote(new, store), training_id

@@ -18,6 +18,7 @@ from pipelines.commands.predict import load_model
 from pipelines.commands.registry import _print_overview as printed
 from pipelines.commands.registry import overview
 from pipelines.commands.status import _print_models as print_models
+from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
 
 
@@ -34,7 +35,7 @@ def train(
     """Log and promote a training over len(S_um) batches."""
     batches = toy_batches(machine, len(S_um))
     result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
-    training_id = tracking.log_training(result, store)
+    training_id = log_training(result, store)
     model, region = toy_model(batches)
     choice = replace(choose(result, store.promotion), **is_)
     text, known = yaml or machine_yaml(machine), batches if batches_given else ()
@@ -197,7 +198,7 @@ def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     choice: Choice = choose(result, store.promotion)
     from models.baselines import Zero
 
-    zero, training_id = Zero().fit(batches, (), "z"), tracking.log_training(result, store)
+    zero, training_id = Zero().fit(batches, (), "z"), log_training(result, store)
     new = registry.Newcomer(result, choice, zero, machine_yaml("toy-zero"), training_id, Region.of([], ()))
     got = registry.promote(new, store)
     assert not got.trusted
@@ -219,9 +220,7 @@ def test_a_newcomer_that_is_not_trustworthy_never_replaces_a_champion(store):
     result = toy_result(batches, {"none|zero|0": [4.5] * 7, "none|mlr|2": [1.0] * 3 + [4.6] * 4})
     choice = decide(result, PromotionRule())
     model, region = toy_model(batches)
-    new = registry.Newcomer(
-        result, choice, model, machine_yaml("toy-doubt"), tracking.log_training(result, store), region
-    )
+    new = registry.Newcomer(result, choice, model, machine_yaml("toy-doubt"), log_training(result, store), region)
     got = registry.promote(new, store)
     assert got.comparison is not None and got.comparison.better and not got.trusted
     assert (got.outcome, got.champion_version) == ("challenger", 1)

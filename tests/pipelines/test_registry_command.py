@@ -20,6 +20,7 @@ from data.errors import InputError
 from models.promotion import choose
 from pipelines import audit, registry, runs, tracking
 from tests.toys.command import Call, in_process
+from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result
 
 MASKED = {"batch_id": "b02", "check": "spike", "channel": "front", "start_s": 60.0, "end_s": 120.0,
@@ -53,7 +54,7 @@ def train(store: Any, machine: str, S_um: list[float], at: str = "", *, force: b
     batches = toy_batches(machine, len(S_um))
     result = toy_result(batches, {"none|zero|0": [50.0] * len(S_um), "none|mlr|2": S_um})
     result = replace(result, findings=pd.DataFrame([dict(f) for f in FINDINGS]))
-    training_id = tracking.log_training(result, store)
+    training_id = log_training(result, store)
     model, region = toy_model(batches)
     new = registry.Newcomer(result, choose(result, store.promotion), model, machine_yaml(machine), training_id, region)
     with clock(at):

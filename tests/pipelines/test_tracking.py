@@ -17,6 +17,7 @@ from models.promotion import judged
 from models.protocols import PromotionRule
 from pipelines import audit, runs, tracking
 from pipelines.settings import NamesPart, Settings
+from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
 
 S_UM = {
@@ -31,7 +32,7 @@ S_UM = {
 def logged(store) -> tuple[Settings, str, object]:
     result = toy_result(toy_batches("toy-tracked", 3), S_UM)
     figures = {"heat.png": b"\x89PNG not really"}
-    return store, tracking.log_training(result, store, figures=figures, params={"seed": 0}), result
+    return store, log_training(result, store, figures=figures, params={"seed": 0}), result
 
 
 def children(settings: Settings, training_id: str) -> dict[str, object]:
@@ -171,7 +172,7 @@ def test_a_training_comes_back_whole(logged):
 
 def test_trainings_are_listed_newest_first(logged):
     settings, training_id, _ = logged
-    later = tracking.log_training(toy_result(toy_batches("toy-tracked", 3), S_UM), settings)
+    later = log_training(toy_result(toy_batches("toy-tracked", 3), S_UM), settings)
     table = tracking.trainings("toy-tracked", "z", settings)
     assert table["training_id"].tolist() == [later, training_id]
     assert table["n_batches"].tolist() == [3, 3]
@@ -186,7 +187,7 @@ def test_an_unfinished_training_is_not_listed(store, monkeypatch):
 
     monkeypatch.setattr(MlflowClient, "log_artifacts", broken)
     with pytest.raises(OSError, match="disk full"):
-        tracking.log_training(toy_result(toy_batches("toy-broken", 3), S_UM), store)
+        log_training(toy_result(toy_batches("toy-broken", 3), S_UM), store)
     assert tracking.trainings("toy-broken", None, store).empty
 
 
