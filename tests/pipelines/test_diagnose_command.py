@@ -82,7 +82,7 @@ def test_a_finding_becomes_files_and_sentences(diagnose: Diagnosed, toy: Toy, gi
     assert got["processes"] >= 1
     lines = done.out.splitlines()
     assert lines[0] == f"{NAME}: diagnosis of 3 batches  (simulated recordings)"
-    assert lines[1] == "The simulation left out one effect; with it nothing else is missing that these runs could show."
+    assert lines[1] == "The simulation left out one effect; with it noise alone is left."
     assert lines[2].startswith("1. The bed loses heat to the floor, 10.2 W/K") and lines[2].endswith("(97 %)")
     z = next(line.split() for line in lines if line.split()[:2] == ["z", "µm"])
     rms = found.fit.left_out_rms
