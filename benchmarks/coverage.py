@@ -36,7 +36,7 @@ from models.crossing import FamilyResult, Plan, cross_family, prepare, refit, wi
 from models.metrics import residual_std_um
 from models.protocols import forward
 from models.result import CELL_KEYS
-from models.stack import stacked
+from models.stack import best_cells
 from models.trust import Region, left_out_runs
 from pipelines.model_store import StoredModel
 from plants.plant import draw
@@ -89,7 +89,7 @@ def bounded(
         every = len(crossing.design.inputs)
         wanted = [(s, f, int(points[0]) if points else every) for s, f, *points in named]
         result = FamilyResult.joined([cross_family(crossing, f, [(s, n)], crossing.folds) for s, f, n in wanted])
-        _, peers = stacked(crossing, result, "forward" if crossing.folds.get("forward") else "leave-batch-out")
+        peers = best_cells(crossing, result, "forward" if crossing.folds.get("forward") else "leave-batch-out")
         models = {
             c: refit(crossing, *c) for c in wanted if f"leave-batch-out|{'|'.join(map(str, c))}" in result.predictions
         }

@@ -205,6 +205,12 @@ def _diagnosis(
         **located,
     }
     simulated = any(b.simulated for b in final.batches)
+    new_file: dict[str, Any] = {
+        "values": {i.name: i.value for i in intervals.values()},
+        "intervals": tuple(intervals.values()),
+        "added": changed_parts(part, part_after),
+        "notes": _notes(findings, len(batches)),
+    }
     return Diagnosis(
         machine=machine,
         findings=Findings(
@@ -232,12 +238,9 @@ def _diagnosis(
         remarks=remarks,
         tables=everything,
         network=final.problem.network,
-        values={} if worse else {i.name: i.value for i in intervals.values()},
-        intervals=() if worse else tuple(intervals.values()),
-        added={} if worse else changed_parts(part, part_after),
-        notes={} if worse else _notes(findings, len(batches)),
         plan_text=(run.plan_text or None) if run is not None else None,
         search=done,
+        **({} if worse else new_file),
     )
 
 

@@ -68,10 +68,10 @@ class RunBound:
     trained region in widths. The slopes are a ridge regression of ln S about a weak prior and never negative: a run
     that is farther out or less agreed upon is never expected to be better.
 
-    expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement; usual_um: above it a run
-    is flagged, one in ten of the left-out runs with less than twice the expected S (conformal risk control of false
-    flags: Angelopoulos et al., ICLR 2024). tested: the greatest distance of a left-out
-    run. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were left out.
+    expected_um, bound_um: of an ordinary run. typical_um, floor_um: of the disagreement. tested: the greatest distance
+    of a left-out run. level: the quantile that the bound is, 0.9 or more. n_runs: how many runs were left out.
+    usual_um: the disagreement above which a run is flagged, one in ten of the left-out runs with less than twice the
+    expected S (conformal risk control of false flags: Angelopoulos et al., ICLR 2024).
     """
 
     expected_um: float
@@ -79,10 +79,10 @@ class RunBound:
     slopes: tuple[float, float]
     typical_um: float
     floor_um: float
-    usual_um: float
     tested: float
     level: float
     n_runs: int
+    usual_um: float = math.inf  # of a model that an earlier program stored
 
     @classmethod
     def of(cls, table: pd.DataFrame) -> Self:
@@ -96,7 +96,7 @@ class RunBound:
         n = table["batch_id"].nunique()
         if not n:
             nan = float("nan")
-            return cls(nan, nan, (0.0, 0.0), nan, nan, nan, nan, LEVEL, 0)
+            return cls(nan, nan, (0.0, 0.0), nan, nan, nan, LEVEL, 0)
         counts = table["protocol"].map(_WEIGHTS).fillna(1.0).to_numpy(float)
         weight = np.asarray(counts * (n / counts.sum()), float)  # a run that several protocols left out is one run
         S_um = np.maximum(table["S_um"].to_numpy(float), _LEAST_UM)
@@ -113,8 +113,8 @@ class RunBound:
         fine = np.isfinite(disagreement_um) & (S_um <= 2.0 * expected_um)
         return cls(
             expected_um, bound_um, (float(slopes[0]), float(slopes[1])), typical_um, floor_um,
-            _quantile(disagreement_um[fine], weight[fine], LEVEL) if fine.any() else 0.0,
             float(np.nanmax(distance, initial=0.0)), level, n,
+            _quantile(disagreement_um[fine], weight[fine], LEVEL) if fine.any() else 0.0,
         )  # fmt: skip
 
     @classmethod
@@ -139,7 +139,7 @@ class RunBound:
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> Self:
         """The inverse of `as_plain`; what other versions of the program kept besides is not read."""
-        own = {f.name: plain.get(f.name, math.inf) for f in fields(cls)}
+        own = {f.name: plain[f.name] for f in fields(cls) if f.name in plain}
         return cls(**{**own, "slopes": (float(plain["slopes"][0]), float(plain["slopes"][1]))})
 
 

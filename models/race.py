@@ -33,7 +33,7 @@ from models import FAMILIES
 from models.crossing import Cell, Crossing, FamilyResult, Inputs, cross_family
 from models.loss import BASELINES, cost_of_choosing, paired, pooled
 from models.protocols import Fold
-from models.stack import stacked
+from models.stack import best_cells, stacked
 
 ROUND_COLUMNS = ["round", "selector", "family", "n_tsp", "n_runs", "S_mean_um", "behind_um", "se_um", "kept", "why"]
 _CLEARLY = 0.99  # one-sided level of the paired test: the leader is the best of many, and so flattered
@@ -71,7 +71,7 @@ class Job:
 
 
 class Raced(NamedTuple):
-    """The scores of all cells of the last rounds, who was dropped when, and the members of the stack."""
+    """The scores of all cells of the last rounds, who was dropped when, and the best cells of the best families."""
 
     result: FamilyResult
     race: pd.DataFrame
@@ -121,9 +121,10 @@ def rounds(crossing: Crossing) -> Rounds:
 
 
 def _with_stack(crossing: Crossing, result: FamilyResult, race: pd.DataFrame, led: str) -> Raced:
-    more, members = stacked(crossing, result, led)
-    wanted = any(FAMILIES[key].combines for key in crossing.plan.families)
-    return Raced(FamilyResult.joined([result, more]) if wanted else result, race, members)
+    cells = best_cells(crossing, result, led)
+    if any(FAMILIES[key].combines for key in crossing.plan.families):
+        result = FamilyResult.joined([result, stacked(crossing, result, cells)])
+    return Raced(result, race, cells)
 
 
 def drive(crossings: Mapping[str, Crossing], cross: Callable[[list[Job]], list[FamilyResult]]) -> dict[str, Raced]:

@@ -145,55 +145,65 @@ def weights_of(runs: Sequence[tuple[Array, Array]], families: Sequence[str]) -> 
     return weights
 
 
-def stacked(crossing: Crossing, result: FamilyResult, led: str) -> tuple[FamilyResult, pd.DataFrame]:
-    """The stack of the best cells, scored on their left-out predictions, and its members.
+def best_cells(crossing: Crossing, result: FamilyResult, led: str) -> pd.DataFrame:
+    """A row per member as in `GridResult.stack`, found by the leading protocol `led`; none for fewer than two."""
+    members = _members(result, led)
+    if len(members) < 2:
+        return pd.DataFrame(columns=[*CELL_KEYS[1:], "inputs", "weight"])
+    runs = [run for own in _left_out(crossing, result, led, members) for run in own.values()]
+    return pd.DataFrame(members, columns=CELL_KEYS[1:]).assign(
+        inputs=["|".join(crossing.inputs(s, crossing.everything, n)) for s, _, n in members],
+        weight=weights_of(runs, [family for _, family, _ in members]),
+    )
+
+
+def stacked(crossing: Crossing, result: FamilyResult, cells: pd.DataFrame) -> FamilyResult:
+    """The stack of the `best_cells`, scored on their left-out predictions as `cross_family` scores; empty of none.
 
     A fold is predicted with the weights that the other folds of its protocol give, forward the earlier ones, so that no
-    weight knows the run that it predicts. The members have been found by the leading protocol `led`, which flatters
-    the stack as the search flatters any other cell. Empty for fewer than two members.
-
-    Returns:
-        the scores as `cross_family` gives them, and a row per member as in `GridResult.stack`.
+    weight knows the run that it predicts. The members have been found by the leading protocol, which flatters the stack
+    as the search flatters any other cell.
     """
-    members = _members(result, led)
-    table = pd.DataFrame(members, columns=["selector", "family", "n_tsp"])
-    if len(members) < 2:
-        return FamilyResult(pd.DataFrame(), pd.DataFrame(), {}, []), table.iloc[:0].assign(weight=0.0)
+    members = list(cells[CELL_KEYS[1:]].itertuples(index=False, name=None))
+    if not members:
+        return FamilyResult(pd.DataFrame(), pd.DataFrame(), {}, [])
     design, parts, families = crossing.design, [], [family for _, family, _ in members]
     trainings = {crossing.everything, *(f.train for p in KEPT for f in crossing.folds.get(p, ()))}
     for train in trainings:
         used = {i for selector, _, n in members for i in crossing.inputs(selector, train, n)}
         crossing.chosen[STACKED, train] = {len(design.inputs): tuple(i for i in design.inputs if i in used)}
     for protocol in [p for p in KEPT if all(_name(p, m) in result.predictions for m in members)]:
-        folds = crossing.folds[protocol]
-        given = np.column_stack([result.predictions[_name(protocol, m)] for m in members]).astype(float)
-        runs = left_out_by_fold(design, folds, given)
-        if protocol == led:
-            table["inputs"] = ["|".join(crossing.inputs(s, crossing.everything, n)) for s, _, n in members]
-            table["weight"] = weights_of([run for own in runs for run in own.values()], families)
-        predicted = []
+        folds, predicted = crossing.folds[protocol], []
+        runs = _left_out(crossing, result, protocol, members)
         for i, fold in enumerate(folds):
             known = runs[:i] if protocol == "forward" else [r for r in runs if not set(r) & set(fold.test)]
             weights = weights_of([run for own in known for run in own.values()], families)
             predicted.append({k: p @ weights for k, (_, p) in runs[i].items()})
         parts.append(_scored(crossing, folds, predicted, protocol))
-    return FamilyResult.joined(parts), table
+    return FamilyResult.joined(parts)
 
 
 def _members(result: FamilyResult, led: str) -> list[tuple[str, str, int]]:
     """Of the cells whose predictions are kept the best of each of the best families, by the pooled loss."""
     rows = result.cells[(result.cells["protocol"] == led) & (result.cells["n_tsp"] > 0)].dropna(subset="S_mean_um")
-    if rows.empty:
+    protocols = {name.partition("|")[0] for name in result.predictions}
+    if rows.empty or led not in protocols:
         return []
     loss_um, _ = pooled(rows["S_mean_um"].to_numpy(float), list(rows["family"]), float(rows["n_batches"].max()))
     rows = rows.assign(loss_um=loss_um).sort_values(["loss_um", "rank"], kind="stable")[CELL_KEYS[1:]]
     best: dict[str, tuple[str, str, int]] = {}
-    protocols = {name.partition("|")[0] for name in result.predictions}
     for selector, family, n in rows.itertuples(index=False):
         cell = (str(selector), str(family), int(n))
         if all(_name(p, cell) in result.predictions for p in protocols):
             best.setdefault(cell[1], cell)
     return list(best.values())[:MOST_MEMBERS]
+
+
+def _left_out(
+    crossing: Crossing, result: FamilyResult, protocol: str, members: Sequence[tuple[str, str, int]]
+) -> list[dict[int, tuple[Array, Array]]]:
+    given = np.column_stack([result.predictions[_name(protocol, m)] for m in members]).astype(float)
+    return left_out_by_fold(crossing.design, crossing.folds[protocol], given)
 
 
 def _name(protocol: str, cell: tuple[str, str, int]) -> str:

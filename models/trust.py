@@ -213,15 +213,14 @@ def left_out_runs(
         peers: see `GridResult.stack`; those of the cell's own family are not used.
     """
     selector, family, n_tsp = cell
-    own = pd.DataFrame([cell], columns=["selector", "family", "n_tsp"])
-    others = own if peers is None or peers.empty else pd.concat([own, peers[peers["family"] != family][own.columns]])
-    labels = ["|".join(map(str, c)) for c in others.itertuples(index=False)]
-    label = labels[0]
+    label = f"{selector}|{family}|{n_tsp}"
+    own = () if peers is None else peers.itertuples()
+    others = [f"{p.selector}|{p.family}|{p.n_tsp}" for p in own if p.family != family]
     runs, curves = [], []
     known = cache(lambda k, name: feature(crossing.batches[k], name))  # sets of inputs have most quantities in common
     for protocol in [p for p in crossing.folds if f"{p}|{label}" in predictions]:
         folds = crossing.folds[protocol]
-        given = [predictions[name] for c in labels if (name := f"{protocol}|{c}") in predictions]
+        given = [predictions[name] for c in (label, *others) if (name := f"{protocol}|{c}") in predictions]
         by_fold = left_out_by_fold(crossing.design, folds, np.column_stack(given).astype(float))
         for design, which in crossing.needed(folds, [(selector, n_tsp)]):
             values = [

@@ -68,12 +68,12 @@ def _siblings(
     """The peers fitted on the same batches, without the family itself; a sum of them holds them already."""
     if peers is None or peers.empty or family.combines or not batches:
         return ()
-    machine = parse_machine(machine_yaml, "machine.yml")
+    machine, known = parse_machine(machine_yaml, "machine.yml"), with_target(batches, family.target)
     fitted = []
     for key, inputs in zip(peers["family"], peers["inputs"].str.split("|"), strict=True):
         if key != family.key:
             with suppress(InputError):
-                fitted.append(unfitted(key).fit(with_target(batches, family.target), inputs, family.target, machine))
+                fitted.append(unfitted(key).fit(known, inputs, family.target, machine))
     return tuple(fitted)
 
 

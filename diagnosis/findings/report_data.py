@@ -46,6 +46,11 @@ def with_unit(number: str, unit: str) -> str:
     return f"{number}{said[1:]}" if said.startswith("1/") else f"{number} {said}".strip()
 
 
+def of_error(value: float, unit: str) -> str:
+    """``1.4 µm``, ``0.79 K``: an error of a channel in `unit`."""
+    return with_unit(few(value), "K" if unit == "degC" else unit)
+
+
 def few(value: float, digits: int = 2) -> str:
     """``0.12``, ``10``, ``1300``: so many significant digits, never an exponent."""
     return "0" if value == 0 else _fixed(value, _decimals(value, digits))
@@ -241,8 +246,7 @@ def empty_tables() -> dict[str, pd.DataFrame]:
 def rises(worse: Mapping[str, tuple[float, float]], units: Mapping[str, str]) -> str:
     """``the left-out error of T1 from 1.4 to 4.5 K``, of every channel that got worse, the largest ratio first."""
     first = sorted(worse, key=lambda c: worse[c][0] / worse[c][1])
-    kelvin = {c: "K" if units.get(c) == "degC" else units.get(c, "") for c in first}
-    said = [f"{c} from {few(worse[c][0])} to {with_unit(few(worse[c][1]), kelvin[c])}" for c in first]
+    said = [f"{c} from {few(worse[c][0])} to {of_error(worse[c][1], units[c])}" for c in first]
     return f"the left-out error of {listed(said)}"
 
 

@@ -20,6 +20,7 @@ from diagnosis.findings.report_data import (
     beyond_noise,
     few,
     listed,
+    of_error,
     percent,
     times_noise,
     with_unit,
@@ -145,17 +146,13 @@ def falls(rms: Sequence[Rms], most: int = 2) -> str:
     for k, r in enumerate(fallen):
         of = " of runs left out of the fit" if k == 0 else ""
         noise = f" (noise {few(r.noise)})" if r.noise > 0 else ""
-        said.append(f"{_error_of(r)}{of} falls from {few(r.before)} to {_left(r)}{noise}")
-    worse = listed([f"{_error_of(r)} rises from {few(r.before)} to {_left(r)}" for r in risen])
+        said.append(f"{_error_of(r)}{of} falls from {few(r.before)} to {of_error(r.after, r.unit)}{noise}")
+    worse = listed([f"{_error_of(r)} rises from {few(r.before)} to {of_error(r.after, r.unit)}" for r in risen])
     return f"{listed(said)}{f', while {worse}' if worse and said else ''}"
 
 
 def _error_of(r: Rms) -> str:
     return f"the misfit of the sensor {r.channel}" if r.sensor else f"the {r.channel} error"
-
-
-def _left(r: Rms) -> str:
-    return with_unit(few(r.after), "K" if r.unit == "degC" else r.unit)
 
 
 def verdict_statement(
@@ -212,7 +209,7 @@ def _open_question(run: str, possible: Sequence[str]) -> str:
 
 
 def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Sequence[str]) -> str:
-    left = [f"{r.channel} {with_unit(few(r.after), 'K' if r.unit == 'degC' else r.unit)}"
+    left = [f"{r.channel} {of_error(r.after, r.unit)}"
             + (f" (noise {few(r.noise)})" if r.noise > 0 else "") for r in rms]  # fmt: skip
     worst = beyond_noise(rms)
     text = "Nothing is missing: the remaining error is the noise"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -233,6 +234,7 @@ class LeftOutRows:
     rms: pd.DataFrame
 
 
+@lru_cache(maxsize=8)
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted by the fit to all others.
 

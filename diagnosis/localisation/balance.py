@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,8 @@ from twin.simulation import Simulation, simulate
 class Impossible:
     """A sensor that left what its part can reach without heat.
 
-    `bodies` are all that conduction connects with it, `from_s` to `to_s` the time in the batch over which no heat
-    entered them, `excess_K` how far the channel was at most beyond what they can reach (negative: below), `watts` the
+    `bodies` are all that conduction connects with it, `to_s` the time in the batch until which no heat entered them,
+    `excess_K` how far the channel was at most beyond what they can reach (negative: below), `watts` the
     mean heat that this takes.
     """
 
@@ -49,6 +50,7 @@ class Impossible:
         )
 
 
+@lru_cache(maxsize=8)
 def impossible(fitted: Fitted) -> tuple[Impossible, ...]:
     """Of every channel the clearest instance, the largest excess first."""
     problem = fitted.problem

@@ -10,7 +10,7 @@ import numpy as np
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted, Tried
-from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, worsened
+from diagnosis.fitting.fitted import left_out_rows, worsened
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY, Policy
 from diagnosis.screening.evidence import Evidence
@@ -77,21 +77,12 @@ class Criteria:
     seed: int
     policy: Policy = POLICY
 
-    @cached_property
-    def left(self) -> LeftOutRows:
-        """What the fit before leaves of batches left out."""
-        return left_out_rows(self.now)
-
-    @cached_property
-    def impossible(self) -> frozenset[str]:
-        """Channels that show what the fit before cannot do whatever its values."""
-        return frozenset(i.channel for i in impossible(self.now))
-
     def resolved(self, t: Tried) -> frozenset[str]:
-        """Those of them that an effect makes possible."""
-        if not self.impossible or t.fitted is None or not t.candidate.kind.is_physics:
+        """Channels that show what the fit before cannot do whatever its values, and that an effect makes possible."""
+        before = frozenset(i.channel for i in impossible(self.now))
+        if not before or t.fitted is None or not t.candidate.kind.is_physics:
             return frozenset()
-        return self.impossible - {i.channel for i in impossible(t.fitted)}
+        return before - {i.channel for i in impossible(t.fitted)}
 
     @cached_property
     def density(self) -> float:
@@ -162,7 +153,7 @@ def evaluated(criteria: Criteria, tried: Sequence[Tried], best: Tried) -> Round:
     threshold = 0.0 if resolved else max(structure, flipped_threshold(flipped, n, which), least)
     unlikely = not resolved and _less_likely_than_nothing(best, threshold, null.temperature)
     accepted = best.gain > threshold and agreed and not unlikely
-    raised = worsened(criteria.left, left_out_rows(best.fitted)) if accepted else {}
+    raised = worsened(left_out_rows(now), left_out_rows(best.fitted)) if accepted else {}
     tried = (best, *(t for t in tried if t is not best))
     return Round(
         now,

@@ -45,9 +45,8 @@ def explanations(done: Round) -> tuple[list[Explanation], float, float]:
     refits = [x for x in done.tried if x.fitted is not None]
     barred = {x.cluster for x in refits} - {x.cluster for x in refits if agrees(x)}
     scores = np.array([x.standing(t) if agrees(x) and x.cluster not in barred else -np.inf for x in done.tried])
-    nothing = done.threshold / t + (min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0)
-    if done.resolved:
-        nothing = -np.inf
+    prior = min(done.best.log_prior, 0.0) if done.accepted and done.best is not None else 0.0
+    nothing = -np.inf if done.resolved else done.threshold / t + prior
     unlisted = (scores.max(initial=nothing)) - np.log(POLICY.unlisted_odds)
     every = np.append(scores, [nothing, unlisted])
     weight = np.exp(every - every.max())

@@ -385,9 +385,9 @@ def _round_with_fair_baseline(now: Fitted, seed: int, workers: Processes, tell: 
         if more < POLICY.baseline_restart_min_gain_nats:
             return done
         fair = replace(done.best, gain=done.best.gain - more)
-        raised = worsened(left_out_rows(back), left_out_rows(done.best.fitted))
-        accepted = fair.gain > done.threshold and not raised
-        done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=accepted, raised=raised)
+        gains = fair.gain > done.threshold
+        raised = worsened(left_out_rows(back), left_out_rows(done.best.fitted)) if gains else {}
+        done = replace(done, before=back, tried=(fair, *done.tried[1:]), accepted=gains and not raised, raised=raised)
         if done.accepted and more < POLICY.baseline_restart_min_gain_share * fair.gain:
             return done
         now = back

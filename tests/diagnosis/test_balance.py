@@ -39,7 +39,7 @@ def unlinked() -> Diagnosis:
     return diagnose(known, runs(two_bodies(), count=6))
 
 
-def test_a_part_that_warms_without_heat_is_impossible_and_the_watts_are_told() -> None:
+def test_a_part_that_warms_without_heat_is_impossible_and_the_watts_are_stated() -> None:
     known = two_bodies(links={})
     (found,) = impossible(fitted(known, runs(two_bodies(), count=6)))
     assert (found.channel, found.bodies) == ("t_head", ("head",)) and found.excess_K > 0
@@ -52,9 +52,9 @@ def test_what_the_twin_can_do_is_not_impossible() -> None:
 
 
 def test_the_missing_path_is_found_and_no_channel_is_worse(without_link: Diagnosis) -> None:
-    told = without_link.findings
-    assert told.findings[0].mechanism == "heat_bridge" and told.findings[0].where.name in ("shaft", "head")
-    assert any("t_head warms by" in r for r in told.remarks)
+    answer = without_link.findings
+    assert answer.findings[0].mechanism == "heat_bridge" and answer.findings[0].where.name in ("shaft", "head")
+    assert any("t_head warms by" in r for r in answer.remarks)
     search = without_link.search
     assert search is not None
     assert worsened(left_out_rows(search.baseline), left_out_rows(search.final)) == {}

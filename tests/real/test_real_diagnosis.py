@@ -194,10 +194,10 @@ def test_the_withheld_speed_is_found_as_heat_that_follows_it() -> None:
 def test_the_boards_missing_link_is_named_by_the_balance_of_heat_and_no_channel_is_worse() -> None:
     machine, batches = recorded("tclab_board", "tclab", 1.0)
     done = diagnose(with_twin(machine, links={}), batches)
-    told = done.findings
-    assert any(r.startswith("temperature2 warms by") and "brings heater2 any heat" in r for r in told.remarks)
-    first = told.findings[0]
+    answer = done.findings
+    assert any(r.startswith("temperature2 warms by") and "brings heater2 any heat" in r for r in answer.remarks)
+    first = answer.findings[0]
     assert (first.mechanism, first.where.name) == ("heat_bridge", "heater1") and first.probability >= 0.85
-    rms = told.fit.left_out_rms
+    rms = answer.fit.left_out_rms
     assert all(rms.after[k] < rms.before[k] for k in rms.after)  # type: ignore[operator]
     assert rms.after["temperature2_K"] < 0.4 * rms.before["temperature2_K"]  # type: ignore[operator]
