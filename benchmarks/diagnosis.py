@@ -28,12 +28,11 @@ from data.processes import Processes
 from diagnosis.contracts import Candidate, Fitted, Scored
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.fitted import baseline
+from diagnosis.fitting.twins import misfits
 from diagnosis.localisation.where_when import locate
 from diagnosis.policy import POLICY
-from diagnosis.screening.screen import Screen, alone, proposed, screen
-from diagnosis.search.null import structural_null
-from diagnosis.search.refits import refit
-from diagnosis.search.shortlist import shortlist
+from diagnosis.screening.screen import Screen, proposed, screen
+from diagnosis.search.refits import odds_of, refit, shortlist
 from plants.plant import Case, draw
 from twin.calibration.least_squares import State
 from twin.schema import twin_part
@@ -41,7 +40,7 @@ from twin.schema import twin_part
 GOAL_S, SCREEN_GOAL_S = 30.0, 1.0
 PLANTS = (7, 9, 13)  # seeds of 9, 12 and 14 bodies
 REFITS = 8  # of the candidates that the screen puts first
-STEPS = ("linearise", "assemble", "score a fit", "candidates", "screen", "null", "refit", "locate")
+STEPS = ("linearise", "assemble", "score a fit", "candidates", "refined twins", "screen", "refit", "locate")
 GROWING = ("linearise", "score a fit", "screen", "refit")
 
 
@@ -87,27 +86,27 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
 
     def linearised() -> None:
         problem._last.clear()
-        list(problem.linearise(fitted.x, state.nuisance))
+        list(problem.linearise(fitted.x, fitted.nuisance))
 
     yield "linearise", timed(linearised, repeats)[0]
     if "assemble" in which:
         yield "assemble", timed(lambda: State.at(problem, state.z, state.nuisance, state.noise), repeats)[0]
-    yield "score a fit", timed(lambda: alone(fitted, fitted.memory).base_score(), repeats)[0]
+    yield "score a fit", timed(lambda: fitted.marginal.log_evidence(fitted.marginal.grams(fitted.columns)), repeats)[0]
     if "candidates" in which:
         yield "candidates", timed(lambda: proposed(fitted), repeats)[0]
     took, seen = timed(lambda: screen(fitted, p.every), repeats)
     yield "screen", took
-    if "null" in which:
-        columns = {s.candidate.name: s.column for s in seen.scored if s.column >= 0}
-        yield "null", timed(lambda: structural_null(fitted, seen.evidence, columns), 1)[0]
-    yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(seen))
+    if "refined twins" in which:
+        rng = np.random.default_rng(0)
+        drawn = partial(misfits, fitted.machine, fitted.part, fitted.batches, problem, fitted.values)
+        yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, rng), 1)[0]
+    yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(fitted, seen))
     if "locate" in which:
-        yield "locate", timed(lambda: locate(problem, fitted.x, state.nuisance, fitted.batches), 1)[0]
+        yield "locate", timed(lambda: locate(problem, fitted.x, fitted.own, fitted.batches), 1)[0]
 
 
-def chosen(seen: Screen) -> list[Scored]:
-    listed = shortlist(seen.scored, seen.evidence)
-    return [listed.worth[k] for k in listed.chosen][:REFITS]
+def chosen(fitted: Fitted, seen: Screen) -> list[Scored]:
+    return shortlist(fitted, seen, odds_of(fitted, seen))[:REFITS]
 
 
 def stages_table(case: Case, processes: int) -> None:
@@ -140,7 +139,7 @@ def steps_table(p: Posed, repeats: int) -> None:
     for step, seconds in steps_of(p, repeats):
         unit = unit or seconds
         goal = f"   goal {1e3 * SCREEN_GOAL_S:.0f} ms" if step == "screen" else ""
-        goal = f"   {POLICY.null_machines} finer machines" if step == "null" else goal
+        goal = f"   {POLICY.refined_twins} draws" if step == "refined twins" else goal
         print(f"{step:38} {1e3 * seconds:8.1f} {seconds / unit:7.1f}×{goal}", flush=True)
     print()
 
@@ -159,7 +158,7 @@ def growth_table(title: str, cases: Sequence[tuple[float, Posed]], repeats: int)
 
 def side_by_side(p: Posed, processes: int) -> None:
     """The same refits on one process and on several; the second call finds the imports done."""
-    work = chosen(screen(p.fitted, p.every))
+    work = chosen(p.fitted, screen(p.fitted, p.every))
     print(f"{f'{len(work)} refits side by side':38} {'wall s':>8} {'ratio':>8}")
     one = 0.0
     for n in range(1, processes + 1):

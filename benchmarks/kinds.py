@@ -26,13 +26,11 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.processes import Processes
-from diagnosis.contracts import Candidate, Fitted
+from diagnosis.contracts import Candidate
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
-from diagnosis.fitting.fitted import left_out_rows
 from diagnosis.result import Diagnosis
-from diagnosis.search.acceptance import flipped_threshold, least_gain
-from diagnosis.search.decision import Round, agreed_on
+from diagnosis.search.claims import Round
 from evidence.proof.scoring.answer_key import AnswerKey, Spot
 from evidence.proof.scoring.matching import names_term
 from evidence.proof.scoring.true_model import TrueModel, true_model
@@ -115,44 +113,26 @@ def _proposed(
 
 
 def _visible(truth: TrueModel) -> dict[str, Any]:
-    """Whether the true effects, refitted, cut a left-out error by a tenth and gain more than structure does."""
-    return {"visible": list(truth.visible), "true_gain": truth.gain_nats, "true_structure": truth.threshold_nats,
-            "true_least": truth.bar_nats}  # fmt: skip
+    """Whether the true effects, refitted, are visible (`evidence.proof.scoring.true_model`)."""
+    return {"visible": list(truth.visible), "true_gain": truth.gain_nats, "true_structure": truth.threshold_nats}
 
 
 def _round(r: Round, key: AnswerKey, bodies: Mapping[str, str]) -> dict[str, Any]:
-    """The criteria of a round, its best refits, and how far the true candidate came: rank and gain in the screen."""
-    n = len(r.before.batches)
+    """The claim of a round with its features, its best refits, and the rank of the true candidate in the screen."""
 
     def right(c: Candidate) -> bool:
         return any(names_term(c.mechanism, Spot(c.where.kind, c.where.name), term, bodies) for term in key.terms)
 
-    refits = [t for t in r.tried if t.fitted is not None]
-    tried = [
-        {"name": t.candidate.name, "gain": t.gain, "level": t.level, "improved": t.improved, "worse": t.worse,
-         "least": least_gain(t),
-         "structure": r.null.threshold(r.density, name=t.candidate.name), "agreed": agreed_on(t, n),
-         "physics": t.candidate.kind.is_physics, "right": right(t.candidate), "refit": k,
-         "left_out": _left_out(t.fitted)}
-        for k, t in enumerate(refits) if k < SHOWN or right(t.candidate)
-    ]  # fmt: skip
+    tried = [{"name": t.candidate.name, "gain": t.gain, "right": right(t.candidate)} for t in r.tried]
     screened = [
         {"name": s.candidate.name, "screen": k, "gain": s.gain, "absorbed": s.absorbed}
         for k, s in enumerate(r.screen.scored) if right(s.candidate)
     ]  # fmt: skip
     return {
-        "accepted": r.accepted, "threshold": r.threshold, "flipped": flipped_threshold(r.flipped, n),
-        "batches": n, "tried": tried, "before": _left_out(r.before),
-        "refits": len(refits), "screened": len(r.screen.scored), "true": screened[:SHOWN],
+        "accepted": r.accepted, "trust": r.trust, "features": dict(r.features), "raised": list(r.raised),
+        "right": r.best is not None and right(r.best.candidate), "threshold": r.threshold, "tried": tried,
+        "screened": len(r.screen.scored), "true": screened[:SHOWN],
     }  # fmt: skip
-
-
-def _left_out(fitted: Fitted | None) -> list[list[float]]:
-    """Root mean squares left out, in the channels' units, by channel (rows) and batch."""
-    if fitted is None:
-        return []
-    rms = left_out_rows(fitted).rms
-    return [[float(v) for v in own["rms"]] for _, own in rms.groupby("channel")]
 
 
 def after_proposed(rows: Sequence[Mapping[str, Any]], runs: int) -> list[str]:

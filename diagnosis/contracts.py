@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.fitting.regression import Filtered, Memory, memory_left
-from twin.calibration.fit_problem import Noise
+from diagnosis.fitting.marginal import Grams, Marginal
+from twin.calibration.fit_problem import Noise, estimate
 from twin.calibration.least_squares import State, x_of
 from twin.calibration.problem import CalibrationProblem
 from twin.quantity import Parameter, Value
@@ -98,8 +98,6 @@ class CandidateKind(StrEnum):
     LISTED = "listed"
     SENSOR_SWAP = "sensor_swap"
     WRONG_PARAMETER = "wrong_parameter"
-    VARIES_BETWEEN_RUNS = "varies_between_runs"
-    COARSE_NETWORK = "coarse_network"
     FREE_FLUX = "free_flux"
     FREE_SHIFT = "free_shift"
     UNLISTED = "unlisted"
@@ -108,11 +106,6 @@ class CandidateKind(StrEnum):
     def of(cls, mechanism: str) -> CandidateKind:
         """The kind of a mechanism key."""
         return cls._value2member_map_.get(mechanism, cls.LISTED)  # type: ignore[return-value]
-
-    @property
-    def is_physics(self) -> bool:
-        """Whether it is an effect, a fault or a wrong value, and no finer network."""
-        return self is not CandidateKind.COARSE_NETWORK
 
     @property
     def is_unlisted(self) -> bool:
@@ -130,11 +123,10 @@ class Where:
 
 @dataclass(frozen=True)
 class Change:
-    """A value of the machine file that is doubted: freed with this spread, or different from run to run."""
+    """A value of the machine file that is doubted: freed with this spread, in the fitting coordinate."""
 
     parameter: Parameter
-    spread: float | None = None  # in the fitting coordinate
-    per_batch: float | None = None
+    spread: float
 
 
 @dataclass(frozen=True)
@@ -146,7 +138,6 @@ class Candidate:
         amplitudes: the parameters that switch it off, with the values at which they do.
         shape: parameters that are freed with them.
         change: of an alternative that changes a value.
-        parts: of an alternative that refines the network, by path.
     """
 
     mechanism: str
@@ -159,7 +150,6 @@ class Candidate:
     fault: bool = False
     change: Change | None = None
     variant_of: str = ""  # the name of what this is at another value of its shape
-    parts: Mapping[str, BaseModel] = field(default_factory=dict)  # by path: what a finer network states anew
 
     @property
     def kind(self) -> CandidateKind:
@@ -177,10 +167,7 @@ class Candidate:
             ValueError: the name is taken.
         """
         if self.change is not None:
-            new = {"spread": self.change.spread, "per_batch": self.change.per_batch}
-            return with_value(part, self.change.parameter, **{k: v for k, v in new.items() if v is not None})
-        if self.parts:
-            return with_parts(part, self.parts)
+            return with_value(part, self.change.parameter, spread=self.change.spread)
         assert self.part is not None
         if self.name in part.mechanisms:
             raise ValueError(f"mechanisms.{self.name}: is there already; the candidate needs another name")
@@ -192,56 +179,37 @@ class Candidate:
 class Scored:
     """A candidate with what the screen says of it; the amplitude in its own unit (of a value's logarithm: a factor).
 
-    `gain` in nats of left-out log density, `improved` of the batches, `absorbed` the share of its signature that a
-    recalibration takes; `moves` (p,) is the linear step of the fit's parameters z with it, where that was computed.
+    `gain` in nats of log evidence, `absorbed` the share of its signature that a recalibration and structure take, `sd`
+    of its amplitude, `column` of its signature in the screen, -1 where it has none.
     """
 
     candidate: Candidate
-    gain: float
-    improved: int
-    absorbed: float
-    amplitudes: dict[str, float]
-    sd: float
-    column: int
-    moves: tuple[float, ...] = ()
+    gain: float = 0.0
+    absorbed: float = 0.0
+    amplitudes: Mapping[str, float] = field(default_factory=dict)
+    sd: float = 0.0
+    column: int = -1
 
 
 @dataclass(frozen=True, eq=False)  # compared by identity, so that results may be cached by fit
-class Fitted:
-    """A twin part at its best fit: the problem that its recordings pose and where the descent ended."""
+class Point:
+    """A twin part and the problem that its recordings pose, at z (p,) and at the batches' own unknowns."""
 
     machine: Machine
     part: TwinPart
     batches: tuple[Batch, ...]
     problem: CalibrationProblem
-    state: State
-    runs: int = 0  # that the batches come from, where they are blocks of fewer
+    z: Array
+    nuisance: list[Array]
 
     @cached_property
     def x(self) -> Array:
-        return x_of(self.problem.unknowns, self.state.z)
+        return x_of(self.problem.unknowns, self.z)
 
     @cached_property
     def values(self) -> Array:
         """Parameter values (n,) of the network."""
         return self.problem.values_at(self.x)
-
-    @cached_property
-    def memory(self) -> Memory:
-        """The autocorrelation of each channel in this fit's residuals."""
-        return memory_left(self.problem, self._left)
-
-    @cached_property
-    def noise(self) -> Noise:
-        """The noise of each channel in this fit's residuals, and how many rows count as one."""
-        filtered = Filtered(self.problem, self.memory)
-        return replace(
-            filtered.noise_of(self._left, self.state.arrow.effective_parameters()), inflation=self.memory.inflation
-        )
-
-    @cached_property
-    def _left(self) -> list[Array]:
-        return self.problem.residuals(self.x, self.state.nuisance)
 
     @property
     def step_s(self) -> float:
@@ -251,41 +219,94 @@ class Fitted:
     @cached_property
     def rows(self) -> Array:
         """Rows (K,) of each channel in all batches."""
-        return np.bincount(np.concatenate(self.state.channels), minlength=len(self.problem.channels)).astype(float)
+        every = np.concatenate([m.channel for m in self.problem.measured])
+        return np.bincount(every, minlength=len(self.problem.channels)).astype(float)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted(Point):
+    """A point at its best fit under a covariance, which all fits of a diagnosis share.
+
+    `columns` (n_b, p + 1) of every batch are the whitened model, per unit of z, and the target; `runs` that the batches
+    come from, where they are blocks of fewer. `nuisance` is where the batches' own unknowns were linearised, `own` what
+    they are in this fit.
+    """
+
+    marginal: Marginal
+    columns: list[Array]
+    runs: int = 0
+    weight: tuple[float, ...] = ()  # by channel, where some count for more when the twin is to simulate alone
+
+    @cached_property
+    def grams(self) -> Grams:
+        return self.marginal.grams(self.columns)
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Nats, up to a constant that all fits of a diagnosis share (Laplace approximation)."""
+        return self.marginal.log_evidence(self.grams)
+
+    @cached_property
+    def foretold(self) -> Array:
+        """Log density (B,) of every batch, predicted from all others, in nats."""
+        return self.marginal.foretold(self.grams)
+
+    @cached_property
+    def own(self) -> list[Array]:
+        """Each batch's unknowns by least squares under the covariance's blocks: a start is no structure."""
+        white, blocks = self.marginal.covariance.white, self.problem.linearise(self.x, self.nuisance)
+        every = enumerate(zip(blocks, self.nuisance, strict=True))
+        return [v + own_step(white(k, b.nuisance), v, white(k, b.residual)) for k, (b, v) in every]
+
+    @cached_property
+    def noise(self) -> Noise:
+        """What each channel leaves, and how many rows count as one."""
+        left = self.problem.residuals(self.x, self.own)
+        return estimate(left, [m.channel for m in self.problem.measured], len(self.problem.channels), len(self.z))
+
+    @cached_property
+    def state(self) -> State:
+        """The fit as a calibration has it; its information is that with structure integrated out."""
+        state = State.at(self.problem, self.z, self.own, self.noise)
+        c = self.marginal.reduced(self.grams)[:-1, :-1]
+        root = np.asarray(np.linalg.cholesky(c + np.eye(len(c))).T, float)
+        return replace(state, arrow=replace(state.arrow, root=root, target=np.zeros(len(c))))
+
+
+def own_step(jacobian: Array, own: Array, left: Array) -> Array:
+    """The step (q,) of a batch's own unknowns from `own` that leaves least of rows `left` (n,), priors counted."""
+    normal = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
+    return np.asarray(np.linalg.solve(normal, jacobian.T @ left - own), float)
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A candidate after its full refit (or, without one, by the screen alone): gain in nats on batches left out.
+    """A candidate after its full refit; `gain` in nats of log evidence over the fit before.
 
-    `improved` counts the left-out batches whose squares fall, `worse` those that lose more than chance makes.
-    `cluster` names the first of the candidates that these recordings cannot distinguish; `log_prior` is of its size.
-    `alike` is the gain with rows counted as for the other finalists: it ranks them, while `gain` is what must pass the
-    threshold. `barred`: structure alone may gain as much with it.
+    `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
+    distinguish, `log_prior` of the equipment that it needs and of its size.
     """
 
     scored: Scored
+    fitted: Fitted
     gain: float
-    improved: int
+    by_run: Array
     cluster: str
     log_prior: float
-    fitted: Fitted | None = None
-    alike: float | None = None
-    barred: bool = False
-    worse: int = 0
 
     @property
     def candidate(self) -> Candidate:
         return self.scored.candidate
 
     @property
-    def level(self) -> float:
-        """The gain that ranks it."""
-        return self.gain if self.alike is None else self.alike
+    def improved(self) -> int:
+        """Left-out batches that are predicted better."""
+        return int((self.by_run > 0).sum())
 
-    def standing(self, temperature: float) -> float:
-        """Log weight among explanations: the gain in units of what structure scatters it by, and what is plausible."""
-        return self.level / temperature + self.log_prior
+    @property
+    def standing(self) -> float:
+        """Log weight among explanations."""
+        return self.gain + self.log_prior
 
 
 # Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.
@@ -301,20 +322,5 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "refinements": ("what", "why", "before", "after"),
     "limits": ("mechanism", "kind", "name", "words", "limit", "unit", "absorbed", "absorbed_by"),
     "flux": ("kind", "place", "batch", "time_s", "value", "sd", "unit"),
-    "null": ("replicate", "gain", "floor"),
+    "null": ("replicate", "gain"),
 }  # fmt: skip
-
-
-NEAR_SUFFIX, FAR_SUFFIX = "_near", "_far"
-
-
-def pieces_of(part: TwinPart) -> dict[str, str]:
-    """The bodies that are pieces of others around or far from a sensor, as a finer network states them."""
-    out = {}
-    for name in part.bodies:
-        for end in (NEAR_SUFFIX, FAR_SUFFIX):
-            if name.endswith(end):
-                ends = next((link.between for link in part.links.values() if link.between[0] == name), None)
-                if ends is not None:
-                    out[name] = ends[1]
-    return out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,17 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from data.processes import Processes
+from diagnosis.candidates.free_forms import Form
 from diagnosis.contracts import Fitted, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.export.machine_file import changed_parts, with_deviations
 from diagnosis.findings import report_data as made
 from diagnosis.findings.conclude import (
-    caps,
     found_of,
     residual_remarks,
     rms_of,
     slow_residual_ratio,
+    unlisted_found,
     verdict_of,
 )
 from diagnosis.findings.report_data import Rms, place_label
@@ -38,22 +38,20 @@ from diagnosis.findings.schema import (
     LeftOutRms,
     NextExperiment,
     Place,
-    Refinement,
 )
 from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, rows_as_given, worsened
+from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, plain, rows_as_given, worsened
 from diagnosis.localisation.balance import impossible
 from diagnosis.localisation.where_when import Located, locate
 from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run, settling_run
 from diagnosis.policy import POLICY
 from diagnosis.result import Diagnosis
-from diagnosis.screening.screen import alone, limits
-from diagnosis.search.decision import Round
+from diagnosis.screening.screen import limits
+from diagnosis.search.claims import Round
 from diagnosis.search.refits import Progress
-from diagnosis.search.residual import UnlistedEffect, in_place_of_listed, unlisted_effect
-from diagnosis.search.search import Search, search, settled, start_worker
-from twin.calibration.identifiability import intervals90
+from diagnosis.search.search import Search, search, start_worker
+from twin.calibration.identifiability import Interval, intervals90
 from twin.calibration.least_squares import result
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
@@ -95,25 +93,18 @@ def diagnose(
         recordings = tuple(b.batch_id for b in batches)
         batches, more = enough_batches(batches)
         remarks += more
-        done = search(baseline(machine, part, batches, tell, len(recordings)), seed, workers, tell, cache)
-        if done.accepted:
-            done = replace(done, final=settled(done.final))
+        fitted = baseline(machine, part, batches, tell, len(recordings), seed)
+        done = search(fitted, workers, tell)
         tell("left out", 0, 0)
-        location = workers.submit(partial(_located, done.baseline, batches))
-        left = unlisted_effect(done, seed)
-        if _physics(done):
-            done, left = in_place_of_listed(done, left, seed) or (done, left)
-        first = location()
+        first = _located(done.baseline, batches)
     located: dict[str, pd.DataFrame] = {}
     if isinstance(first, str):
         remarks.append(f"no map of where and when: {first}")
     else:
         located["map"] = first.map
-    if left is not None:
-        last = first if done.final is done.baseline else _located(done.final, batches)
-        if not isinstance(last, str):
-            located["flux"] = left.flux(last)
-    diagnosis = _diagnosis(part, recordings, done, left, located, tuple(remarks))
+        if (form := _unlisted_form(done)) is not None:
+            located["flux"] = first.over_time("heat" if form.heat else "displacement", form.where.name)
+    diagnosis = _diagnosis(part, recordings, done, located, tuple(remarks))
     seconds = round(time.perf_counter() - begun, 1)
     return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
 
@@ -127,31 +118,31 @@ def stages(done: Search) -> list[tuple[Fitted, LeftOutRows]]:
 def _located(fitted: Fitted, batches: Sequence[Batch], tell: Progress | None = None) -> Located | str:
     """The map of what a fit cannot explain, or why there is none."""
     try:
-        return locate(fitted.problem, fitted.x, fitted.state.nuisance, batches, progress=tell)
+        return locate(fitted.problem, fitted.x, fitted.own, batches, progress=tell)
     except (InputError, WorkError) as error:
         return str(error)
 
 
-def _physics(done: Search) -> list[Round]:
-    """The rounds that found an effect, and not merely a network too coarse."""
-    return [r for r in done.accepted if r.best is not None and r.best.candidate.kind.is_physics]
+def _unlisted_form(done: Search) -> Form | None:
+    """The term of the first effect that no listed mechanism is."""
+    named = ((r.forms, r.best.candidate) for r in done.accepted if r.best is not None)
+    found: Form | None = next((forms[c.name] for forms, c in named if c.kind.is_unlisted), None)
+    return found
 
 
 def _diagnosis(
     part: TwinPart,
     batches: tuple[str, ...],
     done: Search,
-    left: UnlistedEffect | None,
     located: Mapping[str, pd.DataFrame],
     remarks: tuple[str, ...],
 ) -> Diagnosis:
     """What was found, from the search for listed effects, the effect of no list, and the tables of its localisation."""
     machine, steps = done.baseline.machine, stages(done)
-    final = left.fitted if left is not None else done.final
-    before, after = steps[0][1], steps[-1][1] if final is done.final else left_out_rows(final)
-    named = _physics(done)
-    fit = result(final.problem, replace(final.state, noise=final.noise), POLICY.baseline_tolerance, "")
-    intervals = {i.name: i for i in intervals90(fit, final.problem.unknowns)}
+    final, named = done.final, done.accepted
+    before, after = steps[0][1], steps[-1][1]
+    written = _intervals(plain(final))  # the file's twin simulates alone
+    intervals = {i.name: i for i in written}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
     part_after = with_deviations(final)
@@ -169,13 +160,14 @@ def _diagnosis(
     found = []
     for r in named:
         own_rms = rms_of(made.rms_table(*_around(done, r, steps), final), final)
-        found.append(found_of(done, r, part_after, intervals, own_rms, separates))
-    if left is not None:
-        found.append(left.found(part_after, intervals, rms, caps(final.runs)))
+        one = found_of(done, r, part_after, intervals, own_rms, separates)
+        if one.kind.is_unlisted and r.best is not None:
+            one = unlisted_found(one, r.forms[r.best.candidate.name], final, r.best.candidate, intervals)
+        found.append(one)
     found = sorted(found, key=lambda f: -f.probability) if len(found) > 1 else found
     slow = slow_residual_ratio(rms, final)
     listed = [f for f in found if not f.kind.is_unlisted]
-    verdict = verdict_of(listed, left is not None, rms, slow, final.runs)
+    verdict = verdict_of(listed, len(listed) < len(found), rms, slow, final.runs)
     if run is None and verdict != "explained":
         run = revealing_run(done)
     remarks += residual_remarks(slow, final.runs)
@@ -199,15 +191,14 @@ def _diagnosis(
         "acf": made.acf_table(before, after, final),
         "candidates": made.candidates_table(done.rounds),
         "steps": made.steps_table(done.rounds),
-        "refinements": refinements(done),
         "limits": table,
         "null": made.null_table(last.null),
         **located,
     }
     simulated = any(b.simulated for b in final.batches)
     new_file: dict[str, Any] = {
-        "values": {i.name: i.value for i in intervals.values()},
-        "intervals": tuple(intervals.values()),
+        "values": {i.name: i.value for i in written},
+        "intervals": written,
         "added": changed_parts(part, part_after),
         "notes": _notes(findings, len(batches)),
     }
@@ -226,10 +217,6 @@ def _diagnosis(
             simulated=simulated,
             drafted=drafted,
             remarks=remarks,
-            refinements=tuple(
-                Refinement(what=what, why=why, before=b, after=a)
-                for what, why, b, a in rows_of(everything["refinements"])
-            ),
         ),
         part_before=done.baseline.part,
         part_after=part_after,
@@ -244,6 +231,11 @@ def _diagnosis(
     )
 
 
+def _intervals(fitted: Fitted) -> tuple[Interval, ...]:
+    fit = result(fitted.problem, fitted.state, POLICY.fit_tolerance_nats, "")
+    return tuple(intervals90(fit, fitted.problem.unknowns))
+
+
 def _around(done: Search, r: Round, steps: Sequence[tuple[Fitted, LeftOutRows]]) -> tuple[LeftOutRows, LeftOutRows]:
     """What is left of the batches left out before and after one accepted round."""
     k = next(k for k, other in enumerate(done.accepted) if other is r)
@@ -254,17 +246,6 @@ def _per_batch(table: pd.DataFrame, column: str) -> pd.Series:
     """By batch the mean over channels of log rms, noise taken in."""
     level = pd.Series(np.log(np.hypot(table[column].to_numpy(float), table["floor"].to_numpy(float))))
     return level.groupby(table["batch"].to_numpy()).mean()
-
-
-def refinements(done: Search) -> pd.DataFrame:
-    """What was cut finer before and between findings, with the left-out log score before and after, in nats."""
-    why = "the left-out error of its sensor was far above the noise"
-    rows = []
-    for r in done.accepted:
-        if r.best is not None and not r.best.candidate.kind.is_physics:
-            before = float(alone(r.before, r.before.memory).base_score()[0])
-            rows.append((r.best.candidate.label, why, before, before + r.best.gain))
-    return pd.DataFrame(rows, columns=["what", "why", "before", "after"])
 
 
 def _detection_limits(table: pd.DataFrame) -> tuple[DetectionLimit, ...]:

@@ -35,18 +35,49 @@ class Policy:
     min_rows_per_batch: int = convention(60, "rows, median batch", "a run of ten minutes counts as one of six hours")
     initial_noise_factor: float = convention(3.0, "given noises", "all channels begin alike, so that none is neglected")
     initial_rows_per_value: float = convention(20.0, "rows", "so many rows of a smooth misfit count as one")
-    baseline_tolerance: float = analytic(1e-2, "nats", "a smaller fall of the cost changes no decision")
-    baseline_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
-    settle_steps: int = cost(4, "steps per round", "noise and memory are estimated again after them")
-    settle_tolerance: float = analytic(0.01, "nats", "a smaller fall of the cost changes no decision")
-    settle_rounds: int = cost(10, "rounds", "bounds the rounds of noise and memory")
-    settle_max_move_sd: float = analytic(0.1, "prior sd", "a round that moves no parameter further is the last")
-    memory_min_rows: int = analytic(20, "rows", "fewer rows of a channel do not show a correlation")
-    memory_min_gain_nats: float = analytic(4.0, "nats", "what the two parameters of a memory must be worth")
-    min_noise_variance_share: float = physical(0.25, "of the given", "machine files state noise on the safe side")
-    min_residual_freedom: float = analytic(0.1, "of the rows", "keeps the noise finite where parameters outnumber rows")
+    first_steps: int = cost(40, "steps", "bounds the descent from the values of the machine file")
+    baseline_steps: int = cost(12, "steps", "under each covariance")
+    weight_rounds: int = cost(3, "rounds", "of more weight for channels that would be predicted worse")
+    weight_factor: float = convention(4.0, "factor", "of such a channel's weight in each of them")
+    plain_steps: int = cost(5, "steps", "of a fit that is to simulate alone")
 
-    # Slack of a lumped network
+    # Refined twins and their covariance
+    refined_twins: int = cost(100, "draws", "directions of structure; half as many about the first calibration")
+    drawn_value_log_sd: float = physical(0.2, "log", "effective values of lumps scatter as much")
+    drawn_exponent_log_sd: float = physical(0.25, "log", "heat grows with speed by other powers than a law states")
+    drawn_cells: tuple[int, int] = physical((3, 8), "cells", "of a body that is cut into a chain")
+    drawn_length_centre: tuple[float, float] = physical((0.25, 0.75), "of a body", "where the mean of a length lies")
+    inner_conductance: tuple[float, float] = physical(
+        (0.7, 0.7), "of what leaves the body, median; log sd", "castings have Biot numbers about 1"
+    )
+    thin_body_share: float = physical(0.25, "probability", "screws and sheets conduct far less than they exchange")
+    thin_body_conductance: tuple[float, float] = physical((0.1, 1.0), "as above", "of such a body")
+    start_gradient_share: float = physical(0.1, "of the file's initial spread", "what a machine has done before")
+    start_gradient_min_sd_K: float = physical(0.03, "K", "no body is at one temperature")
+    run_to_run_log_sd: float = physical(0.05, "log", "no heat is the same in every run")
+    draw_max_size: float = analytic(4.0, "median draws", "a larger one would be the only direction")
+    rough_memory: tuple[float, float] = convention((0.5, 0.9), "share; AR(1)", "before structure is learned")
+    rough_structure_factor: float = convention(1.5, "of the draws", "before their scale is learned")
+    alone_shares: tuple[float, ...] = analytic(
+        (0.0, 0.3, 1.0, 4.0), "of a draw's own variance", "grid of the likelihood"
+    )
+    structure_scales: tuple[float, ...] = analytic(
+        (0.0, 0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), "of the draws", "grid of the likelihood"
+    )
+    noise_min_rows: int = analytic(10, "rows", "fewer second differences show no noise")
+    noise_kept_share: float = analytic(0.95, "of the rows", "the rest are jumps of a driver")
+    noise_kept_factor: float = analytic(1.15, "factor", "what that share lacks of a normal distribution's rms")
+    rounded_min_share: float = convention(0.05, "of the rows", "that stand still: the channel is rounded")
+    white_noise_bounds: tuple[float, float] = physical((0.5, 5.0), "given noises", "what a machine file may be off by")
+    channel_rounds: int = cost(2, "rounds", "of noise that no refined twin shows")
+    channel_min_excess: float = analytic(1.1, "sd", "less is chance")
+    fit_steps: int = cost(6, "steps", "of a refit; most end after three")
+    fit_tolerance_nats: float = analytic(0.1, "nats", "a smaller fall of the cost changes no decision")
+    damping_tries: int = cost(7, "steps", "shorter each time, before a fit ends")
+    damping_start: float = convention(1e-3, "of the curvature", "of the first shorter step")
+    damping_factor: float = convention(6.0, "factor", "from one shorter step to the next")
+
+    # Imperfections of any machine
     sensor_place_sd: float = physical(0.1, "of a neighbour's lead", "a sensor in a casting stands in a gradient")
     chain_span_sd: float = physical(0.15, "of a length", "a length of an error chain spans a part of its body")
     small_body_span_sd: float = physical(0.5, "of a length", "its ends are as far apart as its neighbours")
@@ -54,35 +85,16 @@ class Policy:
     small_body_capacity_share: float = physical(
         0.03, "of the machine", "a smaller body bends nothing that an error shows"
     )
+    sensor_bonding_sd: float = physical(0.03, "share", "a sensor sees a little of the air")
+    sensor_offset_sd_K: float = physical(0.05, "K", "of a sensor for which the machine file states none")
     sensor_lag_sd_s: float = physical(240.0, "s", "lag of a sensor for which the machine file states none")
     held_lag_log_sd: float = physical(1.5, "log", "a lag that the machine file holds fixed")
     film_area_sd: float = physical(0.2, "m2 per W/K", "about all of a film that is stated as a constant is natural")
-    run_to_run_log_sd: float = physical(0.05, "log", "no heat and no exposure is the same in every run")
     time_skew_sd_rows: float = analytic(0.1, "rows", "a row is a mean over its interval, which blurs corners")
     logger_skew_sd_rows: float = analytic(0.3, "rows", "a time stamp lies anywhere within its interval, uniformly")
 
-    # Coarse network
-    coarse_min_mean_square: float = convention(9.0, "given variances", "three times the noise need no finer network")
-    coarse_sensors: int = cost(2, "sensors", "refinements are tried at the worst only")
-    near_piece_capacity_share: float = physical(0.15, "of the body", "a piece around a sensor, to begin with")
-    near_piece_conductance_factor: float = physical(
-        3.0, "of the body's total", "start of the link from a piece to its body"
-    )
-    far_piece_capacity_share: float = physical(0.4, "of the body", "a piece far from a sensor, to begin with")
-    half_body_conductance_factor: float = physical(0.5, "of the body's total", "start of the link between two halves")
-    shortcut_conductance_factor: float = physical(0.1, "of the body's total", "start of a shortcut across a body")
-    shortcut_log_sd: float = physical(1.5, "log", "prior of a shortcut; wider than that of a piece")
-    coarse_log_sd: float = physical(1.0, "log", "prior of a piece's capacity and conductance, and of a doubted value")
-    coarse_shortcuts: int = cost(1, "per body", "the pair of neighbours that conduct best")
-    coarse_heats: int = cost(1, "per body", "heat that may enter half of the body; one that was found comes first")
-    coarse_entry_links: int = cost(1, "per body", "the best conducting links, through which heat may enter a piece")
-    coarse_min_refit_gain_nats: float = development(20.0, "nats", "from it on a coarse network may be the cause")
-    coarse_first_gain_share: float = development(0.9, "of the best gain", "a finer network is the simpler explanation")
-    coarse_alternatives: int = cost(2, "finer networks", "fitted with each effect before one of them is preferred")
-    coarse_min_gain_nats: float = development(40.0, "nats", "a finer network claims no physics")
-
     # Priors of candidates
-    doubted_run_to_run_log_sd: float = physical(0.2, "log", "a value that may differ from run to run")
+    doubted_value_log_sd: float = physical(1.0, "log", "prior of a value of the machine file that is doubted")
     typical_conductance_W_per_K: float = physical(20.0, "W/K", "a link or exposure of a machine tool's body")
     machine_size_factor: float = physical(10.0, "factor", "within it a machine is of the usual size; priors are wider")
     amplitude_min_log_sd: float = physical(1.5, "log", "machines differ by more than their handbook values")
@@ -90,127 +102,45 @@ class Policy:
     signed_prior_sd_factor: float = physical(3.0, "usual spreads", "prior sd of a signed amplitude")
     signed_start_factor: float = convention(2.0, "of the start", "least prior sd, so that the start is plausible")
     signed_usual_sd_factor: float = physical(5.0, "usual spreads", "sd of a signed amplitude when sizes are compared")
-    signed_max_square: float = convention(50.0, "squared sd", "bounds what an unusual signed size costs")
     shape_default_sd: float = physical(0.5, "log, or the parameter's unit", "prior of a shape whose law states none")
-    shape_parameter_cost_nats: float = analytic(2.0, "nats", "each parameter that shapes an effect (Schwarz 1978)")
     unnamed_equipment_odds: float = physical(0.05, "odds", "a machine file seldom leaves out what the machine has")
     machinery_where_nothing_moves_odds: float = physical(1e-3, "odds", "a board of heaters has no bearings")
     missing_companion_cost_nats: float = physical(3.0, "nats", "a law whose companion is not at its place")
+    start_amplitude_shares: tuple[float, ...] = convention(
+        (0.3, 0.1, 0.03), "of the screen's amplitude", "starts in turn, where the whole of it cannot be simulated"
+    )
     start_min_amplitude_share: float = convention(1e-3, "of the usual value", "lowest start of a positive amplitude")
     start_share_margin: float = convention(0.005, "share", "a fitted share begins so far from 0 and 1")
     start_max_log_factor: float = convention(2.0, "log", "a doubted value begins no further from the file's")
-    amplitude_max_growth: float = convention(100.0, "factor", "bounds the ratio of fitted to screened amplitude")
 
-    # Screening and shortlist
-    doubted_value_max_log_factor: float = physical(3.0, "log", "bounds a doubted value in the linear model")
-    finite_change_max_amplitude: float = convention(2.0, "usual changes", "bounds candidates without a derivative")
-    amplitude_reweighting_rounds: int = cost(3, "rounds", "of channels, in a fold, from the optimum on all batches")
+    # Screening and refits
+    screen_amplitude_noises: float = physical(10.0, "given noises", "sd of a signature in the channel it changes most")
+    refit_min_screen_gain_nats: float = convention(2.0, "nats", "a smaller gain in the screen is not refitted")
+    refits: int = cost(10, "refits", "of a round; each takes half a second")
+    refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
+    same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
+    null_folds: int = cost(5, "folds", "of refined twins that are left out of the covariance in turn")
     label_swaps: int = cost(1, "pairs", "exchanged labels are rare; the plainest is tried")
     label_swap_min_gain_nats: float = development(
         60.0, "nats", "33 true swaps gained 70 or more, 37 of 40 false ones under 31"
     )
     label_swap_reweighting_rounds: int = cost(3, "rounds", "what no linear step can fit counts less")
-    screen_min_gain_nats: float = convention(0.5, "nats", "a smaller gain in the screen is not looked at")
-    screened_candidates: int = cost(80, "candidates", "of the screen that are clustered")
-    same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
-    shape_min_gain_nats: float = analytic(5.0, "nats", "what each parameter of a shape must gain in the screen")
-    refits_best: int = cost(5, "refits", "the best of the screen in every round")
-    refits_with_other_mechanisms: int = cost(7, "refits", "together with the best of every other mechanism")
-    refits_of_strong_mechanisms: int = development(3, "refits", "a strong effect has many imitators")
-    strong_gain_share: float = development(0.25, "of the best gain", "from it on a mechanism counts as a strong one")
-    refit_min_screen_gain_nats: float = development(5.0, "nats", "true effects had 26 or more in 112 cases")
-    refits_unconditional: int = development(2, "refits", "a baseline bent by what it lacks shows little in the screen")
-    sharp_refits: int = cost(2, "refits", "candidates at errors that only rows without memory show")
-    sharp_gain_share: float = development(0.1, "of the best gain there", "a weaker one is not refitted")
-    revisited_places: int = cost(2, "places", "of the best refits, before a round ends without a claim")
-    refits_per_revisited_place: int = cost(3, "refits", "an effect that is not linear shows little in the screen")
-    placement_refits: int = cost(6, "refits", "other placements of a law with an open shape")
-    unseen_min_batches: int = analytic(2, "batches", "on either side of a season or speed that is left out")
-    unseen_top_share: float = convention(0.9, "of the highest value", "batches that reach it are the fastest")
 
-    # Refits
-    refit_steps: int = cost(1, "steps", "whether a candidate is in the running needs no more")
-    refit_tolerance: float = cost(0.1, "nats", "a refit only ranks candidates")
-    short_refit_gain_share: float = development(
-        0.5, "of the screen's", "a refit that gains less does not represent its cluster"
-    )
-    continued_refits: int = cost(2, "refits", "that are fitted on, and as many others of their clusters")
-    continued_min_screen_gain_nats: float = cost(20.0, "nats", "below it a refit that fell short is not worth its time")
-    discounted_channel_noise_factor: float = development(
-        2.0, "given noises", "the fit hardly counts a channel beyond it"
-    )
-    equal_weight_steps: int = cost(3, "steps", "of a refit at a discounted error, all rows counted alike")
-    equal_weight_settle_steps: int = cost(2, "steps per round", "after it, with noise and memory estimated")
-    equal_weight_settle_rounds: int = cost(2, "rounds", "bounds the rounds of noise and memory there")
-    finalist_settle_rounds: int = development(4, "rounds", "with ten, 11 gains of 11 to 900 nats rose by 4 at most")
-    start_amplitude_shares: tuple[float, ...] = convention(
-        (0.3, 0.1, 0.03),
-        "of the screen's amplitude",
-        "starts in turn, where a machine with all of it cannot be simulated",
-    )
-    finalists: int = cost(4, "refits", "that are fitted to their optimum and may be claimed")
-    finalist_min_null_share: float = development(0.25, "of the null threshold", "weaker refits are not fitted on")
-    cluster_member_refits: int = cost(2, "refits", "of those that look like a finalist, the likeliest")
-    member_max_deficit: float = development(2.0, "log weight", "a member further below the best is not refitted")
-    member_max_gain_loss: float = development(0.15, "of its gain", "one linear step may make so small a difference")
-    second_pass_min_gain_nats: float = development(20.0, "nats", "of a refit that calls for a second pass")
-    second_pass_finalists: int = cost(2, "refits", "that are fitted to their optimum in the second pass")
-    second_pass_min_finalist_gain_nats: float = development(40.0, "nats", "one step may gain a tenth of the optimum")
-
-    # Acceptance
+    # Claims
     impossible_min_noises: float = analytic(5.0, "given noises", "by chance one row in two million is so far off")
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
-    max_worse_share: float = development(0.25, "of the left-out batches", "an effect makes few runs worse")
-    claim_min_gain_share: float = development(0.5, "of the highest gain", "what improves most batches comes first")
-    alternatives_judged: int = cost(2, "finalists", "after one whose own null speaks against it")
-    joint_gain_share: float = development(0.4, "of its gain alone", "an effect that keeps as much is not explained")
-    nothing_max_odds: float = analytic(20.0, "odds", "of no effect against a claim")
-    sign_flips: int = cost(60, "draws", "of random signs of the residuals, run by run")
+    unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
+    claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
+    claim_offset: float = development(-3.1, "log odds", "logistic model of 93 refits of 31 cases of four kinds")
+    claim_weights: tuple[float, ...] = development(
+        (0.63, 0.4, 0.7, 0.5, -0.9), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`"
+    )
+    claim_min_probability: float = development(0.55, "probability", "the likeliest false claim had 0.51")
     chance_quantile: float = convention(0.99, "probability", "what chance exceeds once in a hundred cases is no claim")
-    own_quantile_min_nats: float = analytic(20.0, "nats", "the scatter of smaller chance gains says nothing")
-    run_to_run_min_sd: float = physical(0.02, "log", "no heat is the same from run to run to less")
-    even_odds_gain_nats: float = development(110.0, "nats", "half of the claims on other numerics were false there")
-    odds_gain_exponent: float = development(2.4, "log odds per log gain", "how trust grows with the gain")
-    odds_cost_worse_batch: float = development(1.2, "log odds", "each batch that gets worse")
-    odds_cost_network: float = development(1.5, "log odds", "what only says how a network is drawn")
-    odds_cost_lever: float = development(1.4, "log odds", "false levers gained up to 253 nats, true ones 343")
-    odds_cost_labels: float = development(4.5, "log odds", "false exchanges gained up to 630 nats, true ones from 1200")
+    null_min_nats: float = analytic(5.0, "nats", "chance gains as much among hundreds of candidates")
+    temperature_null_share: float = development(0.25, "of the null threshold", "scale on which gains are compared")
+    temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")
     max_effects: int = cost(4, "effects", "of one search")
-    max_rounds_per_effect: int = cost(2, "rounds", "finer networks take rounds, too")
-    baseline_restarts: int = cost(2, "rounds", "a round begins again from a better baseline that its refit showed")
-    baseline_restart_min_gain_nats: float = analytic(2.0, "nats", "by which that baseline is better")
-    baseline_restart_min_gain_share: float = development(
-        0.3, "of the effect's", "a smaller gain leads to the same claim"
-    )
-    exchanged_alternatives: int = cost(2, "per effect", "that are tried in its place in backward elimination")
-    exchange_gain_share: float = development(
-        0.5, "of the effect's gain", "an alternative that gained as much may replace it"
-    )
-    exchange_min_gain_nats: float = analytic(3.0, "nats", "by which an alternative must fit better than the effect")
-    needless_max_loss_share: float = development(0.5, "of its accepted gain", "an effect that still loses more stays")
-    elimination_steps: int = cost(4, "steps per round", "of the fit without an effect")
-    elimination_tolerance: float = cost(0.05, "nats", "of the fit without an effect")
-    elimination_rounds: int = cost(2, "rounds", "of the fit without an effect")
-
-    # Structural null
-    null_machines: int = cost(14, "machines", "refined machines with random details")
-    null_min_machines: int = analytic(3, "machines", "fewer give no quantile, and nothing is accepted")
-    null_cells: int = cost(5, "cells", "of each body that is cut into a bar")
-    null_biot: tuple[float, float] = physical((0.03, 0.5), "Biot number", "of a body cut into a bar")
-    null_length_centre: tuple[float, float] = physical((0.25, 0.75), "of a body", "where the mean of a length lies")
-    null_scales: tuple[float, ...] = physical(
-        (0.3, 1.0, 3.0, 8.0), "of each misfit", "real castings are finer than bars of five cells"
-    )
-    null_margin: float = development(1.25, "factor", "on a quantile of so few machines")
-    amplitude_scatter_factor: float = development(
-        2.0, "factor", "plants of other numerics scatter more than refined networks"
-    )
-    amplitude_scatter_quantile: float = convention(0.9, "probability", "of null amplitudes; signed ones two-sided")
-    null_amplitude_bound_factor: float = convention(10.0, "of the fitted size", "bounds amplitudes under the null")
-    temperature_bounds_nats: tuple[float, float] = development(
-        (8.0, 16.0), "nats", "wrong explanations led by up to 28"
-    )
-    temperature_null_share: float = development(0.25, "of the median null gain", "scale on which scores are compared")
 
     # Probability
     few_runs_max_probability: tuple[float, ...] = analytic(
@@ -236,17 +166,6 @@ class Policy:
     linearisations: int = cost(3, "linearisations", "beyond them places and series hardly change")
     located_places: int = cost(3, "places", "that are located one after the other")
     regime_min_row_share: float = convention(0.005, "of all rows", "rarer regimes are left out of the map")
-
-    # Effects of no listed mechanism
-    unlisted_min_gain_ratio: float = development(1.25, "of the listed gain", "unlisted physics must clearly do better")
-    unlisted_min_screen_gain_nats: float = cost(10.0, "nats", "a term with less in the screen is not refitted")
-    unlisted_refits: int = cost(2, "refits", "of each screen: with the rows' memory and without")
-    unlisted_close_gain_share: float = development(
-        0.8, "of the best refit", "such a term may be the best at its optimum"
-    )
-    unlisted_max_terms: int = convention(3, "terms", "of one effect")
-    term_min_gain_nats: float = analytic(3.0, "nats", "what a further term must gain; closer terms are alike")
-    term_min_gain_share: float = analytic(0.02, "of the gain so far", "a smaller one only improves the form of others")
 
     # Next experiment
     clear_probability: float = convention(0.9, "probability", "above it no run is proposed")
@@ -345,37 +264,24 @@ class Policy:
     limit_absorbed_share: float = convention(0.3, "of a signature", "from it on the hiding parameter is named")
 
     # Rules that an ablation takes out
-    counts_row_memory: bool = analytic(True, "yes or no", "rows that repeat each other count for less")
-    leaves_batches_out: bool = analytic(True, "yes or no", "a gain on the rows that were fitted rewards freedom")
-    uses_structural_null: bool = development(
-        True, "yes or no", "a lumped network leaves structure that looks like physics"
-    )
     checks_residual: bool = development(True, "yes or no", "what is left may show that something else is missing")
-
-    @property
-    def null_own_scale(self) -> int:
-        """The number of the scale at which the misfit of a refined machine is its own."""
-        return self.null_scales.index(1.0)
 
 
 POLICY = Policy()
 
 STAGES = {  # the first field of each
     "min_batches": "Fit of a network",
-    "sensor_place_sd": "Slack of a lumped network",
-    "coarse_min_mean_square": "Coarse network",
-    "doubted_run_to_run_log_sd": "Priors of candidates",
-    "doubted_value_max_log_factor": "Screening and shortlist",
-    "refit_steps": "Refits",
-    "max_worse_share": "Acceptance",
-    "null_machines": "Structural null",
+    "refined_twins": "Refined twins and their covariance",
+    "sensor_place_sd": "Imperfections of any machine",
+    "doubted_value_log_sd": "Priors of candidates",
+    "screen_amplitude_noises": "Screening and refits",
+    "impossible_min_noises": "Claims",
     "few_runs_max_probability": "Probability",
     "knot_spacing_s": "Localisation",
-    "unlisted_min_gain_ratio": "Effects of no listed mechanism",
     "clear_probability": "Next experiment",
     "draft_max_batches": "Drafting of a network",
     "active_min_share": "Findings",
-    "counts_row_memory": "Rules that an ablation takes out",
+    "checks_residual": "Rules that an ablation takes out",
 }
 
 

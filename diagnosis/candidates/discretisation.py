@@ -12,22 +12,32 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from diagnosis.candidates.alternatives import heat_amplitudes
-from diagnosis.contracts import Candidate, CandidateKind, Fitted
+from diagnosis.contracts import Candidate, CandidateKind, Point
 from diagnosis.policy import POLICY
 from twin.compiling.cells import several
 from twin.schema import TwinPart
 
-SLACK_MECHANISMS = ("sensor_place", "sensor_lag", "time_skew", "column_bending", "spindle_growth", "natural_convection")
+SLACK_MECHANISMS = (
+    "sensor_place",
+    "sensor_lag",
+    "time_skew",
+    "column_bending",
+    "spindle_growth",
+    "natural_convection",
+    "sensor_bonding",
+    "sensor_offset",
+)
 
 
-def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
+def slack(proposed: Sequence[Candidate], fitted: Point) -> dict[str, float]:
     """Prior sd of the amplitude, by candidate, of those that every fit has as slack."""
     out = {}
     gains, small = _chain_gains(fitted), _small(fitted)
     conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
     films = films_W_per_K(fitted.part, conductance)
     for c in proposed:
+        if c.variant_of:
+            continue
         if c.mechanism == "sensor_place":
             out[c.name] = POLICY.sensor_place_sd
         elif c.mechanism == "time_skew":
@@ -36,6 +46,10 @@ def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
             assert c.part is not None and isinstance(c.part.at, dict)
             if (stated := films.get((c.where.name, str(c.part.at["air"])), 0.0)) > 0:
                 out[c.name] = POLICY.film_area_sd * stated
+        elif c.mechanism == "sensor_bonding":
+            out[c.name] = POLICY.sensor_bonding_sd
+        elif c.mechanism == "sensor_offset":
+            out[c.name] = POLICY.sensor_offset_sd_K
         elif c.mechanism == "sensor_lag":
             out[c.name] = POLICY.sensor_lag_sd_s
         elif (
@@ -57,7 +71,7 @@ def slack(proposed: Sequence[Candidate], fitted: Fitted) -> dict[str, float]:
     return {name: sd for name, sd in out.items() if sd > 0}
 
 
-def never_reported(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
+def never_reported(proposed: Sequence[Candidate], fitted: Point) -> set[str]:
     """Names of the candidates that a lumped network explains at any size; they are never reported."""
     small = _small(fitted)
     return {
@@ -69,24 +83,7 @@ def never_reported(proposed: Sequence[Candidate], fitted: Fitted) -> set[str]:
     }
 
 
-def from_run_to_run(fitted: Fitted) -> dict[int, float]:
-    """Prior sd, in the fitting coordinate, by which an unknown may differ from batch to batch, by its number.
-
-    Only heats and films that the machine file states may differ: an effect is claimed to be the same in every run.
-    """
-    network = fitted.problem.network
-    stated = (fitted.machine.twin or {}).get("mechanisms", fitted.part.mechanisms)
-    heats = {name for j in heat_amplitudes(network) if (name := network.parameters[j].name).split(".")[1] in stated}
-    out = {}
-    for k, u in enumerate(fitted.problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        film = u.name.startswith("exposures.") and u.name.endswith((".conductance", ".coefficient"))
-        if p.scale == "log" and p.per_batch == 0 and (film or u.name in heats):
-            out[k] = POLICY.run_to_run_log_sd
-    return out
-
-
-def _skew_sd_s(c: Candidate, fitted: Fitted) -> float:
+def _skew_sd_s(c: Candidate, fitted: Point) -> float:
     """Prior sd of a clock's skew: of a sensor, of one error, and of all errors together, which share a logger."""
     if c.where.kind == "sensor":
         return POLICY.sensor_lag_sd_s
@@ -116,7 +113,7 @@ def films_W_per_K(part: TwinPart, conductance: Mapping[str, float]) -> dict[tupl
     return out
 
 
-def _small(fitted: Fitted) -> set[str]:
+def _small(fitted: Point) -> set[str]:
     """Bodies whose capacity is too small to bend the structure that carries the tool."""
     network = fitted.problem.network
     every = network.capacity_J_per_K(fitted.values)
@@ -124,7 +121,7 @@ def _small(fitted: Fitted) -> set[str]:
     return {name for name, capacity in own.items() if capacity < POLICY.small_body_capacity_share * sum(own.values())}
 
 
-def _chain_gains(fitted: Fitted) -> dict[tuple[str, str], float]:
+def _chain_gains(fitted: Point) -> dict[tuple[str, str], float]:
     """Displacement per kelvin, in the error's unit, by error and body; tilts are left out."""
     network = fitted.problem.network
     out: dict[tuple[str, str], float] = {}

@@ -15,7 +15,6 @@ import numpy as np
 
 from data.batch import Batch
 from data.machine import Machine
-from diagnosis.candidates.library import own_bodies
 from diagnosis.contracts import Candidate, CandidateKind, Where
 from diagnosis.findings.report_data import as_given, few, listed, with_unit
 from twin.mechanisms import MECHANISMS
@@ -134,7 +133,7 @@ def candidate_of(forms: Sequence[Form], body: str = "") -> Candidate:
 def free_forms(machine: Machine, part: TwinPart, batches: Sequence[Batch]) -> list[Form]:
     """Every term at every body and error, the simpler ones of a place first."""
     drivers = list(levels(batches))
-    bodies = own_bodies(part)
+    bodies = list(part.bodies)
     errors = [e for e in part.errors if machine.channels[e].unit == "um"]
     return [f for b in bodies for f in _at_body(b, drivers)] + [
         f for e in errors for f in _at_error(e, bodies, drivers)

@@ -10,7 +10,7 @@ from functools import lru_cache
 from itertools import combinations, product
 
 from data.machine import Machine
-from diagnosis.contracts import Candidate, Kind, Where, pieces_of
+from diagnosis.contracts import Candidate, Kind, Where
 from diagnosis.policy import POLICY
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
@@ -223,7 +223,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
     if target == "exposure" and "surrounding" in mechanism.acts_at and "expand" in mechanism.effects():
         return []  # it stands between a surrounding and all that it surrounds
     if target in ("node", "start"):
-        return [Site(kind, name) for name in own_bodies(part)]
+        return [Site(kind, name) for name in list(part.bodies)]
     if target == "heat":
         return [
             Site(kind, name, outlets_of(given))
@@ -231,7 +231,7 @@ def _sites(part: TwinPart, mechanism: type[Mechanism], target: Target) -> list[S
             if "heat_W" in MECHANISMS[given.law].effects() and given.law in (mechanism.multiplies or (given.law,))
         ]
     groups: dict[Target, Mapping[str, object]] = {
-        "link": _own_links(part), "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
+        "link": part.links, "exposure": part.exposures, "sensor": part.sensors, "error": part.errors,
         "surrounding": part.surroundings,
     }  # fmt: skip
     if target == "surrounding":  # ground that follows the season is no air
@@ -307,34 +307,19 @@ def _places(part: TwinPart, port: str, role: PortRole, site: Site) -> list[str]:
         return linked(part, site.name)
     if role == "unlinked":
         return _unlinked(part, site.name)
-    return own_bodies(part)
+    return list(part.bodies)
 
 
 def _unlinked(part: TwinPart, body: str) -> list[str]:
     """The bodies further down in the file that no link or exposure joins with a body: each pair comes once."""
-    own, near = own_bodies(part), linked(part, body)
+    own, near = list(part.bodies), linked(part, body)
     exposed = {frozenset((e.of.partition("@")[0], e.to)) for e in part.exposures.values()}
     return [n for n in own[own.index(body) + 1 :] if n not in near and frozenset((n, body)) not in exposed]
 
 
-def own_bodies(part: TwinPart) -> list[str]:
-    """The machine's bodies: physics at a piece that a finer network invented would be the network's, not hers."""
-    pieces = pieces_of(part)
-    return [name for name in part.bodies if name not in pieces]
-
-
-def _own_links(part: TwinPart) -> dict[str, Link]:
-    """Those between the machine's bodies."""
-    whole = pieces_of(part)
-    return {k: link for k, link in part.links.items() if len({whole.get(n, n) for n in ends_of(link)}) > 1}
-
-
 def linked(part: TwinPart, body: str) -> list[str]:
-    """The bodies that a body has a link with, in the file's order; a piece of a body counts as the body."""
-    whole = pieces_of(part)
-    ends = [tuple(whole.get(name, name) for name in ends_of(link)) for link in part.links.values()]
-    body = whole.get(body, body)
-    near = {b if a == body else a for a, b in ends if body in (a, b)}
+    """The bodies that a body has a link with, in the file's order."""
+    near = {b if a == body else a for a, b in map(ends_of, part.links.values()) if body in (a, b)}
     return [name for name in part.bodies if name in near and name != body]
 
 
@@ -346,7 +331,7 @@ def ends_of(link: Link) -> list[str]:
 def _there_already(part: TwinPart, c: Candidate) -> bool:
     """Whether the machine file has this law at this place with these drivers: its values are the baseline's to fit."""
     assert c.part is not None
-    own, pieces = _ends(c.part), pieces_of(part)
+    own = _ends(c.part)
     either_way = {"unlinked", "facing"} & set(MECHANISMS[c.mechanism].port_roles.values())
     for given in part.mechanisms.values():
         if given.law != c.mechanism or driver_channels(given) != driver_channels(c.part):
@@ -356,7 +341,7 @@ def _there_already(part: TwinPart, c: Candidate) -> bool:
             return True
         if c.part.into is not None:
             alike = all(own[port] == ends.get(port, own[port]) for port in own if port in _exchanging(c))
-            if alike and c.part.into in [pieces.get(name, name) for name in outlets_of(given)]:
+            if alike and c.part.into in outlets_of(given):
                 return True
         elif (set(several(c.part.acts_on)) <= set(several(given.acts_on)) and (not ends or ends == own)) or (
             c.part.acts_on is None and ends == own

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.candidates.library import log_prior_odds, outlets_of
-from diagnosis.contracts import Candidate, Fitted, Scored
+from diagnosis.contracts import Candidate, Point, Scored
 from diagnosis.policy import POLICY
-from twin.calibration.least_squares import x_of, z_bounds
 from twin.mechanisms import MECHANISMS
 from twin.quantity import Spec, Value, convert, same_dimension
 from twin.schema import TwinPart
@@ -18,7 +17,7 @@ from twin.schema import TwinPart
 SIZE_UNITS = ("W", "W/K", "m**2")  # units of what goes with the size
 
 
-def size_of(fitted: Fitted) -> float:
+def size_of(fitted: Point) -> float:
     """Geometric mean of the fitted conductances over a machine tool's; 1 where that is within `machine_size_factor`."""
     network = fitted.problem.network
     conductances = np.array([float(e.conductance(fitted.values)) for e in network.edges])
@@ -41,7 +40,7 @@ def at_size(spec: Spec, size: float) -> Spec:
     return replace(spec, value=float(np.clip(spec.value * size, spec.low, spec.high)))
 
 
-def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[str, float]]:
+def start_values(s: Scored, now: Point) -> tuple[Mapping[str, Value], Mapping[str, float]]:
     """A candidate's free values with priors, and parameter values by network name where its fit begins.
 
     The prior's centre is the usual value, its spread wide; the fit begins at the amplitude that the screen found.
@@ -55,18 +54,17 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
         p = c.change.parameter
         margin = POLICY.start_share_margin if p.scale == "logit" else 0.0  # no share begins at 0 or 1: its logit is ∞
         begin = float(np.clip(value * factor, p.low + margin, p.high - margin))
-        return {}, {name: begin} if c.change.spread else {}
-    if c.parts:
-        return {}, {}
+        return {}, {name: begin}
     mechanism = MECHANISMS[c.mechanism]
     values: dict[str, Value] = {}
     at: dict[str, float] = {}
     size = size_of(now)
+    found = _in_proportion(s, size)
     for amplitude, off in c.amplitudes.items():
         spec = at_size(mechanism.spec(amplitude), size)
         if mechanism.any_unit:  # per unit of whatever drives it: no size is usual
             spec = replace(spec, spread=0.0)
-        begin = off + s.amplitudes.get(amplitude, 0.0)
+        begin = off + found.get(amplitude, 0.0)
         values[amplitude], begin = _free(spec, off, begin)
         at[f"mechanisms.{c.name}.{amplitude}"] = begin
         if "expand" in mechanism.effects():  # it is elsewhere in the network, under another name
@@ -84,27 +82,26 @@ def start_values(s: Scored, now: Fitted) -> tuple[Mapping[str, Value], Mapping[s
     return values, at
 
 
-def starts(s: Scored, now: Fitted) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
+def _in_proportion(s: Scored, size: float) -> dict[str, float]:
+    """The amplitudes where a fit begins: one that the screen found, and others of the same law in their usual ratio."""
+    specs = {a: at_size(MECHANISMS[s.candidate.mechanism].spec(a), size) for a in s.candidate.amplitudes}
+    found = {a: v for a, v in s.amplitudes.items() if a in specs}
+    if len(found) != 1 or len(specs) == 1 or any(spec.scale != "log" or not spec.value for spec in specs.values()):
+        return found
+    ((name, value),) = found.items()
+    share = value / (specs[name].value or 1.0) / len(specs)
+    return {a: share * (spec.value or 0.0) for a, spec in specs.items()}
+
+
+def starts(s: Scored, now: Point) -> Iterator[tuple[Mapping[str, Value], Mapping[str, float]]]:
     """Free values and start values of a refit, in the order of trial.
 
     A linear step may lead to a machine that cannot be simulated, as where heat that feeds itself runs away.
     """
     values, at = start_values(s, now)
-    yield values, {**_joint_start(s, now), **at}
     yield values, at
     for share in POLICY.start_amplitude_shares if s.amplitudes else ():
         yield start_values(replace(s, amplitudes={a: share * v for a, v in s.amplitudes.items()}), now)
-
-
-def _joint_start(s: Scored, now: Fitted) -> dict[str, float]:
-    """Start values of the fit's own parameters: the linear joint optimum with the candidate.
-
-    From their old values some channels would start with large residuals, and their noise would be inflated.
-    """
-    z = now.state.z + np.array(s.moves[: len(now.state.z)]) if s.moves else now.state.z
-    values = now.problem.values_at(x_of(now.problem.unknowns, np.clip(z, *z_bounds(now.problem.unknowns))))
-    network = now.problem.network
-    return {u.name: float(values[network.index(u.name)]) for u in now.problem.unknowns}
 
 
 def _free(spec: Spec, off: float, begin: float) -> tuple[Value, float]:
@@ -153,40 +150,32 @@ def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
     return _said(spec.low, spec.unit), _said(spec.high, spec.unit)
 
 
-def log_prior(s: Scored, fitted: Fitted | None, like: Scored | None = None) -> float:
+def log_size(s: Scored, fitted: Point) -> float:
     """Log density of an effect's size about the usual one, 0 at best; signed amplitudes by their usual spread. Of
-    several amplitudes the likeliest: they are parts of one effect, and any may be none.
-
-    Where `fitted` holds a candidate `like` this one instead, the screen's amplitude is scaled as that one's was by its
-    fit. Each shape parameter costs `shape_parameter_cost_nats` (Schwarz 1978).
-    """
+    several amplitudes the likeliest: they are parts of one effect, and any may be none. `fitted` has the effect."""
     c = s.candidate
     if c.mechanism not in MECHANISMS:
         return 0.0
-    mechanism = MECHANISMS[c.mechanism]
-    freedom = -POLICY.shape_parameter_cost_nats * len(c.shape)
-    if fitted is not None:
-        freedom += log_prior_odds(fitted.machine, fitted.part, c)
-    if fitted is not None and mechanism.goes_with and _alone(c, fitted.part):
-        freedom -= POLICY.missing_companion_cost_nats
-    size = size_of(fitted) if fitted is not None else 1.0
+    mechanism, size = MECHANISMS[c.mechanism], size_of(fitted)
+    values = {p.name: v for p, v in zip(fitted.problem.network.parameters, fitted.values, strict=True)}
     sizes: list[float] = []
     for amplitude, off in (mechanism.off or {}).items():
         spec = at_size(mechanism.spec(amplitude), size)
-        value = off + s.amplitudes.get(amplitude, 0.0)
-        name = f"mechanisms.{c.name}.{amplitude}"
-        if fitted is not None and any(p.name == name for p in fitted.problem.network.parameters):
-            value = float(fitted.values[fitted.problem.network.index(name)])
-        elif fitted is not None and like is not None:
-            value = off + (value - off) * _grown(like, fitted)
+        value = float(values.get(f"mechanisms.{c.name}.{amplitude}", off + s.amplitudes.get(amplitude, 0.0)))
         if spec.scale == "log" and spec.value and value > 0:
-            sizes.append(
-                -0.5 * (float(np.log(value / spec.value)) / max(POLICY.amplitude_min_log_sd, spec.spread or 0.0)) ** 2
-            )
+            sd = max(POLICY.amplitude_min_log_sd, spec.spread or 0.0)
+            sizes.append(-0.5 * (float(np.log(value / spec.value)) / sd) ** 2)
         elif spec.scale == "linear" and spec.spread:
-            square = ((value - off) / (POLICY.signed_usual_sd_factor * spec.spread)) ** 2
-            sizes.append(-0.5 * min(square, POLICY.signed_max_square))
-    return max(sizes, default=0.0) + freedom
+            sizes.append(-0.5 * ((value - off) / (POLICY.signed_usual_sd_factor * spec.spread)) ** 2)
+    return max(sizes, default=0.0)
+
+
+def log_odds(c: Candidate, now: Point, variants: int) -> float:
+    """Log odds of a candidate before the recordings: of its equipment, of laws that go with it at its place, and of its
+    mechanism, spread over so many variants: hundreds of an unlikely law weigh no more than one."""
+    out = log_prior_odds(now.machine, now.part, c) - float(np.log(max(1, variants)))
+    lonely = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].goes_with and _alone(c, now.part)
+    return out - POLICY.missing_companion_cost_nats if lonely else out
 
 
 def _alone(c: Candidate, part: TwinPart) -> bool:
@@ -195,19 +184,6 @@ def _alone(c: Candidate, part: TwinPart) -> bool:
         given.law in MECHANISMS[c.mechanism].goes_with and c.where.name in outlets_of(given)
         for given in part.mechanisms.values()
     )
-
-
-def _grown(like: Scored, fitted: Fitted) -> float:
-    """The ratio of the fitted to the screened amplitude; 1 where that is not known."""
-    c, most = like.candidate, POLICY.amplitude_max_growth
-    if c.mechanism not in MECHANISMS:
-        return 1.0
-    for amplitude, off in (MECHANISMS[c.mechanism].off or {}).items():
-        name = f"mechanisms.{c.name}.{amplitude}"
-        seen = like.amplitudes.get(amplitude, 0.0)
-        if seen and any(p.name == name for p in fitted.problem.network.parameters):
-            return float(np.clip((fitted.values[fitted.problem.network.index(name)] - off) / seen, 1.0 / most, most))
-    return 1.0
 
 
 def _stated(spec: Spec, c: Candidate) -> Spec:

@@ -238,7 +238,7 @@ def with_deviations(fitted: Fitted) -> TwinPart:
 
 def deviations(fitted: Fitted) -> dict[str, float]:
     """By parameter that differs from run to run the sd of its logarithm over the batches."""
-    own = fitted.problem.own_deviations(fitted.state.nuisance)
+    own = fitted.problem.own_deviations(fitted.own)
     names = [fitted.problem.network.parameters[k].name for k in fitted.problem.nuisances.parameters]
     return dict(zip(names, np.sqrt(np.mean(own**2, axis=0)).tolist(), strict=True))
 

@@ -9,14 +9,12 @@ import numpy as np
 import pandas as pd
 
 from data.arrays import Array
+from diagnosis.candidates.free_forms import Form, phrases
 from diagnosis.contracts import Candidate, Fitted
-from diagnosis.export.machine_file import deviations
 from diagnosis.findings.report_data import Estimate, Found, Other, Rms, beyond_noise, context_label, place_label
 from diagnosis.findings.schema import Verdict
 from diagnosis.policy import POLICY, Policy
-from diagnosis.screening.unseen import unseen
-from diagnosis.search.decision import Round
-from diagnosis.search.probability import Explanation, explanations, probability_cap, reported
+from diagnosis.search.claims import Explanation, Round, explanations, reported
 from diagnosis.search.search import Search
 from twin.calibration.identifiability import Interval
 from twin.compiling.cells import several
@@ -80,7 +78,7 @@ def usual_size(fitted: Fitted, c: Candidate) -> float:
 
 
 def _simulated(fitted: Fitted, values: Array) -> Simulation:
-    problem, nuisance = fitted.problem, fitted.state.nuisance
+    problem, nuisance = fitted.problem, fitted.own
     return simulate(problem.network, values, *problem.own(nuisance), keep_cells=True)
 
 
@@ -150,8 +148,7 @@ def found_of(
     assert best is not None
     c = best.candidate
     _, nothing, unlisted = explanations(done)
-    trusted = done.trust
-    parameters, was = reported_parameters(final, c, intervals, done.scatter)
+    parameters, was = reported_parameters(final, c, intervals)
     regime, windows = activity(final, c)
     return replace(
         claimed(done, part, final),
@@ -165,16 +162,28 @@ def found_of(
         evidence={
             "gain_nats": best.gain,
             "threshold_nats": float(done.threshold),
+            "left_out_nats": float(best.by_run.sum()),
             "batches_improved": best.improved,
             "batches": len(final.batches),
-            "sign_test_p": done.sign_p,
             "absorbed_share": best.scored.absorbed,
-            "probability_nothing": 1.0 - trusted * (1.0 - nothing),
-            "probability_unlisted": trusted * unlisted,
+            "probability_nothing": nothing,
+            "probability_unlisted": unlisted,
             "step": 1 + next(k for k, r in enumerate(search.rounds) if r is done),
-            **unseen(done.before, best.fitted or final),
         },
         was=was,
+    )
+
+
+def unlisted_found(found: Found, form: Form, final: Fitted, c: Candidate, intervals: Mapping[str, Interval]) -> Found:
+    """A finding of no listed mechanism: its term, and its watts or displacement."""
+    head = f"mechanisms.{c.name}."
+    stated = {n.removeprefix(head): i for n, i in intervals.items() if n.startswith(head)}
+    return replace(
+        found,
+        parameters={n: Estimate(i.value, i.unit, i.low, i.high) for n, i in stated.items()},
+        context=f"it follows {form.label}",
+        evidence={**found.evidence, "follows": phrases([form], {n: i.value for n, i in stated.items()})},
+        size=Estimate(usual_size(final, c), "W" if form.heat else "um"),
     )
 
 
@@ -185,15 +194,14 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
     c = best.tried.candidate
     same = [e for e in every if (e.tried.candidate.mechanism, e.tried.candidate.where) == (c.mechanism, c.where)]
     rest = [e for e in every if e not in same]
-    trusted = done.trust
     return Found(
         mechanism=c.mechanism,
         where=c.where,
         place=_place_of(c, part),
         parameters={},
-        probability=trusted * min(sum(e.probability for e in same), probability_cap(final.runs)),
+        probability=sum(e.probability for e in same),
         context=context_label(c.part, c.where, part) if c.part is not None else "",
-        others=tuple(_other(e, part, trusted) for e in reported([best, *rest])),
+        others=tuple(_other(e, part) for e in reported([best, *rest])),
     )
 
 
@@ -204,27 +212,22 @@ def _place_of(c: Candidate, part: TwinPart) -> str:
     return place_label(c.where, part)
 
 
-def _other(e: Explanation, part: TwinPart, trusted: float) -> Other:
+def _other(e: Explanation, part: TwinPart) -> Other:
     c = e.tried.candidate
     context = context_label(c.part, c.where, part) if c.part is not None else ""
-    return Other(c.mechanism, c.where, _place_of(c, part), trusted * e.probability, context, e.alike)
+    return Other(c.mechanism, c.where, _place_of(c, part), e.probability, context, e.alike)
 
 
 def reported_parameters(
-    final: Fitted, c: Candidate, intervals: Mapping[str, Interval], scatter: float
+    final: Fitted, c: Candidate, intervals: Mapping[str, Interval]
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
     """Fitted values of an effect, in their units, and the machine file's values of those that it corrects.
 
-    `scatter` is by how much structure alone moves the only amplitude, in its unit. A parameter that does nothing at the
-    candidate's place is left out.
+    A parameter that does nothing at the candidate's place is left out.
     """
     network = final.problem.network
     if c.change is not None:
         name = c.change.parameter.name
-        if c.change.per_batch is not None:
-            sd = deviations(final).get(name, float("nan"))
-            n = len(final.batches)  # of a standard deviation from n batches: chi-square
-            return {"deviation": Estimate(sd, "1", sd * (1 - 1.16 / np.sqrt(n)), sd * (1 + 1.16 / np.sqrt(n)))}, {}
         found = intervals.get(name)
         was = {name: c.change.parameter.value}
         if found is None:
@@ -243,9 +246,8 @@ def reported_parameters(
         if at is None or spec in idle:
             continue
         if at in intervals:
-            more = scatter if sizes == [spec] else 0.0
-            if spec in sizes and not MECHANISMS[c.mechanism].fault:
-                more = float(np.hypot(more, POLICY.lumped_amplitude_sd * abs(intervals[at].value)))
+            lumped = spec in sizes and not MECHANISMS[c.mechanism].fault
+            more = POLICY.lumped_amplitude_sd * abs(intervals[at].value) if lumped else 0.0
             out[spec.name] = _widened(intervals[at], spec, more)
         else:
             p = network.parameters[network.index(at)]

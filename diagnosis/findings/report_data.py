@@ -16,9 +16,7 @@ from diagnosis.contracts import COLUMNS, CandidateKind, Fitted, Where
 from diagnosis.findings.schema import rms_key
 from diagnosis.fitting.fitted import LeftOutRows
 from diagnosis.policy import POLICY
-from diagnosis.search.decision import Round
-from diagnosis.search.null import Null
-from diagnosis.search.probability import explanations
+from diagnosis.search.claims import Round, explanations
 from twin.calibration.whiteness import lagged_sums
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
@@ -315,19 +313,18 @@ def candidates_table(rounds: Sequence[Round]) -> pd.DataFrame:
         for e in explanations(done)[0]:
             s, c = e.tried.scored, e.tried.candidate
             amplitude, unit = _amplitude(e.tried.scored.amplitudes, c.mechanism)
-            gain = e.tried.gain if e.tried.alike is None else e.tried.alike  # as they were compared
             rows.append(
-                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.label, e.tried.cluster, gain,
+                (len(rows) + 1, c.mechanism, c.where.kind, c.where.name, c.label, e.tried.cluster, e.tried.gain,
                  e.tried.improved, n, s.absorbed, amplitude, unit, e.probability)
             )  # fmt: skip
     table = pd.DataFrame(rows, columns=list(COLUMNS["candidates"]))
     return table.assign(cluster=1 + pd.factorize(table["cluster"])[0])
 
 
-def _amplitude(amplitudes: dict[str, float], mechanism: str) -> tuple[float, str]:
+def _amplitude(amplitudes: Mapping[str, float], mechanism: str) -> tuple[float, str]:
     if not amplitudes or mechanism not in MECHANISMS:
         return float(np.exp(amplitudes["factor"])) if "factor" in amplitudes else np.nan, "1"
-    name = max(amplitudes, key=lambda a: abs(amplitudes[a]))
+    name = next(iter(amplitudes))
     off = (MECHANISMS[mechanism].off or {}).get(name, 0.0)
     return (
         (off + amplitudes[name], MECHANISMS[mechanism].spec(name).unit)
@@ -345,8 +342,6 @@ def steps_table(rounds: Sequence[Round]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS["steps"]))
 
 
-def null_table(null: Null) -> pd.DataFrame:
-    """The largest gain of any candidate in each recording of a refined machine, and its left-out rms over the noise."""
-    gain = null.gain.ravel()
-    floor = np.sqrt(np.nanmean(null.mean_squares, axis=-1)).ravel()
-    return pd.DataFrame({"replicate": np.arange(len(gain)), "gain": gain, "floor": floor})
+def null_table(null: Array) -> pd.DataFrame:
+    """The largest gain of any candidate in the recordings of each refined twin (T,), nothing missing."""
+    return pd.DataFrame({"replicate": np.arange(len(null)), "gain": null})

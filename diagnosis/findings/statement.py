@@ -233,15 +233,10 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
 
 def _sentence(found: Found) -> str:
     """The claim where it is a sentence by itself: alternatives, and summaries such as "sensor that drifts"."""
-    e = next((found.parameters[p] for p in found.main), None)
     if found.kind is CandidateKind.WRONG_PARAMETER:
         said = [_replaced(p, found.was.get(p), found.parameters[p]) for p in found.parameters]
         several = len(said) > 1
         return f"the value{'s' * several} of {listed(said)} in the machine file {'are' if several else 'is'} wrong"
-    if found.kind is CandidateKind.COARSE_NETWORK:
-        return f"the network is too coarse at {found.place}"
-    if found.kind is CandidateKind.VARIES_BETWEEN_RUNS:
-        return f"{found.place} differs from run to run{f' by ±{_share(e)}' if e else ''}"
     if found.mechanism not in MECHANISMS or found.kind.is_unlisted:
         return ""
     thing = re.match(rf"({_THINGS[found.where.kind]}) that (.+)", MECHANISMS[found.mechanism].summary)
@@ -251,17 +246,10 @@ def _sentence(found: Found) -> str:
     return f"the {thing[1]}{place} {thing[2]}{_in_brackets(found.context)}{_when(found)}{_size(found)}"
 
 
-def _share(e: Estimate) -> str:
-    """A deviation in per cent."""
-    return amount(Estimate(100 * e.value, "%", 100 * e.low, 100 * e.high) if e.unit == "1" else e)
-
-
 def _noun(key: str, where: Where, place: str, context: str = "") -> str:
     """``heat to the floor at the bed``, ``constant error of the sensor front``; alternatives have own phrases."""
     names = {
         CandidateKind.WRONG_PARAMETER: f"a wrong value in the machine file ({where.name})",
-        CandidateKind.COARSE_NETWORK: f"a network too coarse at {place}",
-        CandidateKind.VARIES_BETWEEN_RUNS: f"{place} that differs from run to run",
         CandidateKind.UNLISTED: f"something of no listed mechanism {_at(where, place)}",
     }
     if key not in MECHANISMS:
@@ -295,8 +283,6 @@ def _size(found: Found) -> str:
     """``, 10 W/K (90 %: 9–12)``; a bare number, or one of several, with its parameter's name."""
     if found.size is not None:
         return f", {amount(found.size)}"
-    if found.kind is CandidateKind.VARIES_BETWEEN_RUNS:
-        return "".join(f", by ±{_share(found.parameters[p])}" for p in found.main)
     named = len(found.main) > 1 or any(not unit_label(found.parameters[p].unit) for p in found.main)
     said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
     return f", {listed(said)}" if said else ""

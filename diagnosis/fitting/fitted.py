@@ -1,179 +1,41 @@
-"""Fits of a twin part to recordings: the baseline, refits with a changed part, predictions of batches left out."""
+"""Fits of a twin part under the covariance of its structure: the baseline, refits, predictions of batches left out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
 from data.batch import Batch
-from data.errors import InputError
+from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.contracts import Fitted, pieces_of
-from diagnosis.fitting.regression import Filtered, Whitened, left_where_own_follow, memory_left, settle_filtered, whiter
+from diagnosis.contracts import Fitted, Point, own_step
+from diagnosis.fitting.carried import carried_start
+from diagnosis.fitting.covariance import (
+    Covariance,
+    Structure,
+    beyond_recalibration,
+    clipped,
+    independent,
+    learned,
+    rough,
+    white_noise,
+)
+from diagnosis.fitting.marginal import Marginal
+from diagnosis.fitting.twins import misfits
 from diagnosis.policy import POLICY
+from diagnosis.screening.signatures import imperfections
 from twin.calibration.estimate import check_batches
-from twin.calibration.fit_problem import Noise
-from twin.calibration.least_squares import FitOptions, State, descend, settled, x_of, z_bounds
-from twin.calibration.problem import EVERY_S, CalibrationProblem, Nuisances
+from twin.calibration.fit_problem import Block, Noise, Unknown
+from twin.calibration.least_squares import FitOptions, State, annealed, descend, settled, x_of, z_bounds
+from twin.calibration.problem import EVERY_S, CalibrationProblem
 from twin.compile import compile_network
-from twin.network import Network
 from twin.schema import TwinPart
-from twin.simulation.inputs import Inputs, inputs_of
-
-_NO_PIECES: Mapping[str, str] = {}
-
-
-def on_network(
-    problem: CalibrationProblem,
-    batches: Sequence[Batch],
-    network: Network,
-    free_starts: bool = False,
-    pieces: Mapping[str, str] = _NO_PIECES,
-) -> CalibrationProblem:
-    """The calibration problem of the same recordings with another network (more bodies, laws or drivers).
-
-    A new body starts at the temperature of the body that it is linked with most strongly; with `free_starts` its start
-    is an unknown of each batch. `pieces`, {piece: body}, start with their body: with a start of its own a piece would
-    be a heat store that no body is.
-    """
-    inputs = problem.inputs
-    if not _drives(inputs, network):
-        inputs = inputs_of(network, list(batches)).refined(inputs.every)
-    start = np.full((problem.inputs.n_batches, network.n_cells), np.nan)
-    nuisances = Nuisances.of(network)
-    start_K = nuisances.start_K.copy()
-    for name, cells in network.bodies.items():
-        before = problem.start_degC[:, problem.network.bodies[name]] if name in problem.network.bodies else None
-        if before is not None:  # a body that is cut finer starts at its mean
-            start[:, cells] = before if before.shape[1] == len(cells) else before.mean(axis=1, keepdims=True)
-    for k, (name, cells) in enumerate(network.bodies.items()):
-        if name not in problem.network.bodies:
-            start[:, cells] = _beside(network, start, cells)[:, None]
-            if len(start_K) and name in pieces:
-                start_K[list(network.bodies).index(pieces[name]), cells] = network.start_spread_K
-            if len(start_K) and (not free_starts or name in pieces):
-                start_K[k] = 0.0
-    return CalibrationProblem(network, inputs, problem.measured, start, replace(nuisances, start_K=start_K))
-
-
-def _drives(inputs: Inputs, network: Network) -> bool:
-    """Whether the inputs of another network hold all that drives this one, so that they can be used again."""
-    recorded = {s.channel for s in network.surroundings if s.channel}
-    first = {*(r.channel for r in network.readings), *(c for s in network.surroundings for c in s.first)}
-    drivers = set(network.drivers) <= set(inputs.drivers)
-    return drivers and recorded == set(inputs.recorded) and first <= set(inputs.first)
-
-
-def carried_nuisances(old: CalibrationProblem, new: CalibrationProblem, nuisance: Sequence[Array]) -> list[Array]:
-    """Each batch's own unknowns in the new network's order; new ones are at their prior mean, 0."""
-    names, before = _names(new), {name: k for k, name in enumerate(_names(old))}
-    out = []
-    for own in nuisance:
-        shared = np.array([own[before[n]] if n in before else 0.0 for n in names])
-        out.append(np.concatenate([shared, own[old.nuisances.shared :]]))
-    return out
-
-
-def carried_z(old: CalibrationProblem, new: CalibrationProblem, z: Array) -> Array:
-    """z (p,) of the new problem: parameters that both problems fit at their old values, others at their prior means."""
-    by_name = {u.name: u.prior + u.spread * v for u, v in zip(old.unknowns, z, strict=True)}
-    return np.array([(by_name.get(u.name, u.prior) - u.prior) / u.spread for u in new.unknowns])
-
-
-def _names(problem: CalibrationProblem) -> list[str]:
-    bodies = list(problem.network.bodies) if len(problem.nuisances.start_K) else []
-    air = [f"surrounding {problem.network.surroundings[s].name}" for s in problem.nuisances.surroundings]
-    varying = [problem.network.parameters[k].name for k in problem.nuisances.parameters]
-    return bodies + air + varying
-
-
-def _beside(network: Network, start: Array, cells: NDArray[np.int64]) -> Array:
-    """The start temperature (B,) of the known cell that new ones are linked with most strongly."""
-    conductance = -network.conductance_W_per_K(network.values)[cells].sum(axis=0)
-    conductance[np.isnan(start[0])] = -np.inf
-    return np.asarray(start[:, int(np.argmax(conductance))])
-
-
-def carried_start(
-    old: Fitted, part: TwinPart, at: Mapping[str, float] | None = None
-) -> tuple[CalibrationProblem, Array, list[Array]]:
-    """The problem of a changed twin part, and z (p,) and the batches' own unknowns where its fit begins.
-
-    `at` gives start values by parameter name; other new parameters start at their value in the part.
-
-    Raises:
-        InputError: the part does not compile.
-    """
-    network = compile_network(old.machine, part=part)
-    problem = on_network(old.problem, old.batches, network, free_starts=True, pieces=pieces_of(part))
-    z = carried_z(old.problem, problem, old.state.z)
-    known = {u.name for u in old.problem.unknowns}
-    for k, u in enumerate(problem.unknowns):
-        p = network.parameters[network.index(u.name)]
-        begin = at.get(u.name) if at else None
-        if begin is None and u.name not in known:
-            begin = p.value
-        if begin is not None:
-            z[k] = (float(p.to_x(begin)) - u.prior) / u.spread
-    return problem, z, carried_nuisances(old.problem, problem, old.state.nuisance)
-
-
-def refitted(
-    old: Fitted,
-    part: TwinPart,
-    at: Mapping[str, float] | None = None,
-    steps: int = POLICY.refit_steps,
-    tolerance: float = POLICY.refit_tolerance,
-) -> Fitted:
-    """The same recordings fitted by a changed twin part, starting from the old fit.
-
-    `at` gives start values by parameter name; other new parameters start at their value in the part.
-
-    Noise and memory are estimated before every step, and neither exceeds that of the old fit: a start that is still far
-    off must not make a channel count for less.
-
-    Raises:
-        InputError: the part does not compile; WorkError: it cannot be simulated there.
-    """
-    problem, z, nuisance = carried_start(old, part, at)
-    z = np.clip(z, *z_bounds(problem.unknowns))
-    state = State.at(
-        Filtered(problem, old.memory), z, nuisance, Noise(old.noise.factor, np.ones(len(problem.channels)))
-    )
-    left = left_where_own_follow(problem, state)
-    filtered, state = _counted(old, problem, state, left, old.state.arrow.effective_parameters())
-    for _ in range(steps):
-        state = descend(filtered, state, 1, tolerance)
-        left = problem.residuals(x_of(problem.unknowns, state.z), state.nuisance)
-        filtered, state = _counted(old, problem, state, left, state.arrow.effective_parameters())
-    return replace(old, part=part, problem=problem, state=state)
-
-
-def _counted(
-    old: Fitted, problem: CalibrationProblem, state: State, left: list[Array], parameters: float
-) -> tuple[Filtered, State]:
-    """The state with memory and noise of the residuals `left`, neither above that of the old fit."""
-    filtered = Filtered(problem, whiter(old.memory, memory_left(problem, left)))
-    here = filtered.noise_of(left, parameters)
-    noise = replace(state.noise, factor=np.minimum(here.factor, state.noise.factor))
-    return filtered, State.at(filtered, state.z, state.nuisance, noise)
-
-
-def settle(
-    fitted: Fitted,
-    steps: int = POLICY.settle_steps,
-    tolerance: float = POLICY.settle_tolerance,
-    rounds: int = POLICY.settle_rounds,
-) -> Fitted:
-    """The fit continued to its optimum, with noise and memory estimated in every round until no parameter moves."""
-    return replace(fitted, state=settle_filtered(fitted.problem, fitted.state, steps, tolerance, rounds))
 
 
 def check(machine: Machine, batches: Sequence[Batch]) -> None:
@@ -183,44 +45,241 @@ def check(machine: Machine, batches: Sequence[Batch]) -> None:
     check_batches(machine, batches)
 
 
+def spacing_s(batches: Sequence[Batch]) -> float:
+    """Seconds between the rows that are fitted."""
+    lengths = sorted(b.step_s * b.n_rows for b in batches) or [0.0]  # an empty recording is refused where simulated
+    return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
+
+
 def baseline(
     machine: Machine,
     part: TwinPart,
     batches: Sequence[Batch],
     progress: Callable[[str, int, int], None] | None = None,
     runs: int = 0,
+    seed: int = 0,
 ) -> Fitted:
-    """The twin part fitted to all batches, with noise and memory of every channel estimated from its residuals.
+    """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
 
-    `runs` is the number of runs, where batches are blocks of fewer.
+    Refined twins are drawn twice: about a first calibration, and about the fit under what those say.
+
+    Args:
+        runs: the number of runs, where batches are blocks of fewer.
+        seed: of the refined twins.
 
     Raises:
         InputError: batches of another machine, twice the same, or that cannot be simulated.
-        WorkError: the model fails at the priors' means.
+        WorkError: the model fails at the priors' means, or no refined twin can be simulated.
     """
     check(machine, batches)
+    tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
     problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
-    steps = 0
-
-    def count(_: str) -> None:
-        nonlocal steps
-        steps += 1
-        if progress:
-            progress("baseline", steps, 0)
-
+    tell("baseline", 1, 3)
     k = len(problem.channels)
     alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
-    options = FitOptions(max_iterations=POLICY.baseline_steps, tolerance=POLICY.baseline_tolerance)
-    state, _ = settled(problem, options, count, alike)
-    return settle(Fitted(machine, part, tuple(batches), problem, state, runs or len(batches)))
+    options = FitOptions(max_iterations=POLICY.first_steps, tolerance=POLICY.fit_tolerance_nats)
+    state, _ = settled(problem, options, None, alike)
+    at = Point(machine, part, tuple(batches), problem, state.z, state.nuisance)
+    rng = np.random.default_rng(seed)
+    first = POLICY.refined_twins // 2
+    drawn = _structure(at, first, rng, tell)
+    covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
+    tell("baseline", 2, 3)
+    at = _fitted(at, covariance, runs)
+    drawn = _structure(at, POLICY.refined_twins, rng, tell)
+    tell("baseline", 3, 3)
+    blocks = list(problem.linearise(at.x, at.nuisance))
+    known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
+    structure = Structure(drawn, known, white_noise(problem))
+    return _learned(at, structure, runs, POLICY.alone_shares, np.ones(k))
 
 
-def spacing_s(batches: Sequence[Batch]) -> float:
-    """Seconds between the rows that are fitted."""
-    lengths = sorted(b.step_s * b.n_rows for b in batches) or [
-        0.0
-    ]  # an empty recording is refused where it is simulated
-    return min(EVERY_S, lengths[len(lengths) // 2] / POLICY.min_rows_per_batch) or EVERY_S
+def relearned(fitted: Fitted) -> Fitted:
+    """The fit at its optimum with the scale of structure, and what no draw shows, that are likeliest now: they may have
+    stood in for an effect."""
+    before = fitted.marginal.covariance
+    if before.structure is None:
+        return relinearised(fitted)
+    factor = np.ones(len(fitted.rows)) if before.factor is None else before.factor
+    return replace(_learned(fitted, before.structure, fitted.runs, (before.share,), factor), weight=fitted.weight)
+
+
+def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], factor: Array) -> Fitted:
+    """The fit under the likeliest covariance; `factor` (C,) on each channel's sd begins what no draw shows, as where a
+    nut passes a sensor."""
+    covariance = _likeliest(at, structure, shares, factor)
+    fitted = _fitted(at, covariance, runs)
+    for _ in range(POLICY.channel_rounds):
+        new = np.maximum(factor * _excess(fitted), 1.0)
+        change = new / factor
+        if np.abs(np.log(change)).max() < np.log(POLICY.channel_min_excess):
+            break
+        covariance, factor = covariance.scaled(change), new
+        fitted = _fitted(fitted, covariance, runs)
+    return fitted
+
+
+def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[str, int, int], None]) -> list[Array]:
+    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes."""
+    drawn = misfits(
+        at.machine, at.part, at.batches, at.problem, at.values, draws, rng, lambda n, of: tell("refined twins", n, of)
+    )
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
+
+
+def _likeliest(at: Point, structure: Structure, shares: Sequence[float], factor: Array) -> Covariance:
+    """The covariance of the largest marginal likelihood, over the scale of structure and the share of what each draw
+    alone shows; imperfections of sensors, clocks and films are of given sd."""
+    blocks, n = list(at.problem.linearise(at.x, at.nuisance)), structure.drawn[0].shape[1]
+    best, most = None, -np.inf
+    for share in shares:
+        covariance = learned(at.problem, structure, share).scaled(factor)
+        marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
+        grams = marginal.grams(_columns(marginal, blocks, at))
+        for times in POLICY.structure_scales:
+            scale = np.concatenate([np.full(n, times), np.ones(covariance.directions[0].shape[1] - n)])
+            one = marginal.rescaled(scale)
+            likely = one.log_evidence(grams.rescaled(scale))
+            if likely > most:
+                best, most = one.covariance, likely
+    if best is None:
+        raise WorkError(f"machine {at.machine.machine}: the likelihood of its recordings is not finite")
+    return best
+
+
+def _excess(fitted: Fitted) -> Array:
+    """The sd (C,) of each channel's whitened rows; 1 where it is as it should be."""
+    left = fitted.marginal.leftover(fitted.columns, fitted.z, fitted.grams)
+    channels = np.concatenate([m.channel for m in fitted.problem.measured])
+    rows = np.bincount(channels, minlength=len(fitted.problem.channels))
+    squares = np.bincount(channels, np.concatenate(left) ** 2, minlength=len(rows))
+    return np.asarray(np.sqrt(np.where(rows > 0, squares / np.maximum(rows, 1), 1.0)), float)
+
+
+def _spread(unknowns: Sequence[Unknown]) -> Array:
+    return np.array([u.spread for u in unknowns])
+
+
+def _columns(marginal: Marginal, blocks: Sequence[Block], at: Point) -> list[Array]:
+    """Whitened [model, target] (n_b, p + 1) of blocks linearised at a point."""
+    spread = _spread(at.problem.unknowns)
+    out = []
+    for b, (block, offset) in enumerate(zip(blocks, marginal.offset, strict=True)):
+        model = block.jacobian * spread
+        out.append(marginal.covariance.white(b, np.column_stack([model, block.residual + offset + model @ at.z])))
+    return out
+
+
+def _fitted(at: Point, covariance: Covariance, runs: int) -> Fitted:
+    """A point under a covariance, at its optimum; the batches' own unknowns linearised there."""
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
+    start = Fitted(**_fields(at), marginal=marginal, columns=_columns(marginal, blocks, at), runs=runs)
+    done = relinearised(start, POLICY.baseline_steps)
+    return replace(done, nuisance=done.own)
+
+
+def _fields(at: Point) -> dict[str, Any]:
+    return {f.name: getattr(at, f.name) for f in fields(Point)}
+
+
+def under(fitted: Fitted, covariance: Covariance) -> Fitted:
+    """The fit under another covariance."""
+    return _fitted(fitted, covariance, fitted.runs)
+
+
+def relinearised(fitted: Fitted, steps: int = POLICY.fit_steps) -> Fitted:
+    """The fit at its optimum, with all derivatives taken anew at every step."""
+    problem, marginal, spread = fitted.problem, fitted.marginal, _spread(fitted.problem.unknowns)
+
+    def model(z: Array) -> list[Array]:
+        blocks = problem.linearise(x_of(problem.unknowns, z), fitted.nuisance)
+        return marginal.white([block.jacobian * spread for block in blocks])
+
+    return _descended(fitted, model, steps)
+
+
+def refitted(
+    now: Fitted, part: TwinPart, at: Mapping[str, float] | None = None, steps: int = POLICY.fit_steps
+) -> Fitted:
+    """The same recordings fitted by a changed twin part, starting from a fit.
+
+    Only what is new is linearised anew at every step: the derivatives by parameters that both share are those of the
+    fit before (a chord). `at` gives start values by parameter name; other new parameters start at their value.
+
+    Raises:
+        InputError: the part does not compile; WorkError: it cannot be simulated there.
+    """
+    problem, z, nuisance = carried_start(now, part, at)
+    known = {u: k for k, u in enumerate(now.problem.unknowns)}
+    kept = [k for k, u in enumerate(problem.unknowns) if u in known]
+    new = [k for k, u in enumerate(problem.unknowns) if u not in known]
+    before = [known[problem.unknowns[k]] for k in kept]
+    numbers, spread = [int(problem.network.free[k]) for k in new], _spread(problem.unknowns)
+
+    def model(z: Array) -> list[Array]:
+        out = [np.empty((len(columns), len(z))) for columns in now.columns]
+        for own, columns in zip(out, now.columns, strict=True):
+            own[:, kept] = columns[:, before]
+        if new:
+            slopes = problem.columns(x_of(problem.unknowns, z), nuisance, numbers)
+            for own, slope in zip(out, now.marginal.white([x * spread[new] for x in slopes]), strict=True):
+                own[:, new] = slope
+        return out
+
+    z = np.clip(z, *z_bounds(problem.unknowns))
+    return _descended(replace(now, part=part, problem=problem, z=z, nuisance=nuisance), model, steps)
+
+
+def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int) -> Fitted:
+    """Gauss-Newton from a fit, with the whitened `model` (n_b, p) of every batch at z; a step is shortened until the
+    posterior rises (Levenberg and Marquardt).
+
+    Raises:
+        WorkError: not finite at the start.
+    """
+    problem, marginal, z = fitted.problem, fitted.marginal, fitted.z
+    low, high = z_bounds(problem.unknowns)
+
+    def rows(z: Array) -> tuple[list[Array], float]:
+        """Whitened rows left over at z, and twice the negative log posterior up to a constant."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            left = problem.residuals(x_of(problem.unknowns, z), fitted.nuisance)
+            white = marginal.white([r + offset for r, offset in zip(left, marginal.offset, strict=True)])
+            if not all(np.isfinite(r).all() for r in white):
+                return white, np.inf
+            grams = marginal.grams([r[:, None] for r in white])
+            return white, float(marginal.reduced(grams)[0, 0] + z @ z)
+
+    def at(z: Array, left: Sequence[Array]) -> Fitted:
+        columns = [np.column_stack([own, r + own @ z]) for own, r in zip(model(z), left, strict=True)]
+        return replace(fitted, z=z, columns=columns)
+
+    left, cost = rows(z)
+    if not np.isfinite(cost):
+        raise WorkError(f"machine {fitted.machine.machine}: the twin cannot be simulated where a fit begins")
+    here, damping = at(z, left), 0.0
+    for _ in range(steps):
+        c = marginal.reduced(here.grams)
+        normal = c[:-1, :-1] + np.eye(len(z))
+        slope = c[:-1, -1] - normal @ z
+        for _ in range(POLICY.damping_tries):
+            moved = np.clip(z + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope), low, high)
+            try:
+                left, then = rows(moved)
+            except (InputError, WorkError):
+                then = np.inf  # too far a step: no machine has such values
+            if np.isfinite(then) and then < cost:
+                break
+            damping = max(POLICY.damping_factor * damping, POLICY.damping_start)
+        else:
+            return here
+        fallen, z, cost, damping = cost - then, moved, then, damping / POLICY.damping_factor**2
+        here = at(z, left)
+        if fallen < 2.0 * POLICY.fit_tolerance_nats:
+            return here
+    return here
 
 
 RMS_COLUMNS = ("batch", "channel", "unit", "rows", "rms")
@@ -234,32 +293,51 @@ class LeftOutRows:
     rms: pd.DataFrame
 
 
-@lru_cache(maxsize=8)
-def left_out_rows(fitted: Fitted) -> LeftOutRows:
-    """Every batch predicted by the fit to all others.
+@lru_cache(maxsize=16)
+def plain(fitted: Fitted) -> Fitted:
+    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, and rows that repeat each
+    other count as one (`twin.calibration`). What a machine file states is simulated without structure."""
+    problem = fitted.problem
+    state = State.at(problem, fitted.z, fitted.own, fitted.noise)
+    state = annealed(problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
+    at = Point(fitted.machine, fitted.part, fitted.batches, problem, state.z, state.nuisance)
+    one = calibrated(at, state.noise, fitted.runs)
+    return weighted(one, np.array(fitted.weight)) if fitted.weight else one
 
-    Its own starts and zeros are those of plain least squares: an error is stated in the unit of its channel, and what
-    counts a drift as memory leaves a zero almost free.
-    """
-    problem, state = fitted.problem, fitted.state
-    weight = 1.0 / fitted.noise.factor**2
-    blocks = list(problem.linearise(fitted.x, state.nuisance))
-    rows = [
-        Whitened.at(b, v, state.z, problem.unknowns, (), weight, fitted.memory)
-        for b, v in zip(blocks, state.nuisance, strict=True)
-    ]
-    own = [w.jacobian.T @ w.jacobian for w in rows]
-    to = [w.jacobian.T @ w.target for w in rows]
-    information, total = np.sum(own, axis=0) + np.eye(len(state.z)), np.sum(to, axis=0)
+
+def weighted(one: Fitted, weight: Array) -> Fitted:
+    """A `plain` fit with channels (C,) that count for more."""
+    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(weight))
+    state = State.at(one.problem, one.z, one.nuisance, noise)
+    state = descend(one.problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
+    at = Point(one.machine, one.part, one.batches, one.problem, state.z, state.nuisance)
+    return calibrated(at, noise, one.runs)
+
+
+def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
+    """A calibrated point as a fit of independent rows."""
+    blocks = list(at.problem.linearise(at.x, at.nuisance))
+    covariance = independent(at.problem, 1.0 / np.sqrt(noise.weight))
+    marginal = Marginal(covariance, [b.nuisance for b in blocks], at.nuisance)
+    return Fitted(**_fields(at), marginal=marginal, columns=_columns(marginal, blocks, at), runs=runs)
+
+
+@lru_cache(maxsize=16)
+def left_out_rows(fitted: Fitted) -> LeftOutRows:
+    """Every batch predicted, free-running, by the `plain` fit to all others; its starts and zeros are its own."""
+    return _left_out(plain(fitted))
+
+
+def _left_out(one: Fitted) -> LeftOutRows:
+    problem, spread = one.problem, _spread(one.problem.unknowns)
+    blocks = list(problem.linearise(one.x, one.nuisance))
     low, high = z_bounds(problem.unknowns)
-    spread = np.array([u.spread for u in problem.unknowns])
-    every_z = [
-        np.clip(cho_solve(cho_factor(information - own[k]), total - to[k]), low, high) for k in range(len(blocks))
+    every_z = [np.clip(one.marginal.optimum(one.grams, b), low, high) for b in range(len(blocks))]
+    white = one.marginal.covariance.white
+    nuisance = [
+        v + own_step(white(k, b.nuisance), v, white(k, b.residual - b.jacobian @ (spread * (z - one.z))))
+        for k, (b, v, z) in enumerate(zip(blocks, one.nuisance, every_z, strict=True))
     ]
-    nuisance = []
-    for k, (block, w, z) in enumerate(zip(blocks, rows, every_z, strict=True)):
-        moved = block.residual + block.nuisance @ state.nuisance[k] - block.jacobian @ (spread * (z - state.z))
-        nuisance.append(_least_squares(*((part.T * w.scale).T for part in (block.nuisance, moved))))
     return _rows_left(problem, every_z, nuisance)
 
 
@@ -267,12 +345,10 @@ def rows_as_given(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted by the machine file's own values; its starts and zeros alone are fitted."""
     problem = fitted.problem
     z = np.zeros(len(problem.unknowns))
-    nuisance = [np.zeros_like(own) for own in fitted.state.nuisance]
+    nuisance = [np.zeros_like(own) for own in fitted.nuisance]
     for _ in range(2):  # starts enter the temperatures linearly, through laws nearly so
         blocks = problem.linearise(x_of(problem.unknowns, z), nuisance)
-        nuisance = [
-            _least_squares(b.nuisance, b.residual + b.nuisance @ own) for b, own in zip(blocks, nuisance, strict=True)
-        ]
+        nuisance = [own + own_step(b.nuisance, own, b.residual) for b, own in zip(blocks, nuisance, strict=True)]
     return _rows_left(problem, [z] * len(nuisance), nuisance)
 
 
@@ -288,10 +364,21 @@ def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, 
     return {str(c): (float(old[c].mean()), float(new[c].mean())) for c in rise.index[rise > se]}
 
 
-def _least_squares(jacobian: Array, aim: Array) -> Array:
-    """Unknowns of unit prior spread (q,) by regularised least squares."""
-    normal = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
-    return np.asarray(np.linalg.solve(normal, jacobian.T @ aim), float)
+def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[float, float]]]:
+    """The fit after, calibrated so that no channel is predicted worse than before, and the channels that still are.
+
+    What it adds lets it predict every channel as well; which of them it favours is a matter of weights.
+    """
+    weight = np.ones(len(after.problem.channels))
+    raised = worsened(left_out_rows(before), left_out_rows(after))
+    for _ in range(POLICY.weight_rounds):
+        if not raised:
+            break
+        weight[[after.problem.channels.index(c) for c in raised]] *= POLICY.weight_factor
+        then = worsened(left_out_rows(before), _left_out(weighted(plain(after), weight)))
+        if not then:
+            return replace(after, weight=tuple(weight.tolist())), then
+    return after, raised
 
 
 def _rows_left(problem: CalibrationProblem, every_z: Sequence[Array], nuisance: Sequence[Array]) -> LeftOutRows:

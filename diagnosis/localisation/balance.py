@@ -55,10 +55,15 @@ def impossible(fitted: Fitted) -> tuple[Impossible, ...]:
     """Of every channel the clearest instance, the largest excess first."""
     problem = fitted.problem
     network, values = problem.network, fitted.values
-    run = simulate(network, values, *problem.own(fitted.state.nuisance), keep_cells=True)
+    first = [np.zeros(q) for q in problem.nuisance_sizes]  # as first readings say: a start may hide what cannot be
+    run = simulate(network, values, *problem.own(first), keep_cells=True)
+    seen = np.sum([r.cells for r in network.readings], axis=0) if network.readings else np.zeros(network.n_cells)
+    unknown_K = np.where(seen > 0, 0.0, POLICY.unseen_start_sd * network.start_spread_K)
     found: dict[str, Impossible] = {}
     for cells in _parts(network.conductance_W_per_K(values)):
-        reach = _Reach.of(run, cells, network.surrounding_W_per_K(values), _driven(run, values, cells))
+        reach = _Reach.of(
+            run, cells, network.surrounding_W_per_K(values), _driven(run, values, cells), unknown_K[cells]
+        )
         bodies = tuple(name for name, own in network.bodies.items() if set(own) <= set(cells.tolist()))
         capacity = float(network.capacity_J_per_K(values)[cells].sum())
         for reading in network.readings:
@@ -81,12 +86,16 @@ class _Reach:
     loss_W_per_K: float
 
     @classmethod
-    def of(cls, run: Simulation, cells: NDArray[np.int64], exposed: Array, driven: NDArray[np.bool_]) -> _Reach:
+    def of(
+        cls, run: Simulation, cells: NDArray[np.int64], exposed: Array, driven: NDArray[np.bool_], unknown_K: Array
+    ) -> _Reach:
         assert run.cells_degC is not None and run.air_degC is not None
         around = np.flatnonzero(exposed[:, cells].any(axis=1))
         start = np.broadcast_to(run.cells_degC[0][:, :1][..., cells], (*driven.shape, len(cells)))
-        seen = np.concatenate([start, run.air_degC[0][..., around]], axis=-1)
-        low, high = np.minimum.accumulate(seen.min(axis=-1), axis=1), np.maximum.accumulate(seen.max(axis=-1), axis=1)
+        air = run.air_degC[0][..., around]
+        coldest = np.concatenate([start - unknown_K, air], axis=-1).min(axis=-1)
+        warmest = np.concatenate([start + unknown_K, air], axis=-1).max(axis=-1)
+        low, high = np.minimum.accumulate(coldest, axis=1), np.maximum.accumulate(warmest, axis=1)
         passive = ~np.logical_or.accumulate(driven, axis=1) & run.valid
         return cls(low, high, passive, float(exposed[:, cells].sum()))
 

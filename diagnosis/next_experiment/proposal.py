@@ -16,10 +16,7 @@ from diagnosis.findings.report_data import few, listed
 from diagnosis.next_experiment.foreseen import Foreseen, begun, foreseen
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.policy import POLICY
-from diagnosis.search.acceptance import least_gain
-from diagnosis.search.decision import Round, agreed_on
-from diagnosis.search.probability import explanations
-from diagnosis.search.refits import refit
+from diagnosis.search.claims import Round, explanations
 from diagnosis.search.search import Search
 
 NOTHING = "nothing else is missing"  # the alternative to effects that recordings leave possible
@@ -228,9 +225,7 @@ def settling_run(named: Sequence[Round]) -> Proposal | None:
         for e in [
             e for e in every if e.probability >= POLICY.alternative_min_probability and e.tried.candidate.change is None
         ][: POLICY.separated_alternatives]:
-            fitted = e.tried.fitted or _refitted(r, e.tried)
-            if fitted is not None:
-                alternatives[e.tried.candidate.label] = fitted
+            alternatives[e.tried.candidate.label] = e.tried.fitted
         if len(alternatives) >= 2:
             return _simulated(alternatives)
     return None
@@ -246,9 +241,8 @@ def revealing_run(done: Search) -> Proposal | None:
         return None
     alternatives, lacking_nats = {NOTHING: last.before}, {}
     for t in possible(last):
-        assert t.fitted is not None
         alternatives[t.candidate.label] = t.fitted
-        lacking_nats[t.candidate.label] = claim_threshold(last, t) - t.gain
+        lacking_nats[t.candidate.label] = last.threshold - t.gain
     run = _simulated(alternatives, lacking_nats) if len(alternatives) >= 2 else None
     return run if run is not None and run.nats >= POLICY.settling_nats else None
 
@@ -256,20 +250,11 @@ def revealing_run(done: Search) -> Proposal | None:
 def possible(last: Round) -> list[Tried]:
     """The effects that a round leaves possible, the likeliest of each cluster, best first: they gain more than settles
     a tie, and most batches do not speak against them."""
-    batches = len(last.before.batches)
     out: dict[str, Tried] = {}
     for t in last.tried:
-        physics = t.candidate.kind.is_physics and t.candidate.change is None
-        if physics and t.fitted is not None and t.gain >= POLICY.settling_nats and agreed_on(t, batches):
+        if t.candidate.change is None and t.gain >= POLICY.settling_nats and t.improved > len(t.by_run) / 2:
             out.setdefault(t.cluster, t)
     return sorted(out.values(), key=lambda t: -t.gain)[: POLICY.separated_alternatives]
-
-
-def claim_threshold(last: Round, t: Tried) -> float:
-    """What a candidate of a round must gain to be claimed, in nats."""
-    structure = last.null.threshold(last.density, name=t.candidate.name)
-    stated = (last.threshold if t is last.best else 0.0, structure, least_gain(t))
-    return max(nats for nats in stated if np.isfinite(nats))  # too few machines of a null give no threshold
 
 
 def _simulated(alternatives: Mapping[str, Fitted], lacking_nats: Mapping[str, float] | None = None) -> Proposal | None:
@@ -277,8 +262,3 @@ def _simulated(alternatives: Mapping[str, Fitted], lacking_nats: Mapping[str, fl
         return next_experiment(alternatives, lacking_nats=lacking_nats)
     except (InputError, WorkError, ValueError):
         return None  # what cannot be simulated cannot be proposed
-
-
-def _refitted(r: Round, t: Tried) -> Fitted | None:
-    done = refit(r.before, t.scored)
-    return None if done is None else done.fitted

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from data.arrays import Array
-from diagnosis.candidates.alternatives import found_since
 from diagnosis.contracts import Candidate, CandidateKind, Fitted
 from diagnosis.policy import POLICY
 from twin.calibration.least_squares import x_of
@@ -27,7 +26,8 @@ def suspected_swaps(fitted: Fitted, proposed: Sequence[Candidate]) -> list[Candi
 
     Labels are judged before physics: none are returned where the fit holds an effect that the machine file lacks.
     """
-    if found_since(fitted):
+    stated = (fitted.machine.twin or {"mechanisms": fitted.part.mechanisms}).get("mechanisms") or {}
+    if set(fitted.part.mechanisms) - set(stated):
         return []
     line = _Line.at(fitted)
     out = []

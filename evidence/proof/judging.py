@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from evidence.proof.sealing.isolation import own_source
 from evidence.proof.sealing.opening import Opened
 from evidence.proof.sealing.running import RUN, Examinee, examine
 from evidence.proof.sealing.seal import Done
-from evidence.proof.spec import CENTRES, KIND_PLANTS
+from evidence.proof.spec import KIND_PLANTS
 
 if TYPE_CHECKING:
     from evidence.proof.scoring.answer_key import Stored
@@ -128,25 +128,9 @@ def _true(machine: Machine, batches: list[Batch], key: Mapping[str, Any]) -> tup
     from evidence.proof.scoring.true_model import true_model
 
     try:
-        return true_model(machine, batches, key, _redraw(key) if key["plant"] in CENTRES else None), ""
+        return true_model(machine, batches, key), ""
     except (InputError, WorkError) as error:
         return None, str(error)
-
-
-def _redraw(key: Mapping[str, Any]) -> Callable[[str], tuple[Machine, list[Batch]]]:
-    """The same case without one of its effects."""
-    from evidence.proof.spec import CaseSpec
-    from evidence.proof.suite import build, without, write_built
-
-    spec = CaseSpec(**key["redraw"])
-
-    def redraw(effect: str) -> tuple[Machine, list[Batch]]:
-        with tempfile.TemporaryDirectory(prefix="thermodrift-") as place:
-            case = Path(place) / "case"
-            write_built(build(without(spec, effect)), case)
-            return read_case(case, Path(place) / "lake")
-
-    return redraw
 
 
 def plain_json(value: Any) -> Any:

@@ -28,19 +28,18 @@ CHIPS = {
     "unlisted": "not in the library", "undecidable": "undecided",
 }  # fmt: skip
 _ALTERNATIVES = {
-    "wrong_parameter": "a wrong parameter", "coarse_network": "too coarse a network",
-    "varies_between_runs": "something that varies between runs", "free_flux": "missing heat of no listed mechanism",
+    "wrong_parameter": "a wrong parameter", "free_flux": "missing heat of no listed mechanism",
     "free_shift": "missing displacement of no listed mechanism", "unlisted": "no listed mechanism",
 }  # fmt: skip
 
 METHOD = (
-    "The simulation was first given its best chance: its free parameters were recalibrated, and bodies and sensor "
-    "places were refined as long as that lowered the error of runs left out of the fit.",
+    "The simulation was first given its best chance: its free parameters were recalibrated, and what refined twins of "
+    "the same machine would show beyond it counts as structure, not as an effect.",
     "Every mechanism of the library was then tried at every place where it may act, together with sensor faults, "
-    "clock shifts, wrong parameters and too coarse a network as alternatives.",
-    "The best were refitted in full and judged only on runs left out of the fit.",
-    "A finding is accepted when its gain exceeds what structure alone gives when nothing is missing, and when most "
-    "left-out runs improve.",
+    "clock shifts and wrong parameters as alternatives.",
+    "The best were refitted in full; their gain is log evidence with structure integrated out.",
+    "A finding is accepted when claims like it were true more often than not on other machines, and when no channel of "
+    "a left-out run is predicted worse.",
     "Probabilities include “nothing is missing” and “not in the library”; candidates that these "
     "recordings cannot distinguish share theirs.",
 )
@@ -49,7 +48,7 @@ GLOSSARY = (
     ("left out", "Fit on the other runs, predict this one; of it only the start is estimated, within its prior."),
     ("rms", "Root mean square of recorded − simulated over a left-out run, or over the rows of all of them. "
      "Displacements count from their first sample."),
-    ("before, after", "The refined and recalibrated simulation without and with what was found."),
+    ("before, after", "The recalibrated simulation without and with what was found."),
     ("noise floor", "The rms that noise alone leaves to any simulation."),
     ("gain", "Rise of the log score (log likelihood) of the left-out runs, in nats; the threshold is what structure "
      "alone reaches when nothing is missing."),

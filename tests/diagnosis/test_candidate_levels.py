@@ -8,7 +8,7 @@ import pytest
 
 from data.machine import Machine
 from diagnosis.candidates.library import candidates
-from diagnosis.screening.linearisation import asleep
+from diagnosis.screening.signatures import asleep
 from twin.schema import twin_part
 
 

@@ -17,7 +17,7 @@ from data.registry import Registry
 from diagnosis.candidates.alternatives import alternatives
 from diagnosis.candidates.library import HINTS, candidates, equipment_named, linked, log_prior_odds
 from diagnosis.contracts import Candidate, Where
-from diagnosis.screening.linearisation import differences
+from diagnosis.screening.signatures import differences
 from diagnosis.search.search import search
 from tests.diagnosis.small_cases import equipped, fitted, four_bodies, runs, two_bodies
 from twin.compile import compile_network

@@ -10,7 +10,8 @@ import pytest
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network, refitted
+from diagnosis.fitting.carried import carried_nuisances, carried_z, on_network
+from diagnosis.fitting.fitted import refitted
 from tests.diagnosis.small_cases import fitted, runs, two_bodies
 from twin.calibration.least_squares import x_of
 from twin.calibration.problem import CalibrationProblem
@@ -59,20 +60,20 @@ def larger() -> TwinPart:
 def carried(part: TwinPart, free_starts: bool = False) -> tuple[CalibrationProblem, Array, list[Array]]:
     network = compile_network(old().machine, part=part)
     new = on_network(old().problem, old().batches, network, free_starts)
-    z = carried_z(old().problem, new, old().state.z)
-    return new, x_of(new.unknowns, z), carried_nuisances(old().problem, new, old().state.nuisance)
+    z = carried_z(old().problem, new, old().z)
+    return new, x_of(new.unknowns, z), carried_nuisances(old().problem, new, old().own)
 
 
 def gap(problem: CalibrationProblem, x: Array, nuisance: list[Array]) -> float:
     """The largest change of a residual, in units of its noise."""
-    before = old().problem.residuals(old().x, old().state.nuisance)
+    before = old().problem.residuals(old().x, old().own)
     after = problem.residuals(x, nuisance)
     return max(float(np.abs(b - a).max()) for b, a in zip(before, after, strict=True))
 
 
 @pytest.mark.parametrize("free_starts", [False, True])
 def test_what_nobody_would_miss_changes_nothing(free_starts: bool) -> None:
-    assert max(float(np.abs(v).max()) for v in old().state.nuisance) > 0.5  # else a mix-up would not show
+    assert max(float(np.abs(v).max()) for v in old().own) > 0.5  # else a mix-up would not show
     problem, x, nuisance = carried(larger(), free_starts)
     assert gap(problem, x, nuisance) < 1e-3
 
@@ -95,7 +96,7 @@ def test_a_value_stays_where_its_prior_moves() -> None:
 
 def test_each_batchs_own_unknowns_are_carried_by_name() -> None:
     _, _, nuisance = carried(larger())
-    for before, after in zip(old().state.nuisance, nuisance, strict=True):
+    for before, after in zip(old().own, nuisance, strict=True):
         shaft, head, room, belt, *errors = before
         quill, cover, *bodies, own_room, lamp, own_belt, z = after
         assert (bodies, own_room, own_belt, [z]) == ([shaft, head], room, belt, errors)
@@ -113,16 +114,6 @@ def test_a_new_body_starts_as_the_one_that_it_is_linked_with_most() -> None:
             np.testing.assert_array_equal(start[name], known[like])
         own = problem.nuisances.start_K.max(axis=1)
         assert own.tolist() == [spread, spread, 1.0, 1.0]
-
-
-def test_a_piece_of_a_body_starts_with_it() -> None:
-    network = compile_network(old().machine, part=larger())
-    problem = on_network(old().problem, old().batches, network, free_starts=True, pieces={"quill": "head"})
-    bodies = list(network.bodies)
-    moved = {name: problem.nuisances.start_K[bodies.index(name)] for name in bodies}
-    assert {name: [b for b, k in zip(bodies, own, strict=True) if k] for name, own in moved.items()} == {
-        "quill": [], "cover": ["cover"], "shaft": ["shaft"], "head": ["quill", "head"],
-    }  # fmt: skip
 
 
 def test_a_body_that_is_cut_finer_starts_at_its_mean() -> None:
@@ -145,6 +136,6 @@ def test_batches_keep_the_substeps_that_they_need() -> None:
 
 
 def test_a_refit_of_the_same_part_stays_where_it_is() -> None:
-    again = refitted(old(), old().part, steps=3, tolerance=1e-3)
-    assert np.abs(again.state.z - old().state.z).max() < 0.05
+    again = refitted(old(), old().part)
+    assert np.abs(again.z - old().z).max() < 0.05
     assert again.batches is old().batches and again.runs == 4

@@ -49,8 +49,10 @@ def varying(sizes: list[float]) -> Fitted:
     known = two_bodies(mechanisms__belt__parameters__power=POWER)
     done = fitted(known, runs(two_bodies(), count=len(sizes)))
     at = done.problem.nuisances.shared - 1
-    own = [np.concatenate([v[:at], [size], v[at + 1 :]]) for v, size in zip(done.state.nuisance, sizes, strict=True)]
-    return replace(done, state=replace(done.state, nuisance=own))
+    own = [np.concatenate([v[:at], [size], v[at + 1 :]]) for v, size in zip(done.own, sizes, strict=True)]
+    out = replace(done)
+    vars(out)["own"] = own
+    return out
 
 
 def test_deviations_are_what_the_batches_show() -> None:

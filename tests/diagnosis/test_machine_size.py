@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from diagnosis.candidates.library import candidates
-from diagnosis.candidates.priors import at_size, log_prior, size_of, start_values
+from diagnosis.candidates.priors import at_size, log_size, size_of, start_values
 from diagnosis.contracts import Fitted, Scored
 from diagnosis.fitting.fitted import refitted
 from diagnosis.policy import POLICY
@@ -46,7 +46,7 @@ def standing(machine: Any) -> Fitted:
 
 def bridge(conductance_W_per_K: float) -> Scored:
     found = candidates(four_bodies(), twin_part(four_bodies()), ["heat_bridge"])[0]
-    return Scored(found, 5.0, 6, 0.5, {"conductance": conductance_W_per_K}, 1e-4, 0)
+    return Scored(found, 5.0, 0.5, {"conductance": conductance_W_per_K}, 1e-4, 0)
 
 
 def test_a_machine_tool_is_of_the_usual_size_and_grams_are_not() -> None:
@@ -69,8 +69,8 @@ def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:
 def test_what_is_usual_on_a_board_is_plausible_there_and_absurd_on_a_machine() -> None:
     board, machine = standing(of_grams()), cold_floor()
     seen = bridge(3e-3)
-    assert log_prior(seen, board) > -0.5 > -8.0 > log_prior(seen, machine)
-    assert log_prior(bridge(5.0), machine) > -0.5
+    assert log_size(seen, board) > -0.5 > -8.0 > log_size(seen, machine)
+    assert log_size(bridge(5.0), machine) > -0.5
 
 
 def test_a_structural_one_begins_at_what_the_screen_saw_about_the_usual_value() -> None:

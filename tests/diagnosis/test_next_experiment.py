@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,17 +15,18 @@ import pytest
 from data.batch import Batch
 from data.errors import InputError
 from data.machine import Machine, load_machine
-from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
+from diagnosis.contracts import Candidate, Fitted, Point, Scored, Tried, Where
+from diagnosis.fitting.fitted import calibrated
 from diagnosis.next_experiment.foreseen import AlternativeModel, begun, foreseen, with_free_offset
 from diagnosis.next_experiment.menu import Run, menu
 from diagnosis.next_experiment.proposal import COLUMNS, NOTHING, Proposal, next_experiment, revealing_run
 from diagnosis.policy import POLICY
-from diagnosis.search.decision import Round
+from diagnosis.search.claims import Round
 from diagnosis.search.search import Search
 from tests.diagnosis.concealed import chain, empty
 from tests.twin.machines import machine
 from tests.twin.recordings import empty_batches, recorded
-from twin.calibration.least_squares import FitOptions, settled
+from twin.calibration.least_squares import FitOptions, State, settled
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.run_plan import RunPlan, load_run_plan
@@ -42,11 +42,14 @@ AIR = {"mechanisms__spin": SPIN}  # the shaft's air takes more heat the faster i
 LOSS = {"exposures__shaft-room": {"value": "3 W/K", "spread": 0.7}}  # or more at any speed
 
 
-def fitted(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> Fitted:
+def state_of(of: Machine, batches: Sequence[Batch], reweight: bool = True) -> tuple[CalibrationProblem, State]:
     problem = CalibrationProblem.of(compile_network(of), batches)
-    return Fitted(
-        of, twin_part(of), tuple(batches), problem, settled(problem, FitOptions(tolerance=1e-3, reweight=reweight))[0]
-    )
+    return problem, settled(problem, FitOptions(tolerance=1e-3, reweight=reweight))[0]
+
+
+def fitted(of: Machine, batches: Sequence[Batch]) -> Fitted:
+    problem, state = state_of(of, batches)
+    return calibrated(Point(of, twin_part(of), tuple(batches), problem, state.z, state.nuisance), state.noise)
 
 
 @cache
@@ -83,7 +86,7 @@ def carried_out(plan: RunPlan, truth: Fitted, seed: int) -> Batch:
 
 def lead_nats(truth: Fitted, other: Fitted, more: Sequence[Batch] = ()) -> float:
     """By how much the truth's posterior density exceeds the other's, both refitted at the noise given."""
-    costs = [fitted(f.machine, [*f.batches, *more], reweight=False).state.cost for f in (other, truth)]
+    costs = [state_of(f.machine, [*f.batches, *more], reweight=False)[1].cost for f in (other, truth)]
     return 0.5 * (costs[0] - costs[1])
 
 
@@ -210,17 +213,16 @@ def unclaimed(*gains: float, threshold: float = 60.0, accepted: bool = False) ->
     tried = []
     for k, gain in enumerate(gains):
         c = Candidate("rotating_convection", Where("link", "shaft-room"), f"spin{k}", f"spin {k}", part)
-        scored = Scored(c, gain, 4, 0.0, {}, 1.0, -1)
-        tried.append(Tried(scored, gain, 4, f"c{k}", 0.0, after))
-    null: Any = SimpleNamespace(threshold=lambda density, name: threshold)
+        tried.append(Tried(Scored(c), after, gain, np.full(4, gain / 4), f"c{k}", 0.0))
     screen: Any = None
-    return Search(before, before, (Round(before, screen, tuple(tried), threshold, null, np.zeros((0, 0)), accepted),))
+    null = threshold + np.array([-1e-9, 1e-9])
+    return Search(before, before, (Round(before, screen, tuple(tried), null, 0.0, accepted),))
 
 
 def test_a_run_is_proposed_for_what_gains_too_little() -> None:
     run = revealing_run(unclaimed(20.0))
     assert run is not None and run.separates == (NOTHING, "spin 0") and run.plan_text
-    alone = next_experiment({NOTHING: tied()["loss"], "spin 0": tied()["air"]}, lacking_nats={"spin 0": 90.0})
+    alone = next_experiment({NOTHING: tied()["loss"], "spin 0": tied()["air"]}, lacking_nats={"spin 0": 40.0})
     assert run.label == alone.label and run.nats == pytest.approx(alone.nats)
 
 

@@ -20,18 +20,11 @@ NO_DECISION = {
     "findings/report_data.py": {"ACF_LAGS"},
     "findings/schema.py": {"DIGITS", "LARGEST_PROBABILITY"},
     "findings/statement.py": {"_DIGITS", "_MAX_NAMED"},
-    "fitting/regression.py": {
-        "MATRIX_FILTER_ROWS", "MEMORY_REACHES_ROWS", "MEMORY_SHARES", "MIN_DIRECTION_SQUARE",
-    },
-    "structure/covariance.py": {"MAD_TO_SD"},
-    "structure/screen.py": {"NO_TRACE"},
     "localisation/free_series.py": {"STEP_HALVINGS", "UNUSED_CORNER"},
     "localisation/linearised.py": {"MAX_MODAL_VALUES"},
     "localisation/where_when.py": {"CLOCK_EDGES_H", "MAX_DRIVER_LEVELS", "SINCE_START_EDGES_MIN"},
-    "screening/evidence.py": {"TINY"},
-    "screening/linearisation.py": {"EVEN_STEPS", "NEARLY_OFF"},
-    "screening/screen.py": {"NO_TRACE_SD"},
-    "search/null.py": {"CACHED_NULLS", "TINY"},
+    "screening/screen.py": {"NO_TRACE", "TINY"},
+    "screening/signatures.py": {"EVEN_STEPS", "NEARLY_OFF"},
 }  # fmt: skip
 
 
@@ -83,7 +76,6 @@ def test_a_policy_is_not_changed_in_place() -> None:
     with pytest.raises(FrozenInstanceError):
         POLICY.max_effects = 9  # type: ignore[misc]
     assert Policy() == POLICY and set(STAGES) <= {f.name for f in fields(Policy)}
-    assert POLICY.null_scales[POLICY.null_own_scale] == 1.0
 
 
 def test_the_documentation_shows_the_policy() -> None:

@@ -18,11 +18,11 @@ def test_a_parameter_that_does_nothing_at_its_place_is_not_told() -> None:
     known = two_bodies()
     now = fitted(known, runs(known, {"gate": {"law": "draught", "acts_on": "room", "parameters": OPENED}}))
     c = next(c for c in proposed(now) if c.mechanism == "draught" and c.where == Where("node", "room"))
-    done = refit(now, Scored(c, 100.0, 6, 0.5, {"drop": 5.0}, 0.1, -1))
-    assert done is not None and done.fitted is not None
-    fit = result(done.fitted.problem, done.fitted.state, 1e-2, "")
-    intervals = {i.name: i for i in intervals90(fit, done.fitted.problem.unknowns)}
-    told, _ = reported_parameters(done.fitted, c, intervals, 0.0)
+    done = refit(now, Scored(c, amplitudes={"drop": 5.0}))
+    assert done is not None
+    fit = result(done.problem, done.state, 1e-2, "")
+    intervals = {i.name: i for i in intervals90(fit, done.problem.unknowns)}
+    told, _ = reported_parameters(done, c, intervals)
     assert f"mechanisms.{c.name}.factor" in intervals
     assert "factor" not in told
     assert told["drop"].value > 2.0

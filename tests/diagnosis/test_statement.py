@@ -122,9 +122,6 @@ def test_a_tie_is_said_as_one() -> None:
                Estimate(4.2, "W/K", 3.6, 4.9)}, 0.95, was={"exposures.front-air.conductance": 1.0}),
          "The value of exposures.front-air.conductance (1 W/K → 4.2 W/K (90 %: 3.6–4.9)) in the machine file is wrong. "
          "Check the value against the drawing or the data sheet."),
-        (Found("varies_between_runs", BED, "friction of front bearings", {"sd": Estimate(0.15, "1", 0.11, 0.21)}, 0.7),
-         "Most likely (70 %) friction of front bearings differs from run to run by ±15 % (90 %: 11–21)."),
-        (Found("coarse_network", BED, "the bed", {}, 0.95), "The network is too coarse at the bed."),
         (Found("free_flux", Where("node", "column_back"), "the column back", {"linear": Estimate(0.01, "W")}, 0.95,
                regime="coolant on", size=Estimate(58, "W", 49, 66)),
          "58 W (90 %: 49–66) into the column back (when: coolant on); no listed mechanism does this."),

@@ -25,10 +25,9 @@ def test_the_pair_that_was_exchanged_comes_first(pair: tuple[str, str]) -> None:
     first = suspected_swaps(now, proposed(now))[0]
     assert first.part is not None and first.part.acts_on == pair
     # a refit from where the fit has been bent to would not come back: it begins at the machine file's values
-    done = refit(now, Scored(first, 0.0, 0, 0.0, {}, 0.0, -1))
-    assert done is not None and done.fitted is not None and done.gain > 100.0
-    right = fitted(known, runs(known))
-    np.testing.assert_allclose(done.fitted.noise.factor, right.noise.factor, rtol=0.2)
+    done = refit(now, Scored(first))
+    assert done is not None and done.log_evidence - now.log_evidence > 100.0
+    assert done.noise.factor.max() < 2.0 < now.noise.factor.max()
 
 
 @pytest.mark.slow

@@ -144,7 +144,7 @@ def _tables(verdict: str) -> dict[str, pd.DataFrame]:
             ("sensor_drift", "sensor", "bed", "a sensor that drifts", 0.04, "K/h", 0.20, ""),
             ("joint_slip", "error", "z", "a joint that slips", 1.9, "um", 0.05, ""),
         ],
-        "null": [(k, float(g), 1.0 + 0.02 * float(g)) for k, g in enumerate(rng.gamma(3.0, 4.0, 60))],
+        "null": [(k, float(g)) for k, g in enumerate(rng.gamma(3.0, 4.0, 60))],
     }  # fmt: skip
     return {k: v if isinstance(v, pd.DataFrame) else _frame(k, v) for k, v in rows.items()}
 

@@ -72,6 +72,11 @@ class UnknownsOf:
         self.bulge_K = bulge_K(solved, cells_degC[None])[0]
         self.shape = (*self.balance.inputs.valid.shape, 2)
         self.edges, self.heats = _by_parameter(self.network)
+        self.surroundings: dict[int, list[int]] = defaultdict(list)
+        for s, given in enumerate(self.network.surroundings):
+            of_laws = {j for law in given.effects for j in law.parameters.values()}
+            for j in of_laws | {k for k in (given.value, given.follow, given.offset) if k is not None}:
+                self.surroundings[j].append(s)
 
     def parameter(self, j: int) -> Unknown:
         """By a parameter's value, in its own unit."""
@@ -140,7 +145,8 @@ class UnknownsOf:
 
     def _surroundings(self, out: Unknown, j: int) -> None:
         inputs = self.balance.inputs
-        for s, given in enumerate(self.network.surroundings):
+        for s in self.surroundings[j]:
+            given = self.network.surroundings[s]
             warmer = np.zeros(self.shape)
             constant = s not in self.balance.air.moving
             if follows(given, inputs) and given.value is not None and given.follow is not None:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.arrays import Array
-from diagnosis.candidates.discretisation import never_reported, slack
+from diagnosis.candidates.discretisation import slack
 from diagnosis.contracts import Candidate, Scored
-from diagnosis.fitting.regression import Whitened
-from diagnosis.screening.evidence import Evidence
-from diagnosis.search.decision import Round
+from diagnosis.search.claims import Round
+from diagnosis.search.refits import odds_of
+from twin.mechanisms import MECHANISMS
 
 MIN_ALIKE_SHARE = 0.1  # of the first explanation's probability: less likely ones are not in the reported set
 
@@ -79,11 +79,11 @@ def plain_rows(done: Round) -> PlainRows:
     """Of a round's fit, before any candidate."""
     news = beyond_slack(done)
     at = [s.column for s in news]
-    evidence = done.screen.evidence
-    residuals = done.before.problem.residuals(done.before.x, done.before.state.nuisance)
-    channel = np.concatenate([b.channel for b in evidence.batches])
+    problem = done.before.problem
+    residuals = problem.residuals(done.before.x, done.before.own)
+    channel = np.concatenate([m.channel for m in problem.measured])
     residual = np.concatenate(residuals)
-    columns = np.concatenate([b.restored(b.columns[:, at]) / b.scale[:, None] for b in evidence.batches])
+    columns = np.concatenate([x[:, at] for x in done.screen.signatures.columns])
     for c in np.unique(channel):
         own = channel == c
         rms = float(np.sqrt(np.mean(residual[own] ** 2))) + TINY
@@ -92,14 +92,32 @@ def plain_rows(done: Round) -> PlainRows:
     batch = np.repeat(np.arange(len(residuals)), [len(r) for r in residuals])
     moves = np.linalg.norm(columns, axis=0) > TINY
     kept = tuple(s for s, moving in zip(news, moves, strict=True) if moving)
-    low, high = evidence.low[at][moves], evidence.high[at][moves]
+    low, high = bounds(kept)
     return PlainRows(kept, residual, columns[:, moves], batch, low, high)
+
+
+def bounds(scored: Sequence[Scored]) -> tuple[Array, Array]:
+    """Least and largest amplitude (C,) of candidates, less the value at which each is off."""
+    low = np.full(len(scored), -np.inf)
+    for k, s in enumerate(scored):
+        name = next(iter(s.amplitudes), "")
+        off = s.candidate.amplitudes.get(name)
+        if off is not None and MECHANISMS[s.candidate.mechanism].spec(name).low >= off:
+            low[k] = 0.0
+    return low, np.full(len(scored), np.inf)
+
+
+def correlations(done: Round) -> Array:
+    """|cos| (C,) of every signature with the residual, in units of the given noise, nothing projected out."""
+    residual = np.concatenate(done.before.problem.residuals(done.before.x, done.before.own))
+    columns = np.concatenate(done.screen.signatures.columns)
+    return np.asarray(np.abs(residual @ columns) / np.maximum(np.linalg.norm(columns, axis=0), TINY))
 
 
 def claimable(done: Round) -> list[Scored]:
     """Candidates with a signature, but those that any lumped network has some of."""
-    loose = never_reported([s.candidate for s in done.screen.scored], done.before)
-    return [s for s in done.screen.scored if s.column >= 0 and s.candidate.name not in loose]
+    own = odds_of(done.before, done.screen)
+    return [s for s in done.screen.scored if s.candidate.name in own and not s.candidate.kind.is_unlisted]
 
 
 def beyond_slack(done: Round) -> list[Scored]:
@@ -109,35 +127,3 @@ def beyond_slack(done: Round) -> list[Scored]:
     """
     loose = slack([s.candidate for s in done.screen.scored], done.before)
     return [s for s in claimable(done) if s.candidate.name not in loose]
-
-
-def counted_in_full(evidence: Evidence) -> Evidence:
-    """The same evidence with independent noise in every row."""
-    memory = evidence.batches[0].memory
-    white = np.ones(len(evidence.rows)) if memory is None else memory.white
-    batches = tuple(_without_memory(b) for b in evidence.batches)
-    return replace(evidence, batches=batches, weight=evidence.weight / white)
-
-
-def without_nuisances(evidence: Evidence, residuals: Sequence[Array]) -> Evidence:
-    """The same columns without fitted parameters, starts and offsets; the targets are the residuals of the fit."""
-    batches = []
-    for b, residual in zip(evidence.batches, residuals, strict=True):
-        bare = replace(b, jacobian=np.zeros((len(residual), 1)), mixing=b.mixing[:, :0], damping=b.damping[:0])
-        target, columns = b.innovations(residual * b.scale), b.innovations(b.restored(b.columns))
-        batches.append(replace(bare, target=target, columns=columns))
-    return replace(evidence, batches=tuple(batches))
-
-
-def _without_memory(b: Whitened) -> Whitened:
-    """A batch whose rows are taken as independent, its own unknowns integrated out again."""
-    spread = np.sqrt(1.0 / (1.0 - b.damping) ** 2 - 1.0)
-    plain = replace(b, mixing=b.mixing[:, :0], damping=b.damping[:0])
-    mixing, s, _ = np.linalg.svd(plain.restored(b.mixing * spread), full_matrices=False)
-    damping = 1.0 - 1.0 / np.sqrt(1.0 + s**2)
-    rows = b.restored(np.column_stack([b.target, b.jacobian, b.columns]))
-    rows = rows - mixing @ (damping[:, None] * (mixing.T @ rows))
-    p = 1 + b.jacobian.shape[1]
-    return replace(
-        b, target=rows[:, 0], jacobian=rows[:, 1:p], columns=rows[:, p:], mixing=mixing, damping=damping, memory=None
-    )

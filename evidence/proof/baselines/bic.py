@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
 
 from data.arrays import Array
 from diagnosis.contracts import Scored
+from diagnosis.fitting.covariance import beyond_recalibration, slices_of
 from diagnosis.policy import POLICY
-from diagnosis.screening.evidence import Evidence
+from diagnosis.search.claims import Round
 from diagnosis.search.search import Search
-from evidence.proof.baselines.base import Claim, Reply, beyond_slack, counted_in_full
+from evidence.proof.baselines.base import Claim, Reply, beyond_slack, bounds
 
 LOOKED_AT = 40  # candidates of a step whose criterion is computed, by their reduction at the weights of the step before
 REWEIGHTING_ROUNDS = 5  # of reweighting the channels
@@ -26,7 +26,7 @@ ALIKE = 2.0  # of the criterion: "not worth more than a bare mention" (Raftery 1
 def in_sample_bic(done: Search) -> Reply:
     """All effects that lower the criterion, in the order of entry; those that lower it equally are alike."""
     news = beyond_slack(done.rounds[0])
-    sums = _Sums.of(counted_in_full(done.rounds[0].screen.evidence), news)
+    sums = _Sums.of(done.rounds[0], news)
     chosen: list[int] = []
     claims: list[Claim] = []
     now = sums.criterion([])
@@ -53,16 +53,18 @@ class _Sums:
     high: Array
 
     @classmethod
-    def of(cls, evidence: Evidence, news: list[Scored]) -> _Sums:
-        at = [s.column for s in news]
-        gram = np.zeros((len(evidence.rows), len(at) + 1, len(at) + 1))
-        total = np.sum([b.jacobian.T @ b.target for b in evidence.batches], axis=0)
-        z = cho_solve(evidence.factor, total)
-        for b, columns in zip(evidence.batches, evidence.beyond, strict=True):
-            rows = np.column_stack([columns[:, at], b.target - b.jacobian @ z])
-            for c, where in b.slices:
+    def of(cls, done: Round, news: list[Scored]) -> _Sums:
+        now, at = done.before, [s.column for s in news]
+        blocks = list(now.problem.linearise(now.x, now.nuisance))
+        spread = np.array([u.spread for u in now.problem.unknowns])
+        every = [
+            np.column_stack([x[:, at], b.residual]) for x, b in zip(done.screen.signatures.columns, blocks, strict=True)
+        ]
+        gram = np.zeros((len(now.rows), len(at) + 1, len(at) + 1))
+        for m, rows in zip(now.problem.measured, beyond_recalibration(blocks, spread, every), strict=True):
+            for c, where in slices_of(m.channel):
                 gram[c] += rows[where].T @ rows[where]
-        return cls(gram, evidence.rows, evidence.rows * evidence.weight, evidence.low[at], evidence.high[at])
+        return cls(gram, now.rows, now.rows, *bounds(news))
 
     def criterion(self, chosen: list[int]) -> float:
         """n log of every channel's mean square, and log n for each effect; infinite where a size is not allowed."""

@@ -27,8 +27,7 @@ ABLATIONS = Registry(
         "reference": "evidence.proof.baselines.ablations:reference",
         "no_projection": "evidence.proof.baselines.ablations:no_projection",
         "independent_noise": "evidence.proof.baselines.ablations:independent_noise",
-        "in_sample": "evidence.proof.baselines.ablations:in_sample",
-        "no_structural_null": "evidence.proof.baselines.ablations:no_structural_null",
+        "no_veto": "evidence.proof.baselines.ablations:no_veto",
         "no_floor_check": "evidence.proof.baselines.ablations:no_floor_check",
     },
 )
@@ -38,8 +37,8 @@ ABLATIONS = Registry(
 def replies(done: Diagnosis | Search) -> dict[str, Any]:
     """The reply of each to the same recordings, as stored in `rivals.json`.
 
-    Baselines start from the first fit, before anything was refined; ablations and the reference, the full rules, are of
-    the round that first decided about physics. With a diagnosis, the reference can say that something is unlisted.
+    Baselines start from the first fit; ablations and the reference, the full rules, are of the first round. With a
+    diagnosis, the reference can say that something is unlisted.
 
     Raises:
         WorkError: a diagnosis that kept no search.

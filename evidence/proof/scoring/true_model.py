@@ -1,14 +1,13 @@
 """The true model, the twin with the concealed terms, refitted: errors of a perfect answer, and visibility of each term.
 
-A term is visible when, with the others in, it cuts the left-out error of some channel by a tenth and gains more on the
-left-out batches than structure alone does (99 % quantile of the structural null, without a diagnosis' own margin).
-A term that no candidate describes is compared with the same case simulated without it.
+A term is visible when, with the others in, it gains `VISIBLE_NATS` of log evidence and more than structure alone does
+in one of a hundred refined twins. Of a term that no candidate describes it is unknown.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -19,20 +18,17 @@ from threadpoolctl import threadpool_limits
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.candidates.discretisation import never_reported
 from diagnosis.candidates.free_forms import BODY_PARAMETERS, Form, Level, candidate_of
 from diagnosis.candidates.priors import start_values
-from diagnosis.contracts import Candidate, Fitted, Scored, Tried, Where
+from diagnosis.contracts import Candidate, Fitted, Scored, Where
 from diagnosis.drafting.draft import drafted_part
 from diagnosis.findings.conclude import reported_parameters
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, settle
-from diagnosis.fitting.regression import Memory, whiter
+from diagnosis.fitting.fitted import baseline, left_out_rows, refitted, relinearised
 from diagnosis.policy import POLICY
-from diagnosis.screening.screen import Screen, alone, proposed, screen
-from diagnosis.search.acceptance import least_gain
-from diagnosis.search.null import Null, null_with, structural_null
-from diagnosis.search.refits import better_and_worse
+from diagnosis.screening.screen import Screen, proposed, screen
+from diagnosis.search.claims import null_quantile
+from diagnosis.search.refits import odds_of
 from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from evidence.proof.scoring.matching import Sized, counted_as, exact, sized
 from twin.calibration.identifiability import Interval, intervals90
@@ -53,7 +49,7 @@ def true_candidates(term: TrueTerm, seen: Screen, every: Sequence[Candidate]) ->
     if own:
         return sorted(own, key=lambda s: -s.gain)
     unseen = next((c for c in every if _is(term, c)), None)  # a term that cannot be switched off has no signature
-    return [] if unseen is None else [Scored(unseen, 0.0, 0, 0.0, {}, 0.0, -1)]
+    return [] if unseen is None else [Scored(unseen)]
 
 
 def open_shape(term: TrueTerm, s: Scored) -> bool:
@@ -141,18 +137,17 @@ def _said(number: float, unit: str) -> str | float:
     return float(f"{number:.6g}") if unit == "1" else f"{number:.6g} {unit}"
 
 
-CUT = 0.1  # of a channel's left-out error: a smaller reduction is not visible
-Redraw = Callable[[str], tuple[Machine, Sequence[Batch]]]
+VISIBLE_NATS = 30.0  # odds of 1e13: with the truth told nobody would doubt it
 
 
 @dataclass(frozen=True)
 class TrueModel:
     """Errors in units of the noise (`error_level`) of the baseline, the true model and noise alone; one entry a term of
-    `gain_nats`, `threshold_nats` and `bar_nats`, the gain that a diagnosis requires for a claim; nan where nothing
+    `gain_nats`, `threshold_nats`, what structure alone gains, and `bar_nats`, what visible takes; nan where nothing
     could be fitted. `sizes`: a term's amplitude as the true model fits it, low and high of its 90 % interval as a
     diagnosis states them (`amplitude.sized`).
 
-    `visible` None: unknown, since no candidate describes the term and the case cannot be redrawn.
+    `visible` None: unknown, since no candidate describes the term.
     """
 
     error_before: float
@@ -166,14 +161,8 @@ class TrueModel:
 
 
 @threadpool_limits.wrap(limits=1)
-def true_model(
-    machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any], redraw: Redraw | None = None, seed: int = 0
-) -> TrueModel:
-    """The true model of an opened case.
-
-    Args:
-        answer: the key as the vault's JSON gives it.
-        redraw: from an effect's key to machine and batches of the same case without that effect.
+def true_model(machine: Machine, batches: Sequence[Batch], answer: Mapping[str, Any]) -> TrueModel:
+    """The true model of an opened case; `answer` is the key as the vault's JSON gives it.
 
     Raises:
         InputError: recordings or a machine file that cannot be used; WorkError: the machine file's model fails.
@@ -185,30 +174,18 @@ def true_model(
         return TrueModel(level, level, 1.0, (), (), (), (), ())
     every = [*proposed(fit), *(c for t in key.terms if (c := of_no_list(t, fit)) is not None)]
     seen = screen(fit, every)
+    threshold = null_quantile(seen.null_gains(odds_of(fit, seen)))
     found, full = best_candidates(fit, key.terms, [true_candidates(t, seen, every) for t in key.terms])
-    stated = [k for k, s in enumerate(found) if s is not None]
-    if full is None:
-        full, stated = fit, []
-    judged = [
-        _judged(fit, full, key.terms, found, k, stated, seed)
-        if k in stated
-        else _redrawn(fit, t, redraw, _null(fit, seed))
-        for k, t in enumerate(key.terms)
-    ]
-    others = [j.fitted for k, j in enumerate(judged) if k not in stated and j.fitted is not None]
-    best = full if stated and not others else others[0] if others else fit  # an unlisted effect is the only one
-    numbers = zip(*((j.gain, j.threshold, j.bar, j.visible, j.size) for j in judged), strict=True)
-    return TrueModel(level, _level(best), 1.0, *numbers)
+    judged = [_judged(fit, full, key.terms, found, k, threshold) for k in range(len(key.terms))]
+    numbers = zip(*((j.gain, threshold, max(threshold, VISIBLE_NATS), j.visible, j.size) for j in judged), strict=True)
+    return TrueModel(level, _level(full or fit), 1.0, *numbers)
 
 
 @dataclass(frozen=True)
 class _Judged:
     gain: float = float("nan")
-    threshold: float = float("nan")
-    bar: float = float("nan")
     visible: bool | None = None
     size: Sized = (None, None, None)
-    fitted: Fitted | None = None  # of the case redrawn
 
 
 def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
@@ -216,12 +193,6 @@ def _fit(machine: Machine, batches: Sequence[Batch]) -> Fitted:
     usable, _ = usable_batches(compile_network(machine, part=part), sorted(batches, key=lambda b: b.batch_id))
     parts, _ = enough_batches(usable)
     return baseline(machine, part, parts, None, len(usable))
-
-
-def _null(fit: Fitted, seed: int) -> Null:
-    every = proposed(fit)
-    seen = screen(fit, every)
-    return structural_null(fit, seen.evidence, seen.columns(never_reported(every, fit)), seed)
 
 
 def best_candidates(
@@ -237,7 +208,7 @@ def best_candidates(
     for k in several:
         every = [[*found[:k], s, *found[k + 1 :]] for s in choices[k]]
         fits = [_with(fit, terms, one) for one in every]
-        gains = [-np.inf if full is None else _gain(fit, full, whiter(fit.memory, full.memory)) for full in fits]
+        gains = [-np.inf if full is None else full.log_evidence for full in fits]
         best = int(np.argmax(gains))
         found, full = every[best], fits[best]
     return found, full
@@ -253,7 +224,7 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
     for share in (1.0, *POLICY.start_amplitude_shares):
         try:
             part, at = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit, share)
-            return settle(refitted(fit, part, at))
+            return relinearised(refitted(fit, part, at))
         except (InputError, WorkError):
             continue
         except ValueError:  # one candidate twice
@@ -262,74 +233,35 @@ def _with(fit: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None]
 
 
 def _judged(
-    fit: Fitted, full: Fitted, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int,
-    stated: Sequence[int], seed: int,
+    fit: Fitted, full: Fitted | None, terms: Sequence[TrueTerm], found: Sequence[Scored | None], which: int,
+    threshold: float,
 ) -> _Judged:  # fmt: skip
     """One term with the others in the model, compared with the better of two fits without it."""
-    others = [k for k in stated if k != which]
-    own = [(terms[k], s) for k in others if (s := found[k]) is not None]
-    part: TwinPart = with_terms(fit.part, [t for t, _ in own], [s for _, s in own], fit)[0]
+    s = found[which]
+    if full is None or s is None:
+        return _Judged()
+    own = [(t, o) for k, (t, o) in enumerate(zip(terms, found, strict=True)) if k != which and o is not None]
+    part: TwinPart = with_terms(fit.part, [t for t, _ in own], [o for _, o in own], fit)[0]
     try:
-        back = refitted(full, part)
-        # the second fit shows whether the first one stopped short of its optimum
-        without = [settle(back)] if others else [settle(back, steps=4, tolerance=0.05, rounds=2), fit]
+        without = [relinearised(refitted(full, part)).log_evidence, *([] if own else [fit.log_evidence])]
     except (InputError, WorkError):
         return _Judged()
-    memory = whiter(full.memory, without[0].memory)
-    scores = [_score(w, memory) for w in without]
-    best = int(np.argmax(scores))
-    s = found[which]
-    assert s is not None
-    nulls = null_with(without[best], full, s.candidate, seed)
-    if nulls is None:  # an uncertain value, swapped labels
-        nulls = _null(without[best], seed), _score(full, memory)
-    structure = nulls[0].threshold(nulls[1], name=s.candidate.name, margin=1.0)
-    out = _beyond(without[best], full, memory, structure)
-    better, worse = better_and_worse(alone(without[best], memory), alone(full, memory))
-    least = least_gain(Tried(s, out.gain, better, s.candidate.name, 0.0, full, worse=worse))
-    size = _size(full, s, terms[which], nulls[0].scatter(s.candidate.name, nulls[1]))
-    return replace(out, bar=max(least, POLICY.null_margin * structure), size=size)
+    gain = full.log_evidence - max(without)
+    return _Judged(gain, gain > max(threshold, VISIBLE_NATS), _size(full, s, terms[which]))
 
 
 @lru_cache(maxsize=1)
 def _known(full: Fitted) -> dict[str, Interval]:
     """Intervals of the parameters of a fit, by name; those of the last fit are cached, as each term needs them."""
-    state = replace(full.state, noise=full.noise)
-    return {
-        i.name: i
-        for i in intervals90(result(full.problem, state, POLICY.baseline_tolerance, ""), full.problem.unknowns)
-    }
+    fit = result(full.problem, full.state, POLICY.fit_tolerance_nats, "")
+    return {i.name: i for i in intervals90(fit, full.problem.unknowns)}
 
 
-def _size(full: Fitted, s: Scored, term: TrueTerm, scatter: float) -> Sized:
+def _size(full: Fitted, s: Scored, term: TrueTerm) -> Sized:
     """The amplitude of the term in the true model, stated as in a diagnosis."""
-    stated, _ = reported_parameters(full, s.candidate, _known(full), scatter)
+    stated, _ = reported_parameters(full, s.candidate, _known(full))
     parameters = {name: (e.value, (e.low, e.high) if e.known else None) for name, e in stated.items()}
     return sized(s.candidate.mechanism, parameters, term)
-
-
-def _redrawn(fit: Fitted, term: TrueTerm, redraw: Redraw | None, null: Null) -> _Judged:
-    """The case with the term against the case without it, each with the machine file alone."""
-    if redraw is None:
-        return _Judged()
-    other = _fit(*redraw(term.effect))
-    memory = whiter(fit.memory, other.memory)
-    return replace(_beyond(fit, other, memory, null.threshold(_score(other, memory), margin=1.0)), fitted=other)
-
-
-def _beyond(before: Fitted, after: Fitted, memory: Memory, threshold: float) -> _Judged:
-    gain = _gain(before, after, memory)
-    old, new = _rms(before), _rms(after)
-    cut = max((1.0 - new[c] / old[c] for c in old if c in new and old[c] > 0), default=0.0)
-    return _Judged(gain, threshold, visible=bool(gain > threshold and cut >= CUT))
-
-
-def _gain(before: Fitted, after: Fitted, memory: Memory) -> float:
-    return _score(after, memory) - _score(before, memory)
-
-
-def _score(fitted: Fitted, memory: Memory) -> float:
-    return float(alone(fitted, memory).base_score()[0])
 
 
 def _rms(fitted: Fitted) -> dict[str, float]:

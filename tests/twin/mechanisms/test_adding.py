@@ -13,7 +13,7 @@ import pytest
 import signatures_heat
 
 from diagnosis.candidates.library import candidates
-from diagnosis.screening.linearisation import asleep
+from diagnosis.screening.signatures import asleep
 from thermodrift.testing.small_machine import BODIES, machine_with
 from twin.mechanisms import MECHANISMS
 from twin.schema import twin_part

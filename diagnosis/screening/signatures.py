@@ -1,4 +1,4 @@
-"""A network in which every candidate is switched off: one linearisation gives the signatures of all.
+"""Signatures of candidates: what recordings would show of each, from one linearisation with all of them switched off.
 
 Each candidate has the values that switch it off, so the simulation is the baseline's; the derivatives by its
 amplitudes are its signatures (the first-order response, Lindley 1958's score direction).
@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data.arrays import Array
-from data.batch import Batch
+from data.arrays import Array, Mask
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from diagnosis.contracts import Candidate, CandidateKind, Fitted
-from diagnosis.fitting.fitted import carried_nuisances, carried_z, on_network
+from diagnosis.candidates.alternatives import alternatives
+from diagnosis.candidates.discretisation import SLACK_MECHANISMS, slack
+from diagnosis.candidates.library import candidates
+from diagnosis.contracts import Candidate, CandidateKind, Point
+from diagnosis.fitting.carried import carried_nuisances, carried_z, on_network
 from twin.calibration.least_squares import x_of
-from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
 from twin.compiling.cells import several
 from twin.mechanisms import MECHANISMS
@@ -150,24 +151,72 @@ def _sleeping(network: Network, names: set[str]) -> Network:
     )
 
 
-def columns_of(
-    problem: CalibrationProblem, batches: Sequence[Batch], network: Network, z: Array, nuisance: Sequence[Array],
-    numbers: Sequence[int],
-) -> Array:  # fmt: skip
-    """Derivatives (n, k) of all rows by k numbered parameters of a network with more in it, at a fit's unknowns."""
-    other = on_network(problem, batches, network)
-    at, own = carried_z(problem, other, z), carried_nuisances(problem, other, nuisance)
-    return np.concatenate(list(other.columns(x_of(other.unknowns, at), own, numbers)))
+@dataclass(frozen=True)
+class Signatures:
+    """Derivatives and finite changes (n_b, C) of every batch's rows, in units of the given noise.
+
+    `of` numbers the columns by candidate; those that are `whole` (C,) are changes, the others derivatives by
+    amplitudes. `left_out` says why a candidate has none.
+    """
+
+    columns: list[Array]
+    of: Mapping[str, tuple[int, ...]]
+    whole: Mask
+    left_out: Mapping[str, str]
+
+    def joined(self, more: Signatures) -> Signatures:
+        """These and others."""
+        n = len(self.whole)
+        of = {**self.of, **{name: tuple(n + k for k in own) for name, own in more.of.items()}}
+        columns = [np.hstack([a, b]) for a, b in zip(self.columns, more.columns, strict=True)]
+        return Signatures(columns, of, np.append(self.whole, more.whole), {**self.left_out, **more.left_out})
 
 
-def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
+def signatures(at: Point, every: Sequence[Candidate], known: Signatures | None = None) -> Signatures:
+    """Of candidates at a point; those that only change a parameter that is fitted anyway have none.
+
+    What is `known` from a fit with fewer effects is taken over: a signature hardly depends on them.
+    """
+    if known is not None:
+        new = [c for c in every if c.name not in known.of and c.name not in known.left_out]
+        names = {c.name for c in every}
+        kept = replace(known, of={n: c for n, c in known.of.items() if n in names})
+        return kept.joined(signatures(at, new)) if new else kept
+    found = asleep(at.machine, at.part, every)
+    problem = on_network(at.problem, at.batches, found.network)
+    fitted = {u.name for u in at.problem.unknowns}
+    waking = sorted({j for js in found.amplitudes.values() for j in js})
+    numbers = [j for j in waking if found.network.parameters[j].name not in fitted]
+    x = x_of(problem.unknowns, carried_z(at.problem, problem, at.z))
+    smooth = list(problem.columns(x, carried_nuisances(at.problem, problem, at.nuisance), numbers))
+    finite, refused = differences(at, every)
+    place = {j: k for k, j in enumerate(numbers)}
+    of = {name: tuple(place[j] for j in js if j in place) for name, js in found.amplitudes.items()}
+    of |= {name: (len(numbers) + k,) for k, name in enumerate(finite)}
+    columns = [np.column_stack([s, *(d[b] for d in finite.values())]) for b, s in enumerate(smooth)]
+    whole = np.arange(columns[0].shape[1]) >= len(numbers)
+    return Signatures(columns, {n: c for n, c in of.items() if c}, whole, {**found.left_out, **refused})
+
+
+def imperfections(at: Point) -> list[Array]:
+    """What sensors, clocks, films and lengths of any machine are off by, (n_b, K) of every batch per sd of each."""
+    every = candidates(at.machine, at.part, SLACK_MECHANISMS) + alternatives(at.problem.network)
+    sd = slack(every, at)
+    own = [c for c in every if c.name in sd and (c.amplitudes or c.change)]
+    seen = signatures(at, own)
+    which = [(seen.of[c.name][0], sd[c.name]) for c in own if c.name in seen.of]
+    scale = np.array([s for _, s in which])
+    return [x[:, [k for k, _ in which]] * scale for x in seen.columns]
+
+
+def differences(fitted: Point, proposed: Sequence[Candidate]) -> tuple[dict[str, list[Array]], dict[str, str]]:
     """By candidate the change (n_b,) of every batch's rows, in units of the given noise, at its usual values.
 
     The second mapping says why others are left out: they do not compile, or the recordings contradict them outright.
     """
     out: dict[str, list[Array]] = {}
     left_out: dict[str, str] = {}
-    problem, nuisance = fitted.problem, fitted.state.nuisance
+    problem, nuisance = fitted.problem, fitted.nuisance
     before = problem.residuals(fitted.x, nuisance)
     run = simulate(problem.network, fitted.values, *problem.own(nuisance))
     for c in proposed:
@@ -188,19 +237,19 @@ def differences(fitted: Fitted, proposed: Sequence[Candidate]) -> tuple[dict[str
     return out, left_out
 
 
-def difference(fitted: Fitted, part: TwinPart, before: Sequence[Array]) -> list[Array]:
+def difference(fitted: Point, part: TwinPart, before: Sequence[Array]) -> list[Array]:
     """What a changed twin part shows beyond the fit whose residuals are `before`, (n_b,) of every batch.
 
     Raises:
         InputError, WorkError: the part does not compile or cannot be simulated.
     """
     problem = on_network(fitted.problem, fitted.batches, compile_network(fitted.machine, part=part))
-    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.state.z))
-    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.state.nuisance))
+    x = x_of(problem.unknowns, carried_z(fitted.problem, problem, fitted.z))
+    after = problem.residuals(x, carried_nuisances(fitted.problem, problem, fitted.nuisance))
     return [b - a for b, a in zip(before, after, strict=True)]
 
 
-def _read_otherwise(fitted: Fitted, c: Candidate, run: Simulation) -> list[Array]:
+def _read_otherwise(fitted: Point, c: Candidate, run: Simulation) -> list[Array]:
     """A sensor or a clock moves no heat: the law reads the same simulation otherwise."""
     assert c.part is not None
     problem, mechanism = fitted.problem, MECHANISMS[c.mechanism]
@@ -221,7 +270,7 @@ def _read_otherwise(fitted: Fitted, c: Candidate, run: Simulation) -> list[Array
     return out
 
 
-def _exchanged(fitted: Fitted, c: Candidate, before: Sequence[Array]) -> list[Array] | None:
+def _exchanged(fitted: Point, c: Candidate, before: Sequence[Array]) -> list[Array] | None:
     """Two labels exchanged move no heat: the simulation is read the other way round; None if that fits worse."""
     assert c.part is not None and c.part.acts_on is not None
     one, other = (fitted.problem.channels.index(name) for name in c.part.acts_on)

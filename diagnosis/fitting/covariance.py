@@ -1,0 +1,187 @@
+"""The covariance of what a calibrated network leaves: noise, structure of refined twins, and known imperfections.
+
+``Σ = blocks + D Dᵀ``: a block per batch and channel of white noise and of what refined twins show that no other does,
+and directions D (n, K), of sd 1 each, that all batches share: structure is the same in every run. Directions are
+unknowns of prior N(0, 1) like parameters, so that effects are judged with all of them integrated out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from data.arrays import Array
+from diagnosis.policy import POLICY
+from twin.calibration.fit_problem import Block
+from twin.calibration.problem import CalibrationProblem
+
+Slices = Sequence[tuple[int, slice]]  # every channel's number and rows
+
+
+def slices_of(channel: NDArray[np.int64]) -> Slices:
+    """Every channel's number and rows, of the channels (n,) of rows in their order."""
+    starts = np.flatnonzero(np.diff(channel, prepend=-1))
+    ends = np.append(starts[1:], len(channel))
+    return [(c, slice(a, b)) for c, a, b in zip(channel[starts].tolist(), starts.tolist(), ends.tolist(), strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What covariances are learned from, in units of the given noise.
+
+    Of every batch `drawn` (n_b, T), what refined twins show beyond a recalibration, and `known` (n_b, K), imperfections
+    of any machine per sd; `noise` (C,) is each channel's white noise.
+    """
+
+    drawn: Sequence[Array]
+    known: Sequence[Array]
+    noise: Array
+
+    @cached_property
+    def alone(self) -> list[Array]:
+        """What each draw shows that no other does (n_b, T)."""
+        return alone_in(self.drawn)
+
+    @property
+    def directions(self) -> tuple[Array, ...]:
+        """Draws and imperfections, each of sd 1."""
+        n = np.sqrt(self.drawn[0].shape[1])
+        return tuple(np.hstack([d / n, k]) for d, k in zip(self.drawn, self.known, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """`roots` are, by batch and channel, inverse lower Cholesky factors (n, n) of the blocks; `directions` (n_b, K) by
+    batch, in units of the given noise; `structure` is what it was learned from.
+    """
+
+    channels: tuple[NDArray[np.int64], ...]
+    roots: tuple[dict[int, Array], ...]
+    directions: tuple[Array, ...]
+    structure: Structure | None = None
+    share: float = 0.0  # of what draws alone show
+    factor: Array | None = None  # of each channel's (C,) block sd
+
+    @classmethod
+    def of(cls, problem: CalibrationProblem, block: Callable[[int, int, slice], Array], **given: Any) -> Covariance:
+        """With `block` of a batch, a channel and its rows in the batch."""
+        channels = tuple(m.channel for m in problem.measured)
+        roots = tuple({c: _inverse_root(block(b, c, at)) for c, at in slices_of(m)} for b, m in enumerate(channels))
+        bare = tuple(np.zeros((len(m), 0)) for m in channels)
+        return cls(**{"channels": channels, "roots": roots, "directions": bare, **given})
+
+    def white(self, batch: int, rows: Array) -> Array:
+        """Rows (n_b, …) of a batch, uncorrelated and of unit variance but for the directions."""
+        out = np.empty(rows.shape)
+        for channel, at in self._slices[batch]:
+            out[at] = self.roots[batch][channel] @ rows[at]
+        return out
+
+    @cached_property
+    def _slices(self) -> list[Slices]:
+        return [slices_of(c) for c in self.channels]
+
+    @cached_property
+    def log_det(self) -> Array:
+        """Of every batch's blocks (B,)."""
+        return np.array([-2.0 * sum(float(np.log(np.diag(r)).sum()) for r in own.values()) for own in self.roots])
+
+    def scaled(self, factor: Array) -> Covariance:
+        """The same with each channel's (C,) block sd times a factor."""
+        roots = tuple({c: root / factor[c] for c, root in own.items()} for own in self.roots)
+        return replace(self, roots=roots, factor=factor if self.factor is None else self.factor * factor)
+
+
+def _inverse_root(block: Array) -> Array:
+    root = np.linalg.cholesky(block)
+    return np.asarray(solve_triangular(root, np.eye(len(root)), lower=True), float)
+
+
+def independent(problem: CalibrationProblem, noise: Array) -> Covariance:
+    """White noise of sd `noise` (C,) alone."""
+    return Covariance.of(problem, lambda b, c, at: noise[c] ** 2 * np.eye(at.stop - at.start))
+
+
+def rough(problem: CalibrationProblem, directions: Sequence[Array]) -> Covariance:
+    """Unit noise and as much again that an AR(1) remembers, to begin with."""
+    share, keep = POLICY.rough_memory
+
+    def block(b: int, c: int, at: slice) -> Array:
+        rows = np.arange(at.stop - at.start)
+        return np.asarray(np.eye(len(rows)) + share * keep ** np.abs(np.subtract.outer(rows, rows)), float)
+
+    return Covariance.of(problem, block, directions=tuple(directions))
+
+
+def learned(problem: CalibrationProblem, structure: Structure, share: float) -> Covariance:
+    """White noise and, times `share`, the variance of what each draw alone shows; all directions of sd 1."""
+
+    def block(b: int, c: int, at: slice) -> Array:
+        alone = structure.alone[b][at]
+        white = structure.noise[c] ** 2 * np.eye(len(alone))
+        return np.asarray(white + share / alone.shape[1] * alone @ alone.T, float)
+
+    return Covariance.of(problem, block, directions=structure.directions, structure=structure, share=share)
+
+
+def white_noise(problem: CalibrationProblem) -> Array:
+    """The sd (C,) of each channel's white noise in units of the given one, from second differences.
+
+    A channel that stands still from row to row is rounded: it has at least the given noise.
+    """
+    out = np.ones(len(problem.channels))
+    for c in range(len(out)):
+        apart = []
+        for m in problem.measured:
+            at = m.channel == c
+            even = np.diff(m.row[at], 2) == 0
+            apart.append(np.diff(m.value[at], 2)[even] / (np.sqrt(6.0) * problem.noise[c]))
+        second = np.abs(np.concatenate(apart)) if apart else np.zeros(0)
+        if len(second) < POLICY.noise_min_rows:
+            continue
+        kept = np.sort(second)[: int(POLICY.noise_kept_share * len(second))]
+        rms = POLICY.noise_kept_factor * float(np.sqrt(np.mean(kept**2)))
+        rounded = np.mean(second < 1e-6) > POLICY.rounded_min_share
+        sd = max(1.0, rms) if rounded else 1.4826 * float(np.median(second))
+        out[c] = np.clip(sd, *POLICY.white_noise_bounds)
+    return out
+
+
+def beyond_recalibration(blocks: Sequence[Block], spread: Array, drawn: Sequence[Array]) -> list[Array]:
+    """Signatures (n_b, K) less what one linear step of parameters and own unknowns, within their priors, takes."""
+    size = len(spread)
+    information, shared, own = np.eye(size), np.zeros((size, drawn[0].shape[1])), []
+    for b, d in zip(blocks, drawn, strict=True):
+        jacobian, n = b.jacobian * spread, b.nuisance
+        factor = cho_factor(n.T @ n + np.eye(n.shape[1]))
+        of_jacobian, of_drawn = cho_solve(factor, n.T @ jacobian), cho_solve(factor, n.T @ d)
+        information += jacobian.T @ (jacobian - n @ of_jacobian)
+        shared += jacobian.T @ (d - n @ of_drawn)
+        own.append((jacobian, of_jacobian, of_drawn))
+    z = np.linalg.solve(information, shared)
+    return [
+        d - jacobian @ z - b.nuisance @ (of_drawn - of_jacobian @ z)
+        for b, d, (jacobian, of_jacobian, of_drawn) in zip(blocks, drawn, own, strict=True)
+    ]
+
+
+def clipped(drawn: Sequence[Array]) -> list[Array]:
+    """Draws (n_b, K) of which none is much larger than the median one."""
+    size = np.sqrt(sum(np.einsum("nk,nk->k", d, d) for d in drawn))
+    most = POLICY.draw_max_size * float(np.median(size))
+    factor = np.minimum(1.0, most / np.maximum(size, 1e-300))
+    return [d * factor for d in drawn]
+
+
+def alone_in(drawn: Sequence[Array]) -> list[Array]:
+    """What each of the draws (n_b, K) shows that no combination of the others does (ridge 1)."""
+    gram = sum(d.T @ d for d in drawn)
+    inverse = np.linalg.inv(np.asarray(gram) + np.eye(len(np.asarray(gram))))
+    rest = inverse / np.diag(inverse)
+    return [d @ rest for d in drawn]

@@ -1,0 +1,145 @@
+"""Refined twins: machines that a lumped network may stand for, and what their recordings would differ by.
+
+A body of a lumped network has one temperature; a casting has gradients, a sensor sits somewhere in them, heat enters
+somewhere else. What that makes of recordings is no noise: it has a shape, given by this machine, its inputs and its
+sensors. The shape is drawn by simulation and taken as the covariance of the misfit (Bayesian approximation error,
+Kaipio and Somersalo 2007, J. Comput. Appl. Math. 198, 493; model discrepancy, Kennedy and O'Hagan 2001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from data.arrays import Array
+from data.batch import Batch
+from data.errors import InputError, WorkError
+from data.machine import Machine
+from diagnosis.fitting.carried import on_network
+from diagnosis.policy import POLICY
+from twin.calibration.problem import CalibrationProblem
+from twin.compile import compile_network
+from twin.network import Network
+from twin.quantity import Value
+from twin.schema import Body, ErrorChain, MechanismPart, TwinPart
+from twin.simulation import simulate
+
+Rng = np.random.Generator
+
+
+def misfits(
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    problem: CalibrationProblem,
+    values: Array,
+    draws: int,
+    rng: Rng,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Array]:
+    """What `draws` refined twins about parameter values (n,) show beyond the lumped one, (n_b, draws) of every batch in
+    units of the given noise.
+
+    Raises:
+        WorkError: no more than one draw in four can be simulated.
+    """  # fmt: skip
+    out: list[list[Array]] = []
+    for _ in range(4 * draws):
+        try:
+            out.append(_misfit(machine, part, batches, problem, values, rng))
+        except (InputError, WorkError):
+            continue  # a draw that no machine has
+        if progress:
+            progress(len(out), draws)
+        if len(out) == draws:
+            return [np.column_stack(own) for own in zip(*out, strict=True)]
+    raise WorkError(
+        f"machine {machine.machine}: {len(out)} of {4 * draws} refined twins could be simulated, expected {draws}; "
+        "check the values of the machine file"
+    )
+
+
+def _misfit(
+    machine: Machine, part: TwinPart, batches: Sequence[Batch], problem: CalibrationProblem, values: Array, rng: Rng
+) -> list[Array]:
+    """One refined twin less the lumped one with the same totals, (n_b,) of every batch."""
+    network = problem.network
+    lumped, drawn = values.copy(), values.copy()
+    for j, p in enumerate(network.parameters):
+        if p.free and p.scale == "log" and drawn[j] > 0:
+            lumped[j] = drawn[j] = drawn[j] * np.exp(rng.normal(0.0, POLICY.drawn_value_log_sd))
+        elif "exponent" in p.name and drawn[j] > 0:  # how heat grows with speed is part of the structure
+            drawn[j] *= np.exp(rng.normal(0.0, POLICY.drawn_exponent_log_sd))
+    finer, cut = refined(part, network, drawn, rng)
+    fine = on_network(problem, batches, compile_network(machine, part=finer))
+    known = {p.name: v for p, v in zip(network.parameters, drawn, strict=True)}
+    own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
+    n = len(batches)
+    for body in cut:  # what a machine has done before leaves gradients
+        cells = fine.network.bodies[body]
+        sd_K = max(POLICY.start_gradient_min_sd_K, POLICY.start_gradient_share * network.start_spread_K)
+        fine.start_degC[:, cells] += rng.normal(0.0, sd_K, (n, 1)) * np.linspace(-1.0, 1.0, len(cells))
+    scatter = {h.law.name: np.exp(rng.normal(0.0, POLICY.run_to_run_log_sd, n)) for h in network.heats if not h.asleep}
+    return [f - g for f, g in zip(_shown(fine, own, scatter), _shown(problem, lumped, {}), strict=True)]
+
+
+def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array]) -> list[Array]:
+    """What every batch shows, (n_b,) in units of the given noise; `scatter` (B,) multiplies heats by law."""
+    inputs, start = problem.own([np.zeros(q) for q in problem.nuisance_sizes])
+    run = simulate(problem.network, values, inputs.with_own({**inputs.times, **scatter}), start)
+    series = np.concatenate([run.readings[0], run.errors[0]], axis=-1)
+    return [m.of(s) / problem.noise[m.channel] for m, s in zip(problem.measured, series, strict=True)]
+
+
+def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[TwinPart, list[str]]:
+    """A twin part whose lumps are chains of cells with inner resistance, and the bodies that were cut; links, heats and
+    sensors stand anywhere in them. Its parameters keep their names."""
+    total = network.conductance_W_per_K(values)
+    joined = {place.partition("@")[0] for link in part.links.values() for place in link.between}
+    joined |= {e.of.partition("@")[0] for e in part.exposures.values()}
+    bodies: dict[str, Body] = dict(part.bodies)
+    cut = [name for name, body in part.bodies.items() if body.shape == "lump" and name in joined]
+    for name in cut:
+        (cell,) = network.bodies[name]
+        thin = rng.random() < POLICY.thin_body_share
+        median, log_sd = POLICY.thin_body_conductance if thin else POLICY.inner_conductance
+        through = float(total[cell, cell]) * float(np.exp(rng.normal(np.log(median), log_sd)))
+        cells = int(rng.integers(POLICY.drawn_cells[0], POLICY.drawn_cells[1] + 1))
+        bodies[name] = part.bodies[name].model_copy(
+            update={"shape": "bar", "cells": cells, "conductance": Value(value=f"{through:.6g} W/K")}
+        )
+
+    def place(at: str, low: float = 0.0, high: float = 1.0) -> str:
+        return f"{at}@{rng.uniform(low, high):.3f}" if at in cut else at
+
+    links = {
+        key: link.model_copy(update={"between": (place(link.between[0]), place(link.between[1]))})
+        for key, link in part.links.items()
+    }
+    update = {
+        "bodies": bodies,
+        "links": links,
+        "sensors": {key: s.model_copy(update={"at": place(s.at)}) for key, s in part.sensors.items()},
+        "mechanisms": {key: _placed(m, place) for key, m in part.mechanisms.items()},
+        "errors": {key: _seen(chain, place) for key, chain in part.errors.items()},
+    }
+    return part.model_copy(update=update), cut
+
+
+def _seen(chain: ErrorChain, place: Callable[..., str]) -> ErrorChain:
+    """The error chain with its lengths and levers attached about the middle of the bodies."""
+    span = POLICY.drawn_length_centre
+    links = tuple(c.model_copy(update={"body": place(c.body, *span)}) for c in chain.chain)
+    tilts = tuple(t.model_copy(update={"hot": place(t.hot, *span), "cold": place(t.cold, *span)}) for t in chain.tilts)
+    return chain.model_copy(update={"chain": links, "tilts": tilts})
+
+
+def _placed(given: MechanismPart, place: Callable[..., str]) -> MechanismPart:
+    """The mechanism with its heat into a place of the body; fitted shares keep their names."""
+    if isinstance(given.into, str):
+        return given.model_copy(update={"into": place(given.into)})
+    if isinstance(given.into, Mapping):
+        into = {place(k) if v == "rest" else k: v for k, v in given.into.items()}
+        return given.model_copy(update={"into": into})
+    return given
