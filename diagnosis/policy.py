@@ -116,6 +116,7 @@ class Policy:
     # Screening and refits
     screen_amplitude_noises: float = physical(10.0, "given noises", "sd of a signature in the channel it changes most")
     refit_min_screen_gain_nats: float = convention(2.0, "nats", "a smaller gain in the screen is not refitted")
+    unlisted_term_cost_nats: float = analytic(1.0, "nats", "of what gains alike a listed law comes first")
     refits: int = cost(10, "refits", "of a round; each takes half a second")
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")

@@ -14,7 +14,7 @@ from diagnosis.contracts import Candidate, Fitted
 from diagnosis.findings.report_data import Estimate, Found, Other, Rms, beyond_noise, context_label, place_label
 from diagnosis.findings.schema import Verdict
 from diagnosis.policy import POLICY, Policy
-from diagnosis.search.claims import Explanation, Round, explanations, reported
+from diagnosis.search.claims import Explanation, Round, explanations, probability_cap, reported
 from diagnosis.search.search import Search
 from twin.calibration.identifiability import Interval
 from twin.compiling.cells import several
@@ -199,7 +199,7 @@ def claimed(done: Round, part: TwinPart, final: Fitted) -> Found:
         where=c.where,
         place=_place_of(c, part),
         parameters={},
-        probability=sum(e.probability for e in same),
+        probability=min(sum(e.probability for e in same), probability_cap(final.runs)),
         context=context_label(c.part, c.where, part) if c.part is not None else "",
         others=tuple(_other(e, part) for e in reported([best, *rest])),
     )

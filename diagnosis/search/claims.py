@@ -61,18 +61,20 @@ def features(t: Tried, others: Sequence[Tried]) -> dict[str, float]:
     """Of a claim, by `FEATURES`.
 
     gain: logarithm of its nats; improved: share of the runs on which it has a say that are predicted better when they
-    are left out; margin: nats to the best of another signature as a share of its own; odds: log prior; network: 1 for
+    are left out; margin: nats to the best of another signature as a share of its own; odds: log prior, 0 of what no
+    list has; network: 1 for
     what may only say that a network is drawn too coarse, or follows no law.
     """
     telling = np.abs(t.by_run) > POLICY.telling_nats
     margin = t.standing - max([0.0, *(o.standing for o in others if o.cluster != t.cluster)])
-    law = MECHANISMS.get(t.candidate.mechanism)
+    c = t.candidate
+    coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
     return {
         "gain": float(np.log1p(max(t.gain, 0.0))),
         "improved": float((t.by_run[telling] > 0).mean()) if telling.any() else 0.0,
         "margin": float(np.clip(margin / max(t.gain, 1.0), -1.0, 1.0)),
-        "odds": t.log_prior,
-        "network": float(t.candidate.kind.is_unlisted or (law is not None and law.of_network)),
+        "odds": 0.0 if c.kind.is_unlisted else t.log_prior,
+        "network": float(c.kind.is_unlisted or coarse),
     }
 
 

@@ -30,8 +30,8 @@ def odds_of(now: Fitted, seen: Screen) -> dict[str, float]:
     never = never_reported(every, now)
     own = [c for c in every if c.name not in never and c.kind is not CandidateKind.SENSOR_SWAP]
     variants = Counter(c.mechanism for c in own if not c.variant_of)
-    unlisted = float(np.log(POLICY.unlisted_odds))
-    return {c.name: log_odds(c, now, variants[c.mechanism]) - unlisted * c.kind.is_unlisted for c in own}
+    cost = POLICY.unlisted_term_cost_nats
+    return {c.name: log_odds(c, now, variants[c.mechanism]) - cost * c.kind.is_unlisted for c in own}
 
 
 def shortlist(now: Fitted, seen: Screen, odds: dict[str, float]) -> list[Scored]:

@@ -106,7 +106,7 @@ def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
 
 
 def _judged(done: Round, t: Tried, impossible_now: frozenset[str], vetoed: bool) -> Round:
-    """The round with `t` as its claim: probable enough, some channel predicted better and none worse."""
+    """The round with `t` as its claim: probable enough, and no channel predicted worse."""
     rest = [o for o in done.tried if o is not t]
     own = features(t, rest)
     resolved = _resolves(t, impossible_now)
@@ -116,7 +116,8 @@ def _judged(done: Round, t: Tried, impossible_now: frozenset[str], vetoed: bool)
     if enough and vetoed:
         fitted, raised = unharmed(done.before, t.fitted)
         t = replace(t, fitted=fitted)
-        enough = bool(worsened(left_out_rows(fitted), left_out_rows(done.before)))
+        if resolved:  # what makes it possible must also show it
+            enough = bool(worsened(left_out_rows(fitted), left_out_rows(done.before)))
     return replace(
         done, tried=(t, *rest), trust=probable, accepted=enough and not raised, features=own, raised=raised,
         resolved=resolved,

@@ -10,7 +10,7 @@ import pytest
 
 from data.arrays import Array
 from diagnosis.contracts import Fitted
-from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, refitted, relearned, relinearised
+from diagnosis.fitting.fitted import LeftOutRows, left_out_rows, plain, refitted, relearned, relinearised
 from tests.diagnosis.small_cases import FLOOR, cold_floor, consistent
 from twin.calibration.estimate import CalibrationOptions, LeftOut, leave_batch_out
 from twin.calibration.identifiability import intervals90
@@ -113,8 +113,10 @@ def own_start_estimated(done: Fitted, k: int, values: Array) -> Array:
     own: Array = np.zeros(done.problem.nuisance_sizes[k])
     for _ in range(5):
         (block,) = one.linearise(x, [own])
-        normal = block.nuisance.T @ block.nuisance + np.eye(len(own))
-        own = np.asarray(np.linalg.solve(normal, block.nuisance.T @ (block.residual + block.nuisance @ own)), float)
+        weight = plain(done).noise.weight[block.channel]
+        normal = (block.nuisance.T * weight) @ block.nuisance + np.eye(len(own))
+        aim = (block.nuisance.T * weight) @ (block.residual + block.nuisance @ own)
+        own = np.asarray(np.linalg.solve(normal, aim), float)
     return one.residuals(x, [own])[0] * done.problem.noise[done.problem.measured[k].channel]
 
 

@@ -32,7 +32,7 @@ def found(case: str) -> Search:
 
 def recordings(case: str) -> list[Batch]:
     hidden: dict[str, Any] = {
-        "nothing": {}, "floor": {"a": COLD}, "drift": {"a": DRIFT}, "floor and shift": {"a": COLD, "b": SHIFT},
+        "nothing": {}, "floor": {"a": COLD}, "drift": {"a": DRIFT}, "drift and shift": {"a": DRIFT, "b": SHIFT},
     }[case]  # fmt: skip
     return runs(two_bodies(), hidden, 6 if case == "floor" else COUNT)
 
@@ -61,7 +61,7 @@ def test_a_cold_floor_is_found_with_its_size() -> None:
 
 
 def test_a_claim_is_probable_and_no_channel_is_predicted_worse() -> None:
-    for r in found("floor and shift").accepted:
+    for r in found("drift and shift").accepted:
         assert r.best is not None and r.trust >= POLICY.claim_min_probability and not r.raised
         assert r.best.gain > 0 and float(r.best.by_run.sum()) > 0
         assert not worsened(left_out_rows(r.before), left_out_rows(r.best.fitted))
@@ -89,10 +89,10 @@ def test_a_drifting_sensor_is_the_sensors_fault() -> None:
 
 
 def test_two_effects_at_once_are_both_found() -> None:
-    done = found("floor and shift")
-    assert sorted(names(done)) == ["floor_sink_head_room", "speed_shift_z_rpm"]
+    done = found("drift and shift")
+    assert sorted(names(done)) == ["sensor_drift_t_head", "speed_shift_z_rpm"]
     intervals = stated(done)
-    assert intervals["exposures.head-floor_sink_head_room.conductance"].value == pytest.approx(8.0, rel=0.1)
+    assert intervals["mechanisms.sensor_drift_t_head.rate"].value == pytest.approx(0.3, rel=0.1)
     assert intervals["mechanisms.speed_shift_z_rpm.shift"].value == pytest.approx(6.0, rel=0.05)
     assert not done.rounds[-1].accepted
 
