@@ -225,7 +225,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Fitted(Point):
-    """A point at its best fit under a covariance, which all fits of a diagnosis share.
+    """A point at its best fit under a covariance.
 
     `columns` (n_b, p + 1) of every batch are the whitened model, per unit of z, and the target; `runs` that the batches
     come from, where they are blocks of fewer. `nuisance` is where the batches' own unknowns were linearised, `own` what
@@ -243,7 +243,7 @@ class Fitted(Point):
 
     @cached_property
     def log_evidence(self) -> float:
-        """Nats, up to a constant that all fits of a diagnosis share (Laplace approximation)."""
+        """Nats, up to a constant of the recordings (Laplace approximation)."""
         return self.marginal.log_evidence(self.grams)
 
     @cached_property
@@ -284,7 +284,7 @@ class Tried:
     """A candidate after its full refit; `gain` in nats of log evidence over the fit before.
 
     `by_run` (B,) is what each left-out batch gains, `cluster` the first of the candidates that these recordings cannot
-    distinguish, `log_prior` of the equipment that it needs and of its size.
+    distinguish, `log_prior` of its law and of the equipment that it needs.
     """
 
     scored: Scored

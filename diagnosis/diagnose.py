@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,13 +63,12 @@ def diagnose(
     *,
     seed: int = 0,
     processes: int = 1,
-    cache: Path | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Locate, name, model and show what recordings have and the machine file's twin lacks.
 
     Without a twin part the simplest network that the recordings support is drafted first. `processes` side by side for
-    refits; results do not depend on it. `cache` keeps the structural null by data and machine file.
+    refits; results do not depend on it. `seed` is of the refined twins.
 
     Raises:
         InputError: batches or a machine file that cannot be used; WorkError: the model fails at the priors' means.

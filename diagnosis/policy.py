@@ -101,7 +101,6 @@ class Policy:
     amplitude_start_sd: float = convention(2.0, "prior sd", "a screened start lies no further from the usual value")
     signed_prior_sd_factor: float = physical(3.0, "usual spreads", "prior sd of a signed amplitude")
     signed_start_factor: float = convention(2.0, "of the start", "least prior sd, so that the start is plausible")
-    signed_usual_sd_factor: float = physical(5.0, "usual spreads", "sd of a signed amplitude when sizes are compared")
     shape_default_sd: float = physical(0.5, "log, or the parameter's unit", "prior of a shape whose law states none")
     unnamed_equipment_odds: float = physical(0.05, "odds", "a machine file seldom leaves out what the machine has")
     machinery_where_nothing_moves_odds: float = physical(1e-3, "odds", "a board of heaters has no bearings")
@@ -132,13 +131,12 @@ class Policy:
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
-    claim_offset: float = development(-3.1, "log odds", "logistic model of 93 refits of 31 cases of four kinds")
+    claim_offset: float = development(-3.1, "log odds", "near a logistic fit of 99 refits of 33 cases of four kinds")
     claim_weights: tuple[float, ...] = development(
         (0.63, 0.4, 0.7, 0.5, -0.9), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`"
     )
     claim_min_probability: float = development(0.55, "probability", "the likeliest false claim had 0.51")
     chance_quantile: float = convention(0.99, "probability", "what chance exceeds once in a hundred cases is no claim")
-    null_min_nats: float = analytic(5.0, "nats", "chance gains as much among hundreds of candidates")
     temperature_null_share: float = development(0.25, "of the null threshold", "scale on which gains are compared")
     temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")
     max_effects: int = cost(4, "effects", "of one search")

@@ -52,7 +52,6 @@ class Diagnose(Protocol):
         *,
         seed: int,
         processes: int,
-        cache: Path | None,
         progress: Done | None,
     ) -> Diagnosis: ...
 
@@ -271,8 +270,7 @@ def _diagnosed(
             last = step
 
     work = work or library_diagnosis()
-    cache = home() / "diagnosis_cache"
-    return work(machine, batches, seed=seed, processes=os.cpu_count() or 1, cache=cache, progress=progress)
+    return work(machine, batches, seed=seed, processes=os.cpu_count() or 1, progress=progress)
 
 
 def library_diagnosis() -> Diagnose:

@@ -150,26 +150,6 @@ def _bounds(spec: Spec) -> tuple[str | float, str | float] | None:
     return _said(spec.low, spec.unit), _said(spec.high, spec.unit)
 
 
-def log_size(s: Scored, fitted: Point) -> float:
-    """Log density of an effect's size about the usual one, 0 at best; signed amplitudes by their usual spread. Of
-    several amplitudes the likeliest: they are parts of one effect, and any may be none. `fitted` has the effect."""
-    c = s.candidate
-    if c.mechanism not in MECHANISMS:
-        return 0.0
-    mechanism, size = MECHANISMS[c.mechanism], size_of(fitted)
-    values = {p.name: v for p, v in zip(fitted.problem.network.parameters, fitted.values, strict=True)}
-    sizes: list[float] = []
-    for amplitude, off in (mechanism.off or {}).items():
-        spec = at_size(mechanism.spec(amplitude), size)
-        value = float(values.get(f"mechanisms.{c.name}.{amplitude}", off + s.amplitudes.get(amplitude, 0.0)))
-        if spec.scale == "log" and spec.value and value > 0:
-            sd = max(POLICY.amplitude_min_log_sd, spec.spread or 0.0)
-            sizes.append(-0.5 * (float(np.log(value / spec.value)) / sd) ** 2)
-        elif spec.scale == "linear" and spec.spread:
-            sizes.append(-0.5 * ((value - off) / (POLICY.signed_usual_sd_factor * spec.spread)) ** 2)
-    return max(sizes, default=0.0)
-
-
 def log_odds(c: Candidate, now: Point, variants: int) -> float:
     """Log odds of a candidate before the recordings: of its equipment, of laws that go with it at its place, and of its
     mechanism, spread over so many variants: hundreds of an unlikely law weigh no more than one."""

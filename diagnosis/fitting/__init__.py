@@ -1,1 +1,1 @@
-"""Fits of a twin part to batches: generalised least squares with the memory that the fit itself leaves."""
+"""Fits of a twin part to batches: least squares under the covariance of their structure."""

@@ -295,23 +295,23 @@ class LeftOutRows:
 
 @lru_cache(maxsize=16)
 def plain(fitted: Fitted) -> Fitted:
-    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, and rows that repeat each
-    other count as one (`twin.calibration`). What a machine file states is simulated without structure."""
+    """The same twin part calibrated to simulate alone: each channel's misfit is its noise, rows that repeat each other
+    count as one (`twin.calibration`), and some channels for more (`Fitted.weight`). What a machine file states is
+    simulated without structure."""
     problem = fitted.problem
     state = State.at(problem, fitted.z, fitted.own, fitted.noise)
     state = annealed(problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
-    at = Point(fitted.machine, fitted.part, fitted.batches, problem, state.z, state.nuisance)
-    one = calibrated(at, state.noise, fitted.runs)
-    return weighted(one, np.array(fitted.weight)) if fitted.weight else one
+    one = calibrated(_moved(fitted, state), state.noise, fitted.runs)
+    if not fitted.weight:
+        return one
+    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(fitted.weight))
+    state = State.at(problem, one.z, one.nuisance, noise)
+    state = descend(problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
+    return calibrated(_moved(fitted, state), noise, fitted.runs)
 
 
-def weighted(one: Fitted, weight: Array) -> Fitted:
-    """A `plain` fit with channels (C,) that count for more."""
-    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(weight))
-    state = State.at(one.problem, one.z, one.nuisance, noise)
-    state = descend(one.problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
-    at = Point(one.machine, one.part, one.batches, one.problem, state.z, state.nuisance)
-    return calibrated(at, noise, one.runs)
+def _moved(at: Point, state: State) -> Point:
+    return Point(at.machine, at.part, at.batches, at.problem, state.z, state.nuisance)
 
 
 def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
@@ -325,10 +325,7 @@ def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
 @lru_cache(maxsize=16)
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted, free-running, by the `plain` fit to all others; its starts and zeros are its own."""
-    return _left_out(plain(fitted))
-
-
-def _left_out(one: Fitted) -> LeftOutRows:
+    one = plain(fitted)
     problem, spread = one.problem, _spread(one.problem.unknowns)
     blocks = list(problem.linearise(one.x, one.nuisance))
     low, high = z_bounds(problem.unknowns)
@@ -371,13 +368,11 @@ def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[flo
     """
     weight = np.ones(len(after.problem.channels))
     raised = worsened(left_out_rows(before), left_out_rows(after))
-    for _ in range(POLICY.weight_rounds):
-        if not raised:
-            break
+    for _ in range(POLICY.weight_rounds if raised else 0):
         weight[[after.problem.channels.index(c) for c in raised]] *= POLICY.weight_factor
-        then = worsened(left_out_rows(before), _left_out(weighted(plain(after), weight)))
-        if not then:
-            return replace(after, weight=tuple(weight.tolist())), then
+        fair = replace(after, weight=tuple(weight.tolist()))
+        if not worsened(left_out_rows(before), left_out_rows(fair)):
+            return fair, {}
     return after, raised
 
 

@@ -1,1 +1,1 @@
-"""How well each candidate predicts batches left out, all of them from one linearisation."""
+"""What each candidate gains, all of them from one linearisation."""

@@ -1,1 +1,1 @@
-"""Fits, refits and rounds: which candidates are accepted, against what chance and structure alone would gain."""
+"""Refits and rounds: which candidates are claimed, and how probable each explanation is."""

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from diagnosis.candidates.library import candidates
-from diagnosis.candidates.priors import at_size, log_size, size_of, start_values
+from diagnosis.candidates.priors import at_size, size_of, start_values
 from diagnosis.contracts import Fitted, Scored
 from diagnosis.fitting.fitted import refitted
 from diagnosis.policy import POLICY
@@ -64,13 +64,6 @@ def test_watts_conductances_and_surfaces_go_with_it_and_nothing_else() -> None:
     assert at_size(MECHANISMS["radiation"].spec("area"), 1e-3).value == pytest.approx(1e-3)
     for key, name in (("supply_sag", "sag"), ("joint_conductance", "ratio"), ("sensor_drift", "rate")):
         assert at_size(MECHANISMS[key].spec(name), 1e-3) is MECHANISMS[key].spec(name)
-
-
-def test_what_is_usual_on_a_board_is_plausible_there_and_absurd_on_a_machine() -> None:
-    board, machine = standing(of_grams()), cold_floor()
-    seen = bridge(3e-3)
-    assert log_size(seen, board) > -0.5 > -8.0 > log_size(seen, machine)
-    assert log_size(bridge(5.0), machine) > -0.5
 
 
 def test_a_structural_one_begins_at_what_the_screen_saw_about_the_usual_value() -> None:

@@ -98,8 +98,8 @@ def test_what_is_left_is_least() -> None:
     x, grams = columns("model", "target"), marginal().grams(columns("model", "target"))
     z = marginal().optimum(grams)
     left = marginal().leftover(x, z, grams)
-    beside = marginal().leftover(x, z + 0.1, grams)
-    assert sum(float(r @ r) for r in left) + z @ z < sum(float(r @ r) for r in beside) + (z + 0.1) @ (z + 0.1)
+    nearby = marginal().leftover(x, z + 0.1, grams)
+    assert sum(float(r @ r) for r in left) + z @ z < sum(float(r @ r) for r in nearby) + (z + 0.1) @ (z + 0.1)
 
 
 def test_a_draw_is_alone_in_what_no_other_shows() -> None:

@@ -22,7 +22,7 @@ def test_a_parameter_that_does_nothing_at_its_place_is_not_told() -> None:
     assert done is not None
     fit = result(done.problem, done.state, 1e-2, "")
     intervals = {i.name: i for i in intervals90(fit, done.problem.unknowns)}
-    told, _ = reported_parameters(done, c, intervals)
+    stated, _ = reported_parameters(done, c, intervals)
     assert f"mechanisms.{c.name}.factor" in intervals
-    assert "factor" not in told
-    assert told["drop"].value > 2.0
+    assert "factor" not in stated
+    assert stated["drop"].value > 2.0

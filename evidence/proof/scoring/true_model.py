@@ -137,7 +137,7 @@ def _said(number: float, unit: str) -> str | float:
     return float(f"{number:.6g}") if unit == "1" else f"{number:.6g} {unit}"
 
 
-VISIBLE_NATS = 30.0  # odds of 1e13: with the truth told nobody would doubt it
+VISIBLE_NATS = 30.0  # odds of 1e13
 
 
 @dataclass(frozen=True)

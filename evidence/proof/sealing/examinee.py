@@ -33,7 +33,7 @@ def main() -> None:
     _report(place, status)
     try:
         begun, begun_cpu = perf_counter(), process_time()
-        diagnosis = diagnose(*read_case(place / "case", place / "answer" / "lake"), seed=0, processes=1, cache=None)
+        diagnosis = diagnose(*read_case(place / "case", place / "answer" / "lake"), seed=0, processes=1)
         status |= {"stage": "diagnosed", "seconds": round(perf_counter() - begun, 2)}
         status["processor_seconds"] = round(process_time() - begun_cpu, 2)
         _write_diagnosis(place, diagnosis)
