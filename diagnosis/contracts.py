@@ -16,6 +16,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
 from diagnosis.fitting.marginal import Grams, Marginal
+from diagnosis.policy import POLICY
 from twin.calibration.fit_problem import Noise, estimate
 from twin.calibration.least_squares import State, x_of
 from twin.calibration.problem import CalibrationProblem
@@ -305,8 +306,9 @@ class Tried:
 
     @property
     def standing(self) -> float:
-        """Log weight among explanations."""
-        return self.gain + self.log_prior
+        """Log weight among explanations; free forms imitate any law to within a share of its gain."""
+        credit = POLICY.free_form_credit if self.candidate.kind.is_unlisted else 1.0
+        return credit * self.gain + self.log_prior
 
 
 # Left-out values throughout. kind and name: where, as in the findings; a candidate's unique name may stand there too.

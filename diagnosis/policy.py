@@ -52,6 +52,14 @@ class Policy:
     )
     thin_body_share: float = physical(0.25, "probability", "screws and sheets conduct far less than they exchange")
     thin_body_conductance: tuple[float, float] = physical((0.1, 1.0), "as above", "of such a body")
+    webbed_share: float = physical(0.5, "probability", "ribs and webs conduct around a chain")
+    web_conductance: tuple[float, float] = physical(
+        (0.1, 1.0), "of the inner conductance", "each, from weak to as good as the chain"
+    )
+    stray_conductance: float = physical(
+        0.05, "of the weaker total", "bodies that almost touch, between bodies two apart"
+    )
+    leak_share: float = physical(0.15, "of a heat", "at most, into a neighbour of the body that it is drawn into")
     start_gradient_share: float = physical(0.1, "of the file's initial spread", "what a machine has done before")
     start_gradient_min_sd_K: float = physical(0.03, "K", "no body is at one temperature")
     run_to_run_log_sd: float = physical(0.05, "log", "no heat is the same in every run")
@@ -89,7 +97,11 @@ class Policy:
     sensor_offset_sd_K: float = physical(0.05, "K", "of a sensor for which the machine file states none")
     sensor_lag_sd_s: float = physical(240.0, "s", "lag of a sensor for which the machine file states none")
     held_lag_log_sd: float = physical(1.5, "log", "a lag that the machine file holds fixed")
-    film_area_sd: float = physical(0.2, "m2 per W/K", "about all of a film that is stated as a constant is natural")
+    rising_film_share: float = physical(
+        0.35, "of an exposure", "about all of a film is natural convection and radiation"
+    )
+    rising_link_share: float = physical(0.1, "of a link", "joints close as they warm")
+    rising_W_per_m2K: float = analytic(2.7, "W/m2K", "natural convection at 6 K: McAdams 1954, 0.5 m high")
     time_skew_sd_rows: float = analytic(0.1, "rows", "a row is a mean over its interval, which blurs corners")
     logger_skew_sd_rows: float = analytic(0.3, "rows", "a time stamp lies anywhere within its interval, uniformly")
 
@@ -116,6 +128,8 @@ class Policy:
     screen_amplitude_noises: float = physical(10.0, "given noises", "sd of a signature in the channel it changes most")
     refit_min_screen_gain_nats: float = convention(2.0, "nats", "a smaller gain in the screen is not refitted")
     unlisted_term_cost_nats: float = analytic(1.0, "nats", "of what gains alike a listed law comes first")
+    run_windows: int = cost(24, "parts of a run", "in which what happens once is looked for")
+    free_form_credit: float = development(0.9, "of its gain", "free forms imitate any law to within a tenth")
     refits: int = cost(10, "refits", "of a round; each takes half a second")
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
@@ -130,6 +144,7 @@ class Policy:
     impossible_min_noises: float = analytic(5.0, "given noises", "by chance one row in two million is so far off")
     impossible_min_rows: int = convention(3, "rows", "a single one may be a fault of the recording")
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
+    settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
     claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
     claim_offset: float = development(-3.1, "log odds", "near a logistic fit of 99 refits of 33 cases of four kinds")
     claim_weights: tuple[float, ...] = development(

@@ -54,12 +54,17 @@ class Outlet:
 
 @dataclass(frozen=True)
 class Heat:
-    """A heat source: a law, its outlets, the laws that multiply it, and the cells (N,) that lose its watts, if any."""
+    """A heat source: a law, its outlets, the laws that multiply it, and the cells (N,) that lose its watts, if any.
+
+    `bent` is a reference in W and an exponent: what the law says counts as reference · (watts / reference)^exponent,
+    for machines whose heat grows with its drivers by another power.
+    """
 
     law: Law
     outlets: tuple[Outlet, ...]
     factors: tuple[Law, ...] = ()
     taken: Array | None = None
+    bent: tuple[float, float] = (1.0, 1.0)
 
     @property
     def asleep(self) -> bool:

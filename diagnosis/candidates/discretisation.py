@@ -8,14 +8,15 @@ would pass for physics.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from diagnosis.contracts import Candidate, CandidateKind, Point
+from diagnosis.contracts import Candidate, CandidateKind, Point, Where
 from diagnosis.policy import POLICY
 from twin.compiling.cells import several
-from twin.schema import TwinPart
+from twin.mechanisms import MECHANISMS
+from twin.schema import MechanismPart
 
 SLACK_MECHANISMS = (
     "sensor_place",
@@ -23,7 +24,6 @@ SLACK_MECHANISMS = (
     "time_skew",
     "column_bending",
     "spindle_growth",
-    "natural_convection",
     "sensor_bonding",
     "sensor_offset",
 )
@@ -33,8 +33,6 @@ def slack(proposed: Sequence[Candidate], fitted: Point) -> dict[str, float]:
     """Prior sd of the amplitude, by candidate, of those that every fit has as slack."""
     out = {}
     gains, small = _chain_gains(fitted), _small(fitted)
-    conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
-    films = films_W_per_K(fitted.part, conductance)
     for c in proposed:
         if c.variant_of:
             continue
@@ -42,10 +40,6 @@ def slack(proposed: Sequence[Candidate], fitted: Point) -> dict[str, float]:
             out[c.name] = POLICY.sensor_place_sd
         elif c.mechanism == "time_skew":
             out[c.name] = _skew_sd_s(c, fitted)
-        elif c.mechanism == "natural_convection":
-            assert c.part is not None and isinstance(c.part.at, dict)
-            if (stated := films.get((c.where.name, str(c.part.at["air"])), 0.0)) > 0:
-                out[c.name] = POLICY.film_area_sd * stated
         elif c.mechanism == "sensor_bonding":
             out[c.name] = POLICY.sensor_bonding_sd
         elif c.mechanism == "sensor_offset":
@@ -96,20 +90,18 @@ def _sides(c: Candidate) -> set[str]:
     return set(c.part.at.values())
 
 
-def films_W_per_K(part: TwinPart, conductance: Mapping[str, float]) -> dict[tuple[str, str], float]:
-    """Conductance by body and surrounding; `conductance` is that of the exposures by name.
-
-    What a body gives to an enclosure's air counts as given to what that air exchanges with.
-    """
-    exposures = part.exposures
-    around: dict[str, list[str]] = {}
-    for e in exposures.values():
-        around.setdefault(e.of.partition("@")[0], []).append(e.to)
-    out: dict[tuple[str, str], float] = {}
-    for name, e in exposures.items():
-        for air in around.get(e.to, [e.to]):
-            key = e.of.partition("@")[0], air
-            out[key] = out.get(key, 0.0) + conductance.get(name, 0.0)
+def paths_that_rise(fitted: Point) -> list[tuple[Candidate, float]]:
+    """Heat of every exposure and link that grows faster than its temperature difference, with the sd of its size:
+    films rise by natural convection and radiation, joints close as they warm (McAdams 1954; Yovanovich 2005)."""
+    part, out = fitted.part, []
+    conductance = {e.name: float(e.conductance(fitted.values)) for e in fitted.problem.network.edges}
+    paths = [(k, e.of, e.to, POLICY.rising_film_share) for k, e in part.exposures.items()]
+    paths += [(k, *link.between, POLICY.rising_link_share) for k, link in part.links.items()]
+    for key, body, other, share in paths:
+        law = MechanismPart(law="natural_convection", at={"body": body, "air": other}, into=body)
+        name = f"rising_{key}".replace("-", "_")
+        rising = Candidate(law.law, Where("node", body), name, "", law, dict(MECHANISMS[law.law].off or {}))
+        out.append((rising, share * conductance[key] / POLICY.rising_W_per_m2K))
     return out
 
 

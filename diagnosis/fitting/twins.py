@@ -9,6 +9,7 @@ Kaipio and Somersalo 2007, J. Comput. Appl. Math. 198, 493; model discrepancy, K
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,9 +21,10 @@ from diagnosis.fitting.carried import on_network
 from diagnosis.policy import POLICY
 from twin.calibration.problem import CalibrationProblem
 from twin.compile import compile_network
+from twin.mechanisms import MECHANISMS
 from twin.network import Network
 from twin.quantity import Value
-from twin.schema import Body, ErrorChain, MechanismPart, TwinPart
+from twin.schema import Body, ErrorChain, Link, MechanismPart, TwinPart
 from twin.simulation import simulate
 
 Rng = np.random.Generator
@@ -45,9 +47,10 @@ def misfits(
         WorkError: no more than one draw in four can be simulated.
     """  # fmt: skip
     out: list[list[Array]] = []
+    usual_W = _usual_W(problem, values)
     for _ in range(4 * draws):
         try:
-            out.append(_misfit(machine, part, batches, problem, values, rng))
+            out.append(_misfit(machine, part, batches, problem, values, usual_W, rng))
         except (InputError, WorkError):
             continue  # a draw that no machine has
         if progress:
@@ -61,7 +64,13 @@ def misfits(
 
 
 def _misfit(
-    machine: Machine, part: TwinPart, batches: Sequence[Batch], problem: CalibrationProblem, values: Array, rng: Rng
+    machine: Machine,
+    part: TwinPart,
+    batches: Sequence[Batch],
+    problem: CalibrationProblem,
+    values: Array,
+    usual_W: Mapping[str, float],
+    rng: Rng,
 ) -> list[Array]:
     """One refined twin less the lumped one with the same totals, (n_b,) of every batch."""
     network = problem.network
@@ -69,10 +78,8 @@ def _misfit(
     for j, p in enumerate(network.parameters):
         if p.free and p.scale == "log" and drawn[j] > 0:
             lumped[j] = drawn[j] = drawn[j] * np.exp(rng.normal(0.0, POLICY.drawn_value_log_sd))
-        elif "exponent" in p.name and drawn[j] > 0:  # how heat grows with speed is part of the structure
-            drawn[j] *= np.exp(rng.normal(0.0, POLICY.drawn_exponent_log_sd))
     finer, cut = refined(part, network, drawn, rng)
-    fine = on_network(problem, batches, compile_network(machine, part=finer))
+    fine = on_network(problem, batches, _bent(compile_network(machine, part=finer), usual_W, rng))
     known = {p.name: v for p, v in zip(network.parameters, drawn, strict=True)}
     own = np.array([known.get(p.name, v) for p, v in zip(fine.network.parameters, fine.network.values, strict=True)])
     n = len(batches)
@@ -82,6 +89,24 @@ def _misfit(
         fine.start_degC[:, cells] += rng.normal(0.0, sd_K, (n, 1)) * np.linspace(-1.0, 1.0, len(cells))
     scatter = {h.law.name: np.exp(rng.normal(0.0, POLICY.run_to_run_log_sd, n)) for h in network.heats if not h.asleep}
     return [f - g for f, g in zip(_shown(fine, own, scatter), _shown(problem, lumped, {}), strict=True)]
+
+
+def _usual_W(problem: CalibrationProblem, values: Array) -> dict[str, float]:
+    """The root mean square of every heat while it flows, by its law's name."""
+    inputs, start = problem.own([np.zeros(q) for q in problem.nuisance_sizes])
+    run = simulate(problem.network, values, inputs, start, keep_cells=True)
+    flowing = {name: w[0][run.valid & (np.abs(w[0]) > 0)] for name, w in run.heat_W.items()}
+    return {name: float(np.sqrt(np.mean(w**2))) for name, w in flowing.items() if len(w)}
+
+
+def _bent(network: Network, usual_W: Mapping[str, float], rng: Rng) -> Network:
+    """The network whose heats grow with their drivers by other powers than their laws state."""
+    heats = tuple(
+        replace(h, bent=(usual_W[h.law.name], float(np.exp(rng.normal(0.0, POLICY.drawn_exponent_log_sd)))))
+        if h.law.name in usual_W else h
+        for h in network.heats
+    )  # fmt: skip
+    return replace(network, heats=heats)
 
 
 def _shown(problem: CalibrationProblem, values: Array, scatter: Mapping[str, Array]) -> list[Array]:
@@ -99,32 +124,67 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
     joined = {place.partition("@")[0] for link in part.links.values() for place in link.between}
     joined |= {e.of.partition("@")[0] for e in part.exposures.values()}
     bodies: dict[str, Body] = dict(part.bodies)
+    through: dict[str, float] = {}
     cut = [name for name, body in part.bodies.items() if body.shape == "lump" and name in joined]
     for name in cut:
         (cell,) = network.bodies[name]
         thin = rng.random() < POLICY.thin_body_share
         median, log_sd = POLICY.thin_body_conductance if thin else POLICY.inner_conductance
-        through = float(total[cell, cell]) * float(np.exp(rng.normal(np.log(median), log_sd)))
+        through[name] = float(total[cell, cell]) * float(np.exp(rng.normal(np.log(median), log_sd)))
         cells = int(rng.integers(POLICY.drawn_cells[0], POLICY.drawn_cells[1] + 1))
         bodies[name] = part.bodies[name].model_copy(
-            update={"shape": "bar", "cells": cells, "conductance": Value(value=f"{through:.6g} W/K")}
+            update={"shape": "bar", "cells": cells, "conductance": Value(value=f"{through[name]:.6g} W/K")}
         )
 
     def place(at: str, low: float = 0.0, high: float = 1.0) -> str:
         return f"{at}@{rng.uniform(low, high):.3f}" if at in cut else at
 
+    near: dict[str, list[str]] = {}
+    for link in part.links.values():
+        one, other = (at.partition("@")[0] for at in link.between)
+        near.setdefault(one, []).append(other)
+        near.setdefault(other, []).append(one)
     links = {
         key: link.model_copy(update={"between": (place(link.between[0]), place(link.between[1]))})
         for key, link in part.links.items()
     }
     update = {
         "bodies": bodies,
-        "links": links,
+        "links": links | _webs(bodies, cut, through, rng) | _stray(near, network, total, place, rng),
         "sensors": {key: s.model_copy(update={"at": place(s.at)}) for key, s in part.sensors.items()},
-        "mechanisms": {key: _placed(m, place) for key, m in part.mechanisms.items()},
+        "mechanisms": {key: _placed(m, place, near, rng) for key, m in part.mechanisms.items()},
         "errors": {key: _seen(chain, place) for key, chain in part.errors.items()},
     }
     return part.model_copy(update=update), cut
+
+
+def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, float], rng: Rng) -> dict[str, Link]:
+    """Ways within the castings besides the chain, in one draw of two."""
+    out = {}
+    if rng.random() < POLICY.webbed_share:
+        for name in cut:
+            for k in range(int(bodies[name].cells)):  # type: ignore[arg-type]
+                one, other = rng.uniform(0.0, 1.0, 2)
+                share = through[name] * rng.uniform(*POLICY.web_conductance)
+                out[f"web_{name}_{k}"] = _link(f"{name}@{one:.6f}", f"{name}@{other:.6f}", share)
+    return out
+
+
+def _stray(
+    near: Mapping[str, Sequence[str]], network: Network, total: Array, place: Callable[..., str], rng: Rng
+) -> dict[str, Link]:
+    """Weak ways between bodies that have a neighbour in common."""
+    out = {}
+    second = {tuple(sorted((a, b))) for own in near.values() for a in own for b in own if a != b}
+    for a, b in sorted(second):
+        if b not in near[a]:
+            least = min(float(sum(total[c, c] for c in network.bodies[n])) for n in (a, b))
+            out[f"stray_{a}_{b}"] = _link(place(a), place(b), least * rng.uniform(0.0, POLICY.stray_conductance))
+    return out
+
+
+def _link(one: str, other: str, conductance_W_per_K: float) -> Link:
+    return Link(between=(one, other), conductance=Value(value=f"{conductance_W_per_K:.6g} W/K"))
 
 
 def _seen(chain: ErrorChain, place: Callable[..., str]) -> ErrorChain:
@@ -135,11 +195,19 @@ def _seen(chain: ErrorChain, place: Callable[..., str]) -> ErrorChain:
     return chain.model_copy(update={"chain": links, "tilts": tilts})
 
 
-def _placed(given: MechanismPart, place: Callable[..., str]) -> MechanismPart:
-    """The mechanism with its heat into a place of the body; fitted shares keep their names."""
-    if isinstance(given.into, str):
-        return given.model_copy(update={"into": place(given.into)})
-    if isinstance(given.into, Mapping):
-        into = {place(k) if v == "rest" else k: v for k, v in given.into.items()}
-        return given.model_copy(update={"into": into})
-    return given
+def _placed(
+    given: MechanismPart, place: Callable[..., str], near: Mapping[str, Sequence[str]], rng: Rng
+) -> MechanismPart:
+    """The mechanism with its heat into a place of the body, a little of it into a neighbour; fitted shares keep their
+    names."""
+    into = {given.into: "rest"} if isinstance(given.into, str) else given.into
+    if not isinstance(into, Mapping):
+        return given
+    rest = next(k for k, v in into.items() if v == "rest")
+    beside = near.get(rest.partition("@")[0], ())
+    out: dict[str, Value | str] = {place(k) if v == "rest" else k: v for k, v in into.items()}
+    if beside and isinstance(given.into, str) and MECHANISMS[given.law].takes_from is None:
+        out[place(beside[int(rng.integers(len(beside)))])] = Value(
+            value=float(f"{rng.uniform(0.0, POLICY.leak_share):.4g}")
+        )
+    return given.model_copy(update={"into": out})

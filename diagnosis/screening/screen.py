@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -18,7 +18,7 @@ from diagnosis.fitting.covariance import slices_of
 from diagnosis.policy import POLICY
 from diagnosis.screening.signatures import Signatures, signatures
 from twin.mechanisms import MECHANISMS
-from twin.quantity import Spec
+from twin.quantity import Spec, Value, convert
 
 SCANNED = ("draught", "floor_sink")  # laws that are screened at several values of their shape
 TINY = 1e-300
@@ -49,8 +49,30 @@ def proposed(fitted: Fitted) -> list[Candidate]:
 
     Only laws without a trace at their usual value are screened at others, and radiation goes to surroundings alone.
     """
-    every = candidates(fitted.machine, fitted.part) + alternatives(fitted.problem.network)
+    laws = candidates(fitted.machine, fitted.part)
+    hours = float(np.median([b.step_s * b.n_rows for b in fitted.batches])) / 3600.0
+    every = [
+        *laws,
+        *(w for c in laws if not c.variant_of for w in _windows(c, hours)),
+        *alternatives(fitted.problem.network),
+    ]
     return [c for c in every if not (c.variant_of and c.mechanism not in SCANNED) and not _between_bodies(c, fitted)]
+
+
+def _windows(c: Candidate, run_h: float) -> Iterator[Candidate]:
+    """What happens once in a run, in every part of it: at another time it has no trace."""
+    window = MECHANISMS[c.mechanism].window
+    if window is None or c.part is None:
+        return
+    begin, lasting = (MECHANISMS[c.mechanism].spec(name) for name in window)
+    each_h = run_h / POLICY.run_windows
+    duration = Value(value=f"{convert(f'{2.0 * each_h:g} h', lasting.unit):g} {lasting.unit}")
+    for k in range(POLICY.run_windows):
+        given = {begin.name: Value(value=f"{k * each_h:.4g} h"), lasting.name: duration}
+        part = c.part.model_copy(update={"parameters": {**c.part.parameters, **given}})
+        yield replace(
+            c, name=f"{c.name}_at_{k}", label=f"{c.label}, begun at {k * each_h:.2g} h", part=part, variant_of=c.name
+        )
 
 
 def _between_bodies(c: Candidate, fitted: Fitted) -> bool:

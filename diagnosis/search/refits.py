@@ -50,19 +50,22 @@ def shortlist(now: Fitted, seen: Screen, odds: dict[str, float]) -> list[Scored]
             taken[s.candidate.mechanism] += 1
             out.append(s)
     cold = {body for i in impossible(now) for body in i.bodies}
-    out += [s for s in ranked_paths(seen, cold) if s not in out]
+    out += [s for s in one_of_each(ranked_paths(now, seen, cold)) if s not in out and s.candidate.where.kind == "node"]
     return out + [Scored(c) for c in suspected_swaps(now, [s.candidate for s in seen.scored])]
 
 
-def ranked_paths(seen: Screen, bodies: set[str]) -> list[Scored]:
-    """Candidates that join one of these bodies with another, the best first."""
-    joining = [s for s in seen.scored if s.candidate.mechanism in MECHANISMS and s.candidate.part is not None]
-    return [
-        s for s in joining
-        if (port := MECHANISMS[s.candidate.mechanism].takes_from) and s.candidate.part is not None
-        and isinstance(at := s.candidate.part.at, Mapping)
-        and bodies & {str(at.get(port)), str(s.candidate.part.into)}
-    ]  # fmt: skip
+def ranked_paths(now: Fitted, seen: Screen, cold: set[str]) -> list[Scored]:
+    """Candidates that bring heat to one of these bodies from another, the best first."""
+    bodies = set(now.part.bodies)
+
+    def joined(s: Scored) -> set[str]:
+        part = s.candidate.part
+        if part is None or not {"heat_W", "expand"} & set(MECHANISMS[s.candidate.mechanism].effects()):
+            return set()
+        ports = part.at.values() if isinstance(part.at, Mapping) else [part.at]
+        return {str(place) for place in (*ports, part.into)} & bodies
+
+    return [s for s in seen.scored if s.candidate.mechanism in MECHANISMS and len(j := joined(s)) > 1 and j & cold]
 
 
 def refits(

@@ -75,7 +75,7 @@ def decided(done: Round, vetoed: bool = True) -> Round:
     none is made that predicts a channel worse."""
     strange = frozenset(i.channel for i in impossible(done.before))
     able = [t for t in done.tried if _resolves(t, strange)]
-    likely = [*able, *(t for t in done.tried if t not in able)][: max(POLICY.claims_judged, len(able))]
+    likely = [*able, *(t for t in done.tried if t not in able)][: max(POLICY.settled, len(able))]
     settled = [_settled(done.before, t) for t in likely]
     first = sorted(settled, key=lambda t: (not _resolves(t, strange), -t.standing))
     done = replace(done, tried=(*first, *(t for t in done.tried if t not in likely)))

@@ -90,6 +90,7 @@ class Mechanism(ABC):
     # amplitude is screened at each. A parameter of `off`: it is not linear in it, each value is a finite change.
     scan: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     scan_points: ClassVar[tuple[Mapping[str, float], ...]] = ()  # the same where several parameters go together
+    window: ClassVar[tuple[str, str] | None] = None  # start and duration of what happens once in a run
     # Parameters that mean something only with an optional port: that port, and the value of a candidate that names it
     # (None: the usual one).
     of_port: ClassVar[Mapping[str, tuple[str, float | None]]] = {}

@@ -119,9 +119,7 @@ class Draught(Mechanism):
     )
     off: ClassVar[Mapping[str, float]] = {"factor": 1.0, "drop": 0.0}
     shape = ("start", "duration")
-    scan: ClassVar[Mapping[str, tuple[float, ...]]] = {
-        "start": (0.5, *(0.5 * k for k in range(3, 13)), 7.0, 8.0, 9.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0, 22.0)
-    }
+    window = ("start", "duration")
     scan_points: ClassVar[tuple[Mapping[str, float], ...]] = tuple(
         {"start": hour, "clock": 1.0} for hour in (5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0,
                                                    18.0, 20.0, 22.0)

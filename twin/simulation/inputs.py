@@ -94,7 +94,8 @@ def heat_W(heat: Heat, call: Callable[[Law, str], Numeric]) -> Numeric:
     out = call(heat.law, "heat_W")
     for factor in heat.factors:
         out = out * call(factor, "factor")
-    return out
+    about_W, exponent = heat.bent
+    return out if exponent == 1.0 else np.sign(out) * about_W * np.abs(out / about_W) ** exponent
 
 
 def reads_time(law: Law, effect: str) -> bool:
