@@ -14,14 +14,14 @@ from data import guess
 from data.errors import InputError
 from data.groups import FILL_IN, Clock, Group, Joint, files_pattern, grouped, joint
 from data.guess import Guess, PositionGroup
-from data.machine import parse_machine
-from data.units import conversion, known_unit, quantity
+from data.machine import Form, parse_machine
+from data.units import conversion, quantity, stated_unit
 from data.yaml_edit import flow
 
 CHECK = "# check: "  # begins a comment of the draft that the user must read
 
 
-def draft_machine_file(files: Sequence[Path]) -> str:
+def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:
     """YAML text of a machine file for recordings of one machine.
 
     Files with the same columns are the recordings. Files or sheets with other columns are drafted as
@@ -34,7 +34,7 @@ def draft_machine_file(files: Sequence[Path]) -> str:
     """
     if not files:
         raise InputError("describe: no files given, expected recordings of one machine; name at least one")
-    (main, *others), left_out = grouped(files)
+    (main, *others), left_out = grouped(files, form)
     joined: dict[str, tuple[Group, Joint]] = {}
     for other in others:
         if (how := joint(main, other)) is not None:
@@ -84,6 +84,7 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         "recording:",
         f"  files: {flow([pattern])}  # guessed: the names of the files",
         f"  header: {'true' if main.table.header else 'false'}",
+        *(f"  {key}: {flow(value)}" for key, value in _stated(main.table.form).items()),
         f"  time: {_time(main.clock)}",
         *_steps([*groups.values()], min(step for _, step in fine.values())),
     ]
@@ -92,21 +93,28 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
     for k, (key, (group, how)) in enumerate(joined.items()):
         lines += ["  joined:"] * (k == 0) + [f"    {key}:  # guessed: {how.why}"]
         lines += [f"      {name}: {flow(value)}" for name, value in how.keys.items()]
-        lines += ["      header: false"] * (not group.table.header) + [f"      time: {_time(group.clock)}"]
+        lines += ["      header: false"] * (not group.table.header)
+        lines += [f"      {key}: {flow(value)}" for key, value in _stated(group.table.form).items()] + [f"      time: {_time(group.clock)}"]
     lines += ["channels:", *channels]
-    ignored = [c for g in groups.values() if g.table.header for c in _ignored(g)]
-    if ignored:
-        lines.append(f"ignore: {flow(list(dict.fromkeys(ignored)))}  # guessed: no measured values in them")
+    if ignored := dict(left for g in groups.values() for left in _left(g)):
+        lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")
     return "\n".join(lines) + "\n"
+
+
+def _stated(form: Form) -> dict[str, object]:
+    """Keys of the layout that reading does not find by itself."""
+    return form.model_dump(exclude={"time", "header"}, exclude_none=True)
 
 
 def _time(clock: Clock) -> str:
     return f"{clock.line}  # {'' if clock.why.startswith('fill in') else 'guessed: '}{clock.why}"
 
 
-def _ignored(group: Group) -> list[str]:
-    used = {group.table.clock.time, group.table.clock.date, *group.names.values()}
-    return [c for i, c in enumerate(group.table.columns) if c and i not in used]
+def _left(group: Group) -> list[tuple[str, str]]:
+    """Columns of the file that are no channels, as the machine file names them, and why."""
+    table = group.table
+    return [(str(table.key(i)), f"{table.columns[i] or i}: {why}") for i, why in table.left.items()
+            if table.header and i not in group.names.values()]  # fmt: skip
 
 
 def _steps(groups: Sequence[Group], fine_s: float) -> list[str]:
@@ -147,9 +155,9 @@ def _channels(group: Group, linked: dict[str, Guess], source: str, taken: list[s
         if i in of_group:
             continue
         header = table.columns[i] if table.header else ""
-        in_row = known_unit(table.units[i]) is not None
+        where = "given in the units row or the cells" if stated_unit(table.units[i]) else "named so in the header"
         column = _Column(
-            header, group.written_unit(i), in_row, group.roles[key], f"column: {flow(header or i)}", source
+            header, group.written_unit(i), where, group.roles[key], f"column: {flow(table.key(i))}", source
         )
         along = linked.get(key)
         along = along and Guess(name_of[along.value], along.why)
@@ -168,7 +176,7 @@ class _Column:
 
     header: str
     written: str | None
-    units_row: bool
+    where: str  # the unit is written
     role: Guess
     key: str
     source: str
@@ -182,7 +190,7 @@ def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str
     if {position, error} & set(taken):
         position, error = f"{position}_2", f"{error}_2"
     why = Guess("error", f"{len(group.places)} columns whose names differ by a number")
-    column = _Column(group.pattern.partition("*")[0], None, False, why, f"columns: {flow(group.pattern)}", source)
+    column = _Column(group.pattern.partition("*")[0], None, "", why, f"columns: {flow(group.pattern)}", source)
     lines = _channel(error, column, values, Guess(position, "the number in the names is taken for the position"))
     return [
         f"  {position}:",
@@ -196,8 +204,7 @@ def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str
 def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Guess | None) -> list[str]:
     """Lines of one channel; range and resolution show in all `values`."""
     role, written = column.role, column.written
-    unit = Guess(written, "given in the units row") if column.units_row and written else None
-    unit = unit or guess.unit(role.value, column.header, values)
+    unit = Guess(written, column.where) if written else guess.unit(role.value, column.header, values)
     kept = {"temperature": "degC", "ambient": "degC", "error": "um"}.get(role.value, unit.value)
     convertible = quantity(kept) == quantity(unit.value)
     kept = kept if convertible else unit.value

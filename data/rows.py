@@ -70,7 +70,8 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
         texts_of_time = [[row[i] for i in clock if isinstance(row[i], str) and not _is_number(row[i])] for row in head]
         pattern = stamp_format([" ".join(t) for t in texts_of_time if len(t) == len(clock)], where)
     positions = sorted({*clock, *layout.positions.values()})
-    text = clock if time.unit == "timestamp" else ()
+    text = clock if time.unit == "timestamp" or _colons(sheet, layout) else ()
+    units = {n: c.unit_in_file or c.unit for n, c in machine.channels.items()}
     no_date = pattern is not None and not any(d in pattern for d in ("%d", "%j", "8601"))
     late = np.nan
     done = 0
@@ -82,17 +83,23 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
         else:
             stamps = block.columns[layout.time]
             stamps = stamps if layout.date is None else with_date(block.columns[layout.date], stamps)
-            time_s = to_seconds(stamps, time.unit, pattern, sheet.decimal)
+            time_s = to_seconds(stamps, time.unit, pattern, sheet.decimal, machine.recording.timezone)
         if no_date and len(time_s):
             time_s = _past_midnight(time_s, late)
             late = float(_filled(time_s, late)[-1])
         values: dict[str, Array] = {}
         texts: Texts = {}
         for name, position in layout.positions.items():
-            values[name], bad = to_float(block.columns[position], sheet.decimal)
+            values[name], bad = to_float(block.columns[position], sheet.decimal, units.get(name.rpartition("@")[0] or name, ""))
             if bad is not None:
                 texts[name] = np.flatnonzero(bad), cell_texts(block.columns[position], bad)
         yield Rows(time_s, values, texts, block.ragged_rows)
+
+
+def _colons(sheet: Sheet, layout: Layout) -> bool:
+    """Whether an elapsed clock shows h:mm:ss."""
+    rows = [row for row in sheet.head[layout.first_row :][:20] if len(row) > (layout.time or 0)]
+    return layout.time is not None and any(":" in str(row[layout.time]) for row in rows)
 
 
 def _past_midnight(time_s: Array, before: float) -> Array:
