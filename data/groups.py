@@ -215,11 +215,16 @@ class Group:
 
     @cached_property
     def step_and_length(self) -> tuple[float, float]:
-        """Median step and longest recording, in the file's unit of time."""
-        repaired = [repair_time(r.time_s, np.inf).time_s for r in self.rows]
-        steps = np.concatenate([np.diff(t) for t in repaired])
-        interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-        return interval, max(float(t[-1]) if len(t) else 0.0 for t in repaired)
+        """Median step and longest recording, in the file's unit of time; the step of the densest channel."""
+        intervals, lengths = [], []
+        for rows in self.rows:
+            time = repair_time(rows.time_s, np.inf).time_s
+            lengths.append(float(time[-1]) if len(time) else 0.0)
+            dense = any(np.isfinite(v).mean() > 0.5 for v in rows.columns.values())
+            sparse = [np.sort(rows.time_s[np.isfinite(v)]) for v in rows.columns.values()] if not dense else [time]
+            steps = [step[step > 0] for t in sparse if len(step := np.diff(t[np.isfinite(t)]))]
+            intervals += [float(np.median(step)) for step in steps if len(step)]
+        return min(intervals, default=1.0), max(lengths)
 
     @property
     def start_from_name(self) -> str | None:

@@ -24,7 +24,7 @@ _COUNTER = re.compile(
     r"fila|riga|lfd|count|counter|zähler|record|sample|scan|point|序号|序號|编号|編號|番号|行)?[ ._]*(no|nr)?\.?$"
 )
 _SERIES = re.compile(
-    r"entity|sensor|channel|kanal|canal|\btag|variable|\bname|series|field|item|signal|device|node|point|metric|topic|"
+    r"entity|sensor|channel|^ch\b|kanal|canal|\btag|variable|\bname|series|field|item|signal|device|node|point|metric|topic|"
     r"quantity|param|object|messstelle|通道|传感器"
 )
 _VALUE = re.compile(r"^_?(value|val|state|wert|messwert|reading|data|v|valeur|valor|valore|值|値)([ _\[(].*)?$")

@@ -125,7 +125,7 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
         cells = [c for row in body if (c := row[i]) is not None and str(c).strip()]
         numbers = sum(parse_number(c, sheet.decimal) is not None or cell_unit(c) is not None for c in cells)
         if i in clock.counters:
-            left[i] = "numbers the rows"
+            left[i] = "numbers the rows, or is another clock"
         elif not cells:
             left[i] = "empty"
         elif numbers < _LEAST_NUMBERS * len(cells) or numbers == 0:
@@ -146,6 +146,8 @@ def _first_row(sheet: Sheet, where: str, form: Form) -> int:
     """Where similar rows of numbers begin, as wide as most of the last rows."""
     if form.header_rows is not None and form.header_rows < len(sheet.head):
         return form.header_rows
+    if sheet.first_row is not None:
+        return sheet.first_row
     widths = Counter(len(row) for row in sheet.head[-200:] if row)
     usual = widths.most_common(1)[0][0] if widths else 0
     starts = (i for i in range(len(sheet.head)) if _is_data(sheet, i))
@@ -265,7 +267,8 @@ def _clock(
     not be a channel's.
     """
     named = [i for i, c in enumerate(columns) if header and guess.is_time_name(c)]
-    counters = []
+    counters: list[int] = []
+    ticking: list[int] = []
     found: list[tuple[float, int, tuple[str, ...], bool]] = []  # share of rising steps (1 more: named), place, …
     for i, column in enumerate(columns):
         cells = [row[i] for row in body if row[i] is not None and str(row[i]).strip()]
@@ -279,6 +282,8 @@ def _clock(
             if header and i not in named and guess.is_counter_name(column) and bool((steps == 1).all()):
                 counters.append(i)
                 continue
+            if header and bool((steps > 0).all()) and np.ptp(steps) <= 1e-6 * steps[0]:
+                ticking.append(i)
             if not begun and _since_1970(numbers, units[i] or guess.time_unit_in_name(column) if header else None):
                 stamps = ("",)
         elif elapsed or (stamps := _stamps(cells)):
@@ -291,6 +296,7 @@ def _clock(
     if not found:
         return Clock(None, None, (), False, tuple(counters))
     _, place, stamps, elapsed = max(found)
+    counters += [i for i in ticking if i != -place]
     date, stamps = _with_date(body, -place, stamps)
     return Clock(-place, date, stamps, elapsed and date is None, tuple(counters))
 

@@ -44,6 +44,7 @@ class Sheet(ABC):
     head: Sequence[Sequence[Any]] = ()  # first rows, cells as text or as Python values
     decimal: str = "."  # decimal mark of numbers in text cells
     share_read: float = 1.0  # share of the file in the blocks so far: predicts the number of rows
+    first_row: int | None = None  # of the data, where the format states it
     summary: str = ""  # how the text is encoded: "semicolon, decimal comma, cp1252"
     units: Sequence[str] = ()  # by column, where the format states them apart from the rows
     origin_s: float = 0.0  # s since 1970 at which an elapsed clock shows 0; 0 where the file does not say

@@ -201,11 +201,11 @@ def stamp_formats(samples: Sequence[str]) -> list[str]:
     """The strptime patterns (or "ISO8601") in which nearly all samples read as a time; the likeliest first."""
     cells = pd.Series([s.strip() for s in samples if s.strip()], dtype=str)
     need = max(1, int(0.8 * len(cells)))
-    cells = cells[cells.str.contains(r"\d")]
+    cells = cells[cells.str.contains(r"\d\D+\d|\d{6}")]
     if len(cells) < need:
         return []
     cells = _plain(cells)[0]
-    if cells.str.match(r"\d{4}\D").all() and _strptime(cells, _ISO).notna().sum() >= need:
+    if cells.str.match(r"\d{4}\D").mean() >= 0.8 and _strptime(cells, _ISO).notna().sum() >= need:
         return [_ISO]
     shapes = {re.sub(r"[0-9A-Za-z]+", "", cell) for cell in cells.iloc[:3]}
     patterns = [p for p in _PATTERNS if re.sub(r"%?[a-zA-Z]", "", p) in shapes]
@@ -245,8 +245,8 @@ def _strptime(cells: pd.Series[Any], pattern: str) -> pd.Series[Any]:
     try:
         parsed = pd.to_datetime(cells, format=pattern, errors="coerce", utc=zoned)
     except (ValueError, OverflowError):
-        return pd.Series(pd.NaT, index=cells.index)
-    return parsed.dt.tz_localize(None) if zoned else parsed
+        parsed = pd.Series(pd.NaT, index=cells.index, dtype="datetime64[us]")
+    return parsed.dt.tz_localize(None).dt.as_unit("us")  # in ns a damaged year, such as 2826, overflows
 
 
 def _parse(cells: pd.Series[Any], pattern: str) -> pd.Series[Any]:
@@ -303,7 +303,7 @@ def with_date(date: Any, time: Any) -> Any:
     return pc.binary_join_element_wise(*texts, " ")
 
 
-_EPOCH = pd.Timestamp(0).as_unit("us")  # in ns a damaged year, such as 2826, overflows
+_EPOCH = pd.Timestamp(0).as_unit("us")
 
 
 def _text_to_seconds(column: Any, pattern: str | None, decimal: str, zone: str | None) -> Array:

@@ -146,8 +146,9 @@ class CsvSheet(Sheet):
         self._newline = "\n" if "\n" in text or "\r" not in text else "\r"
         lines = [line.rstrip("\r") for line in text.split(self._newline)]
         lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
+        lines = [_COMMENT.sub("", line) for line in lines]
         self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))
-        self.head = [split(_COMMENT.sub("", line), self.separator) if line.strip() else [] for line in lines]
+        self.head = [split(line, self.separator) if line.strip() else [] for line in lines]
         self.decimal = form.decimal or find_decimal(self.head)
         self._quoted = '"' in text and self.separator not in _BLANKS
         mark = "point" if self.decimal == "." else "comma"

@@ -28,11 +28,12 @@ class LvmSheet(CsvSheet):
         self.decimal = form.decimal or first.get("Decimal_Separator") or self.decimal
         self.summary = f"LabVIEW measurement, decimal {self.decimal}, {self.encoding}"
         columns = first.get("X_Columns", "One")
-        labels = keys.get("Y_Unit_Label", [])
+        labels = keys.get("Y_Unit_Label") or [""] * len(self.head[min(end + 1, len(self.head) - 1)])
         self.units = [u for label in labels for u in ("s", label)] if columns == "Multi" else ["s", *labels]
         if columns == "No":
             self.step_s = parse_number(first.get("Delta_X"), self.decimal)
-        if first.get("Time_Pref") == "Absolute":
+        begins = parse_number((self.head[end + 2 : end + 3] or [[""]])[0][0], self.decimal) or 0.0
+        if first.get("Time_Pref") == "Absolute" and begins > -_LABVIEW_S:
             self.origin_s = _LABVIEW_S
         elif "Date" in first and "Time" in first:
             stamp = pd.to_datetime(f"{first['Date']} {first['Time'].replace(',', '.')}", errors="coerce")

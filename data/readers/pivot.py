@@ -16,14 +16,18 @@ from data.readers.csv import normalise
 
 _LOOK_ROWS = 200
 _MOST_NAMES = 2000
+_SCAN_SHARE = 0.05  # of the time between two readings of a name: between two names in a scan
 
 
 class PivotSheet(Sheet):
-    """What `form.pivot` describes; names and readings are text. Readings of one name and time stay apart, in rows.
+    """What `form.pivot` describes; names and readings are text. Readings of one name and time stay apart, in rows;
+    those of different names in one scan share a row.
 
     Raises:
         InputError: a column of the pivot is not in the file, or so many names that they are none.
     """
+
+    first_row = 1
 
     def __init__(self, sheet: Sheet, form: Form, time: str | int, where: str) -> None:
         assert form.pivot is not None
@@ -43,16 +47,18 @@ class PivotSheet(Sheet):
         self.summary = f"long table, {sheet.summary}"
         self._ragged = 0
         frame = self._read(sheet, row + 1, [clock, *(place[n] for n in names)], [place[v] for v in values])
+        seconds = self._seconds(frame["time"])
+        self._ragged += int(np.isnan(seconds).sum())
+        frame = frame.assign(order=seconds)[~np.isnan(seconds)].sort_values("order", kind="stable")
         label = frame["name"] if len(values) == 1 else frame["name"] + " " + frame["value"].map(dict(enumerate(values)))
         if label.nunique() > _MOST_NAMES:
             raise InputError(f"{where}: {label.nunique()} different names in {names}; correct recording.pivot.name")
-        again = frame.groupby([frame["time"], label], sort=False).cumcount()
-        order = self._seconds(frame["time"])
-        wide = frame.assign(label=label, again=again, order=order).pivot(
-            index=["order", "time", "again"], columns="label", values="cell"
-        )
-        self._table = wide.sort_index(level="order", kind="stable")[list(dict.fromkeys(label))]
-        self._times = self._table.index.get_level_values("time")
+        frame = frame.assign(label=label, order=_scans(frame["order"], label))
+        frame = frame.assign(again=frame.groupby(["order", "label"], sort=False).cumcount())
+        wide = frame.pivot(index=["order", "again"], columns="label", values="cell")
+        first = frame.drop_duplicates("order").set_index("order")["time"]
+        self._table = wide[list(dict.fromkeys(label))]
+        self._times = first.reindex(wide.index.get_level_values("order")).tolist()
         title = str(sheet.head[row][clock])
         cells = self._table.iloc[:_LOOK_ROWS * 10].to_numpy(object)
         self.head = [
@@ -77,12 +83,11 @@ class PivotSheet(Sheet):
         return frame[(frame["time"] != "") & (frame["name"].str.strip() != "")]
 
     def _seconds(self, times: pd.Series) -> np.ndarray:
-        """What the rows are sorted by; in the order of the file where the times cannot be read."""
+        """What the rows are sorted by; NaN where a time cannot be read, such as that of a repeated header."""
         column = pa.array(times.tolist(), pa.string())
         formats = stamp_formats(times.iloc[:_LOOK_ROWS].tolist())
         seconds = to_seconds(column, "timestamp" if formats else "s", formats[0] if formats else None, self.decimal)
-        seconds = to_float(column, self.decimal)[0] if np.isnan(seconds).all() else seconds
-        return np.where(np.isnan(seconds), -np.inf, seconds)
+        return to_float(column, self.decimal)[0] if np.isnan(seconds).all() else seconds
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         columns = {}
@@ -90,6 +95,14 @@ class PivotSheet(Sheet):
             cells = self._times if i == 0 else self._table.iloc[:, i - 1]
             columns[i] = pa.array([None if pd.isna(c) else c for c in cells[first_row - 1 :]], pa.string())
         yield Block(columns, self._ragged)
+
+
+def _scans(order: pd.Series, label: pd.Series) -> pd.Series:
+    """Rising times (n,) with one for the readings that a logger takes one after the other in a scan of all names."""
+    interval = order.groupby(label).diff()
+    slack = _SCAN_SHARE * float(interval[interval > 0].median())
+    begins = order.where((order.diff() > slack) | (order.index == order.index[0])).ffill()
+    return begins if bool((order - begins <= 5 * slack).all()) else order
 
 
 def _text(cell: object) -> str:
