@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +14,40 @@ from data import guess
 from data.errors import InputError
 from data.groups import FILL_IN, Clock, Group, Joint, files_pattern, grouped, joint
 from data.guess import Guess, PositionGroup
-from data.machine import Form, parse_machine
-from data.units import conversion, quantity, stated_unit
+from data.machine import Form, Machine, Split, parse_machine
+from data.recording import read_batches
+from data.rows import cut_runs
+from data.units import conversion, convert, quantity, stated_unit
 from data.yaml_edit import flow
 
+_MANY_DROPPED = 0.1  # of a recording's rows: the draft cannot be right
+_PAUSE_S = 600.0  # the shortest pause between two runs
 CHECK = "# check: "  # begins a comment of the draft that the user must read
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A column of a file: its first cells, what it becomes and why, and the first values in the unit of the lake."""
+
+    column: str
+    cells: tuple[str, ...]
+    becomes: str
+    values: tuple[float, ...] = ()
+
+
 def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:
-    """YAML text of a machine file for recordings of one machine.
+    """YAML text of a machine file for recordings of one machine; see `drafted`."""
+    return drafted(files, form)[0]
+
+
+def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]]]:
+    """YAML text of a machine file for recordings of one machine, and the columns of the first file of each kind.
 
     Files with the same columns are the recordings. Files or sheets with other columns are drafted as
     `recording.joined` where names, sheets or time stamps show that they belong to the recordings, and else left out.
     Every guess carries a comment ``# guessed: why`` and stands in the channel's ``guessed`` list; what is doubtful is a
-    comment ``# check: …`` at the beginning. Values are taken from up to 20 tables and their first 200 000 rows.
+    comment ``# check: …`` at the beginning. Values are taken from up to 20 tables and their first 200 000 rows. `form`
+    overrides what is found of the files' layout. The draft is tried on the first recording.
 
     Raises:
         InputError: no files, or none holds a table of numbers.
@@ -47,8 +67,46 @@ def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:
                 for path, table in other.tables
             ]
     text = _write(main, joined, left_out)
-    parse_machine(text.replace(FILL_IN, "1 s"), "draft")
-    return text
+    machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
+    if FILL_IN not in text and (trouble := _tried(main.paths[0], machine)):
+        text = f"{CHECK}{trouble}\n{text}"
+    groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
+    return text, {g.paths[0].name: _shown(g, key, machine) for key, g in groups.items()}
+
+
+def _tried(path: Path, machine: Machine) -> str:
+    """What an ingest says against a draft: it refuses the recording, or drops a good part of it; else nothing."""
+    read = dropped = 0
+    try:
+        for batch in read_batches(path, machine, need_error=False):
+            read += batch.repairs["rows_in"]
+            dropped += batch.repairs["rows_dropped"]
+    except InputError as error:
+        return f"ingest refuses this draft: {error}"
+    return f"ingest drops {dropped} of {read} rows of {path.name}" if dropped > _MANY_DROPPED * read else ""
+
+
+def _shown(group: Group, source: str, machine: Machine) -> list[Shown]:
+    table = group.table
+    parts = {part.column if part.column is not None else n: (n, part) for n, part in machine.channels.items()
+             if part.source == source}  # fmt: skip
+    name_of = {i: name for name, i in group.names.items()}
+    out = []
+    for i, column in enumerate(table.columns):
+        cells = tuple(str(c) for c in table.cells[i])
+        if i in (table.time, table.clock.date):
+            out.append(Shown(column or str(i), cells, f"clock: {group.clock.why}"))
+        elif (found := parts.get(table.key(i))) and i in name_of:
+            name, part = found
+            values = convert(
+                group.rows[0].columns[name_of[i]][: len(cells)], part.unit_in_file or part.unit, part.unit, name
+            )
+            unit = f"{part.unit_in_file} → {part.unit}" if part.unit_in_file else part.unit
+            out.append(Shown(column or str(i), cells, f"{part.role} {name}, {unit}", tuple(values.tolist())))
+        else:
+            along = "along an axis" if i in name_of else ""
+            out.append(Shown(column or str(i), cells, along or f"left out: {table.left.get(i, 'no values')}"))
+    return out
 
 
 def notes(draft: str) -> list[str]:
@@ -71,6 +129,7 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
     taken: list[str] = []
     for key, group in groups.items():
         channels += _channels(group, fine[key][0], key, taken)
+    runs = _runs(main)
     files = [p.name for p in main.paths]
     folder = re.sub(r"[^a-z0-9_\-]+", "_", main.paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
     doubts = [(g, note) for g in groups.values() for note in (g.clock.note, *g.notes) if note]
@@ -87,6 +146,7 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         *(f"  {key}: {flow(value)}" for key, value in _stated(main.table.form).items()),
         f"  time: {_time(main.clock)}",
         *_steps([*groups.values()], min(step for _, step in fine.values())),
+        *runs,
     ]
     if start := main.start_from_name:
         lines.append(f"  start_from_name: {flow(start)}  # guessed: the files or sheets are named by date")
@@ -94,7 +154,9 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         lines += ["  joined:"] * (k == 0) + [f"    {key}:  # guessed: {how.why}"]
         lines += [f"      {name}: {flow(value)}" for name, value in how.keys.items()]
         lines += ["      header: false"] * (not group.table.header)
-        lines += [f"      {key}: {flow(value)}" for key, value in _stated(group.table.form).items()] + [f"      time: {_time(group.clock)}"]
+        lines += [f"      {key}: {flow(value)}" for key, value in _stated(group.table.form).items()] + [
+            f"      time: {_time(group.clock)}"
+        ]
     lines += ["channels:", *channels]
     if ignored := dict(left for g in groups.values() for left in _left(g)):
         lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")
@@ -129,6 +191,32 @@ def _steps(groups: Sequence[Group], fine_s: float) -> list[str]:
     if fine_s < step_s:
         step_s, words = fine_s, "each reading of a sweep takes a row"
     return [f"  step_s: {step_s:g}  # guessed: {words}", f"  max_gap_s: {5 * slowest_s:g}  # guessed: {gap}"]
+
+
+def _runs(group: Group) -> list[str]:
+    """Lines of a comment that proposes how to cut one long recording into runs, the first way that gives several."""
+    if len(group.tables) > 1 or group.table.time is None or group.position_groups:
+        return []
+    rows, unit_s = group.longest, group.clock.unit_s
+    seen = {n: guess.seen_range(rows.columns[n]) for n in group.names}
+    gap_s = 5.0 * group.step_and_length[0] * unit_s
+    ways = [{"driver": n} for n in group.named("driver") if seen[n][0] <= 0.05 * seen[n][1]]
+    ways += [{"pause": f"{guess.grid_step_s(max(2 * gap_s, _PAUSE_S)):g} s"}]
+    warm = sorted(group.named("temperature"), key=lambda n: seen[n][0] - seen[n][1])[:1]
+    ways += [{"driver": n, "above": float(f"{seen[n][0] + 0.25 * (seen[n][1] - seen[n][0]):.3g}")} for n in warm]
+    ways += [{"every": "24 h"}]
+    for way in ways:
+        time_s = rows.time_s * unit_s
+        try:
+            cut = [
+                len(r) for r in cut_runs(iter([replace(rows, time_s=time_s)]), Split(**way), way.get("above", 0.0), "")
+            ]
+        except InputError:
+            continue
+        if len(cut) > 1:
+            group.notes.append(f"one recording only; recording.split: {flow(way)} would cut it into {len(cut)} runs")
+            return [f"  # split: {flow(way)}  # proposed: {len(cut)} runs from this one recording"]
+    return []
 
 
 def _linked(group: Group) -> tuple[dict[str, Guess], float]:

@@ -143,7 +143,9 @@ class Group:
         open_ = [n for n, r in roles.items() if r.value != "error" and guess.may_be_error(headers[n], units[n])]
         if any(r.value == "error" for r in roles.values()):
             asked = [f"{n} ({units[n]})" for n in open_ if roles[n].value == "driver"]
-            self.notes += [f"{', '.join(asked)}: taken for drivers; set role: error if one is measured"] if asked else []
+            self.notes += (
+                [f"{', '.join(asked)}: taken for drivers; set role: error if one is measured"] if asked else []
+            )
         elif len(open_) == 1:
             self.notes.append(f"{open_[0]} ({units[open_[0]]}) is taken for the measured error; else set its role")
             roles[open_[0]] = Guess("error", f"the only channel that can be it, by its unit {units[open_[0]]}")
@@ -176,7 +178,9 @@ class Group:
         header = table.columns[table.time] if table.header else ""
         column = flow(table.key(table.time))
         if table.clock.elapsed:
-            return Clock(f"{{column: {column}, clock: elapsed}}", "durations that begin at 0 or go on beyond a day", 1.0)
+            return Clock(
+                f"{{column: {column}, clock: elapsed}}", "durations that begin at 0 or go on beyond a day", 1.0
+            )
         if table.stamps:
             form = f", format: {flow(pattern(table))}" if pattern(table) else ""
             at = table.clock.date

@@ -44,7 +44,9 @@ def joined_machine(machine: Machine, key: str) -> Machine:
         update={
             **{key: getattr(part, key) for key in Form.model_fields},
             "timezone": part.timezone or machine.recording.timezone,
-            "joined": {}, "split": None, "schedule": None,
+            "joined": {},
+            "split": None,
+            "schedule": None,
         }  # fmt: skip
     )
     channels = {

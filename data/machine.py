@@ -121,10 +121,25 @@ class Schedule(Section):
 
 
 class Split(Section):
-    """Cut one long recording into batches where `driver` rises from 0; the stop that follows belongs to the batch."""
+    """Cut one long recording into batches. Exactly one of three keys says where a batch begins; shorter ones make none.
 
-    driver: str  # channel
+    `driver`: where a channel rises above `above`, by default 0; the stop that follows belongs to the batch. It may be a
+    temperature, with its idle value as `above`. `pause`: after so long without a row. `every`: after each such stretch.
+    """
+
+    driver: str | None = None  # channel
+    above: float | None = None  # in the channel's unit; default: its size above half a resolution
+    pause: str | None = None  # such as "30 min"
+    every: str | None = None  # such as "24 h"
     min_run_s: Annotated[float, Field(gt=0)] = 600.0  # a shorter run makes no batch
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Split:
+        if sum(key is not None for key in (self.driver, self.pause, self.every)) != 1:
+            raise ValueError("expected exactly one of driver, pause and every")
+        for text in filter(None, (self.pause, self.every)):
+            seconds(text)
+        return self
 
 
 class Pivot(Section):

@@ -28,6 +28,7 @@ from data.units import stated_unit
 _CLOCK_ROWS = 2000  # that are searched for a clock
 _EXCEL_DAYS = (36_000.0, 60_000.0)  # 1998 to 2064
 _UNIX_S = 1e9  # from 2001 on
+_SHOWN_ROWS = 3
 _PIVOT_ROWS = 5000  # that are searched for a long table
 _HEADER_ROWS = 5  # above the data, that are searched for names and units
 _LEAST_ALONE = 5  # numbers below each other that are a table of one column
@@ -60,6 +61,7 @@ class Table:
     clock: Clock
     numeric: tuple[int, ...]  # positions of the channels
     left: dict[int, str]  # other columns, and why they are no channels
+    cells: tuple[tuple[Any, ...], ...]  # the first ones of each column
     summary: str
     form: Form
     sheet: str = ""  # its name, where the file has several
@@ -137,7 +139,8 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
     if not numeric:
         raise InputError(f"{where}: no numeric column in addition to the time column; record channels")
     return Table(
-        tuple(columns), tuple(stated), bool(header), first, clock, tuple(numeric), left, sheet.summary, form,
+        tuple(columns), tuple(stated), bool(header), first, clock, tuple(numeric), left,
+        tuple(tuple(row[i] for row in body[:_SHOWN_ROWS]) for i in range(width)), sheet.summary, form,
         sheet.name, sheet.origin_s, sheet.step_s,
     )  # fmt: skip
 

@@ -55,7 +55,7 @@ from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, cut_runs, gather, stream
 from data.sweeps import Columns, take_readings
 from data.timegrid import check_reduction, repair_time, to_grid
-from data.units import check_canonical, convert
+from data.units import check_canonical, conversion, convert
 
 _LONGER_SHARE = 0.05
 _LONGER_S = 600.0
@@ -287,9 +287,14 @@ def _sheet_batches(
     if split is None:
         yield _batch(gather(blocks, sheet), source, extra, 0.0)
         return
-    if split.driver not in machine.channels:
-        raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
-    still = 0.5 * (machine.channels[split.driver].resolution or 0.0)
+    still = 0.0
+    if split.driver is not None:
+        if split.driver not in machine.channels:
+            raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
+        part = machine.channels[split.driver]
+        factor, offset = conversion(part.unit, part.unit_in_file or part.unit, split.driver)
+        still = 0.5 * (part.resolution or 0.0) * abs(factor)
+        still = still if split.above is None else factor * split.above + offset
     first: list[float] = []
 
     def noting_the_start() -> Iterator[Rows]:
@@ -298,11 +303,11 @@ def _sheet_batches(
                 first.extend(rows.time_s[np.isfinite(rows.time_s)][:1].tolist())
             yield rows
 
-    for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
+    for k, rows in enumerate(cut_runs(noting_the_start(), split, still, where)):
         place = replace(source.place, batch_id=f"{source.place.batch_id}-{k + 1:02d}")
-        part = replace(source, place=place, where=f"{where} part {k + 1:02d}")
+        of_run = replace(source, place=place, where=f"{where} part {k + 1:02d}")
         try:
-            yield _batch(rows, part, extra, first[0])
+            yield _batch(rows, of_run, extra, first[0])
         except InputError as error:
             errors.append(error)
         extra = {}

@@ -70,7 +70,15 @@ _SPELLINGS: dict[str, str] = {
     }.items()
     for word in words.split("|")
 }  # fmt: skip
-TIME_UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # the usual ones first
+TIME_UNITS_S = {
+    "s": 1.0,
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86400.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+}  # the usual ones first
 
 _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
 
@@ -194,7 +202,9 @@ def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> N
         if kept and kind is None:
             raise InputError(f"{here} has the unknown unit {unit!r}; write unit: {kept}")
         if role == "error" and unit in _OFFSET_UNITS:
-            raise InputError(f"{here} has unit {unit!r}; expected that of a difference, such as K; correct unit or role")
+            raise InputError(
+                f"{here} has unit {unit!r}; expected that of a difference, such as K; correct unit or role"
+            )
         if kept == "degC" and kind != "temperature":
             raise InputError(f"{here} has unit {unit!r}, expected 'degC'; correct it")
         if kept and unit != kept and kind == quantity(kept):

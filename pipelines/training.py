@@ -159,6 +159,7 @@ def train(
         clock("ingest")
     with _naming_quarantine(outcome.ingested):
         batches = load_batches(lake, machine)
+        _check_several(batches, machine)
     if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome
@@ -244,6 +245,15 @@ def promote_tracked(
 def promote_waiting(settings: Settings, training_id: str, machine_file: Path) -> registry.Promotion:
     """The promotion of a training that waited in the spool: the cell that the rule picks."""
     return promote_tracked(training_id, machine_file, "", False, settings)
+
+
+def _check_several(batches: Sequence[Batch], machine: Machine) -> None:
+    """Raises InputError where one recording is all there is, before anything is computed."""
+    if len(batches) == 1 and machine.recording.split is None:
+        raise InputError(
+            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or cut a"
+            " long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
+        )
 
 
 @contextmanager

@@ -21,7 +21,15 @@ READERS = Registry(
     },
 )
 
-_OTHER_SUFFIXES = {"txt": "csv", "tsv": "csv", "dat": "csv", "asc": "csv", "log": "csv", "xlsm": "xlsx", "pq": "parquet"}
+_OTHER_SUFFIXES = {
+    "txt": "csv",
+    "tsv": "csv",
+    "dat": "csv",
+    "asc": "csv",
+    "log": "csv",
+    "xlsm": "xlsx",
+    "pq": "parquet",
+}
 _LABVIEW = b"LabVIEW Measurement"  # first bytes, whatever the suffix
 
 

@@ -60,7 +60,7 @@ class PivotSheet(Sheet):
         self._table = wide[list(dict.fromkeys(label))]
         self._times = first.reindex(wide.index.get_level_values("order")).tolist()
         title = str(sheet.head[row][clock])
-        cells = self._table.iloc[:_LOOK_ROWS * 10].to_numpy(object)
+        cells = self._table.iloc[: _LOOK_ROWS * 10].to_numpy(object)
         self.head = [
             [title, *self._table.columns],
             *([t, *(None if pd.isna(c) else c for c in row)] for t, row in zip(self._times, cells, strict=False)),
