@@ -21,6 +21,7 @@ from data.units import conversion, convert, quantity, stated_unit
 from data.yaml_edit import flow
 
 _MANY_DROPPED = 0.1  # of a recording's rows: the draft cannot be right
+_IDLE_SHARE = 0.25  # of a temperature's span: below, the machine is idle
 _PAUSE_S = 600.0  # the shortest pause between two runs
 CHECK = "# check: "  # begins a comment of the draft that the user must read
 
@@ -200,17 +201,20 @@ def _runs(group: Group) -> list[str]:
     rows, unit_s = group.longest, group.clock.unit_s
     seen = {n: guess.seen_range(rows.columns[n]) for n in group.names}
     gap_s = 5.0 * group.step_and_length[0] * unit_s
-    ways = [{"driver": n} for n in group.named("driver") if seen[n][0] <= 0.05 * seen[n][1]]
-    ways += [{"pause": f"{guess.grid_step_s(max(2 * gap_s, _PAUSE_S)):g} s"}]
-    warm = sorted(group.named("temperature"), key=lambda n: seen[n][0] - seen[n][1])[:1]
-    ways += [{"driver": n, "above": float(f"{seen[n][0] + 0.25 * (seen[n][1] - seen[n][0]):.3g}")} for n in warm]
+    factor, offset = 1.0, 0.0
+    ways: list[dict[str, object]] = [{"driver": n} for n in group.named("driver") if seen[n][0] <= 0.05 * seen[n][1]]
+    if not group.clock.note:  # no gap of summer time
+        ways.append({"pause": f"{guess.grid_step_s(max(2 * gap_s, _PAUSE_S)):g} s"})
+    for n in sorted(group.named("temperature"), key=lambda n: seen[n][0] - seen[n][1])[:1]:
+        factor, offset = conversion(group.written_unit(group.names[n]) or "degC", "degC", n)
+        idle = factor * (seen[n][0] + _IDLE_SHARE * (seen[n][1] - seen[n][0])) + offset
+        ways.append({"driver": n, "above": float(f"{idle:.3g}")})
     ways += [{"every": "24 h"}]
     for way in ways:
-        time_s = rows.time_s * unit_s
+        split = Split.model_validate(way)
+        still = 0.0 if split.above is None else (split.above - offset) / factor
         try:
-            cut = [
-                len(r) for r in cut_runs(iter([replace(rows, time_s=time_s)]), Split(**way), way.get("above", 0.0), "")
-            ]
+            cut = [*cut_runs(iter([replace(rows, time_s=rows.time_s * unit_s)]), split, still, "")]
         except InputError:
             continue
         if len(cut) > 1:

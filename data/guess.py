@@ -38,6 +38,7 @@ _DRIVER = re.compile(
 _TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
 _POSITION = re.compile(r"\bpos|axis|achse")
 _LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%", "°", "℃"}
+_LABELS = ("A", "W", "N")  # letters of sensors rather than units where the name is one of a temperature
 _TIME_OF_DAY = {"ora", "hora", "heure"}  # also the word for an hour
 _LONE_TIMES = {"s", "h", "d"}  # as the unit of a clock only
 _BRACKETS = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]")
@@ -127,7 +128,8 @@ def unknown_unit_in_name(name: str) -> str | None:
 def channel_unit_in_name(name: str) -> str | None:
     """The unit in a channel's header, which is none of time: the "min" of "T_min" is a minimum."""
     unit = unit_in_name(name)
-    return None if quantity(unit or "") == "time" else unit
+    label = unit in _LABELS and _TEMPERATURE.search(normalise(name.replace("_", " ")))
+    return None if label or quantity(unit or "") == "time" else unit
 
 
 def time_unit_in_name(name: str) -> str | None:

@@ -203,7 +203,7 @@ def _headers(sheet: Sheet, first: int, width: int, form: Form) -> tuple[Sequence
         rows = [row for row in rows if row is not best]
     if not rows or not form.header:
         return (), units
-    header = max(reversed(rows), key=_texts)
+    header = max(reversed(rows), key=lambda row: (_texts([c for c in row if parse_number(c) is None]), _texts(row)))
     shifted = "blank" in sheet.summary and len(header) != width  # names and cells do not stand under each other
     return () if shifted else header, units
 

@@ -113,7 +113,8 @@ def stated_unit(text: str) -> str | None:
     if (known := known_unit(text)) or text.isalnum() or not re.search(r"[^\W\d_]", text):
         return known  # a lone word is none: pint would read "rod" and "link"
     try:
-        return f"{unit_registry().Unit(text):~C}"
+        powers = re.sub(r"(?<=[a-z])([23])", r"**\1", text)  # W/m2
+        return f"{unit_registry().Unit(powers):~C}"
     except Exception:  # pint has no common base for its many parsing errors
         return None
 
@@ -214,6 +215,16 @@ def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> N
 
 
 _SPELT = {"um": "µm", "degC": "°C", "ohm": "Ω", "**2": "²", "**3": "³", "*": "·"}
+
+
+def in_error_unit(text: str, unit: str) -> str:
+    """A text on errors in µm as the same on errors in `unit`, in which a result counts as in µm elsewhere."""
+    return text if unit == "um" else text.replace("µm", unit_label(unit) or "1")
+
+
+def error_column(name: str, unit: str) -> str:
+    """The name of a column of errors: ``predicted_um`` in um, else ``predicted_error``."""
+    return name if unit == "um" else f"{name.removesuffix('_um')}_error"
 
 
 def unit_label(unit: str) -> str:

@@ -121,6 +121,7 @@ class TrainOutcome:
     stopped: str = ""  # why nothing was trained
     postponed: str = ""  # why results wait in the spool for the tracking store; else empty
     records: dict[str, Record] = field(default_factory=dict)  # the trainings as they are tracked
+    units: dict[str, str] = field(default_factory=dict)  # of the errors
 
 
 def train(
@@ -150,6 +151,7 @@ def train(
         say(line)
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
+    outcome.units |= {t: machine.channels[t].unit for t in targets}
     clock = _Clock(outcome.seconds)
     lake = home_lake()
     if request.recordings:
@@ -326,7 +328,7 @@ def _record(
     outcome: TrainOutcome, plan: Plan, settings: Settings, target: str, record_id: str, started_ms: int
 ) -> Record:
     plain = {k: v if isinstance(v, tuple) else (v,) for k, v in asdict(plan).items()}
-    params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()}
+    params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()} | {"unit": outcome.units[target]}
     return tracking.training_record(
         outcome.results[target], settings.promotion, params, choice=outcome.choices.get(target), record_id=record_id,
         started_ms=started_ms,
