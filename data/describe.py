@@ -141,6 +141,7 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         *(f"{CHECK}{f'{g.paths[0].name}: ' if joined else ''}{note}" for g, note in doubts),
         *(f"# left out: {line}" for line in left_out),
         f"machine: {flow(folder)}  # guessed: the folder's name",
+        *(["simulated: true  # a line of the file says so"] if main.table.simulated else []),
         "recording:",
         f"  files: {flow([pattern])}  # guessed: the names of the files",
         f"  header: {'true' if main.table.header else 'false'}",

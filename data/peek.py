@@ -64,6 +64,7 @@ class Table:
     cells: tuple[tuple[Any, ...], ...]  # the first ones of each column
     summary: str
     form: Form
+    simulated: bool = False  # a line above the table says so
     sheet: str = ""  # its name, where the file has several
     origin_s: float = 0.0
     step_s: float | None = None  # between two rows, where the file says so
@@ -141,6 +142,7 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
     return Table(
         tuple(columns), tuple(stated), bool(header), first, clock, tuple(numeric), left,
         tuple(tuple(row[i] for row in body[:_SHOWN_ROWS]) for i in range(width)), sheet.summary, form,
+        any("simulat" in str(c).lower() for row in sheet.head[:first] if _texts(row) == 1 for c in row),
         sheet.name, sheet.origin_s, sheet.step_s,
     )  # fmt: skip
 

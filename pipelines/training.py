@@ -102,7 +102,7 @@ def error_channels(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
     return tuple(dict.fromkeys(wanted)) or allowed
 
 
-@dataclass
+@dataclass(repr=False)
 class TrainOutcome:
     """The results by channel, and where they are tracked, registered and reported."""
 
@@ -122,6 +122,10 @@ class TrainOutcome:
     postponed: str = ""  # why results wait in the spool for the tracking store; else empty
     records: dict[str, Record] = field(default_factory=dict)  # the trainings as they are tracked
     units: dict[str, str] = field(default_factory=dict)  # of the errors
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{t}: {c.family} on {c.n_tsp} by {c.selector}" for t, c in self.choices.items())
+        return f"TrainOutcome({self.machine}, {found or self.stopped or 'nothing chosen'}, report {self.report})"
 
 
 def train(
@@ -253,8 +257,8 @@ def _check_several(batches: Sequence[Batch], machine: Machine) -> None:
     """Raises InputError where one recording is all there is, before anything is computed."""
     if len(batches) == 1 and machine.recording.split is None:
         raise InputError(
-            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or cut a"
-            " long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
+            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or cut"
+            " a long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
         )
 
 

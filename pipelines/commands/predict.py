@@ -90,11 +90,12 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     """Predicted error of batches, batch after batch; None without any.
 
     Returns:
-        batch_id, time_s (s), for an error along an axis position_mm, predicted_um (relative to the batch's start, in
-        `unit`; predicted_error, expected_S_error and bound90_S_error where that is not um; NaN where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
+        batch_id, time_s (s), for an error along an axis position_mm, predicted_um (relative to the batch's start; NaN
+        where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
         quantities), distance (in widths of the trained range), of the whole run expected_S_um, bound90_S_um (nine runs
         in ten stay below) and flagged (why the run is unlike those that the bound comes from, empty where it is not),
-        simulated (model or recording), standing (of the model: champion, provisional or refused).
+        unit (of the error; where it is not um, predicted_error, expected_S_error and bound90_S_error take the place of
+        the columns in um), simulated (model or recording), standing (of the model: champion, provisional or refused).
 
     Raises:
         InputError: an input of the model is missing.

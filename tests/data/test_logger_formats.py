@@ -239,6 +239,19 @@ def test_a_draft_proposes_how_to_cut_one_long_recording(tmp_path: Path, pause_s:
     assert len(list(read_batches(path, parse_machine(with_split(text, proposal), "draft")))) == 3
 
 
+def test_a_line_that_says_simulated_marks_the_machine(tmp_path: Path) -> None:
+    path = saved(tmp_path, "a.csv", ["# simulated recording", HEAD, *rows("{t},{f},{b},{z}")])
+    assert parse_machine(draft_machine_file([path]), "draft").simulated
+    path = saved(tmp_path, "b.csv", ["Time,T_simulated,z_um", *rows("{t},{f},{z}")])
+    assert not parse_machine(draft_machine_file([path]), "draft").simulated
+
+
+def test_without_an_error_the_draft_says_how_to_name_one(tmp_path: Path) -> None:
+    path = saved(tmp_path, "a.csv", ["Time,T1,T2", *rows("{t},{f},{b}")])
+    (note,) = notes(draft_machine_file([path]))
+    assert note.startswith("no channel is the measured error; set role: error and its unit where it is, such as T1, T2")
+
+
 def test_a_split_needs_exactly_one_way() -> None:
     with pytest.raises(InputError, match="expected exactly one of driver, pause and every"):
         machine("split: {pause: 1 h, every: 1 d}")

@@ -211,7 +211,7 @@ def test_what_is_stored_stays_when_the_source_turns_bad(place: Place) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("step_s:", "stepp_s:", "unknown key 'recording.stepp_s'; did you mean 'step_s'? Allowed: files, header"),
+        ("step_s:", "stepp_s:", "unknown key 'recording.stepp_s'; did you mean 'step_s'? Allowed: decimal"),
         ("resolution: 1,", "resolutoin: 1,", "unknown key 'channels.speed.resolutoin'; did you mean 'resolution'?"),
         ("role: ambient", "role: room", "key 'channels.room.role': got 'room'"),
         ("step_s: 300", "step_s: -1", "key 'recording.step_s': got -1"),
@@ -322,9 +322,9 @@ def test_describe_writes_into_a_new_folder_or_says_why_not(place: Place) -> None
 def test_describe_of_what_is_no_file(place: Place) -> None:
     code, _, err = place.call("describe", place.folder / "gone.csv")
     gone = place.folder / "gone.csv"
-    assert (code, trouble(err)) == (2, f"gone.csv: no such file at {gone}; give the path of a recording")
+    assert (code, trouble(err)) == (2, f"{gone}: no such file; give the path of a recording")
     code, _, err = place.call("describe", place.folder)
     assert code == 2
-    assert trouble(err) == f"{place.folder.name}: is a directory, expected recordings; give its files, such as " + (
+    assert trouble(err) == f"{place.folder}: is a directory, expected one recording file; give its files, such as " + (
         f"{place.folder}/*.csv"
     )
