@@ -33,7 +33,7 @@ class Shown:
     column: str
     cells: tuple[str, ...]
     becomes: str
-    values: tuple[float, ...] = ()
+    numbers: tuple[float, ...] = ()
 
 
 def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:

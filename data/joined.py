@@ -40,15 +40,9 @@ class JoinedRows:
 def joined_machine(machine: Machine, key: str) -> Machine:
     """The machine file as it describes the joined files of that key: their clock, header and channels."""
     part = machine.recording.joined[key]
-    recording = machine.recording.model_copy(
-        update={
-            **{key: getattr(part, key) for key in Form.model_fields},
-            "timezone": part.timezone or machine.recording.timezone,
-            "joined": {},
-            "split": None,
-            "schedule": None,
-        }  # fmt: skip
-    )
+    form = {k: getattr(part, k) for k in Form.model_fields}
+    form["timezone"] = part.timezone or machine.recording.timezone
+    recording = machine.recording.model_copy(update={**form, "joined": {}, "split": None, "schedule": None})
     channels = {
         n: c.model_copy(update={"source": "file"})
         for n, c in machine.channels.items()

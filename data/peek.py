@@ -6,7 +6,7 @@ import datetime as dt
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,12 @@ def look(path: Path, form: Form | None = None) -> list[Table]:
                 tables.append(look_at(sheet, path.name, form))
             except InputError as error:
                 problems.append(error)
-    if not tables:
-        raise problems[0]
-    if form.pivot is None and len(tables) == 1 and (pivot := _pivot(path, tables[0])):
+        pivot = _pivot(sheets[0], tables[0]) if len(sheets) == len(tables) == 1 and form.pivot is None else None
+    if pivot is not None:
         time = TimeColumn(column=tables[0].key(tables[0].time or 0))
         return look(path, form.model_copy(update={"pivot": pivot, "time": time}))
+    if not tables:
+        raise problems[0]
     return tables
 
 
@@ -118,25 +119,28 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
     columns = [str(c or "").strip() for c in header[:width]] if header else [str(i) for i in range(width)]
     columns += [""] * (width - len(columns))
     body = [row for row in sheet.head[first : first + _CLOCK_ROWS] if len(row) == width]
-    own = [[c for row in body[:200] if (c := row[i]) is not None and str(c).strip()] for i in range(width)]
-    stated = [_unit_of(cells) for cells in own]
-    stated = [stated[i] or (str(units[i] or "").strip() if i < len(units) else "") for i in range(width)]
-    clock = _clock(columns, body, sheet.decimal, bool(header), stated, bool(sheet.origin_s))
+    filled = [[c for row in body if (c := row[i]) is not None and str(c).strip()] for i in range(width)]
+    of_rows = [str(units[i] or "").strip() if i < len(units) else "" for i in range(width)]
+    stated = [_unit_of(cells[:200]) or of_rows[i] for i, cells in enumerate(filled)]
+    clock = _clock(columns, filled, sheet.decimal, bool(header), stated, bool(sheet.origin_s))
+    if clock.time is not None:
+        clock = replace(clock, **_with_date(body, clock.time, clock.stamps))
     left: dict[int, str] = {}
     numeric = []
-    for i in range(width):
-        cells = [c for row in body if (c := row[i]) is not None and str(c).strip()]
-        numbers = sum(parse_number(c, sheet.decimal) is not None or cell_unit(c) is not None for c in cells)
+    for i, cells in enumerate(filled):
+        some = cells[:: max(1, len(cells) // 200)]
+        numbers = sum(_kind(c, sheet.decimal) == "n" for c in some)
+        if i in (clock.time, clock.date):
+            continue
         if i in clock.counters:
             left[i] = "numbers the rows, or is another clock"
         elif not cells:
             left[i] = "empty"
-        elif numbers < _LEAST_NUMBERS * len(cells) or numbers == 0:
+        elif numbers <= _LEAST_NUMBERS * len(some):
             time = bool(header) and guess.is_time_name(columns[i]) and clock.time is None
             left[i] = f"{'a time in no known format' if time else 'text'}, such as {str(cells[0])[:30]!r}"
-        elif i not in (clock.time, clock.date):
+        else:
             numeric.append(i)
-    left = {i: why for i, why in left.items() if i not in (clock.time, clock.date)}
     if not numeric:
         raise InputError(f"{where}: no numeric column in addition to the time column; record channels")
     return Table(
@@ -226,46 +230,48 @@ def _unit_of(cells: Sequence[Any]) -> str:
     return unit if n >= _MOST * len(cells) else ""
 
 
-def _pivot(path: Path, table: Table) -> Pivot | None:
+def _pivot(sheet: Sheet, table: Table) -> Pivot | None:
     """The columns of names and of readings, if the table holds one reading in a row.
 
-    It does where the times repeat or fall, and rise within the rows of each name; or where a column that is called
-    like one of names changes from row to row, with a single column of readings.
+    The times then rise within the rows of each name, and names change with times that repeat or fall: from row to row,
+    or from one block of rows to the next. A column that is called like one of names may also change while times rise.
     """
-    clock = table.time
-    if clock is None or not table.header:
+    if table.time is None or not table.header:
         return None
-    with sheets_of(path, (), table.form) as sheets:
-        sheet = next(s for s in sheets if s.name == table.sheet)
-        body = [row for row in sheet.head[table.first_row :] if len(row) == len(table.columns)][:_PIVOT_ROWS]
-        decimal = sheet.decimal
+    body = [row for row in sheet.head[table.first_row :] if len(row) == len(table.columns)][:_PIVOT_ROWS]
     kind, stamp = ("timestamp", table.stamps[0] or None) if table.stamps else ("s", None)
-    time_s = to_seconds(arrow_column([row[clock] for row in body]), kind, stamp, decimal)
-    rises = float(np.mean(np.diff(time_s) > 0)) if len(body) > 1 else 1.0
+    time_s = pd.Series(to_seconds(arrow_column([row[table.time] for row in body]), kind, stamp, sheet.decimal))
+    stands = time_s.diff() <= 0
     frame = pd.DataFrame(body).map(lambda c: str(c or "").strip())
-    texts = {i: frame[i].nunique() for i, why in table.left.items() if why.startswith("text")}
-    texts |= {i: frame[i].nunique() for i in table.numeric if guess.is_series_name(table.columns[i])}
-    names = [i for i, n in sorted(texts.items(), key=lambda t: (-t[1], t[0])) if 2 <= n <= 0.34 * len(body)]
+    called = [i for i in table.numeric if guess.is_series_name(table.columns[i])]
+    texts = [*(i for i, why in table.left.items() if why.startswith("text")), *called]
+    names = sorted((i for i in texts if 2 <= frame[i].nunique() <= len(body) / 3), key=lambda i: -frame[i].nunique())
     values = [i for i in table.numeric if i not in names]
-    called = [i for i in values if guess.is_value_name(table.columns[i])]
-    values = called or values
-    for group in ([i] for i in names) if len(names) < 2 else [*([i] for i in names), names]:
-        keys = frame[group].agg(" ".join, axis=1)
-        within = pd.Series(time_s).groupby(keys).diff().dropna()
-        changes = float((keys != keys.shift()).mean())
-        named = len(group) == 1 and guess.is_series_name(table.columns[group[0]]) and len(values) == 1
-        long = rises < 0.999 and len(within) and float((within > 0).mean()) > _MOST
-        mixed = long and (changes > 0.3 or rises > _MOST) or named and changes > 0.3
-        if mixed and len({table.key(i) for i in (*group, *values)} & set(table.columns)) == len(group) + len(values):
-            found = [[table.columns[i] for i in places] for places in (group, values)]
-            return Pivot(**{k: v[0] if len(v) == 1 else v for k, v in zip(("name", "value"), found, strict=True)})
+    values = [i for i in values if guess.is_value_name(table.columns[i])] or values
+    for group in [*([i] for i in names), *([names] if len(names) > 1 else [])]:
+        name = frame[group].agg(" ".join, axis=1)
+        change = name != name.shift()
+        rises = time_s.groupby(name).diff().dropna() > 0
+        series = len(values) == 1 and any(guess.is_series_name(table.columns[i]) for i in group)
+        scans = change.mean() > 0.3 and (series or stands.mean() > 0.3)
+        blocks = bool(stands.any()) and bool(change[stands].all()) and stands[change][1:].mean() > _MOST
+        if rises.mean() > _MOST and (scans or blocks) and all(isinstance(table.key(i), str) for i in (*group, *values)):
+            keys = [[table.columns[i] for i in places] for places in (group, values)]
+            return Pivot(
+                name=keys[0][0] if len(group) == 1 else keys[0], value=keys[1][0] if len(values) == 1 else keys[1]
+            )
     return None
 
 
 def _clock(
-    columns: Sequence[str], body: Sequence[Sequence[Any]], decimal: str, header: bool, units: Sequence[str], begun: bool
+    columns: Sequence[str],
+    filled: Sequence[Sequence[Any]],
+    decimal: str,
+    header: bool,
+    units: Sequence[str],
+    begun: bool,
 ) -> Clock:
-    """The clock and the row counters. `begun`: the file states when an elapsed clock began.
+    """The clock and the row counters, from the filled cells by column. `begun`: the file states when the clock began.
 
     A column with a header that says time may repeat times, as the rows of a sweep do; of several such columns the one
     that rises most often is the clock. Any other must rise with every row, in nearly equal steps, and its header must
@@ -275,8 +281,7 @@ def _clock(
     counters: list[int] = []
     ticking: list[int] = []
     found: list[tuple[float, int, tuple[str, ...], bool]] = []  # share of rising steps (1 more: named), place, …
-    for i, column in enumerate(columns):
-        cells = [row[i] for row in body if row[i] is not None and str(row[i]).strip()]
+    for i, (column, cells) in enumerate(zip(columns, filled, strict=True)):
         if len(cells) < 2 or (header and i not in named and guess.is_other_name(column)):
             continue
         numbers = [n for c in cells if (n := parse_number(c, decimal)) is not None]
@@ -301,25 +306,23 @@ def _clock(
     if not found:
         return Clock(None, None, (), False, tuple(counters))
     _, place, stamps, elapsed = max(found)
-    counters += [i for i in ticking if i != -place]
-    date, stamps = _with_date(body, -place, stamps)
-    return Clock(-place, date, stamps, elapsed and date is None, tuple(counters))
+    return Clock(-place, None, stamps, elapsed, (*counters, *(i for i in ticking if i != -place)))
 
 
-def _with_date(body: Sequence[Sequence[Any]], time: int, stamps: tuple[str, ...]) -> tuple[int | None, tuple[str, ...]]:
-    """The column of the dates that a clock of times of day needs, and the patterns of both together."""
-    of_day = all(isinstance(row[time], dt.time) for row in body) if stamps == ("",) else bool(stamps)
+def _with_date(body: Sequence[Sequence[Any]], time: int, stamps: tuple[str, ...]) -> dict[str, Any]:
+    """The column of the dates that a clock of times of day needs, and the patterns of both together; for `Clock`."""
+    of_day = all(isinstance(row[time], dt.time) for row in body) if stamps == ("",) else True
     if not of_day or any("%d" in s or "8601" in s for s in stamps):
-        return None, stamps
+        return {}
     times = arrow_column([row[time] for row in body[:200]])
     for i in range(len(body[0])):
         dates = arrow_column([row[i] for row in body[:200]])
         of_dates = pa.types.is_timestamp(dates.type) or parse_number(body[0][i]) is None
-        if i == time or dates.null_count or not of_dates:
+        if i == time or dates.null_count or not of_dates or pa.types.is_floating(times.type):
             continue
         if fits := stamp_formats([text or "" for text in with_date(dates, times).to_pylist()]):
-            return i, tuple(fits)
-    return None, stamps
+            return {"date": i, "stamps": tuple(fits), "elapsed": False}
+    return {}
 
 
 def _since_1970(numbers: Sequence[float], unit: str | None) -> bool:

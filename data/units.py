@@ -42,7 +42,8 @@ _QUANTITIES: dict[str, tuple[str, ...]] = {
 _UNITS = {unit: kind for kind, units in _QUANTITIES.items() for unit in units}
 _OFFSET_UNITS = ("degC", "degF")  # their zero is not that of K: a difference needs pint's delta units
 _PINT = {"": "dimensionless", "1": "dimensionless", "%": "percent", "Nm": "N*m", "rev/s": "revolution/s", "mil": "thou",
-         "%RH": "percent", "gpm": "gallon/min", "m3/h": "m**3/h", "m/s2": "m/s**2", "step": "count", "oz": "ounce"}  # fmt: skip
+         "%RH": "percent", "gpm": "gallon/min", "m3/h": "m**3/h", "m/s2": "m/s**2", "step": "count",
+         "oz": "ounce"}  # fmt: skip
 
 # spellings and words found in recordings (English, German, French, Spanish, Italian, Chinese, Japanese), as `_fold`
 # leaves them: without case and accents
@@ -56,8 +57,9 @@ _SPELLINGS: dict[str, str] = {
         "mm": "millimeter|millimeters|millimetre|millimetres|milimetro|milimetros|millimetri|毫米|ミリ|ミリメートル",
         "in": "inch|inches", "mil": "thou",
         "rpm": "1/min|min-1|u/min|upm|r/min|rev/min|tr/min|giri/min|转/分|轉/分|回転/分", "rev/s": "1/s|rps",
-        "in/min": "ipm", "kg": "kgs|kilogram|kilogramm|kilo", "g": "gram|gramm", "lb": "lbs|pound|pounds", "Pa": "pascal",
-        "psi": "psig|psia|lbf/in2", "%RH": "%rf|% rh|%r.h.|rel%|%rel", "gpm": "gal/min|us gal/min", "m3/h": "m³/h|m^3/h",
+        "in/min": "ipm", "kg": "kgs|kilogram|kilogramm|kilo", "g": "gram|gramm", "lb": "lbs|pound|pounds",
+        "Pa": "pascal", "psi": "psig|psia|lbf/in2", "%RH": "%rf|% rh|%r.h.|rel%|%rel", "gpm": "gal/min|us gal/min",
+        "m3/h": "m³/h|m^3/h",
         "m/s2": "m/s²|m/s^2", "ohm": "ω|ohms", "lux": "lx", "cfm": "ft3/min", "um/m": "ustrain|microstrain|µε",
         "step": "steps|schritte", "count": "counts|cts|digits|digit|pulses|imp|inkr",
         "Hz": "hertz", "s": "sec|secs|sek|second|seconds|sekunde|sekunden|seconde|secondes|seg|segundo|segundos"
@@ -65,20 +67,13 @@ _SPELLINGS: dict[str, str] = {
         "min": "mins|minute|minutes|minuten|minuto|minutos|minuti|分|分钟|分鐘|分間",
         "h": "hr|hrs|hour|hours|std|stunde|stunden|heure|heures|hora|horas|ora|ore|小时|小時",
         "d": "day|days|tag|tage|jour|jours|dia|dias|giorno|giorni|天|日",
-        "W": "watt|watts", "V": "volt|volts|vdc|vac", "mV": "millivolt|millivolts", "A": "amp|amps|ampere", "N": "newton", "Nm": "n*m|n·m|n m",
+        "W": "watt|watts", "V": "volt|volts|vdc|vac", "mV": "millivolt|millivolts", "A": "amp|amps|ampere",
+        "N": "newton", "Nm": "n*m|n·m|n m",
         "%": "percent|prozent|pourcent|百分比", "l/min": "l/m", "1": "-",
     }.items()
     for word in words.split("|")
 }  # fmt: skip
-TIME_UNITS_S = {
-    "s": 1.0,
-    "min": 60.0,
-    "h": 3600.0,
-    "d": 86400.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-}  # the usual ones first
+TIME_UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # usual first
 
 _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
 
@@ -108,7 +103,7 @@ def known_unit(text: str) -> str | None:
 
 @lru_cache
 def stated_unit(text: str) -> str | None:
-    """The same for a text that stands where a unit belongs: terms that pint understands count as well (``"kW/m^2"``)."""
+    """The same for a text that stands where a unit belongs: terms of pint count as well (``"kW/m^2"``)."""
     text = text.strip(" []()")
     if (known := known_unit(text)) or text.isalnum() or not re.search(r"[^\W\d_]", text):
         return known  # a lone word is none: pint would read "rod" and "link"

@@ -257,8 +257,8 @@ def _check_several(batches: Sequence[Batch], machine: Machine) -> None:
     """Raises InputError where one recording is all there is, before anything is computed."""
     if len(batches) == 1 and machine.recording.split is None:
         raise InputError(
-            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or cut"
-            " a long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
+            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or"
+            " cut a long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
         )
 
 

@@ -18,8 +18,8 @@ from data.errors import InputError
 from data.units import TIME_UNITS_S, conversion, known_unit, quantity
 
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%m-%d-%Y", "%Y%m%d",
-          "%d.%m.%y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%y", "%m-%d-%y", "%Y年%m月%d日", "%d-%b-%Y", "%d %b %Y", "%d. %b %Y",
-          "%d/%b/%Y", "%d.%b.%Y", "%d-%b-%y", "%b %d, %Y", "%Y-%b-%d")  # fmt: skip
+          "%d.%m.%y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%y", "%m-%d-%y", "%Y年%m月%d日", "%d-%b-%Y", "%d %b %Y",
+          "%d. %b %Y", "%d/%b/%Y", "%d.%b.%Y", "%d-%b-%y", "%b %d, %Y", "%Y-%b-%d")  # fmt: skip
 _TIMES = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%H-%M-%S", "%I:%M:%S %p", "%I:%M:%S.%f %p", "%I:%M %p", "%H%M%S",
           "%H.%M.%S", "%H时%M分%S秒", "%H時%M分%S秒")  # fmt: skip
 _BETWEEN = (" ", "T", "-", "_", ", ")  # date and time of day
@@ -27,16 +27,15 @@ _PATTERNS = [*(f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in _BETWEE
 _ISO = "ISO8601"
 _MISSING = ("", "nan", "NaN", "NAN")
 _ZONES_H = {
-    "Z": 0.0, "UTC": 0.0, "GMT": 0.0, "WET": 0.0, "WEST": 1.0, "BST": 1.0, "CET": 1.0, "MEZ": 1.0, "CEST": 2.0,
-    "MESZ": 2.0, "EET": 2.0, "EEST": 3.0, "MSK": 3.0, "IST": 5.5, "JST": 9.0, "KST": 9.0, "EST": -5.0, "EDT": -4.0,
-    "CST": -6.0, "CDT": -5.0, "MST": -7.0, "MDT": -6.0, "PST": -8.0, "PDT": -7.0,
+    zone: hours
+    for hours, zones in {0: "Z UTC GMT WET", 1: "WEST BST CET MEZ", 2: "CEST MESZ EET", 3: "EEST MSK", 9: "JST KST",
+                         -4: "EDT", -5: "EST CDT", -6: "CST MDT", -7: "MST PDT", -8: "PST"}.items()
+    for zone in zones.split()
 }  # fmt: skip
-_ZONE = re.compile(rf"\s*\b({'|'.join(_ZONES_H)})\b|(?<=:\d\d)\s*([+-]\d\d):?(\d\d)$|(?<=\.\d\d\d)([+-]\d\d):?(\d\d)$")
-_MONTHS = {  # by three letters, where they are not the English ones
-    "mär": "Mar", "mrz": "Mar", "mai": "May", "okt": "Oct", "dez": "Dec", "fév": "Feb", "avr": "Apr", "aoû": "Aug",
-    "déc": "Dec", "ene": "Jan", "abr": "Apr", "ago": "Aug", "dic": "Dec", "gen": "Jan", "mag": "May", "giu": "Jun",
-    "lug": "Jul", "ott": "Oct",
-}  # fmt: skip
+_ZONE = re.compile(rf"\s*\b({'|'.join(_ZONES_H)})\b|(?<=\d)([+-]\d\d):?(\d\d)$")
+_ABROAD = "mär mrz mai okt dez fév avr aoû déc ene abr ago dic gen mag giu lug ott"  # three letters of months
+_ENGLISH = "Mar Mar May Oct Dec Feb Apr Aug Dec Jan Apr Aug Dec Jan May Jun Jul Oct"
+_MONTHS = dict(zip(_ABROAD.split(), _ENGLISH.split(), strict=True))
 # spellings of time stamps, in this order, and what they become
 _PLAIN = (
     (re.compile(r"^(mon|tue|wed|thu|fri|sat|sun)[a-z]*[.,]?\s+", re.I), ""),
@@ -45,6 +44,7 @@ _PLAIN = (
     (re.compile(r"(\d:\d\d:\d\d)[:,](\d+)"), r"\1.\2"),
     (re.compile(r"^([a-z]{3}) +(\d+) +(\d\S+) +(\d{4})$", re.I), r"\2 \1 \4 \3"),  # ctime
 )
+_NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_boolean)
 _ELAPSED = re.compile(r"(\d+ ?d(ays?)?,? ?)?\d+:\d\d:\d\d([.,]\d+)?")
 _QUANTITY = re.compile(r"([+-]?\s*[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,;:+-][^\d;:]{0,8})")
 
@@ -59,12 +59,7 @@ def to_float(column: Any, decimal: str = ".", unit: str = "") -> tuple[Array, ND
     if pa.types.is_dictionary(kind):
         column = column.cast(kind.value_type)
         kind = column.type
-    if (
-        pa.types.is_floating(kind)
-        or pa.types.is_integer(kind)
-        or pa.types.is_decimal(kind)
-        or pa.types.is_boolean(kind)
-    ):
+    if any(test(kind) for test in _NUMERIC):
         if not pa.types.is_float64(kind):
             column = column.cast(pa.int8()) if pa.types.is_boolean(kind) else column
             column = column.cast(pa.float64(), safe=False)
@@ -119,6 +114,7 @@ def _copying(column: Any) -> dict[str, bool]:
 
 
 _NUMBER = re.compile(r"([+-]?)\s*(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
+_OPEN = re.compile(r"\d{1,3}[.,]\d{3}", re.ASCII)  # a thousand times more or less
 _GROUPED = re.compile(r"\d{1,3}(?:([.,])\d{3}(?:\1\d{3})*(?!\1)[.,]\d+|([.,])\d{3}(?:\2\d{3})+)", re.ASCII)
 
 
@@ -140,9 +136,7 @@ def parse_number(cell: Any, decimal: str = ".") -> float | None:
     sign, digits, exponent = found[1], found[2], found[3] or ""
     if (groups := _GROUPED.fullmatch(digits)) and not exponent:
         digits = digits.replace(groups[1] or groups[2], "")
-    elif digits.count(".") + digits.count(",") > 1:
-        return None
-    elif decimal not in digits and not exponent and re.fullmatch(r"\d{1,3}[.,]\d{3}", digits):
+    elif digits.count(".") + digits.count(",") > 1 or (decimal not in digits and _OPEN.fullmatch(digits + exponent)):
         return None
     value = float(f"{sign}{digits.replace(',', '.')}{exponent}")
     return value if np.isfinite(value) else None
@@ -166,11 +160,10 @@ def _in_unit(cell: str, decimal: str, unit: str) -> float | None:
 
 def _plain(cells: pd.Series[Any]) -> tuple[pd.Series[Any], pd.Series[Any]]:
     """Time stamps without weekday and time zone, AM and PM, months and fractions in one spelling; the zones' hours."""
-    zones = cells.str.extract(_ZONE)
-    minutes = zones[2].fillna(zones[4]).astype(float) / 60
-    hours = zones[1].fillna(zones[3]).astype(float)
-    offset_h = zones[0].map(_ZONES_H).fillna(hours + np.copysign(minutes, hours)).fillna(0.0)
-    cells = cells.str.replace(_ZONE, "", regex=True)
+    zones = cells.str.extract(_ZONE).where(cells.str.contains(":"))
+    hours = zones[1].astype(float)
+    offset_h = zones[0].map(_ZONES_H).fillna(hours + np.copysign(zones[2].astype(float) / 60, hours)).fillna(0.0)
+    cells = cells.str.replace(_ZONE, "", regex=True).where(cells.str.contains(":"), cells)
     for spelling, becomes in _PLAIN:
         cells = cells.str.replace(spelling, becomes, regex=True)
     return cells, offset_h
@@ -192,8 +185,8 @@ def is_elapsed(cells: Sequence[Any]) -> bool:
     return bool(spans_s[0] < 1.0 or (spans_s >= 86400.0).any())
 
 
-def _elapsed_s(texts: Sequence[str | None]) -> Array:
-    spans = pd.to_timedelta(pd.Series(texts, dtype=object).str.replace(",", ".", regex=False), errors="coerce")
+def _elapsed_s(texts: Sequence[Any]) -> Array:
+    spans = pd.to_timedelta([str(text).replace(",", ".") for text in texts], errors="coerce").to_series()
     return np.asarray(spans.dt.total_seconds(), np.float64)
 
 

@@ -202,7 +202,7 @@ def _print_columns(name: str, columns: Sequence[Shown]) -> None:
     for heading in ("column", "first cells", "read as", "first values"):
         table.add_column(heading, overflow="fold")
     for c in columns:
-        values = ", ".join(f"{v:.6g}" for v in c.values)
+        values = ", ".join(f"{v:.6g}" for v in c.numbers)
         table.add_row(*(escape(text) for text in (c.column, ", ".join(c.cells), c.becomes, values)))
     console.out.print(table)
 
