@@ -186,7 +186,8 @@ def is_elapsed(cells: Sequence[Any]) -> bool:
 
 
 def _elapsed_s(texts: Sequence[Any]) -> Array:
-    spans = pd.to_timedelta([str(text).replace(",", ".") for text in texts], errors="coerce").to_series()
+    plain = [re.sub(r"(\d) ?d(ays?)?,? ", r"\1 days ", str(text)).replace(",", ".") for text in texts]
+    spans = pd.to_timedelta(plain, errors="coerce").to_series()
     return np.asarray(spans.dt.total_seconds(), np.float64)
 
 

@@ -25,7 +25,8 @@ _OTHER_ENCODINGS = ["gb18030", "cp932", "cp1252"]  # than UTF-8 and UTF-16
 SEPARATORS = (";", "\t", "|", ",")  # the comma last: it may be a decimal mark
 _BLANKS = {"  ": re.compile(r" {2,}|\t"), " ": re.compile(r"[ \t]+")}  # two at least, one at least
 _NAMES = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", "  ": "blanks", " ": "blank"}
-_COMMENT = re.compile(r"^[#%]+[ \t]+(?=\S)")  # before a header
+_COMMENT = re.compile(r"^[#%]+[ \t]+(?=\S)")  # before a header, which numbers follow
+_NUMERIC = re.compile(r"\s*[-+.\d]")
 _POINT = re.compile(r"\s*[+-]?\s*\d*\.\d+([eE][+-]?\d+)?\s*[^\d\s.,:]{0,4}\s*")  # may have a unit behind it
 _COMMA = re.compile(_POINT.pattern.replace(r"\.", ",", 1))
 
@@ -146,7 +147,8 @@ class CsvSheet(Sheet):
         self._newline = "\n" if "\n" in text or "\r" not in text else "\r"
         lines = [line.rstrip("\r") for line in text.split(self._newline)]
         lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
-        lines = [_COMMENT.sub("", line) for line in lines]
+        below = [*lines[1:], ""]
+        lines = [_COMMENT.sub("", a) if _NUMERIC.match(b) else a for a, b in zip(lines, below, strict=True)]
         self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))
         self.head = [split(line, self.separator) if line.strip() else [] for line in lines]
         self.decimal = form.decimal or find_decimal(self.head)
