@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +68,7 @@ def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[
                 f" {first}"
                 for path, table in other.tables
             ]
-    text = _write(main, joined, left_out)
+    text = _write(main, joined, left_out, {p.name for p in files} - {p.name for p in main.paths})
     machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
     if FILL_IN not in text and (trouble := _tried(main.paths[0], machine)):
         text = f"{CHECK}{trouble}\n{text}"
@@ -123,7 +124,7 @@ def _key(group: Group, taken: Sequence[str]) -> str:
     return name if name not in taken else f"{name}_{len(taken) + 1}"
 
 
-def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequence[str]) -> str:
+def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequence[str], others: set[str]) -> str:
     groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
     fine: dict[str, tuple[dict[str, Guess], float]] = {key: _linked(g) for key, g in groups.items()}
     channels: list[str] = []
@@ -134,7 +135,9 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
     files = [p.name for p in main.paths]
     folder = re.sub(r"[^a-z0-9_\-]+", "_", main.paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
     doubts = [(g, note) for g in groups.values() for note in (g.clock.note, *g.notes) if note]
-    pattern = next((how.files for _, how in joined.values() if how.files), None) or files_pattern(main.paths)
+    patterns = [next((how.files for _, how in joined.values() if how.files), None) or files_pattern(main.paths)]
+    if fnmatch.filter(others, patterns[0]):  # those are no recordings
+        patterns = files
     lines = [
         f"# Drafted from {len(files)} file{'s' * (len(files) > 1)}: {files[0]}{' … ' + files[-1] if files[1:] else ''}",
         f"# ({main.table.summary}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
@@ -143,7 +146,7 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         f"machine: {flow(folder)}  # guessed: the folder's name",
         *(["simulated: true  # a line of the file says so"] if main.table.simulated else []),
         "recording:",
-        f"  files: {flow([pattern])}  # guessed: the names of the files",
+        f"  files: {flow(patterns)}  # guessed: the names of the files",
         f"  header: {'true' if main.table.header else 'false'}",
         *(f"  {key}: {flow(value)}" for key, value in _stated(main.table.form).items()),
         f"  time: {_time(main.clock)}",
@@ -156,9 +159,8 @@ def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequen
         lines += ["  joined:"] * (k == 0) + [f"    {key}:  # guessed: {how.why}"]
         lines += [f"      {name}: {flow(value)}" for name, value in how.keys.items()]
         lines += ["      header: false"] * (not group.table.header)
-        lines += [f"      {key}: {flow(value)}" for key, value in _stated(group.table.form).items()] + [
-            f"      time: {_time(group.clock)}"
-        ]
+        lines += [f"      {name}: {flow(value)}" for name, value in _stated(group.table.form).items()]
+        lines.append(f"      time: {_time(group.clock)}")
     lines += ["channels:", *channels]
     if ignored := dict(left for g in groups.values() for left in _left(g)):
         lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")

@@ -51,6 +51,7 @@ class Group:
 
     tables: list[tuple[Path, Table]]
     notes: list[str] = field(default_factory=list)
+    row_step_s: float | None = None  # of rows without a clock that are those of the recordings
 
     @property
     def table(self) -> Table:
@@ -143,9 +144,8 @@ class Group:
         open_ = [n for n, r in roles.items() if r.value != "error" and guess.may_be_error(headers[n], units[n])]
         if any(r.value == "error" for r in roles.values()):
             asked = [f"{n} ({units[n]})" for n in open_ if roles[n].value == "driver"]
-            self.notes += (
-                [f"{', '.join(asked)}: taken for drivers; set role: error if one is measured"] if asked else []
-            )
+            if asked:
+                self.notes.append(f"{', '.join(asked)}: taken for drivers; set role: error if one is measured")
         elif len(open_) == 1:
             self.notes.append(f"{open_[0]} ({units[open_[0]]}) is taken for the measured error; else set its role")
             roles[open_[0]] = Guess("error", f"the only channel that can be it, by its unit {units[open_[0]]}")
@@ -163,8 +163,9 @@ class Group:
     @cached_property
     def clock(self) -> Clock:
         table = self.table
-        if table.time is None and table.step_s:
-            return Clock(f"{{step: {f'{table.step_s:g} s'!r}}}", "the file's header gives it", 1.0)
+        if table.time is None and (step_s := self.row_step_s or table.step_s):
+            why = "as in the recording, which has as many rows" if self.row_step_s else "the file's header gives it"
+            return Clock(f"{{step: {f'{step_s:g} s'!r}}}", why, 1.0)
         if table.time is None:
             unread = [f"{table.columns[i]!r} ({why})" for i, why in table.left.items() if why.startswith("a time")]
             note = (
@@ -178,9 +179,7 @@ class Group:
         header = table.columns[table.time] if table.header else ""
         column = flow(table.key(table.time))
         if table.clock.elapsed:
-            return Clock(
-                f"{{column: {column}, clock: elapsed}}", "durations that begin at 0 or go on beyond a day", 1.0
-            )
+            return Clock(f"{{column: {column}, clock: elapsed}}", "durations from 0, or beyond a day", 1.0)
         if table.stamps:
             form = f", format: {flow(pattern(table))}" if pattern(table) else ""
             at = table.clock.date
@@ -304,14 +303,18 @@ def joint(main: Group, other: Group) -> Joint | None:
     if main.paths == other.paths:
         same = len(other.sheets) == 1 and other.sheets[0] not in main.sheets
         return Joint({"sheet": other.sheets[0]}, "the sheet has other columns of the same run") if same else None
-    if other.table.time is None:
-        return None
     folder = Path(os.path.relpath(other.paths[0].resolve().parent, main.paths[0].resolve().parent))
+    single = {"file": (folder / other.paths[0].name).as_posix()}
+    if other.table.time is None:
+        steps = np.diff(main.longest.time_s)
+        if len(main.paths) > 1 or len(other.paths) > 1 or len(main.longest) != len(other.longest) or np.ptp(steps) > 0:
+            return None
+        other.row_step_s = float(steps[0]) * main.clock.unit_s
+        return Joint(single, "given together with the recording, with as many rows", main.paths[0].name)
     here, there = _runs(main.paths, other.paths), _runs(other.paths, main.paths)
     if here and there and here[1] == there[1]:
         files = {"file": (folder / there[0]).as_posix()}
         return Joint(files, "the names of the files differ by the same text", here[0])
-    single = {"file": (folder / other.paths[0].name).as_posix()}
     if len(other.paths) == 1:
         if len(main.paths) == 1 and (main.sheets == other.sheets or len(main.sheets) == len(other.sheets) == 1):
             return Joint(single, "given together with the recording", main.paths[0].name)

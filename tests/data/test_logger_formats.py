@@ -262,6 +262,22 @@ def test_without_an_error_the_draft_says_how_to_name_one(tmp_path: Path) -> None
     assert note.startswith("no channel is the measured error; set role: error and its unit where it is, such as T1, T2")
 
 
+def test_errors_without_a_clock_are_joined_row_by_row(tmp_path: Path) -> None:
+    warm = saved(tmp_path, "temperatures.csv", ["Time,T1,T2", *rows("{t:%Y-%m-%d %H:%M:%S},{f},{b}")])
+    error = saved(tmp_path, "errors.csv", ["z_um", *rows("{z}")])
+    text = draft_machine_file([warm, error])
+    machine = parse_machine(text, "draft")
+    assert machine.recording.files == ["temperatures.csv"] and machine.recording.joined["errors"].time.step == "60 s"
+    assert np.array_equal(read(warm, text).values("z_um"), Z)
+
+
+def test_files_of_other_columns_are_not_in_the_pattern(tmp_path: Path) -> None:
+    first = saved(tmp_path, "warm.csv", ["time_s,T1,z_um", *rows("{s},{f},{z}")])
+    other = saved(tmp_path, "notes.csv", ["time_s,T1", *rows("{s},{f}")])
+    text = draft_machine_file([first, other])
+    assert parse_machine(text, "draft").recording.files == ["warm.csv"] and "# left out: notes.csv" in text
+
+
 def test_a_split_needs_exactly_one_way() -> None:
     with pytest.raises(InputError, match="expected exactly one of driver, pause and every"):
         machine("split: {pause: 1 h, every: 1 d}")
