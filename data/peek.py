@@ -179,7 +179,7 @@ def _is_data(sheet: Sheet, i: int) -> bool:
     if len(rows[0]) < 2:
         rows = [row for row in sheet.head[i : i + _LEAST_ALONE] if row]
     kinds = [[_kind(c, sheet.decimal) for c in row] for row in rows]
-    alike = all(len({k for k in column if k in "nt"}) < 2 for column in zip(*kinds, strict=False))
+    alike = all(len({k for k in column if k in ("n", "t")}) < 2 for column in zip(*kinds, strict=False))
     enough = all(k.count("n") + k.count("t") >= max(1, 0.5 * (len(k) - k.count("") - 1)) for k in kinds)
     return alike and enough and "n" in kinds[0] and (len(kinds[0]) > 1 or len(kinds) == _LEAST_ALONE)
 

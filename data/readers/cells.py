@@ -22,7 +22,7 @@ _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%d.%m.%Y", "%d/%m/%Y", "%m/%d/%Y"
           "%d. %b %Y", "%d/%b/%Y", "%d.%b.%Y", "%d-%b-%y", "%b %d, %Y", "%Y-%b-%d")  # fmt: skip
 _TIMES = ("%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%H-%M-%S", "%I:%M:%S %p", "%I:%M:%S.%f %p", "%I:%M %p", "%H%M%S",
           "%H.%M.%S", "%H时%M分%S秒", "%H時%M分%S秒")  # fmt: skip
-_BETWEEN = (" ", "T", "-", "_", ", ")  # date and time of day
+_BETWEEN = (" ", "T", "-", "_", ", ", ":")  # date and time of day
 _PATTERNS = [*(f"{d}{sep}{t}" for d in _DATES for t in _TIMES for sep in _BETWEEN), *_TIMES, *_DATES]
 _ISO = "ISO8601"
 _MISSING = ("", "nan", "NaN", "NAN")
@@ -32,7 +32,7 @@ _ZONES_H = {
                          -4: "EDT", -5: "EST CDT", -6: "CST MDT", -7: "MST PDT", -8: "PST"}.items()
     for zone in zones.split()
 }  # fmt: skip
-_ZONE = re.compile(rf"\s*\b({'|'.join(_ZONES_H)})\b|(?<=\d)([+-]\d\d):?(\d\d)$")
+_ZONE = re.compile(rf"\s*\b({'|'.join(_ZONES_H)})\b|(?<=\d)\s*([+-]\d\d):?(\d\d)$")
 _ABROAD = "mär mrz mai okt dez fév avr aoû déc ene abr ago dic gen mag giu lug ott"  # three letters of months
 _ENGLISH = "Mar Mar May Oct Dec Feb Apr Aug Dec Jan Apr Aug Dec Jan May Jun Jul Oct"
 _MONTHS = dict(zip(_ABROAD.split(), _ENGLISH.split(), strict=True))
@@ -41,7 +41,7 @@ _PLAIN = (
     (re.compile(r"^(mon|tue|wed|thu|fri|sat|sun)[a-z]*[.,]?\s+", re.I), ""),
     (re.compile(r"\s*\b([ap])\.?\s?m\b\.?", re.I), lambda m: f" {m[1].upper()}M"),
     (re.compile(r"([^\W\d_]{3})[^\W\d_]*\.?(?=[ \-/.,]+\d)"), lambda m: _MONTHS.get(m[1].lower(), m[1])),
-    (re.compile(r"(\d:\d\d:\d\d)[:,](\d+)"), r"\1.\2"),
+    (re.compile(r"(?<![\d:])(\d\d?:\d\d:\d\d)[:,](\d+)"), r"\1.\2"),
     (re.compile(r"^([a-z]{3}) +(\d+) +(\d\S+) +(\d{4})$", re.I), r"\2 \1 \4 \3"),  # ctime
 )
 _NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_boolean)

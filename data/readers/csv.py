@@ -21,6 +21,7 @@ from data.readers.base import Block, Reader, Sheet
 from data.readers.cells import cell_unit, parse_number
 
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+_EUROPEAN = frozenset("äöüßéèêàâçîôûñóíáúåøæÄÖÜÉµ°²³±·–€")
 _OTHER_ENCODINGS = ["gb18030", "cp932", "cp1252"]  # than UTF-8 and UTF-16
 SEPARATORS = (";", "\t", "|", ",")  # the comma last: it may be a decimal mark
 _BLANKS = {"  ": re.compile(r" {2,}|\t"), " ": re.compile(r"[ \t]+")}  # two at least, one at least
@@ -61,6 +62,8 @@ def find_encoding(raw: bytes, where: str) -> str:
     if _decodes(raw, "utf-8"):
         return "utf-8"
     foreign = b"\n".join(line for line in raw.splitlines() if not line.isascii())
+    if {c for c in foreign.decode("cp1252", "replace") if ord(c) > 127} <= _EUROPEAN:
+        return "cp1252"  # a few letters are too little to tell
     best = from_bytes(foreign[:10_000], cp_isolation=_OTHER_ENCODINGS).best()
     return best.encoding if best is not None else "cp1252"
 
@@ -130,6 +133,19 @@ def find_decimal(rows: Sequence[Sequence[str]]) -> str:
     return "," if count[","] > count["."] else "."
 
 
+def _whole(lines: list[str]) -> list[str]:
+    """Lines whose header cells go on over several: the whole row stands in the last one, empty lines before it."""
+    for i in range(min(_TITLE_LINES, len(lines))):
+        if lines[i].count('"') % 2:
+            end = next((k for k in range(i + 1, min(i + 5, len(lines))) if lines[k].count('"') % 2), None)
+            if end is None:
+                break
+            lines[i + 1] = f"{lines[i]} {lines[i + 1]}"
+            lines[i] = ""
+    return lines
+
+
+_TITLE_LINES = 50
 _HEAD_BYTES = 1 << 20
 _BLOCK_BYTES = 4 << 20
 
@@ -147,6 +163,7 @@ class CsvSheet(Sheet):
         self._newline = "\n" if "\n" in text or "\r" not in text else "\r"
         lines = [line.rstrip("\r") for line in text.split(self._newline)]
         lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
+        lines = _whole(lines)
         below = [*lines[1:], ""]
         lines = [_COMMENT.sub("", a) if _NUMERIC.match(b) else a for a, b in zip(lines, below, strict=True)]
         self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))

@@ -75,6 +75,11 @@ FORMATS: dict[str, tuple[Lines, str, bool]] = {
     "ctime.csv": ([HEAD, *rows("{t:%a %b %d %H:%M:%S %Y},{f},{b},{z}")], "utf-8", True),
     "zone.csv": ([HEAD, *rows("{t:%Y-%m-%d %H:%M:%S} CET,{f},{b},{z}")], "utf-8", True),
     "noon.csv": ([HEAD.replace(",", ";"), *rows("{t:%d/%m/%Y %I:%M:%S} a. m.;{f};{b};{z}", True)], "utf-8", True),
+    "rfc.csv": (["date,T1,T2,z_um", *rows('"{t:%a, %d %b %Y %H:%M:%S} +0100",{f},{b},{z}')], "utf-8", True),
+    "apache.csv": (["time,T1,T2,z_um", *rows("{t:%d/%b/%Y:%H:%M:%S} +0100,{f},{b},{z}")], "utf-8", True),
+    "lines.csv": (['Time,"Front\n(°F)","Bed\n(°C)","Displ\n(µm)"', *rows("{t:%Y-%m-%d %H:%M:%S},{F},{b},{z}")],
+                  "utf-8", True),
+    "latin.csv": (["Zeit;T1;T2;Weg µm", *rows("{t:%d.%m.%Y %H:%M:%S};{f};{b};{z}", True)], "cp1252", True),
     "micro.csv": ([HEAD, *(f"{int(t.timestamp() * 1e6)},{f},{b},{z}"
                            for t, f, b, z in zip(STAMPS, FRONT, BED, Z, strict=True))], "utf-8", True),
     "days.csv": (["Elapsed;T1;T2;z_um", *(f"{i // 1440}d {i // 60 % 24:02d}:{i % 60:02d}:00;{f};{b};{z}"
