@@ -278,7 +278,7 @@ def grouped(files: Sequence[Path], form: Form | None = None) -> tuple[list[Group
             for table in look(path, form):
                 groups.setdefault((table.columns, table.header), Group([])).tables.append((path, table))
         except InputError as error:
-            left_out.append(f"{path.name}: {str(error).removeprefix(path.name + ': ')}")
+            left_out.append(f"{path.name}: {str(error).removeprefix(f'{path}: ').removeprefix(f'{path.name}: ')}")
     if not groups:
         raise InputError(left_out[0])
     if len(groups) == 1:
