@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,27 +15,48 @@ from data import guess
 from data.errors import InputError
 from data.groups import FILL_IN, Clock, Group, Joint, files_pattern, grouped, joint
 from data.guess import Guess, PositionGroup
-from data.machine import parse_machine
-from data.units import conversion, known_unit, quantity
+from data.machine import Form, Machine, Split, parse_machine
+from data.recording import read_batches
+from data.rows import cut_runs
+from data.units import conversion, convert, quantity, stated_unit
 from data.yaml_edit import flow
 
+_MANY_DROPPED = 0.1  # of a recording's rows: the draft cannot be right
+_IDLE_SHARE = 0.25  # of a temperature's span: below, the machine is idle
+_PAUSE_S = 600.0  # the shortest pause between two runs
 CHECK = "# check: "  # begins a comment of the draft that the user must read
 
 
-def draft_machine_file(files: Sequence[Path]) -> str:
-    """YAML text of a machine file for recordings of one machine.
+@dataclass(frozen=True)
+class Shown:
+    """A column of a file: its first cells, what it becomes and why, and the first values in the unit of the lake."""
+
+    column: str
+    cells: tuple[str, ...]
+    becomes: str
+    numbers: tuple[float, ...] = ()
+
+
+def draft_machine_file(files: Sequence[Path], form: Form | None = None) -> str:
+    """YAML text of a machine file for recordings of one machine; see `drafted`."""
+    return drafted(files, form)[0]
+
+
+def drafted(files: Sequence[Path], form: Form | None = None) -> tuple[str, dict[str, list[Shown]]]:
+    """YAML text of a machine file for recordings of one machine, and the columns of the first file of each kind.
 
     Files with the same columns are the recordings. Files or sheets with other columns are drafted as
     `recording.joined` where names, sheets or time stamps show that they belong to the recordings, and else left out.
     Every guess carries a comment ``# guessed: why`` and stands in the channel's ``guessed`` list; what is doubtful is a
-    comment ``# check: …`` at the beginning. Values are taken from up to 20 tables and their first 200 000 rows.
+    comment ``# check: …`` at the beginning. Values are taken from up to 20 tables and their first 200 000 rows. `form`
+    overrides what is found of the files' layout. The draft is tried on the first recording.
 
     Raises:
         InputError: no files, or none holds a table of numbers.
     """
     if not files:
         raise InputError("describe: no files given, expected recordings of one machine; name at least one")
-    (main, *others), left_out = grouped(files)
+    (main, *others), left_out = grouped(files, form)
     joined: dict[str, tuple[Group, Joint]] = {}
     for other in others:
         if (how := joint(main, other)) is not None:
@@ -46,9 +68,47 @@ def draft_machine_file(files: Sequence[Path]) -> str:
                 f" {first}"
                 for path, table in other.tables
             ]
-    text = _write(main, joined, left_out)
-    parse_machine(text.replace(FILL_IN, "1 s"), "draft")
-    return text
+    text = _write(main, joined, left_out, {p.name for p in files} - {p.name for p in main.paths})
+    machine = parse_machine(text.replace(FILL_IN, "1 s"), "draft")
+    if FILL_IN not in text and (trouble := _tried(main.paths[0], machine)):
+        text = f"{CHECK}{trouble}\n{text}"
+    groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
+    return text, {g.paths[0].name: _shown(g, key, machine) for key, g in groups.items()}
+
+
+def _tried(path: Path, machine: Machine) -> str:
+    """What an ingest says against a draft: it refuses the recording, or drops a good part of it; else nothing."""
+    read = dropped = 0
+    try:
+        for batch in read_batches(path, machine, need_error=False):
+            read += batch.repairs["rows_in"]
+            dropped += batch.repairs["rows_dropped"]
+    except InputError as error:
+        return f"ingest refuses this draft: {error}"
+    return f"ingest drops {dropped} of {read} rows of {path.name}" if dropped > _MANY_DROPPED * read else ""
+
+
+def _shown(group: Group, source: str, machine: Machine) -> list[Shown]:
+    table = group.table
+    parts = {part.column if part.column is not None else n: (n, part) for n, part in machine.channels.items()
+             if part.source == source}  # fmt: skip
+    name_of = {i: name for name, i in group.names.items()}
+    out = []
+    for i, column in enumerate(table.columns):
+        cells = tuple(str(c) for c in table.cells[i])
+        if i in (table.time, table.clock.date):
+            out.append(Shown(column or str(i), cells, f"clock: {group.clock.why}"))
+        elif (found := parts.get(table.key(i))) and i in name_of:
+            name, part = found
+            values = convert(
+                group.rows[0].columns[name_of[i]][: len(cells)], part.unit_in_file or part.unit, part.unit, name
+            )
+            unit = f"{part.unit_in_file} → {part.unit}" if part.unit_in_file else part.unit
+            out.append(Shown(column or str(i), cells, f"{part.role} {name}, {unit}", tuple(values.tolist())))
+        else:
+            along = "along an axis" if i in name_of else ""
+            out.append(Shown(column or str(i), cells, along or f"left out: {table.left.get(i, 'no values')}"))
+    return out
 
 
 def notes(draft: str) -> list[str]:
@@ -64,49 +124,63 @@ def _key(group: Group, taken: Sequence[str]) -> str:
     return name if name not in taken else f"{name}_{len(taken) + 1}"
 
 
-def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequence[str]) -> str:
+def _write(main: Group, joined: dict[str, tuple[Group, Joint]], left_out: Sequence[str], others: set[str]) -> str:
     groups = {"file": main, **{key: group for key, (group, _) in joined.items()}}
     fine: dict[str, tuple[dict[str, Guess], float]] = {key: _linked(g) for key, g in groups.items()}
     channels: list[str] = []
     taken: list[str] = []
     for key, group in groups.items():
         channels += _channels(group, fine[key][0], key, taken)
+    runs = _runs(main)
     files = [p.name for p in main.paths]
     folder = re.sub(r"[^a-z0-9_\-]+", "_", main.paths[0].resolve().parent.name.lower()).strip("_-") or "machine"
     doubts = [(g, note) for g in groups.values() for note in (g.clock.note, *g.notes) if note]
-    pattern = next((how.files for _, how in joined.values() if how.files), None) or files_pattern(main.paths)
+    patterns = [next((how.files for _, how in joined.values() if how.files), None) or files_pattern(main.paths)]
+    if fnmatch.filter(others, patterns[0]):  # those are no recordings
+        patterns = files
     lines = [
         f"# Drafted from {len(files)} file{'s' * (len(files) > 1)}: {files[0]}{' … ' + files[-1] if files[1:] else ''}",
         f"# ({main.table.summary}). Look at every line marked 'guessed', correct it, and empty the guessed lists.",
         *(f"{CHECK}{f'{g.paths[0].name}: ' if joined else ''}{note}" for g, note in doubts),
         *(f"# left out: {line}" for line in left_out),
         f"machine: {flow(folder)}  # guessed: the folder's name",
+        *(["simulated: true  # a line of the file says so"] if main.table.simulated else []),
         "recording:",
-        f"  files: {flow([pattern])}  # guessed: the names of the files",
+        f"  files: {flow(patterns)}  # guessed: the names of the files",
         f"  header: {'true' if main.table.header else 'false'}",
+        *(f"  {key}: {flow(value)}" for key, value in _stated(main.table.form).items()),
         f"  time: {_time(main.clock)}",
         *_steps([*groups.values()], min(step for _, step in fine.values())),
+        *runs,
     ]
     if start := main.start_from_name:
         lines.append(f"  start_from_name: {flow(start)}  # guessed: the files or sheets are named by date")
     for k, (key, (group, how)) in enumerate(joined.items()):
         lines += ["  joined:"] * (k == 0) + [f"    {key}:  # guessed: {how.why}"]
         lines += [f"      {name}: {flow(value)}" for name, value in how.keys.items()]
-        lines += ["      header: false"] * (not group.table.header) + [f"      time: {_time(group.clock)}"]
+        lines += ["      header: false"] * (not group.table.header)
+        lines += [f"      {name}: {flow(value)}" for name, value in _stated(group.table.form).items()]
+        lines.append(f"      time: {_time(group.clock)}")
     lines += ["channels:", *channels]
-    ignored = [c for g in groups.values() if g.table.header for c in _ignored(g)]
-    if ignored:
-        lines.append(f"ignore: {flow(list(dict.fromkeys(ignored)))}  # guessed: no measured values in them")
+    if ignored := dict(left for g in groups.values() for left in _left(g)):
+        lines.append(f"ignore: {flow([*ignored])}  # guessed: {'; '.join(ignored.values())}")
     return "\n".join(lines) + "\n"
+
+
+def _stated(form: Form) -> dict[str, object]:
+    """Keys of the layout that reading does not find by itself."""
+    return form.model_dump(exclude={"time", "header"}, exclude_none=True)
 
 
 def _time(clock: Clock) -> str:
     return f"{clock.line}  # {'' if clock.why.startswith('fill in') else 'guessed: '}{clock.why}"
 
 
-def _ignored(group: Group) -> list[str]:
-    used = {group.table.clock.time, group.table.clock.date, *group.names.values()}
-    return [c for i, c in enumerate(group.table.columns) if c and i not in used]
+def _left(group: Group) -> list[tuple[str, str]]:
+    """Columns of the file that are no channels, as the machine file names them, and why."""
+    table = group.table
+    return [(str(table.key(i)), f"{table.columns[i] or i}: {why}") for i, why in table.left.items()
+            if table.header and i not in group.names.values()]  # fmt: skip
 
 
 def _steps(groups: Sequence[Group], fine_s: float) -> list[str]:
@@ -121,6 +195,35 @@ def _steps(groups: Sequence[Group], fine_s: float) -> list[str]:
     if fine_s < step_s:
         step_s, words = fine_s, "each reading of a sweep takes a row"
     return [f"  step_s: {step_s:g}  # guessed: {words}", f"  max_gap_s: {5 * slowest_s:g}  # guessed: {gap}"]
+
+
+def _runs(group: Group) -> list[str]:
+    """Lines of a comment that proposes how to cut one long recording into runs, the first way that gives several."""
+    if len(group.tables) > 1 or group.table.time is None or group.position_groups:
+        return []
+    rows, unit_s = group.longest, group.clock.unit_s
+    seen = {n: guess.seen_range(rows.columns[n]) for n in group.names}
+    gap_s = 5.0 * group.step_and_length[0] * unit_s
+    factor, offset = 1.0, 0.0
+    ways: list[dict[str, object]] = [{"driver": n} for n in group.named("driver") if seen[n][0] <= 0.05 * seen[n][1]]
+    if not group.clock.note:  # no gap of summer time
+        ways.append({"pause": f"{guess.grid_step_s(max(2 * gap_s, _PAUSE_S)):g} s"})
+    for n in sorted(group.named("temperature"), key=lambda n: seen[n][0] - seen[n][1])[:1]:
+        factor, offset = conversion(group.written_unit(group.names[n]) or "degC", "degC", n)
+        idle = factor * (seen[n][0] + _IDLE_SHARE * (seen[n][1] - seen[n][0])) + offset
+        ways.append({"driver": n, "above": float(f"{idle:.3g}")})
+    ways += [{"every": "24 h"}]
+    for way in ways:
+        split = Split.model_validate(way)
+        still = 0.0 if split.above is None else (split.above - offset) / factor
+        try:
+            cut = [*cut_runs(iter([replace(rows, time_s=rows.time_s * unit_s)]), split, still, "")]
+        except InputError:
+            continue
+        if len(cut) > 1:
+            group.notes.append(f"one recording only; recording.split: {flow(way)} would cut it into {len(cut)} runs")
+            return [f"  # split: {flow(way)}  # proposed: {len(cut)} runs from this one recording"]
+    return []
 
 
 def _linked(group: Group) -> tuple[dict[str, Guess], float]:
@@ -147,9 +250,9 @@ def _channels(group: Group, linked: dict[str, Guess], source: str, taken: list[s
         if i in of_group:
             continue
         header = table.columns[i] if table.header else ""
-        in_row = known_unit(table.units[i]) is not None
+        where = "given in the units row or the cells" if stated_unit(table.units[i]) else "named so in the header"
         column = _Column(
-            header, group.written_unit(i), in_row, group.roles[key], f"column: {flow(header or i)}", source
+            header, group.written_unit(i), where, group.roles[key], f"column: {flow(table.key(i))}", source
         )
         along = linked.get(key)
         along = along and Guess(name_of[along.value], along.why)
@@ -168,7 +271,7 @@ class _Column:
 
     header: str
     written: str | None
-    units_row: bool
+    where: str  # the unit is written
     role: Guess
     key: str
     source: str
@@ -182,7 +285,7 @@ def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str
     if {position, error} & set(taken):
         position, error = f"{position}_2", f"{error}_2"
     why = Guess("error", f"{len(group.places)} columns whose names differ by a number")
-    column = _Column(group.pattern.partition("*")[0], None, False, why, f"columns: {flow(group.pattern)}", source)
+    column = _Column(group.pattern.partition("*")[0], None, "", why, f"columns: {flow(group.pattern)}", source)
     lines = _channel(error, column, values, Guess(position, "the number in the names is taken for the position"))
     return [
         f"  {position}:",
@@ -196,8 +299,7 @@ def _axis(group: PositionGroup, values: NDArray[np.float64], taken: Sequence[str
 def _channel(name: str, column: _Column, values: NDArray[np.float64], along: Guess | None) -> list[str]:
     """Lines of one channel; range and resolution show in all `values`."""
     role, written = column.role, column.written
-    unit = Guess(written, "given in the units row") if column.units_row and written else None
-    unit = unit or guess.unit(role.value, column.header, values)
+    unit = Guess(written, column.where) if written else guess.unit(role.value, column.header, values)
     kept = {"temperature": "degC", "ambient": "degC", "error": "um"}.get(role.value, unit.value)
     convertible = quantity(kept) == quantity(unit.value)
     kept = kept if convertible else unit.value

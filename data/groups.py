@@ -18,21 +18,20 @@ from data.arrays import Array
 from data.checks.invalid import sentinels
 from data.errors import InputError
 from data.guess import Guess, PositionGroup
-from data.machine import MAX_NAME, TAKEN, ChannelPart, Machine
-from data.peek import Table, look, sheets_of
+from data.machine import MAX_NAME, TAKEN, ChannelPart, Form, Machine
+from data.peek import Table, look
+from data.readers import sheets_of
 from data.readers.csv import normalise
 from data.readers.header import Layout
 from data.rows import Rows, join, stream
 from data.timegrid import repair_time
-from data.units import TIME_UNITS_S, known_unit, quantity
+from data.units import TIME_UNITS_S, quantity, stated_unit
 from data.yaml_edit import flow
 
 FILL_IN = "? s"  # in place of the step of a recording without a clock
 _MAX_TABLES = 20
 _MAX_ROWS = 200_000
 _NAME_DATES = ("%Y%m%d", "%Y-%m-%d", "%Y_%m_%d", "%Y%m%d_%H%M%S", "%Y-%m-%d_%H%M%S", "%Y%m%d-%H%M%S", "%Y%m%d%H%M%S")
-_EXCEL_DAYS = (36_000.0, 60_000.0)  # 1998 to 2064
-_UNIX_S, _UNIX_MS = 1e9, 1e11  # from 2001 on
 _ANY = ChannelPart(role="temperature", unit="1")  # no range and no physical limits are known yet
 
 
@@ -52,6 +51,7 @@ class Group:
 
     tables: list[tuple[Path, Table]]
     notes: list[str] = field(default_factory=list)
+    row_step_s: float | None = None  # of rows without a clock that are those of the recordings
 
     @property
     def table(self) -> Table:
@@ -98,13 +98,15 @@ class Group:
         return found
 
     def _read(self, path: Path, table: Table) -> Rows:
-        time: dict[str, object] = (
-            {"unit": "timestamp", "format": pattern(table), "date": table.clock.date} if table.stamps else {}
-        )
+        time: dict[str, object] = {}
+        if table.stamps:
+            time = {"unit": "timestamp", "format": pattern(table), "date": table.clock.date}
         if table.time is None:
             time = {"step": "1 s"}
-        machine = Machine.model_validate({"machine": "draft", "channels": {}, "recording": {"time": time}})
-        with sheets_of(path) as sheets:
+        channels = {n: {"role": "driver", "unit": table.units[i] or "1"} for n, i in self.names.items()}
+        recording = table.form.model_dump(exclude={"time"}) | {"time": time}
+        machine = Machine.model_validate({"machine": "draft", "channels": channels, "recording": recording})
+        with sheets_of(path, (), table.form) as sheets:
             sheet = next(s for s in sheets if s.name == table.sheet)
             layout = Layout(table.first_row, table.time, self.names, date=table.clock.date)
             return join(list(_limited(stream(sheet, layout, machine, path.name))))
@@ -121,19 +123,39 @@ class Group:
     def position_groups(self) -> list[PositionGroup]:
         """Columns that are one error at several positions; what is in degrees is none."""
         table = self.table
-        places = [i for i in self.names.values() if quantity(known_unit(table.units[i]) or "um") == "length"]
+        places = [i for i in self.names.values() if quantity(table.units[i] or "um") in (None, "length")]
         return guess.position_groups(table.columns, places) if table.header else []
 
     def written_unit(self, i: int) -> str | None:
-        """The unit of a column as its units row or its header gives it."""
-        in_row = known_unit(self.table.units[i])
-        return in_row or (guess.channel_unit_in_name(self.table.columns[i]) if self.table.header else None)
+        """The unit of a column as its units row, its cells or its header gives it, known or not."""
+        header = self.table.columns[i] if self.table.header else ""
+        in_row = self.table.units[i]
+        return stated_unit(in_row) or guess.channel_unit_in_name(header) or guess.unknown_unit_in_name(header)
 
     @cached_property
     def roles(self) -> dict[str, Guess]:
-        """Role of each channel, from its name and its longest recording."""
+        """Role of each channel, from its name and its longest recording.
+
+        Where none is an error, the one that can be by its unit is; `notes` say so, or how to name one.
+        """
         headers = {n: self.table.columns[i] if self.table.header else "" for n, i in self.names.items()}
-        return {n: guess.role(headers[n], self.written_unit(i), self.longest.columns[n]) for n, i in self.names.items()}
+        units = {n: self.written_unit(i) for n, i in self.names.items()}
+        roles = {n: guess.role(headers[n], units[n], self.longest.columns[n]) for n in self.names}
+        open_ = [n for n, r in roles.items() if r.value != "error" and guess.may_be_error(headers[n], units[n])]
+        if any(r.value == "error" for r in roles.values()):
+            asked = [f"{n} ({units[n]})" for n in open_ if roles[n].value == "driver"]
+            if asked:
+                self.notes.append(f"{', '.join(asked)}: taken for drivers; set role: error if one is measured")
+        elif len(open_) == 1:
+            self.notes.append(f"{open_[0]} ({units[open_[0]]}) is taken for the measured error; else set its role")
+            roles[open_[0]] = Guess("error", f"the only channel that can be it, by its unit {units[open_[0]]}")
+        else:
+            shown = open_ or [n for n, r in roles.items() if r.value == "driver"] or [*roles]
+            self.notes.append(
+                f"no channel is the measured error; set role: error and its unit where it is, such as"
+                f" {', '.join(shown[:4])}, or join the file that holds it (recording.joined)"
+            )
+        return roles
 
     def named(self, role: str) -> list[str]:
         return [n for n, r in self.roles.items() if r.value == role]
@@ -141,33 +163,54 @@ class Group:
     @cached_property
     def clock(self) -> Clock:
         table = self.table
+        if table.time is None and (step_s := self.row_step_s or table.step_s):
+            why = "as in the recording, which has as many rows" if self.row_step_s else "the file's header gives it"
+            return Clock(f"{{step: {f'{step_s:g} s'!r}}}", why, 1.0)
         if table.time is None:
+            unread = [f"{table.columns[i]!r} ({why})" for i, why in table.left.items() if why.startswith("a time")]
+            note = (
+                f"column {', '.join(unread)}: set recording.time to {{column, unit: timestamp, format: its strptime "
+                "pattern}, or write" if unread else "no column is a clock: write"
+            )  # fmt: skip
             return Clock(
                 f"{{step: {FILL_IN!r}}}", "fill in: no column is a clock; the time between two rows, such as 60 s", 1.0,
-                "no column is a clock: write the time between two rows as recording.time.step, such as 60 s",
+                f"{note} the time between two rows as recording.time.step, such as 60 s",
             )  # fmt: skip
         header = table.columns[table.time] if table.header else ""
-        column = flow(header) if table.header else str(table.time)
+        column = flow(table.key(table.time))
+        if table.clock.elapsed:
+            return Clock(f"{{column: {column}, clock: elapsed}}", "durations from 0, or beyond a day", 1.0)
         if table.stamps:
             form = f", format: {flow(pattern(table))}" if pattern(table) else ""
             at = table.clock.date
-            form = form if at is None else f", date: {flow(table.columns[at]) if table.header else at}{form}"
+            form = form if at is None else f", date: {flow(table.key(at))}{form}"
             others = f" (or {', '.join(table.stamps[1:])})" if len(table.stamps) > 1 else ""
-            note = f"time stamps can be {' or '.join(table.stamps)}: day and month" if others else ""
+            note = f"time stamps can be {' or '.join(table.stamps)}: day and month" if others else self._summer_time()
             return Clock(f"{{column: {column}, unit: timestamp{form}}}", f"its cells look like it{others}", 1.0, note)
         unit, unit_s, note = self._time_unit(header)
         return Clock(f"{{column: {column}, unit: {unit.value}}}", unit.why, unit_s, note)
 
+    def _summer_time(self) -> str:
+        """What to check where stamps without a zone jump by an hour in a night of March or April, else nothing."""
+        if self.table.form.timezone:
+            return ""
+        for rows in self.rows:
+            step_s = np.diff(rows.time_s)
+            usual = float(np.nanmedian(step_s)) if len(step_s) else 0.0
+            for at in np.flatnonzero(np.abs(step_s - usual - 3600.0) < 0.5 * usual):
+                when = dt.datetime.fromtimestamp(rows.time_s[at] + usual, dt.UTC)
+                if when.month in (3, 4) and when.weekday() == 6 and when.hour < 4:
+                    return (
+                        f"the clock jumps by an hour at {when:%Y-%m-%d %H:%M}, as at the start of summer time; if so, "
+                        "set recording.timezone, such as Europe/Berlin"
+                    )
+        return ""
+
     def _time_unit(self, header: str) -> tuple[Guess, float, str]:
         """Unit of a numeric clock, in s, and what to check."""
         step, length = self.step_and_length
-        first = float(np.nanmedian(self.longest.time_s))
-        written = known_unit(self.table.units[self.table.time or 0]) or guess.time_unit_in_name(header)
+        written = stated_unit(self.table.units[self.table.time or 0]) or guess.time_unit_in_name(header)
         written = written if written in TIME_UNITS_S else None
-        if written is None and _EXCEL_DAYS[0] <= first <= _EXCEL_DAYS[1] and step < 0.5:
-            return Guess("timestamp", "numbers like the days of a workbook"), 86400.0, ""
-        if written in (None, "s", "ms") and first >= _UNIX_S:
-            return Guess("timestamp", "numbers like seconds since 1970"), 1.0 if first < _UNIX_MS else 1e-3, ""
         warm = self.named("temperature")
         rates = [guess.sustained_rate(r.time_s, r.columns[n]) for r in self.rows for n in warm]
         unit, note = guess.time_unit(written, step, length, max(rates, default=0.0))
@@ -175,11 +218,16 @@ class Group:
 
     @cached_property
     def step_and_length(self) -> tuple[float, float]:
-        """Median step and longest recording, in the file's unit of time."""
-        repaired = [repair_time(r.time_s, np.inf).time_s for r in self.rows]
-        steps = np.concatenate([np.diff(t) for t in repaired])
-        interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-        return interval, max(float(t[-1]) if len(t) else 0.0 for t in repaired)
+        """Median step and longest recording, in the file's unit of time; the step of the densest channel."""
+        intervals, lengths = [], []
+        for rows in self.rows:
+            time = repair_time(rows.time_s, np.inf).time_s
+            lengths.append(float(time[-1]) if len(time) else 0.0)
+            dense = any(np.isfinite(v).mean() > 0.5 for v in rows.columns.values())
+            sparse = [np.sort(rows.time_s[np.isfinite(v)]) for v in rows.columns.values()] if not dense else [time]
+            steps = [step[step > 0] for t in sparse if len(step := np.diff(t[np.isfinite(t)]))]
+            intervals += [float(np.median(step)) for step in steps if len(step)]
+        return min(intervals, default=1.0), max(lengths)
 
     @property
     def start_from_name(self) -> str | None:
@@ -215,7 +263,7 @@ def _limited(blocks: Iterator[Rows]) -> Iterator[Rows]:
             return
 
 
-def grouped(files: Sequence[Path]) -> tuple[list[Group], list[str]]:
+def grouped(files: Sequence[Path], form: Form | None = None) -> tuple[list[Group], list[str]]:
     """Groups of the files' tables, the recordings first, and a line for each file without a table.
 
     The recordings are the group of most tables, or else of most temperatures.
@@ -227,10 +275,10 @@ def grouped(files: Sequence[Path]) -> tuple[list[Group], list[str]]:
     left_out: list[str] = []
     for path in files:
         try:
-            for table in look(path):
+            for table in look(path, form):
                 groups.setdefault((table.columns, table.header), Group([])).tables.append((path, table))
         except InputError as error:
-            left_out.append(f"{path.name}: {str(error).removeprefix(path.name + ': ')}")
+            left_out.append(f"{path.name}: {str(error).removeprefix(f'{path}: ').removeprefix(f'{path.name}: ')}")
     if not groups:
         raise InputError(left_out[0])
     if len(groups) == 1:
@@ -255,14 +303,18 @@ def joint(main: Group, other: Group) -> Joint | None:
     if main.paths == other.paths:
         same = len(other.sheets) == 1 and other.sheets[0] not in main.sheets
         return Joint({"sheet": other.sheets[0]}, "the sheet has other columns of the same run") if same else None
-    if other.table.time is None:
-        return None
     folder = Path(os.path.relpath(other.paths[0].resolve().parent, main.paths[0].resolve().parent))
+    single = {"file": (folder / other.paths[0].name).as_posix()}
+    if other.table.time is None:
+        steps = np.diff(main.longest.time_s)
+        if len(main.paths) > 1 or len(other.paths) > 1 or len(main.longest) != len(other.longest) or np.ptp(steps) > 0:
+            return None
+        other.row_step_s = float(steps[0]) * main.clock.unit_s
+        return Joint(single, "given together with the recording, with as many rows", main.paths[0].name)
     here, there = _runs(main.paths, other.paths), _runs(other.paths, main.paths)
     if here and there and here[1] == there[1]:
         files = {"file": (folder / there[0]).as_posix()}
         return Joint(files, "the names of the files differ by the same text", here[0])
-    single = {"file": (folder / other.paths[0].name).as_posix()}
     if len(other.paths) == 1:
         if len(main.paths) == 1 and (main.sheets == other.sheets or len(main.sheets) == len(other.sheets) == 1):
             return Joint(single, "given together with the recording", main.paths[0].name)

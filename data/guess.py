@@ -13,7 +13,7 @@ from data.arrays import Array
 from data.readers.csv import normalise
 from data.rows import Rows
 from data.sweeps import position_bins
-from data.units import TIME_UNITS_S, known_unit, quantity
+from data.units import TIME_UNITS_S, known_unit, quantity, stated_unit
 
 _TIME = re.compile(
     r"time|zeit|时间|時間|时刻|時刻|日時|日期|elapsed|datum|date|^t$|^t ?[\[(/]|\btemps\b(?! ?\d)|heure|horodat|tiempo|"
@@ -23,23 +23,30 @@ _COUNTER = re.compile(
     r"^(unnamed: 0|#|no|nr|n°|nº|num|number|nummer|numero|numéro|número|index|idx|indice|índice|id|row|zeile|ligne|"
     r"fila|riga|lfd|count|counter|zähler|record|sample|scan|point|序号|序號|编号|編號|番号|行)?[ ._]*(no|nr)?\.?$"
 )
+_SERIES = re.compile(
+    r"entity|sensor|channel|^ch\b|kanal|canal|\btag|variable|\bname|series|field|item|signal|device|node|point|metric|topic|"
+    r"quantity|param|object|messstelle|通道|传感器"
+)
+_VALUE = re.compile(r"^_?(value|val|state|wert|messwert|reading|data|v|valeur|valor|valore|值|値)([ _\[(].*)?$")
 _SETPOINT = re.compile(r"set ?point|sollwert|\bset\b|command")
 _AMBIENT = re.compile(r"amb|room|hall|umgebung|raum|环境|環境|室温|雰囲気|\bair\b|luft")
 _ERROR = re.compile(r"disp|err|drift|deviat|\bweg|位移|変位|変形|误差|誤差|\bgap\b|probe|^d[xyz]\b|strain|dehnung")
 _DRIVER = re.compile(
     r"rpm|speed|drehzahl|转速|轉速|回転|feed|vorschub|進給|进给|power|leistung|current|strom|load|heater|"
-    r"^q\d|torque|coolant|pump|flow|volt"
+    r"^q\d|torque|pump|flow|volt|humid|feucht|press|druck"
 )
 _TEMPERATURE = re.compile(r"temp|^t[a-z]? ?\d|^pt ?\d|thermo|温")
 _POSITION = re.compile(r"\bpos|axis|achse")
 _LONE_LETTERS = {"W", "A", "V", "N", "C", "K", "%", "°", "℃"}
+_LABELS = ("A", "W", "N")  # letters of sensors rather than units where the name is one of a temperature
 _TIME_OF_DAY = {"ora", "hora", "heure"}  # also the word for an hour
 _LONE_TIMES = {"s", "h", "d"}  # as the unit of a clock only
-# where a header holds its unit, the likeliest first: in brackets; behind "in", a separator or CJK text; all of it
+_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]")
+_STATISTIC = re.compile(r"[_ ](avg|average|mean|smp|std|raw|last|tot|med)$", re.IGNORECASE)
+# where else a header holds its unit, the likeliest first: behind "in", a separator or CJK text; all of it
 _UNIT_PLACES = tuple(
     re.compile(pattern)
     for pattern in (
-        r"[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$",
         r"\b(?:in|en)\s+(\S.*)$",
         r"(?<=\w)[_ /,;:]\s*([^_\s]+)$",
         r"(?<=[\u3040-\u30ff\u3400-\u9fff])([^\u3040-\u9fff\s_]{2,})$",
@@ -48,6 +55,7 @@ _UNIT_PLACES = tuple(
         r"^(\D{3,}|[\u3040-\u9fff]+)$",
     )
 )
+_ERROR_KINDS = ("length", "voltage", "angle", "ratio", "count", "force", "resistance", "frequency")  # can be measured
 _LENGTH_S = (500.0, 30 * 86400.0)  # a thermal test lasts ten minutes to weeks
 _SAMPLE_S = (0.01, 600.0)  # slower than 10 min misses a warm-up, faster than 100 Hz is no temperature record
 _RATE_K_PER_MIN = 8.0  # 1 kW into the smallest instrumented body, about 7.5 kJ/K
@@ -75,6 +83,16 @@ def is_counter_name(name: str) -> bool:
     return bool(_COUNTER.match(normalise(name)))
 
 
+def is_series_name(name: str) -> bool:
+    """Whether a header is one of a column that says of what a row's reading is."""
+    return bool(_SERIES.search(normalise(name)))
+
+
+def is_value_name(name: str) -> bool:
+    """Whether a header is one of a column of readings of any kind."""
+    return bool(_VALUE.match(normalise(name)))
+
+
 def is_other_name(name: str) -> bool:
     """Whether a header says that the column is a channel and no clock."""
     folded = normalise(name.replace("_", " "))
@@ -85,21 +103,33 @@ def is_other_name(name: str) -> bool:
 def unit_in_name(name: str, lone: Collection[str] = _LONE_LETTERS) -> str | None:
     """A unit in a header, by its known name: ``"ch1_um"`` and ``"Weg in Mikrometer"`` -> ``um``.
 
-    `lone` are the single letters that count as a unit outside brackets.
+    Brackets come first, then what stands in front of them (``"Temp, °F (S/N 12)"``). `lone` are the single letters that
+    count as a unit outside brackets.
     """
     text = unicodedata.normalize("NFKC", name).strip()
-    for place, pattern in enumerate(_UNIT_PLACES):
+    inside = (unit for content in reversed(_BRACKETS.findall(text)) if (unit := stated_unit(content)))
+    if unit := next(inside, None):
+        return unit
+    text = _STATISTIC.sub("", _BRACKETS.sub("", text).strip())
+    for pattern in _UNIT_PLACES:
         found = pattern.search(text)
-        counts = found is not None and (place == 0 or len(found[1]) > 1 or found[1] in lone)
-        if found is not None and counts and (unit := known_unit(found[1])):
+        if found is not None and (len(found[1]) > 1 or found[1] in lone) and (unit := known_unit(found[1])):
             return unit
     return None
+
+
+def unknown_unit_in_name(name: str) -> str | None:
+    """What square brackets hold, if it is written like a unit and is not known as one."""
+    found = re.search(r"\[\s*([^\[\]]+?)\s*\]\s*$", name)
+    looks = found and re.fullmatch(r"[^\W\d_]{1,4}|\S*[/%²³°µ^·]\S*", found[1]) and not _STATISTIC.match(f"_{found[1]}")
+    return found[1] if found and looks and stated_unit(found[1]) is None else None
 
 
 def channel_unit_in_name(name: str) -> str | None:
     """The unit in a channel's header, which is none of time: the "min" of "T_min" is a minimum."""
     unit = unit_in_name(name)
-    return None if quantity(unit or "") == "time" else unit
+    label = unit in _LABELS and _TEMPERATURE.search(normalise(name.replace("_", " ")))
+    return None if label or quantity(unit or "") == "time" else unit
 
 
 def time_unit_in_name(name: str) -> str | None:
@@ -112,12 +142,12 @@ def time_unit_in_name(name: str) -> str | None:
 
 
 def role(name: str, unit: str | None, values: Array) -> Guess:
-    """Role of a channel from its name and unit, else from its values."""
+    """Role of a channel from its name and unit, else from its values. A unit that is not known is none of kelvins."""
     folded = normalise(name.replace("_", " "))
     kind = quantity(unit) if unit else None
     if _SETPOINT.search(folded):
         return Guess("driver", "its name sounds like a set point")
-    if kind == "temperature" or (kind is None and _TEMPERATURE.search(folded)):
+    if kind == "temperature" or (unit is None and _TEMPERATURE.search(folded)):
         if _AMBIENT.search(folded):
             return Guess("ambient", "a temperature whose name sounds like the room")
         return Guess("temperature", f"its unit {unit}" if kind else "its name")
@@ -125,13 +155,20 @@ def role(name: str, unit: str | None, values: Array) -> Guess:
         if _ERROR.search(folded) or unit in ("um", "nm"):
             return Guess("error", f"a length in {unit}")
         return Guess("position", f"a length in {unit}")
-    if kind is not None and not _ERROR.search(folded):
-        return Guess("driver", f"its unit {unit}")
-    if kind is None:
-        for pattern, value in ((_AMBIENT, "ambient"), (_ERROR, "error"), (_DRIVER, "driver"), (_POSITION, "position")):
-            if pattern.search(folded):
-                return Guess(value, "its name")
+    if unit is not None and not _ERROR.search(folded):
+        return Guess("driver", f"its unit {unit}" if kind else f"its unit {unit}, which is not known")
+    for pattern, value in ((_AMBIENT, "ambient"), (_ERROR, "error"), (_DRIVER, "driver"), (_POSITION, "position")):
+        if pattern.search(folded):
+            return Guess(value, "its name")
     return _role_of_values(values)
+
+
+def may_be_error(name: str, unit: str | None) -> bool:
+    """Whether a channel of another role can be the measured error by its unit, and is not named as something else."""
+    folded = normalise(name.replace("_", " "))
+    kind = quantity(unit or "")
+    named = (_SETPOINT, _AMBIENT, _TEMPERATURE, *([_DRIVER] if kind in _ERROR_KINDS else []))
+    return unit is not None and not any(p.search(folded) for p in named) and kind in (*_ERROR_KINDS, "mass", None)
 
 
 def _role_of_values(values: Array) -> Guess:
@@ -150,10 +187,7 @@ def _role_of_values(values: Array) -> Guess:
 
 
 def unit(of_role: str, name: str, values: Array) -> Guess:
-    """Unit in the file for a channel of that role."""
-    written = channel_unit_in_name(name)
-    if written:
-        return Guess(written, "named so in the header")
+    """Unit in the file for a channel of that role whose unit is not stated."""
     v = values[np.isfinite(values)]
     size = float(np.max(np.abs(v))) if len(v) else 0.0
     middle = float(np.median(v)) if len(v) else 0.0
@@ -276,7 +310,9 @@ def seen_range(values: Array) -> tuple[float, float]:
 
 
 def grid_step_s(interval_s: float) -> float:
-    """The nearest usual step that is not finer than the samples."""
+    """The nearest usual step that is not finer than the samples, or whole minutes as they are."""
+    if interval_s >= 60.0 and abs(interval_s - 60.0 * round(interval_s / 60.0)) < 1e-3 * interval_s:
+        return 60.0 * round(interval_s / 60.0)
     return next((s for s in NICE_STEPS_S if s >= interval_s * 0.999), float(np.ceil(interval_s)))
 
 

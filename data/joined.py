@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from data.errors import InputError
-from data.machine import Joined, Machine
-from data.readers import reader_for
+from data.machine import Form, Joined, Machine
+from data.readers import sheets_of
 from data.readers.base import Sheet
 from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, gather, join, stream
@@ -40,9 +40,9 @@ class JoinedRows:
 def joined_machine(machine: Machine, key: str) -> Machine:
     """The machine file as it describes the joined files of that key: their clock, header and channels."""
     part = machine.recording.joined[key]
-    recording = machine.recording.model_copy(
-        update={"time": part.time, "header": part.header, "joined": {}, "split": None, "schedule": None}
-    )
+    form = {k: getattr(part, k) for k in Form.model_fields}
+    form["timezone"] = part.timezone or machine.recording.timezone
+    recording = machine.recording.model_copy(update={**form, "joined": {}, "split": None, "schedule": None})
     channels = {
         n: c.model_copy(update={"source": "file"})
         for n, c in machine.channels.items()
@@ -78,7 +78,7 @@ def read_joined(machine: Machine, key: str, place: Place, time_s: tuple[float, f
     name = run_name(place.path, machine)
     found: list[tuple[str, str, Rows, Layout]] = []
     for path in _files(part, place, name):
-        with reader_for(path).open(path, hints(described)) as sheets:
+        with sheets_of(path, hints(described), described.recording) as sheets:
             for where, sheet, layout in _tables(sheets, path, described, part.sheet):
                 found.append((where, sheet.name, gather(stream(sheet, layout, described, where), sheet), layout))
     if not found:

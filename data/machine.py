@@ -5,8 +5,9 @@ from __future__ import annotations
 import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zoneinfo import available_timezones
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from data.batch import Channel, Role
 from data.errors import InputError, closest
@@ -58,7 +59,10 @@ class Section(BaseModel):
 
 
 class TimeColumn(Section):
-    """Which column is time. `unit` is s, min, h, d, ms, or timestamp (then `format` may name a strptime pattern).
+    """Which column is time. `unit` is s, min, h, …, or timestamp (then `format` may name a strptime pattern).
+
+    `clock` overrides how a column of time is taken: `stamp` is the unit timestamp, `elapsed` counts from the start
+    (numbers in `unit`, or h:mm:ss, also beyond 24 h), `step` needs the key `step`.
 
     `date` names the column of the dates where `column` holds times of day; `format` is then of both with a blank
     between them. `step` instead of all these: the recordings have no clock, and their rows follow each other by that
@@ -66,13 +70,23 @@ class TimeColumn(Section):
     """
 
     column: str | int = "time_s"  # a header, or a 0-based position where the file has none
-    unit: Literal["s", "min", "h", "d", "ms", "timestamp"] = "s"  # of elapsed time, or timestamp
+    unit: Literal["s", "min", "h", "d", "ms", "us", "ns", "timestamp"] = "s"  # of elapsed time, or timestamp
+    clock: Literal["elapsed", "stamp", "step"] | None = None  # default: what the other keys say
     format: str | None = None  # strptime pattern of time stamps; default: found by itself
     date: str | int | None = None  # column of the dates where `column` holds times of day
     step: str | None = None  # between two rows of a recording without a clock, such as "60 s"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _stamps(cls, given: Any) -> Any:
+        stamp = isinstance(given, dict) and given.get("clock") == "stamp"
+        return {"unit": "timestamp", **given} if stamp else given
+
     @model_validator(mode="after")
     def _one_clock(self) -> TimeColumn:
+        means = "step" if self.step is not None else "stamp" if self.unit == "timestamp" else "elapsed"
+        if self.clock not in (None, means):
+            raise ValueError(f"clock: {self.clock} contradicts the other keys, which mean {means}; give unit or step")
         if self.step is not None:
             try:
                 seconds(self.step)
@@ -107,13 +121,60 @@ class Schedule(Section):
 
 
 class Split(Section):
-    """Cut one long recording into batches where `driver` rises from 0; the stop that follows belongs to the batch."""
+    """Cut one long recording into batches. Exactly one of three keys says where a batch begins; shorter ones make none.
 
-    driver: str  # channel
+    `driver`: where a channel rises above `above`, by default 0; the stop that follows belongs to the batch. It may be a
+    temperature, with its idle value as `above`. `pause`: after so long without a row. `every`: after each such stretch.
+    """
+
+    driver: str | None = None  # channel
+    above: float | None = None  # in the channel's unit; default: its size above half a resolution
+    pause: str | None = None  # such as "30 min"
+    every: str | None = None  # such as "24 h"
     min_run_s: Annotated[float, Field(gt=0)] = 600.0  # a shorter run makes no batch
 
+    @model_validator(mode="after")
+    def _one_way(self) -> Split:
+        if sum(key is not None for key in (self.driver, self.pause, self.every)) != 1:
+            raise ValueError("expected exactly one of driver, pause and every")
+        for text in filter(None, (self.pause, self.every)):
+            seconds(text)
+        return self
 
-class Joined(Section):
+
+class Pivot(Section):
+    """Rows of one reading each: `name` are the columns that say of what, `value` the column of the readings.
+
+    A channel's `column` is then what `name` holds, with a blank between several columns.
+    """
+
+    name: str | list[str]
+    value: str | list[str]  # of several, the value's column follows the name
+
+
+class Form(Section):
+    """Layout of a file's table. Each key overrides what reading finds by itself."""
+
+    format: str | None = None  # of the file, whatever its suffix: csv, lvm, xlsx, parquet
+    encoding: str | None = None  # of text, such as cp1252
+    separator: Annotated[str, Field(min_length=1, max_length=2)] | None = None  # " " for blanks, "  " for two at least
+    decimal: Literal[".", ","] | None = None
+    header: bool = True  # the file has a row of names
+    header_rows: Annotated[int, Field(ge=0)] | None = None  # lines above the first data row
+    units_row: Annotated[int, Field(ge=1)] | None = None  # the line of the units, counted from 1; for `describe`
+    timezone: str | None = None  # of time stamps without one, such as Europe/Berlin
+    pivot: Pivot | None = None  # of a long table
+    time: TimeColumn = TimeColumn()
+
+    @field_validator("timezone")
+    @classmethod
+    def _known_zone(cls, name: str | None) -> str | None:
+        if name is not None and name not in available_timezones():
+            raise ValueError(f"unknown time zone {name!r}; {closest(name, sorted(available_timezones()))}")
+        return name
+
+
+class Joined(Form):
     """Other files, or other sheets, that hold further channels of the same runs (channels with this `source`).
 
     `file` is a name or pattern next to the recording; its * stands for what the * of `recording.files` stands for in
@@ -125,8 +186,6 @@ class Joined(Section):
     file: str | None = None
     sheet: str | None = None
     by: Literal["name", "time"] = "name"
-    header: bool = True
-    time: TimeColumn = TimeColumn()
 
     @model_validator(mode="after")
     def _time_stamps(self) -> Joined:
@@ -135,12 +194,10 @@ class Joined(Section):
         return self
 
 
-class Recording(Section):
+class Recording(Form):
     """How a recording file becomes batches."""
 
     files: list[str] = ["*.csv", "*.xlsx", "*.parquet", "*.txt"]  # patterns inside a directory
-    header: bool = True  # the file has a row of names
-    time: TimeColumn = TimeColumn()
     step_s: Annotated[float, Field(gt=0)] = 60.0  # of the regular grid in the lake
     max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
     start_from_name: str | None = None  # strptime pattern of the file's stem or its sheet, e.g. "%Y%m%d"

@@ -47,7 +47,7 @@ from data.errors import InputError
 from data.joined import Place, read_joined
 from data.lakefile import native_parquet
 from data.machine import Machine, Schedule
-from data.readers import has_reader, reader_for
+from data.readers import has_reader, sheets_of
 from data.readers.base import Sheet
 from data.readers.cells import parse_number
 from data.readers.csv import read_text_table
@@ -55,7 +55,7 @@ from data.readers.header import Layout, NotThisTable, hints, locate
 from data.rows import Rows, cut_runs, gather, stream
 from data.sweeps import Columns, take_readings
 from data.timegrid import check_reduction, repair_time, to_grid
-from data.units import check_canonical, convert
+from data.units import check_canonical, conversion, convert
 
 _LONGER_SHARE = 0.05
 _LONGER_S = 600.0
@@ -214,7 +214,6 @@ def read_batches(
     Raises:
         InputError: the file, a sheet or a stretch cannot be used; one line.
     """
-    _check_file(path)
     check_canonical({n: (c.role, c.unit) for n, c in machine.channels.items()}, f"machine file {machine.machine}")
     needed = set(machine.channels if channels is None else channels)
     if not need_error:
@@ -228,7 +227,7 @@ def read_batches(
 
 
 def _file_batches(path: Path, machine: Machine, need_error: bool, needed: Collection[str]) -> Iterator[Batch]:
-    with reader_for(path).open(path, hints(machine)) as sheets:
+    with sheets_of(path, hints(machine), machine.recording) as sheets:
         tables: list[tuple[Sheet, Layout]] = []
         errors: list[InputError] = []
         skipped: list[InputError] = []
@@ -250,7 +249,7 @@ def _file_batches(path: Path, machine: Machine, need_error: bool, needed: Collec
             try:
                 name = sheet.name if len(tables) + len(errors) > 1 else ""
                 place = Place(path, name, batch_id)
-                source = _Source(machine, place, where, need_error, needed, layout.sweeps)
+                source = _Source(machine, place, where, need_error, needed, layout.sweeps, layout.origin_s)
                 yield from _sheet_batches(sheet, layout, source, extra, errors)
             except InputError as error:
                 errors.append(error)
@@ -258,17 +257,6 @@ def _file_batches(path: Path, machine: Machine, need_error: bool, needed: Collec
     if errors:
         more = f" (and {len(errors) - 1} more parts of the file cannot be used)" if len(errors) > 1 else ""
         raise InputError(f"{errors[0]}{more}")
-
-
-def _check_file(path: Path) -> None:
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory, expected one recording file; give the file, or ingest the directory")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the path of a recording")
-    if path.stat().st_size == 0:
-        raise InputError(
-            f"{path.name}: the file is empty (0 bytes); expected a header and at least 2 rows; copy it again"
-        )
 
 
 @dataclass(frozen=True)
@@ -281,6 +269,7 @@ class _Source:
     need_error: bool
     needed: Collection[str]
     sweeps: Columns
+    origin_s: float = 0.0  # what the wall clock shows more than the clock of the rows
 
     def needs(self, source: str) -> bool:
         """Whether a needed channel comes from there."""
@@ -298,9 +287,14 @@ def _sheet_batches(
     if split is None:
         yield _batch(gather(blocks, sheet), source, extra, 0.0)
         return
-    if split.driver not in machine.channels:
-        raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
-    still = 0.5 * (machine.channels[split.driver].resolution or 0.0)
+    still = 0.0
+    if split.driver is not None:
+        if split.driver not in machine.channels:
+            raise InputError(f"machine file {machine.machine}: recording.split.driver {split.driver!r} is no channel")
+        part = machine.channels[split.driver]
+        factor, offset = conversion(part.unit, part.unit_in_file or part.unit, split.driver)
+        still = 0.5 * (part.resolution or 0.0) * abs(factor)
+        still = still if split.above is None else factor * split.above + offset
     first: list[float] = []
 
     def noting_the_start() -> Iterator[Rows]:
@@ -309,11 +303,11 @@ def _sheet_batches(
                 first.extend(rows.time_s[np.isfinite(rows.time_s)][:1].tolist())
             yield rows
 
-    for k, rows in enumerate(cut_runs(noting_the_start(), split.driver, split.min_run_s, still, where)):
+    for k, rows in enumerate(cut_runs(noting_the_start(), split, still, where)):
         place = replace(source.place, batch_id=f"{source.place.batch_id}-{k + 1:02d}")
-        part = replace(source, place=place, where=f"{where} part {k + 1:02d}")
+        of_run = replace(source, place=place, where=f"{where} part {k + 1:02d}")
         try:
-            yield _batch(rows, part, extra, first[0])
+            yield _batch(rows, of_run, extra, first[0])
         except InputError as error:
             errors.append(error)
         extra = {}
@@ -426,7 +420,7 @@ def _batch(rows: Rows, source: _Source, extra: dict[str, int], file_start: float
     repairs |= {"skipped_sources": skipped} if skipped else {}
     columns = _in_canonical_units(found, machine, skipped > 0)
     _check_filled(columns, machine, where, source.need_error, repairs["unparsable_values"])
-    start = _start(place, machine, main.start + origin_s, file_start)
+    start = _start(source, main.start + origin_s, file_start)
     if start is None and machine.recording.start_from_name:
         repairs["start_unreadable"] = 1
     return Batch(
@@ -505,16 +499,22 @@ def _check_filled(columns: dict[str, np.ndarray], machine: Machine, where: str, 
         )
 
 
-def _start(place: Place, machine: Machine, batch_start: float, file_start: float) -> pd.Timestamp | None:
-    pattern = machine.recording.start_from_name
-    stamped = machine.recording.time.unit == "timestamp" and batch_start > _FIRST_STAMP_S
-    for name in (place.path.stem, place.sheet) if pattern else ():
+def _start(source: _Source, batch_start: float, file_start: float) -> pd.Timestamp | None:
+    """When the batch begins, as a clock on the wall shows it."""
+    place, recording = source.place, source.machine.recording
+    for name in (place.path.stem, place.sheet) if recording.start_from_name else ():
         try:
-            named = pd.Timestamp(dt.datetime.strptime(name, pattern or ""))
-            return named + pd.Timedelta(seconds=batch_start - file_start) if machine.recording.split else named
+            named = pd.Timestamp(dt.datetime.strptime(name, recording.start_from_name or ""))
+            return named + pd.Timedelta(seconds=batch_start - file_start) if recording.split else named
         except ValueError:
             pass  # counted as start_unreadable; a time column may still give the start
+    shown_s = batch_start + source.origin_s
+    if (recording.time.unit != "timestamp" and not source.origin_s) or shown_s <= _FIRST_STAMP_S:
+        return None
     try:
-        return pd.Timestamp(0) + pd.Timedelta(seconds=round(batch_start, 6)) if stamped else None
+        if recording.timezone:
+            utc = pd.Timestamp(round(batch_start * 1e6), unit="us", tz="UTC")
+            return utc.tz_convert(recording.timezone).tz_localize(None)
+        return pd.Timestamp(round(shown_s * 1e6), unit="us")
     except (ValueError, OverflowError):  # beyond the year 2262, so a damaged stamp
         return None

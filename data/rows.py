@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from data.arrays import Array, Index
 from data.errors import InputError
-from data.machine import Machine
+from data.machine import Machine, Split
 from data.readers.base import Sheet
 from data.readers.cells import cell_texts, stamp_format, to_float, to_seconds, with_date
 from data.readers.header import Layout
+from data.units import seconds
 
 Texts = dict[str, tuple[Index, NDArray[Any]]]
 
@@ -70,7 +71,8 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
         texts_of_time = [[row[i] for i in clock if isinstance(row[i], str) and not _is_number(row[i])] for row in head]
         pattern = stamp_format([" ".join(t) for t in texts_of_time if len(t) == len(clock)], where)
     positions = sorted({*clock, *layout.positions.values()})
-    text = clock if time.unit == "timestamp" else ()
+    text = clock if time.unit == "timestamp" or _colons(sheet, layout) else ()
+    units = {n: c.unit_in_file or c.unit for n, c in machine.channels.items()}
     no_date = pattern is not None and not any(d in pattern for d in ("%d", "%j", "8601"))
     late = np.nan
     done = 0
@@ -82,17 +84,25 @@ def stream(sheet: Sheet, layout: Layout, machine: Machine, where: str) -> Iterat
         else:
             stamps = block.columns[layout.time]
             stamps = stamps if layout.date is None else with_date(block.columns[layout.date], stamps)
-            time_s = to_seconds(stamps, time.unit, pattern, sheet.decimal)
+            time_s = to_seconds(stamps, time.unit, pattern, sheet.decimal, machine.recording.timezone)
         if no_date and len(time_s):
             time_s = _past_midnight(time_s, late)
             late = float(_filled(time_s, late)[-1])
         values: dict[str, Array] = {}
         texts: Texts = {}
         for name, position in layout.positions.items():
-            values[name], bad = to_float(block.columns[position], sheet.decimal)
+            values[name], bad = to_float(
+                block.columns[position], sheet.decimal, units.get(name.rpartition("@")[0] or name, "")
+            )
             if bad is not None:
                 texts[name] = np.flatnonzero(bad), cell_texts(block.columns[position], bad)
         yield Rows(time_s, values, texts, block.ragged_rows)
+
+
+def _colons(sheet: Sheet, layout: Layout) -> bool:
+    """Whether an elapsed clock shows h:mm:ss."""
+    rows = [row for row in sheet.head[layout.first_row :][:20] if len(row) > (layout.time or 0)]
+    return layout.time is not None and any(":" in str(row[layout.time]) for row in rows)
 
 
 def _past_midnight(time_s: Array, before: float) -> Array:
@@ -154,30 +164,36 @@ def join(parts: Sequence[Rows]) -> Rows:
     )
 
 
-def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float, where: str) -> Iterator[Rows]:
-    """Batches of a long recording: from where |driver| rises above `still` to the next such rise.
+def cut_runs(blocks: Iterator[Rows], split: Split, still: float, where: str) -> Iterator[Rows]:
+    """Batches of a long recording: from where a run begins to the next such begin.
 
-    Runs shorter than `min_run_s` start no batch; they belong to the stop in which they lie. A recording that begins
-    running begins with a batch; rows before the first run are counted (`before_run` of the first batch) and dropped.
-    A batch is given out as soon as the next one has begun: only one is held in memory.
+    With `split.driver` a run is where its values (in the file's unit) are above `still`, in size where no `above` is
+    given. Runs shorter than `min_run_s` start no batch; they belong to the stop in which they lie. A recording that
+    begins running begins with a batch; rows before the first run are counted (`before_run` of the first batch) and
+    dropped. A batch is given out as soon as the next one has begun: only one is held in memory.
 
     Raises:
-        InputError: the driver is not in the file, or never runs for min_run_s.
+        InputError: the driver is not in the file, or no run lasts for min_run_s.
     """
     pending: list[Rows] = []
-    runs = _Runs(min_run_s)
+    runs = _Runs(split)
     before_run, started, first, last_on, last_time = 0, False, 0, False, np.nan
     for rows in blocks:
-        if driver not in rows.columns:
-            raise InputError(
-                f"{where}: recording.split needs the driver {driver!r}, which is not in the file; correct its column"
-            )
-        on = _filled(np.where(np.isnan(rows.columns[driver]), np.nan, np.abs(rows.columns[driver]) > still), last_on)
         time = _filled(rows.time_s, last_time)
-        if len(rows):
-            last_on, last_time = bool(on[-1]), float(time[-1])
+        last_time = float(time[-1]) if len(rows) else last_time
+        on = None
+        if split.driver is not None:
+            if split.driver not in rows.columns:
+                raise InputError(
+                    f"{where}: recording.split needs the driver {split.driver!r}, which is not in the file; correct its"
+                    " column"
+                )
+            values = rows.columns[split.driver]
+            size = np.abs(values) if split.above is None else values
+            on = _filled(np.where(np.isnan(values), np.nan, size > still), last_on) > 0
+            last_on = bool(on[-1]) if len(rows) else last_on
         pending.append(rows)
-        for cut in runs.starts(on > 0, time):
+        for cut in runs.starts(on, time):
             done, pending = _split(pending, cut - first)
             first = cut
             if started:
@@ -188,8 +204,9 @@ def cut_runs(blocks: Iterator[Rows], driver: str, min_run_s: float, still: float
                 before_run = sum(len(p) + p.ragged for p in done)
             started = True
     if not started:
+        what = f"{split.driver} never runs" if split.driver else "no stretch lasts"
         raise InputError(
-            f"{where}: {driver} never runs for {min_run_s:g} s (longest run {runs.longest_s:g} s); nothing to cut;"
+            f"{where}: {what} for {split.min_run_s:g} s (longest run {runs.longest_s:g} s); nothing to cut;"
             " correct recording.split"
         )
     whole = join(pending)
@@ -207,20 +224,25 @@ def _filled(values: Array, before: float) -> Array:
 class _Runs:
     """Where runs of at least min_run_s begin, block by block; only the run under way is remembered."""
 
-    def __init__(self, min_run_s: float) -> None:
+    def __init__(self, split: Split) -> None:
         self.longest_s = 0.0
-        self._min_run_s = min_run_s
+        self._min_run_s = split.min_run_s
+        self._pause_s = seconds(split.pause) if split.pause else np.inf
+        self._every_s = seconds(split.every) if split.every else np.inf
         self._rows = 0  # of the blocks before
         self._begun: tuple[int, float] | None = None  # row and time of the run under way
         self._reported = False  # the run under way is already among the results
+        self._first_s = self._last_s = np.nan  # time of the first row, and of the last one so far
 
-    def starts(self, on: NDArray[np.bool_], time: Array) -> list[int]:
-        """Rows, counted from the first block on, of the runs that are seen to be long enough within this block."""
-        if not len(on):
+    def starts(self, on: NDArray[np.bool_] | None, time: Array) -> list[int]:
+        """Rows, counted from the first block on, of the runs that are seen to be long enough within this block.
+
+        `on` (n,) is where the machine runs; None: runs end where a pause or a stretch does.
+        """
+        if not len(time):
             return []
-        before = np.int8(self._begun is not None)
-        edges = np.diff(on.astype(np.int8), prepend=before, append=np.int8(0))
-        begin, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+        begin, end = self._stretches(time) if on is None else self._edges(on)
+        self._last_s = float(time[-1])
         begun = [(self._rows + int(b), float(time[b])) for b in begin]
         if self._begun is not None:
             begun.insert(0, self._begun)
@@ -232,9 +254,24 @@ class _Runs:
             if run_s >= self._min_run_s and not self._reported:
                 found.append(row)
                 self._reported = True
-        self._rows += len(on)
-        self._begun = begun[-1] if on[-1] else None
+        self._rows += len(time)
+        self._begun = begun[-1] if on is None or on[-1] else None
         return found
+
+    def _edges(self, on: NDArray[np.bool_]) -> tuple[Index, Index]:
+        edges = np.diff(on.astype(np.int8), prepend=np.int8(self._begun is not None), append=np.int8(0))
+        return np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+
+    def _stretches(self, time: Array) -> tuple[Index, Index]:
+        known = time[np.isfinite(time)]
+        self._first_s = self._first_s if np.isfinite(self._first_s) or not len(known) else float(known[0])
+        before = np.concatenate([[self._last_s], time[:-1]])
+        turns = np.floor((time - self._first_s) / self._every_s) > np.floor((before - self._first_s) / self._every_s)
+        new = (time - before > self._pause_s) | turns
+        new[0] |= self._begun is None
+        begin = np.flatnonzero(new)
+        ends = np.append(begin - 1, len(time) - 1)  # the last row of each stretch, that under way first
+        return begin, ends if self._begun is not None else ends[1:]
 
 
 def _split(parts: list[Rows], n: int) -> tuple[list[Rows], list[Rows]]:

@@ -20,47 +20,65 @@ _QUANTITIES: dict[str, tuple[str, ...]] = {
     "length": ("um", "nm", "mm", "cm", "m", "in", "mil"),
     "rotation": ("rpm", "krpm", "rev/s", "rad/s"),
     "feed": ("mm/min", "m/min", "mm/s", "m/s", "in/min"),
-    "time": ("s", "ms", "min", "h", "d"),
-    "power": ("W", "mW", "kW"),
+    "time": ("s", "ms", "us", "ns", "min", "h", "d"),
+    "power": ("W", "mW", "kW", "VA", "kVA"),
+    "energy": ("J", "kJ", "Wh", "kWh"),
     "current": ("A", "mA"),
-    "voltage": ("V", "mV"),
-    "force": ("N", "kN"),
+    "voltage": ("V", "mV", "uV"),
+    "resistance": ("ohm", "mohm", "kohm"),
+    "frequency": ("Hz", "kHz"),
+    "force": ("N", "kN", "lbf"),
     "torque": ("Nm",),
-    "pressure": ("bar", "kPa", "MPa"),
-    "flow": ("l/min", "l/h"),
-    "angle": ("deg", "rad", "urad", "arcsec"),
-    "ratio": ("1", "%", "um/m", "m/m"),
+    "mass": ("kg", "g", "mg", "lb", "oz"),
+    "pressure": ("bar", "mbar", "Pa", "hPa", "kPa", "MPa", "psi"),
+    "flow": ("l/min", "l/h", "l/s", "m3/h", "gpm", "cfm"),
+    "angle": ("deg", "rad", "mrad", "urad", "arcsec"),
+    "acceleration": ("m/s2",),
+    "illuminance": ("lux",),
+    "humidity": ("%RH",),
+    "count": ("step", "count"),
+    "ratio": ("1", "%", "ppm", "um/m", "mm/m", "m/m"),
 }
 _UNITS = {unit: kind for kind, units in _QUANTITIES.items() for unit in units}
 _OFFSET_UNITS = ("degC", "degF")  # their zero is not that of K: a difference needs pint's delta units
-_PINT = {"": "dimensionless", "1": "dimensionless", "%": "percent", "Nm": "N*m", "rev/s": "revolution/s", "mil": "thou"}
+_PINT = {"": "dimensionless", "1": "dimensionless", "%": "percent", "Nm": "N*m", "rev/s": "revolution/s", "mil": "thou",
+         "%RH": "percent", "gpm": "gallon/min", "m3/h": "m**3/h", "m/s2": "m/s**2", "step": "count",
+         "oz": "ounce"}  # fmt: skip
 
 # spellings and words found in recordings (English, German, French, Spanish, Italian, Chinese, Japanese), as `_fold`
 # leaves them: without case and accents
 _SPELLINGS: dict[str, str] = {
     word: unit
     for unit, words in {
-        "degC": "°c|c|deg c|celsius|grad c|摄氏度|攝氏度|度",
-        "K": "kelvin", "degF": "°f|f|deg f|fahrenheit",
+        "degC": "°c|c|celsius|grad celsius|摄氏度|攝氏度|度",
+        "K": "kelvin", "degF": "°f|f|fahrenheit|deg fahrenheit",
         "um": "micron|microns|mym|mikron|micrometer|micrometers|micrometre|micrometres|mikrometer|micrometro"
         "|micrometros|micrometri|micra|micras|微米|マイクロメートル|ミクロン",
         "mm": "millimeter|millimeters|millimetre|millimetres|milimetro|milimetros|millimetri|毫米|ミリ|ミリメートル",
         "in": "inch|inches", "mil": "thou",
-        "rpm": "1/min|min-1|u/min|upm|r/min|rev/min|tr/min|giri/min|转/分|轉/分|回転/分", "rev/s": "1/s|hz",
-        "in/min": "ipm", "s": "sec|secs|sek|second|seconds|sekunde|sekunden|seconde|secondes|seg|segundo|segundos"
+        "rpm": "1/min|min-1|u/min|upm|r/min|rev/min|tr/min|giri/min|转/分|轉/分|回転/分", "rev/s": "1/s|rps",
+        "in/min": "ipm", "kg": "kgs|kilogram|kilogramm|kilo", "g": "gram|gramm", "lb": "lbs|pound|pounds",
+        "Pa": "pascal", "psi": "psig|psia|lbf/in2", "%RH": "%rf|% rh|%r.h.|rel%|%rel", "gpm": "gal/min|us gal/min",
+        "m3/h": "m³/h|m^3/h",
+        "m/s2": "m/s²|m/s^2", "ohm": "ω|ohms", "lux": "lx", "cfm": "ft3/min", "um/m": "ustrain|microstrain|µε",
+        "step": "steps|schritte", "count": "counts|cts|digits|digit|pulses|imp|inkr",
+        "Hz": "hertz", "s": "sec|secs|sek|second|seconds|sekunde|sekunden|seconde|secondes|seg|segundo|segundos"
         "|secondo|secondi|秒|秒数|秒間", "ms": "millisecond|milliseconds|millisekunden|毫秒|ミリ秒",
         "min": "mins|minute|minutes|minuten|minuto|minutos|minuti|分|分钟|分鐘|分間",
         "h": "hr|hrs|hour|hours|std|stunde|stunden|heure|heures|hora|horas|ora|ore|小时|小時",
         "d": "day|days|tag|tage|jour|jours|dia|dias|giorno|giorni|天|日",
-        "W": "watt|watts", "V": "volt|volts", "A": "amp|amps|ampere", "N": "newton", "Nm": "n*m",
+        "W": "watt|watts", "V": "volt|volts|vdc|vac", "mV": "millivolt|millivolts", "A": "amp|amps|ampere",
+        "N": "newton", "Nm": "n*m|n·m|n m",
         "%": "percent|prozent|pourcent|百分比", "l/min": "l/m", "1": "-",
     }.items()
     for word in words.split("|")
 }  # fmt: skip
-TIME_UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3}  # the usual ones first
+TIME_UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # usual first
 
-_DISPLACEMENT = ("length", "angle", "ratio")  # what an error channel can measure
 _CANONICAL = {"temperature": "degC", "ambient": "degC", "error": "um"}
+
+
+_CASE_TELLS = ("mW", "MPa", "mohm", "VA")  # in other cases they are other units, or words
 
 
 def _fold(text: str) -> str:
@@ -70,16 +88,30 @@ def _fold(text: str) -> str:
             c for c in unicodedata.normalize("NFD", folded) if c == "\u3099" or not unicodedata.combining(c)
         )
         folded = unicodedata.normalize("NFC", folded)
-    return folded.replace("μ", "u").replace("\N{MINUS SIGN}", "-").casefold()
+    folded = folded.replace("μ", "u").replace("\N{MINUS SIGN}", "-").casefold()
+    return re.sub(r"^(deg(ree)?s?\.?|grad|°) ?(?=[ckf])", "deg ", folded)
 
 
-_BY_FOLD = {**{_fold(u): u for u in _UNITS if u not in ("mW", "MPa")}, **{_fold(k): v for k, v in _SPELLINGS.items()}}
+_BY_FOLD = {**{_fold(u): u for u in _UNITS if u not in _CASE_TELLS}, **{_fold(k): v for k, v in _SPELLINGS.items()}}
 
 
 def known_unit(text: str) -> str | None:
     """The name under which a spelling is known (``"°C"`` -> ``"degC"``, ``"µm"`` -> ``"um"``), or None."""
     stripped = text.strip()
     return stripped if stripped in _UNITS else _BY_FOLD.get(_fold(text))
+
+
+@lru_cache
+def stated_unit(text: str) -> str | None:
+    """The same for a text that stands where a unit belongs: terms of pint count as well (``"kW/m^2"``)."""
+    text = text.strip(" []()")
+    if (known := known_unit(text)) or text.isalnum() or not re.search(r"[^\W\d_]", text):
+        return known  # a lone word is none: pint would read "rod" and "link"
+    try:
+        powers = re.sub(r"(?<=[a-z])([23])", r"**\1", text)  # W/m2
+        return f"{unit_registry().Unit(powers):~C}"
+    except Exception:  # pint has no common base for its many parsing errors
+        return None
 
 
 def seconds(text: str) -> float:
@@ -96,8 +128,9 @@ def seconds(text: str) -> float:
 
 
 def quantity(unit: str) -> str | None:
-    """What a unit measures (temperature, length, …), or None if the unit is not known."""
-    return _UNITS.get(known_unit(unit) or "")
+    """What a unit measures (temperature, length, …, or a dimension of pint), or None if the unit is not known."""
+    known = known_unit(unit) or stated_unit(unit)
+    return None if known is None else _UNITS.get(known) or str(unit_registry().Unit(known).dimensionality)
 
 
 @lru_cache(maxsize=1)
@@ -122,14 +155,14 @@ def conversion(unit_from: str, unit_to: str, where: str) -> tuple[float, float]:
     """
     if unit_from == unit_to:
         return 1.0, 0.0
-    names = [known_unit(unit) for unit in (unit_from, unit_to)]
+    names = [stated_unit(unit) for unit in (unit_from, unit_to)]
     for unit, name in zip((unit_from, unit_to), names, strict=True):
         if name is None:
             raise InputError(f"{where}: unknown unit {unit!r}; {closest(unit, _UNITS)}")
     one, other = (str(name) for name in names)
-    if _UNITS[one] != _UNITS[other]:
+    if quantity(one) != quantity(other):
         raise InputError(
-            f"{where}: {unit_from!r} is a {_UNITS[one]} and cannot become {unit_to!r}, a {_UNITS[other]};"
+            f"{where}: {unit_from!r} is a {quantity(one)} and cannot become {unit_to!r}, a {quantity(other)};"
             " correct unit or unit_in_file"
         )
     return _factor_offset(one, other)
@@ -152,30 +185,41 @@ def convert(values: NDArray[np.float64], unit_from: str, unit_to: str, where: st
 
 
 def check_canonical(roles_units: Mapping[str, tuple[str, str]], where: str) -> None:
-    """Temperatures are kept in degC and lengths of error channels in um; `roles_units` is name -> (role, unit).
+    """Temperatures are kept in degC, lengths of error channels in um; `roles_units` is name -> (role, unit).
+
+    An error may be of any quantity whose unit is known (kg, V, mrad, …).
 
     Raises:
         InputError: another unit stands there, with what to write instead, or one that nobody knows.
     """
     for name, (role, unit) in roles_units.items():
-        kept = _CANONICAL.get(role)
-        if kept and quantity(unit) is None:
-            raise InputError(f"{where}: channel {name!r} ({role}) has the unknown unit {unit!r}; write unit: {kept}")
-        if kept == "degC" and quantity(unit) != "temperature":
-            raise InputError(f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r}; correct it")
-        if role == "error" and quantity(unit) not in _DISPLACEMENT:
+        kept, kind = _CANONICAL.get(role), quantity(unit)
+        here = f"{where}: channel {name!r} ({role})"
+        if kept and kind is None:
+            raise InputError(f"{here} has the unknown unit {unit!r}; write unit: {kept}")
+        if role == "error" and unit in _OFFSET_UNITS:
             raise InputError(
-                f"{where}: channel {name!r} (error) has unit {unit!r}, a {quantity(unit)}; expected a length, an angle"
-                f" or a ratio such as um/m: correct unit, or role if it is no displacement"
+                f"{here} has unit {unit!r}; expected that of a difference, such as K; correct unit or role"
             )
-        if kept and unit != kept and quantity(unit) == quantity(kept):
+        if kept == "degC" and kind != "temperature":
+            raise InputError(f"{here} has unit {unit!r}, expected 'degC'; correct it")
+        if kept and unit != kept and kind == quantity(kept):
             raise InputError(
-                f"{where}: channel {name!r} ({role}) has unit {unit!r}, expected {kept!r};"
-                f" write unit: {kept} and unit_in_file: {unit!r}"
+                f"{here} has unit {unit!r}, expected {kept!r}; write unit: {kept} and unit_in_file: {unit!r}"
             )
 
 
 _SPELT = {"um": "µm", "degC": "°C", "ohm": "Ω", "**2": "²", "**3": "³", "*": "·"}
+
+
+def in_error_unit(text: str, unit: str) -> str:
+    """A text on errors in µm as the same on errors in `unit`, in which a result counts as in µm elsewhere."""
+    return text if unit == "um" else text.replace("µm", unit_label(unit) or "1")
+
+
+def error_column(name: str, unit: str) -> str:
+    """The name of a column of errors: ``predicted_um`` in um, else ``predicted_error``."""
+    return name if unit == "um" else f"{name.removesuffix('_um')}_error"
 
 
 def unit_label(unit: str) -> str:

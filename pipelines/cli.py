@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import sys
 from collections.abc import Callable
+from typing import Annotated
 
 import typer
 
@@ -37,6 +38,7 @@ app = typer.Typer(
     name="thermodrift",
     help="Thermal error of machine tools: from a year of recordings to a promoted compensation model.",
     no_args_is_help=True,
+    invoke_without_command=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -46,6 +48,19 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="print the version", is_eager=True)] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        console.line(f"thermodrift {installed('thermodrift')}")
+        raise typer.Exit
+
+
 app.add_typer(prove, name="prove")
 app.add_typer(lake, name="lake")
 

@@ -102,7 +102,7 @@ def error_channels(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
     return tuple(dict.fromkeys(wanted)) or allowed
 
 
-@dataclass
+@dataclass(repr=False)
 class TrainOutcome:
     """The results by channel, and where they are tracked, registered and reported."""
 
@@ -121,6 +121,11 @@ class TrainOutcome:
     stopped: str = ""  # why nothing was trained
     postponed: str = ""  # why results wait in the spool for the tracking store; else empty
     records: dict[str, Record] = field(default_factory=dict)  # the trainings as they are tracked
+    units: dict[str, str] = field(default_factory=dict)  # of the errors
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{t}: {c.family} on {c.n_tsp} by {c.selector}" for t, c in self.choices.items())
+        return f"TrainOutcome({self.machine}, {found or self.stopped or 'nothing chosen'}, report {self.report})"
 
 
 def train(
@@ -150,6 +155,7 @@ def train(
         say(line)
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
+    outcome.units |= {t: machine.channels[t].unit for t in targets}
     clock = _Clock(outcome.seconds)
     lake = home_lake()
     if request.recordings:
@@ -159,6 +165,7 @@ def train(
         clock("ingest")
     with _naming_quarantine(outcome.ingested):
         batches = load_batches(lake, machine)
+        _check_several(batches, machine)
     if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome
@@ -246,6 +253,15 @@ def promote_waiting(settings: Settings, training_id: str, machine_file: Path) ->
     return promote_tracked(training_id, machine_file, "", False, settings)
 
 
+def _check_several(batches: Sequence[Batch], machine: Machine) -> None:
+    """Raises InputError where one recording is all there is, before anything is computed."""
+    if len(batches) == 1 and machine.recording.split is None:
+        raise InputError(
+            f"{machine.machine}: got 1 batch(es), {batches[0].batch_id}, need at least 2; ingest more recordings, or"
+            " cut a long one into runs by recording.split (driver, pause or every; `thermodrift describe` proposes one)"
+        )
+
+
 @contextmanager
 def _naming_quarantine(ingested: IngestReport | None) -> Iterator[None]:
     """Add the files in quarantine to the error that too few batches are left to train on."""
@@ -316,7 +332,7 @@ def _record(
     outcome: TrainOutcome, plan: Plan, settings: Settings, target: str, record_id: str, started_ms: int
 ) -> Record:
     plain = {k: v if isinstance(v, tuple) else (v,) for k, v in asdict(plan).items()}
-    params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()}
+    params = {k: ", ".join(map(str, v or ("all",))) for k, v in plain.items()} | {"unit": outcome.units[target]}
     return tracking.training_record(
         outcome.results[target], settings.promotion, params, choice=outcome.choices.get(target), record_id=record_id,
         started_ms=started_ms,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
+from data.units import in_error_unit
 from reports.drawing import inline_svg
 
 _MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
@@ -131,6 +133,26 @@ class Key:
 
 
 _PX_PER_IN = 108  # a label of 7.5 points is 11 px high
+
+
+def with_unit(block: Any, unit: str) -> Any:
+    """A part of a page on errors in µm as one on errors in `unit`: its texts, also those of figures."""
+    if unit == "um":
+        return block
+    if isinstance(block, str):
+        return in_error_unit(block, unit)
+    if isinstance(block, Figure):
+        for text in block.findobj(Text):
+            text.set_text(in_error_unit(text.get_text(), unit))
+    elif isinstance(block, dict):
+        return {k: with_unit(v, unit) for k, v in block.items()}
+    elif isinstance(block, tuple) and hasattr(block, "_fields"):
+        return type(block)(*(with_unit(v, unit) for v in block))
+    elif isinstance(block, tuple | list):
+        return type(block)(with_unit(v, unit) for v in block)
+    elif is_dataclass(block) and not isinstance(block, type):
+        return replace(block, **{f.name: with_unit(getattr(block, f.name), unit) for f in fields(block) if f.init})
+    return block
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from data.machine import Form
+
 HEAD_ROWS = 1000  # the header is searched in these rows only, in formats that are slow to scan
 
 
@@ -42,7 +44,11 @@ class Sheet(ABC):
     head: Sequence[Sequence[Any]] = ()  # first rows, cells as text or as Python values
     decimal: str = "."  # decimal mark of numbers in text cells
     share_read: float = 1.0  # share of the file in the blocks so far: predicts the number of rows
+    first_row: int | None = None  # of the data, where the format states it
     summary: str = ""  # how the text is encoded: "semicolon, decimal comma, cp1252"
+    units: Sequence[str] = ()  # by column, where the format states them apart from the rows
+    origin_s: float = 0.0  # s since 1970 at which an elapsed clock shows 0; 0 where the file does not say
+    step_s: float | None = None  # between two rows, where the format states it in place of a clock
 
     @abstractmethod
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
@@ -54,7 +60,9 @@ class Sheet(ABC):
 
 
 class Reader(ABC):
-    """One file format."""
+    """One file format. `form`: what the machine file states of the layout; the rest is found."""
+
+    form: Form = Form()
 
     @abstractmethod
     def open(self, path: Path, hints: Sequence[str]) -> AbstractContextManager[Sequence[Sheet]]:

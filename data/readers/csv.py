@@ -7,7 +7,7 @@ import csv
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,20 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from data.errors import InputError
+from data.machine import Form
 from data.readers.base import Block, Reader, Sheet
-from data.readers.cells import parse_number
+from data.readers.cells import cell_unit, parse_number
 
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
-_SEPARATORS = (",", ";", "\t", "|")
-_WORDS = ("温度", "时间", "時間", "日時", "位移", "変位", "主轴", "主軸", "转速", "回転", "环境", "室温", "進給",
-          "轴", "軸", "℃", "°C", "µm", "temperatur", "weg", "zeit", "vorschub", "drehzahl")  # fmt: skip
 _EUROPEAN = frozenset("äöüßéèêàâçîôûñóíáúåøæÄÖÜÉµ°²³±·–€")
-_POINT = re.compile(r"\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*")
-_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
+_OTHER_ENCODINGS = ["gb18030", "cp932", "cp1252"]  # than UTF-8 and UTF-16
+SEPARATORS = (";", "\t", "|", ",")  # the comma last: it may be a decimal mark
+_BLANKS = {"  ": re.compile(r" {2,}|\t"), " ": re.compile(r"[ \t]+")}  # two at least, one at least
+_NAMES = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", "  ": "blanks", " ": "blank"}
+_COMMENT = re.compile(r"^[#%]+[ \t]+(?=\S)")  # before a header, which numbers follow
+_NUMERIC = re.compile(r"\s*[-+.\d]")
+_POINT = re.compile(r"\s*[+-]?\s*\d*\.\d+([eE][+-]?\d+)?\s*[^\d\s.,:]{0,4}\s*")  # may have a unit behind it
+_COMMA = re.compile(_POINT.pattern.replace(r"\.", ",", 1))
 
 
 def normalise(name: object) -> str:
@@ -33,15 +37,17 @@ def normalise(name: object) -> str:
     return " ".join(unicodedata.normalize("NFKC", str(name)).casefold().split())
 
 
-def find_encoding(raw: bytes, hints: Sequence[str], where: str) -> str:
+def find_encoding(raw: bytes, where: str) -> str:
     """Codec name of the first bytes of a file.
 
-    A byte order mark decides; then zero bytes (UTF-16); then strict UTF-8. Of GB18030, Shift-JIS (cp932) and CP1252
-    that one wins in which most of the expected names are found, then the one whose characters are common.
+    A byte order mark decides; then zero bytes (UTF-16); then strict UTF-8; then which of GB18030, Shift-JIS (cp932) and
+    CP1252 gives the likeliest text.
 
     Raises:
         InputError: not a text file.
     """
+    from charset_normalizer import from_bytes  # takes long to load
+
     for bom, name in _BOMS:
         if raw.startswith(bom):
             return name
@@ -55,15 +61,11 @@ def find_encoding(raw: bytes, hints: Sequence[str], where: str) -> str:
         raise _not_text(where)
     if _decodes(raw, "utf-8"):
         return "utf-8"
-    candidates = [e for e in ("gb18030", "cp932", "cp1252") if _decodes(raw, e)]
-    wanted = [normalise(h) for h in hints if not h.isascii()]
-
-    def score(name: str) -> tuple[int, int, float]:
-        text = raw.decode(name, "replace")
-        folded = normalise(text)
-        return sum(h in folded for h in wanted), sum(w in text or w in folded for w in _WORDS), _common(text, name)
-
-    return max(candidates, key=score) if candidates else "cp1252"
+    foreign = b"\n".join(line for line in raw.splitlines() if not line.isascii())
+    if {c for c in foreign.decode("cp1252", "replace") if ord(c) > 127} <= _EUROPEAN:
+        return "cp1252"  # a few letters are too little to tell
+    best = from_bytes(foreign[:10_000], cp_isolation=_OTHER_ENCODINGS).best()
+    return best.encoding if best is not None else "cp1252"
 
 
 def _not_text(where: str) -> InputError:
@@ -78,33 +80,19 @@ def _decodes(raw: bytes, encoding: str) -> bool:
     return True
 
 
-def _common(text: str, encoding: str) -> float:
-    """Share of the non-ASCII characters that are everyday ones in that encoding."""
-    foreign = [c for c in text if ord(c) > 127]
-    tests: dict[str, Callable[[str], bool]] = {
-        "cp1252": _EUROPEAN.__contains__,
-        "gb18030": lambda c: b"\xa1" <= c.encode("gb18030")[:1] <= b"\xd7" and c.encode("gb18030")[1:2] >= b"\xa1",
-        "cp932": lambda c: b"\x81" <= c.encode("cp932", "replace")[:1] <= b"\x97",
-    }
-    return sum(map(tests[encoding], foreign)) / len(foreign) if foreign else 0.0
-
-
-def find_separator(lines: Sequence[str], hints: Sequence[str]) -> str:
+def find_separator(lines: Sequence[str], hints: Sequence[str], separators: Sequence[str] = SEPARATORS) -> str:
     """The separator with which most expected names stand as fields of one line, else most cells are numbers."""
     wanted = {normalise(h) for h in hints}
-    best = {s: 0 for s in _SEPARATORS}
+    best = {s: 0 for s in separators}
     for line in lines:
         folded = normalise(line.replace("\t", "\0")) if wanted else ""
         if not any(w in folded.replace("\0", " ") for w in wanted):
             continue
-        for separator in _SEPARATORS:
+        for separator in separators:
             best[separator] = max(best[separator], len(wanted & {normalise(c) for c in split(line, separator)}))
-    if max(best.values()) > 0:
-        return max(_SEPARATORS, key=lambda s: best[s])
-
     sample = [line for line in lines if line.strip()][-50:]
 
-    def numbers(separator: str) -> float:
+    def numbers(separator: str) -> tuple[int, float]:
         rows = [split(line, separator) for line in sample]
         width = Counter(len(row) for row in rows).most_common(1)[0][0] if rows else 1
         total = 0.0
@@ -112,17 +100,19 @@ def find_separator(lines: Sequence[str], hints: Sequence[str]) -> str:
             filled = [cell for cell in row if cell.strip()]
             good = sum(_is_number(cell) and "\t" not in cell for cell in filled)
             total += good * good / max(1, len(filled)) if len(row) == width > 1 else 0.0
-        return total
+        return best[separator], total
 
-    return max((";", "\t", "|", ","), key=numbers)  # the comma last: it may be a decimal mark
+    return max(separators, key=numbers)
 
 
 def _is_number(cell: str) -> bool:
-    return parse_number(cell) is not None or parse_number(cell, ",") is not None
+    return any(parse_number(cell, mark) is not None for mark in ".,") or cell_unit(cell) is not None
 
 
 def split(line: str, separator: str) -> list[str]:
-    """The fields of one line; quotes are understood."""
+    """The fields of one line; quotes are understood, except between blanks."""
+    if separator in _BLANKS:
+        return _BLANKS[separator].split(line.strip())
     if '"' not in line:
         return line.split(separator)
     try:
@@ -143,30 +133,45 @@ def find_decimal(rows: Sequence[Sequence[str]]) -> str:
     return "," if count[","] > count["."] else "."
 
 
+def _whole(lines: list[str]) -> list[str]:
+    """Lines whose header cells go on over several: the whole row stands in the last one, empty lines before it."""
+    for i in range(min(_TITLE_LINES, len(lines))):
+        if lines[i].count('"') % 2:
+            end = next((k for k in range(i + 1, min(i + 5, len(lines))) if lines[k].count('"') % 2), None)
+            if end is None:
+                break
+            lines[i + 1] = f"{lines[i]} {lines[i + 1]}"
+            lines[i] = ""
+    return lines
+
+
+_TITLE_LINES = 50
 _HEAD_BYTES = 1 << 20
 _BLOCK_BYTES = 4 << 20
 
 
 class CsvSheet(Sheet):
-    """A text file with separators. Encoding, separator and decimal mark are found from its first megabyte."""
+    """A text file with separators. What `form` leaves open is found from the file's first megabyte."""
 
-    def __init__(self, path: Path, hints: Sequence[str]) -> None:
+    def __init__(self, path: Path, hints: Sequence[str], form: Form) -> None:
         self.path = path
         with path.open("rb") as file:
             raw = file.read(_HEAD_BYTES)
             more = bool(file.read(1))
-        self.encoding = find_encoding(raw, hints, path.name)
+        self.encoding = form.encoding or find_encoding(raw, path.name)
         text = raw.decode(self.encoding, "replace")
         self._newline = "\n" if "\n" in text or "\r" not in text else "\r"
         lines = [line.rstrip("\r") for line in text.split(self._newline)]
         lines = lines[:-1] if (more and len(lines) > 1) or not lines[-1] else lines
-        self.separator = find_separator(lines, hints)
+        lines = _whole(lines)
+        below = [*lines[1:], ""]
+        lines = [_COMMENT.sub("", a) if _NUMERIC.match(b) else a for a, b in zip(lines, below, strict=True)]
+        self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))
         self.head = [split(line, self.separator) if line.strip() else [] for line in lines]
-        self.decimal = find_decimal([[c for c in row] for row in self.head])
-        self._quoted = '"' in text
-        names = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar"}
+        self.decimal = form.decimal or find_decimal(self.head)
+        self._quoted = '"' in text and self.separator not in _BLANKS
         mark = "point" if self.decimal == "." else "comma"
-        self.summary = f"{names[self.separator]} separated, decimal {mark}, {self.encoding}"
+        self.summary = f"{_NAMES.get(self.separator, self.separator)} separated, decimal {mark}, {self.encoding}"
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         widths = Counter(len(row) for row in self.head[first_row : first_row + 200] if row)
@@ -181,6 +186,7 @@ class CsvSheet(Sheet):
     def _bytes(self, skip_lines: int) -> Iterator[bytes]:
         """The file below its first lines, as UTF-8 bytes in pieces that end with a line."""
         end = self._newline.encode()
+        blanks = re.compile(_BLANKS.get(self.separator, _BLANKS[" "]).pattern.encode())
         wide = self.encoding.startswith("utf-16")
         decoder = codecs.getincrementaldecoder(self.encoding)("replace") if wide else None
         size = self.path.stat().st_size
@@ -199,6 +205,8 @@ class CsvSheet(Sheet):
                 piece = piece[start:] if start else piece
                 if not wide and not piece.isascii():
                     piece = piece.decode(self.encoding, "replace").encode()
+                if self.separator in _BLANKS:
+                    piece = b"\n".join(b"\t".join(blanks.split(line.strip())) for line in piece.splitlines())
                 if piece:
                     self.share_read = min(1.0, (file.tell() - len(rest)) / size)
                     yield piece
@@ -221,7 +229,9 @@ class CsvSheet(Sheet):
                 pa.BufferReader(lines),
                 read_options=pc.ReadOptions(column_names=names),
                 parse_options=pc.ParseOptions(
-                    delimiter=self.separator, quote_char='"' if self._quoted else False, invalid_row_handler=skip
+                    delimiter="\t" if self.separator in _BLANKS else self.separator,
+                    quote_char='"' if self._quoted else False,
+                    invalid_row_handler=skip,
                 ),
                 convert_options=pc.ConvertOptions(
                     column_types=types,
@@ -259,16 +269,16 @@ class CsvSheet(Sheet):
 
 
 class CsvReader(Reader):
-    """Comma, semicolon, tab or bar; UTF-8, UTF-16, GB18030, Shift-JIS, CP1252; decimal point or comma."""
+    """Comma, semicolon, tab, bar or blanks; UTF-8, UTF-16, GB18030, Shift-JIS, CP1252; decimal point or comma."""
 
     @contextmanager
     def open(self, path: Path, hints: Sequence[str]) -> Iterator[list[Sheet]]:
-        yield [CsvSheet(path, hints)]
+        yield [CsvSheet(path, hints, self.form)]
 
 
 def read_text_table(path: Path) -> list[dict[str, str]]:
     """A small table of text, first row the header: one dict per row. For tables next to recordings, up to 1 MB."""
-    head = CsvSheet(path, ()).head
+    head = CsvSheet(path, (), Form()).head
     rows = [[cell.strip() for cell in row] for row in head if row]
     if not rows:
         return []

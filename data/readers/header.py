@@ -10,7 +10,7 @@ from typing import Any
 from data.errors import InputError
 from data.machine import Machine
 from data.readers.base import Sheet
-from data.readers.cells import parse_number
+from data.readers.cells import parse_number, wall_clock_s
 from data.readers.csv import normalise
 
 _UNIT_ROWS = 3  # rows between header and data that may hold units or descriptions
@@ -34,6 +34,7 @@ class Layout:
     counts: Mapping[str, int] = field(default_factory=dict)
     sweeps: Mapping[str, tuple[tuple[str, float], ...]] = field(default_factory=dict)
     date: int | None = None  # of the dates, where time holds times of day
+    origin_s: float = 0.0  # what the wall clock shows more than the clock of the rows
 
 
 def wanted_columns(machine: Machine) -> dict[str, str | int]:
@@ -82,7 +83,7 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
     header: Sequence[Any] = ()
     row = -1
     if machine.recording.header:
-        row = _header_row(sheet.head, hints(machine), where)
+        row = _header_row(sheet.head[: machine.recording.header_rows], hints(machine), where)
         header = sheet.head[row]
     width = len(header) or max((len(r) for r in sheet.head[-200:]), default=0)
     by_name: dict[str, int] = {}
@@ -128,14 +129,19 @@ def locate(sheet: Sheet, machine: Machine, where: str, need_error: bool = True) 
     ignored = (position(int(c) if c.isdigit() else c) for c in machine.ignore)
     known = {*positions.values(), *(p for p in (at, date, *ignored) if p is not None)}
     named = sum(bool(str(c or "").strip()) for c in header) if header else width
-    first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
+    first = machine.recording.header_rows
+    if first is None:
+        first = _first_data_row(sheet, row + 1, at, list(positions.values()), bool(header))
     counts = {
         "preamble_rows": max(row, 0) if header else first,
         "unit_rows": sum(bool(r) for r in sheet.head[row + 1 : first]) if header else 0,
         "unknown_columns": max(0, named - len(known)),
         "missing_channels": len(wanted) - len(got_channels),
     }
-    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps, date)
+    origin_s = sheet.origin_s
+    if time.unit == "timestamp" and first < len(sheet.head) and at is not None and at < len(sheet.head[first]):
+        origin_s = wall_clock_s(sheet.head[first][at])
+    return Layout(first, at, positions, {k: v for k, v in counts.items() if v}, sweeps, date, origin_s)
 
 
 def _some(names: Sequence[str], n: int = 3) -> str:

@@ -20,6 +20,7 @@ class ParquetSheet(Sheet):
     """One Parquet file; row 0 of `head` are the column names."""
 
     summary = "parquet"
+    first_row = 1
 
     def __init__(self, path: Path, file: Any) -> None:
         self._path = path

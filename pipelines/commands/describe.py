@@ -16,6 +16,7 @@ from data.files import write_atomic
 from pipelines import console
 
 if TYPE_CHECKING:
+    from data.describe import Shown
     from data.machine import Machine
     from reports.layout import Table
     from twin.network import Network
@@ -152,6 +153,13 @@ def describe(
     twin: Annotated[
         Path | None, typer.Option("--twin", help="draw this machine file's thermal network instead")
     ] = None,
+    show: Annotated[
+        bool, typer.Option("--show", help="print the first rows of each column, and what it becomes or why not")
+    ] = False,
+    given: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="a key of the files' layout that overrides what is found, such as header_rows=4"),
+    ] = None,
     at: Annotated[
         list[str] | None, typer.Option("--at", help="with --twin: a driver's value for the heat flows, NAME=VALUE")
     ] = None,
@@ -168,18 +176,35 @@ def describe(
         raise InputError("describe: got nothing to describe; name recordings, or a machine file as --twin MACHINE.yml")
     if at:
         raise InputError(f"--at {at[0]}: belongs to a twin's picture; add --twin MACHINE.yml")
-    from data.describe import draft_machine_file, notes
+    from data.describe import drafted, notes
+    from data.machine import Form
+    from data.yaml_file import parse_yaml
 
-    text = draft_machine_file(files)
-    if to is None:
+    keys = "\n".join(": ".join(text.split("=", 1)) for text in given or ())
+    text, columns = drafted(files, parse_yaml(keys or "{}", Form, "describe --set"))
+    if show:
+        for name, shown in columns.items():
+            _print_columns(name, shown)
+    elif to is None:
         sys.stdout.write(text)
-    else:
+    if to is not None:
         _write(to, text)
         console.line(
             f"{to}: a draft; check every line marked 'guessed', then call `thermodrift ingest --machine {to} …`"
         )
     for note in notes(text):
         console.note(f"check: {note}")
+
+
+def _print_columns(name: str, columns: Sequence[Shown]) -> None:
+    """First cells of each column and what becomes of them."""
+    table = console.table(name)
+    for heading in ("column", "first cells", "read as", "first values"):
+        table.add_column(heading, overflow="fold")
+    for c in columns:
+        values = ", ".join(f"{v:.6g}" for v in c.numbers)
+        table.add_row(*(escape(text) for text in (c.column, ", ".join(c.cells), c.becomes, values)))
+    console.out.print(table)
 
 
 def _write(to: Path, text: str) -> None:

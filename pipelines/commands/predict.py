@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from data.errors import InputError, check_suffix
+from data.units import error_column, in_error_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,11 +90,12 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     """Predicted error of batches, batch after batch; None without any.
 
     Returns:
-        batch_id, time_s (s), for an error along an axis position_mm, predicted_um (µm, relative to the batch's start;
-        NaN where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
+        batch_id, time_s (s), for an error along an axis position_mm, predicted_um (relative to the batch's start; NaN
+        where an input or the position is missing), outside_region (the row extrapolates), outside_of (which
         quantities), distance (in widths of the trained range), of the whole run expected_S_um, bound90_S_um (nine runs
         in ten stay below) and flagged (why the run is unlike those that the bound comes from, empty where it is not),
-        simulated (model or recording), standing (of the model: champion, provisional or refused).
+        unit (of the error; where it is not um, predicted_error, expected_S_error and bound90_S_error take the place of
+        the columns in um), simulated (model or recording), standing (of the model: champion, provisional or refused).
 
     Raises:
         InputError: an input of the model is missing.
@@ -101,6 +103,7 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
     import pandas as pd
 
     tables = []
+    unit = model.machine.channels[model.family.target].unit
     for batch in batches:
         predicted = model.predict(batch)
         outside, distance, run = model.outside(batch), model.distance(batch), model.run_error(batch, predicted)
@@ -109,9 +112,10 @@ def predict_batches(model: StoredModel, batches: Iterable[Batch]) -> pd.DataFram
             "batch_id": batch.batch_id, "time_s": batch.time_s,
             **({"position_mm": batch.masked(along)} if along else {}), "predicted_um": predicted,
             "outside_region": [bool(o) for o in outside], "outside_of": outside, "distance": distance,
-            **run._asdict(), "simulated": model.simulated or batch.simulated, "standing": model.standing,
+            **run._asdict(), "unit": unit, "simulated": model.simulated or batch.simulated, "standing": model.standing,
         }))  # fmt: skip
-    return pd.concat(tables, ignore_index=True) if tables else None
+    names = {n: error_column(n, unit) for n in ("predicted_um", "expected_S_um", "bound90_S_um")}
+    return pd.concat(tables, ignore_index=True).rename(columns=names) if tables else None
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -122,7 +126,9 @@ def summary(table: pd.DataFrame) -> str:
     """
     from reports.labels import count
 
+    unit = str(table["unit"].iloc[0])
     runs = table.groupby("batch_id", sort=False).first()
+    runs = runs.rename(columns={error_column(c, unit): c for c in ("expected_S_um", "bound90_S_um")})
     expected, most = (_between(runs[c]) for c in ("expected_S_um", "bound90_S_um"))
     number = f"expect S {expected}, 90 % below {most}" if expected else "no expected error is stored; train again"
     parts = [f"{count(len(runs), 'run')}: {number}"]
@@ -137,7 +143,7 @@ def summary(table: pd.DataFrame) -> str:
     if (rows := table["outside_region"]).any():
         names = dict.fromkeys(n for text in table.loc[rows, "outside_of"].unique() for n in text.split(", "))
         parts.append(f"{rows.sum()} of {len(rows)} rows are outside the trained range ({', '.join(names)})")
-    return ("warning: " if len(parts) > 1 else "") + "; ".join(parts)
+    return in_error_unit(("warning: " if len(parts) > 1 else "") + "; ".join(parts), unit)
 
 
 def _between(values_um: pd.Series) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from data.errors import InputError
 from pipelines import console
 from pipelines.commands.compensate import MaxOffset, Period, Rate
 from pipelines.options import Json
@@ -27,8 +28,11 @@ def rehearsal_dict(r: Rehearsal) -> dict[str, Any]:
 
 
 def rehearse(
-    models: Annotated[list[str], typer.Argument(help="models:/NAME@champion or a folder, one for each axis")],
     recordings: Annotated[list[Path], typer.Option(help="file or folder; batches that the model has not seen")],
+    models: Annotated[
+        list[str] | None, typer.Argument(help="models:/NAME@champion or a folder, one for each axis")
+    ] = None,
+    model: Annotated[list[str] | None, typer.Option("--model", help="the same, as `predict` takes it")] = None,
     fail: Annotated[
         list[str] | None, typer.Option(help="SENSOR:HOW@START+DURATION, HOW lost, frozen or stepping")
     ] = None,
@@ -60,7 +64,10 @@ def rehearse(
 
     configure_environment()
     settings = load()
-    stored = [load_model(m, settings) for m in models]
+    named = [*(models or ()), *(model or ())]
+    if not named:
+        raise InputError("rehearse: got no model; give --model models:/NAME@champion or a folder, one for each axis")
+    stored = [load_model(m, settings) for m in named]
     machine = stored[0].machine
     check_recordings(recordings)
     batches = [b for path in recordings for b in read_files(machine, path)]
@@ -71,7 +78,7 @@ def rehearse(
             through=through, done=lambda n, of: done("rehearse", n, of),
         )  # fmt: skip
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
-    write_rehearsal(page, r, labelled(models, stored))
+    write_rehearsal(page, r, labelled(named, stored))
     remarks = {m.family.target: m.remark for m in stored if m.remark}
     if as_json:
         console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks})

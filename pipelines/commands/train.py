@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError, one_of
+from data.units import in_error_unit, unit_label
 from pipelines import console
 from pipelines.commands.ingest import ingest_totals, print_findings, print_ingest
 from pipelines.options import Json, MachineFile, names, split
@@ -29,6 +30,7 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
     }
     return {
         "machine": outcome.machine,
+        "units": outcome.units,
         "simulated": outcome.simulated,
         "ingested": ingest_totals(outcome.ingested) if outcome.ingested else None,
         "trainings": outcome.training_ids,
@@ -63,12 +65,13 @@ def print_training(outcome: TrainOutcome) -> None:
         badge = (
             "provisional; " if choice.standing == "provisional" else "no trustworthy model; " if choice.caution else ""
         )
-        console.line(f"{target}: {badge}{expected.summary}")
+        console.line(in_error_unit(f"{target}: {badge}{expected.summary}", outcome.units[target]))
     for target, result in outcome.results.items():
-        _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells)
+        _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target])
     for target, training in outcome.training_ids.items():
         promotion = outcome.promotions.get(target)
-        console.line(promotion.summary if promotion else f"training {target} {training}")
+        said = promotion.summary if promotion else f"training {target} {training}"
+        console.line(in_error_unit(said, outcome.units[target]))
     if outcome.postponed:
         console.line(f"postponed: {outcome.postponed}")
     console.line(f"report   {outcome.report}")
@@ -84,8 +87,8 @@ def _shown_protocol(cells: pd.DataFrame) -> str:
     return next(p for p in PROTOCOLS if p in set(cells["protocol"]))
 
 
-def _print_leaderboard(title: str, cells: pd.DataFrame) -> None:
-    """The best cell of each family, S_mean ± S_std in µm by protocol; the baseline without a model is always shown."""
+def _print_leaderboard(title: str, cells: pd.DataFrame, unit: str) -> None:
+    """The best cell of each family, S_mean ± S_std by protocol; the baseline without a model is always shown."""
     protocols = [p for p in _SHOWN_PROTOCOLS if (cells["protocol"] == p).any()] or [_shown_protocol(cells)]
     keys = ["selector", "family", "n_tsp"]
     rows = cells[cells["protocol"].isin(protocols)]
@@ -93,7 +96,9 @@ def _print_leaderboard(title: str, cells: pd.DataFrame) -> None:
     best = worst.sort_values().reset_index().drop_duplicates("family")
     heads = [_SHOWN_PROTOCOLS.get(p, p) for p in protocols]
     names = ("family", "selector")
-    table = console.table(f"{title}, S mean ± std, µm", *names, "n", *heads, left=names, wrap=names[1:])
+    table = console.table(
+        f"{title}, S mean ± std, {unit_label(unit) or 1}", *names, "n", *heads, left=names, wrap=names[1:]
+    )
     for row in best[(best["family"] == "zero") | best["family"].isin(best["family"].head(SHOWN))].to_dict("records"):
         own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
         scores = [_score(own, p) for p in protocols]
@@ -105,7 +110,9 @@ def _score(own: pd.DataFrame, protocol: str) -> str:
     if protocol not in own.index:
         return "–"
     mean_um, std_um = (float(own[c][protocol]) for c in ("S_mean_um", "S_std_um"))
-    return " ± ".join(f"{v:.2f}" if abs(v) < 9.995 else f"{v:.1f}" for v in (mean_um, std_um))
+    return " ± ".join(
+        f"{v:.2f}" if 0.05 < abs(v) < 9.995 else f"{v:.2g}" if v < 1 else f"{v:.1f}" for v in (mean_um, std_um)
+    )
 
 
 def train(

@@ -21,7 +21,7 @@ from reports.comparison.headline import overview
 from reports.comparison.story import promoted_cell, verdict
 from reports.comparison.tables import group_order, protocols_of, scored
 from reports.labels import count, decimals, family_label, listed, number, selector_label
-from reports.layout import Table
+from reports.layout import Table, with_unit
 from reports.rendering import FORMATS, write_page
 
 _FEW_FINDINGS = 12
@@ -59,7 +59,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     machines = list(dict.fromkeys(t.result.machine for t in trainings))
     newest = [group[0] for group in groups]
     names = [_name(t, len(machines) > 1) for t in newest]
-    channels, rows = [], []
+    channels, rows, units = [], [], []
     for i, (name, group) in enumerate(zip(names, groups, strict=True)):
         protocol = protocols_of(group[0].result)[0]
         cells = scored(group[0].result, protocol)
@@ -69,7 +69,9 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
         digits = decimals(choices[0].S_std_um, choices[0].n_batches)
         said = verdict(name, group[0], choices[0])
         rows.append((name, group[0], choices[0], said, digits))
-        channels.append(channel_part(f"c{i + 1}", name, group, choices, said, rule))
+        units.append(group[0].params.get("unit", "um"))
+        channels.append(with_unit(channel_part(f"c{i + 1}", name, group, choices, said, rule), units[-1]))
+    common = units[0] if len({*units}) == 1 else "its own unit"
     results = [t.result for t in newest]
     simulated = any(t.simulated or t.result.simulated for t in trainings)
     found = records.findings_of(results)
@@ -82,7 +84,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
         machines=listed(machines),
         simulated=simulated,
         facts=_facts(newest, n_batches),
-        overview=overview(rows, simulated) if len(rows) > 1 else None,
+        overview=with_unit(overview(rows, simulated), common) if len(rows) > 1 else None,
         channels=tuple(channels),
         findings_summary=records.findings_summary(found, n_batches),
         findings=many + every,

@@ -139,5 +139,5 @@ def test_a_time_unit_that_squeezes_the_run_is_refused(tmp_path: Path, unit: str,
 
 
 def test_an_error_channel_in_degC_is_refused() -> None:
-    with pytest.raises(InputError, match=r"channel 'z' \(error\) has unit 'degC', a temperature; expected a length"):
+    with pytest.raises(InputError, match=r"channel 'z' \(error\) has unit 'degC'; expected that of a difference"):
         check_canonical({"z": ("error", "degC")}, "machine file toy")

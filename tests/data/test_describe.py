@@ -225,7 +225,16 @@ def test_columns_that_are_no_clock():
     for header, values in (("T9", 20 + np.arange(400) * 1e-4), ("Weg", np.arange(400.0)), ("a", warm),
                            ("a", np.cumsum(rng.exponential(1, 400)))):  # fmt: skip
         body = [[v, 1.0] for v in values.tolist()]
-        sheet = SimpleNamespace(head=[[header, "b"], *body], decimal=".", summary="", name="")
+        sheet = SimpleNamespace(
+            head=[[header, "b"], *body],
+            decimal=".",
+            summary="",
+            name="",
+            units=(),
+            origin_s=0.0,
+            step_s=None,
+            first_row=None,
+        )
         assert look_at(sheet, "test").time is None
 
 

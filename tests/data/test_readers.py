@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from data.errors import InputError
-from data.machine import Machine, parse_machine
+from data.machine import Form, Machine, parse_machine
 from data.readers import READERS, reader_for
 from data.readers.cells import parse_number, stamp_formats
 from data.readers.csv import CsvSheet
@@ -202,9 +202,9 @@ def test_encoding_is_settled_by_the_expected_names(tmp_path):
     path = tmp_path / "run.csv"
     for encoding, names in NAMES.items():
         write_csv(path, names, [(0, 1, 2)], encoding=encoding)
-        head = CsvSheet(path, names).head[0]
+        head = CsvSheet(path, names, Form()).head[0]
         assert tuple(c.strip("\ufeff") for c in head) == names, encoding
-        unaided = CsvSheet(path, ()).head[0]
+        unaided = CsvSheet(path, (), Form()).head[0]
         assert tuple(c.strip("\ufeff") for c in unaided) == names, encoding
 
 
@@ -252,7 +252,7 @@ def test_stamps_with_an_offset_do_not_jump_with_summer_time(tmp_path):
     )
     batch = only(path, machine_for("t", "front", "z", unit="timestamp"))
     assert batch.values("z").tolist() == [1, 2, 3]
-    assert batch.start == pd.Timestamp("2024-10-27 00:59:50")
+    assert batch.start == pd.Timestamp("2024-10-27 02:59:50")  # as the wall clock shows it
 
 
 @pytest.mark.parametrize("unit", ["s", "min", "h"])
@@ -289,13 +289,15 @@ def test_parquet_kinds_of_columns(tmp_path):
     batch = only(tmp_path / "run.parquet", machine_for("t", "front", "z", unit="timestamp"))
     assert batch.values("front").tolist() == list(range(20))  # row 4 is interpolated over 20 s
     assert batch.values("z").tolist() == [i + 0.5 for i in range(20)]
-    assert batch.start == pd.Timestamp("2024-04-30 22:00:00")
+    assert batch.start == pd.Timestamp("2024-05-01 00:00:00")  # as the wall clock shows it
 
 
+LVM = "LabVIEW Measurement\t\nDecimal_Separator\t.\n***End_of_Header***\t\n"
 WRITERS = {
     "csv": lambda table, path: table.to_csv(path, index=False),
     "xlsx": lambda table, path: table.to_excel(path, index=False),
     "parquet": lambda table, path: table.to_parquet(path),
+    "lvm": lambda table, path: path.write_text(LVM + table.to_csv(sep="\t", index=False)),
 }
 CONTRACT = [c for key in READERS for c in check_reader(key, WRITERS[key], generate_only=True)]
 

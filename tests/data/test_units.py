@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from data.units import conversion, convert, known_unit, quantity, seconds
+from data.units import check_canonical, conversion, convert, error_column, in_error_unit, known_unit, quantity, seconds
 
 
 @pytest.mark.parametrize(
@@ -48,3 +48,16 @@ def test_durations(text: str, expected: float) -> None:
 def test_what_is_no_duration(text: str) -> None:
     with pytest.raises(ValueError, match=r"expected a duration above 0 with its unit, such as '60 s'"):
         seconds(text)
+
+
+@pytest.mark.parametrize("unit", ["kg", "V", "mrad", "um/m", "K", "W/m^2"])
+def test_an_error_may_be_of_any_quantity(unit: str) -> None:
+    check_canonical({"z": ("error", unit)}, "machine file m")
+    assert error_column("predicted_um", unit) == "predicted_error" and "\u00b5m a" not in in_error_unit(
+        "5 \u00b5m a run", unit
+    )
+
+
+def test_lengths_keep_their_column_and_text() -> None:
+    assert error_column("predicted_um", "um") == "predicted_um" and in_error_unit("5 \u00b5m", "um") == "5 \u00b5m"
+    assert in_error_unit("S 5 \u00b5m", "kg") == "S 5 kg"

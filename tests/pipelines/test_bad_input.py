@@ -211,7 +211,7 @@ def test_what_is_stored_stays_when_the_source_turns_bad(place: Place) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("step_s:", "stepp_s:", "unknown key 'recording.stepp_s'; did you mean 'step_s'? Allowed: files, header"),
+        ("step_s:", "stepp_s:", "unknown key 'recording.stepp_s'; did you mean 'step_s'? Allowed: decimal"),
         ("resolution: 1,", "resolutoin: 1,", "unknown key 'channels.speed.resolutoin'; did you mean 'resolution'?"),
         ("role: ambient", "role: room", "key 'channels.room.role': got 'room'"),
         ("step_s: 300", "step_s: -1", "key 'recording.step_s': got -1"),
@@ -264,11 +264,10 @@ def test_training_from_one_recording(place: Place) -> None:
     code, _, err = place.call("train", "--machine", place.machine, "--recordings", files[0], "--direct",
                               "--families", "zero", "--selectors", "none")  # fmt: skip
     assert code == 2
-    assert re.fullmatch(
-        rf"{NAME}: got 1 batch\(es\) with a usable [xz], need at least 2; ingest more recordings or overrule a "
-        "check in the machine file",
-        trouble(err),
+    assert trouble(err).startswith(
+        f"{NAME}: got 1 batch(es), {files[0].stem}, need at least 2; ingest more recordings, or"
     )
+    assert "recording.split (driver, pause or every; `thermodrift describe` proposes one)" in trouble(err)
     assert place.lake.batch_ids(NAME) == [files[0].stem]
 
 
@@ -321,10 +320,11 @@ def test_describe_writes_into_a_new_folder_or_says_why_not(place: Place) -> None
 
 def test_describe_of_what_is_no_file(place: Place) -> None:
     code, _, err = place.call("describe", place.folder / "gone.csv")
-    gone = place.folder / "gone.csv"
-    assert (code, trouble(err)) == (2, f"gone.csv: no such file at {gone}; give the path of a recording")
+    assert (code, trouble(err)) == (2, "gone.csv: no such file; give the path of a recording")
     code, _, err = place.call("describe", place.folder)
     assert code == 2
-    assert trouble(err) == f"{place.folder.name}: is a directory, expected recordings; give its files, such as " + (
+    assert trouble(
+        err
+    ) == f"{place.folder.name}: is a directory, expected one recording file; give its files, such as " + (
         f"{place.folder}/*.csv"
     )

@@ -65,7 +65,7 @@ def test_a_raw_file_is_predicted_from_any_folder(promoted, store, tmp_path, monk
         uri = f"runs:/{training_id}/model"
     got = predict_file(uri.format(name=promotion.name, run=training_id), Path("run7.csv"), store)
     assert list(got) == ["batch_id", "time_s", "predicted_um", "outside_region", "outside_of", "distance",
-                         "expected_S_um", "bound90_S_um", "flagged", "simulated", "standing"]  # fmt: skip
+                         "expected_S_um", "bound90_S_um", "flagged", "unit", "simulated", "standing"]  # fmt: skip
     assert np.allclose(got["predicted_um"], law_um(table), atol=1e-6)
     assert not got["outside_region"].any()
     assert got["simulated"].all() and (got["standing"] == "champion").all()

@@ -180,7 +180,7 @@ def test_a_recording_serves_as_a_plan(tmp_path: Path, machine: Machine) -> None:
         ("time_s,spindle_rpm,room\n0,1,20\n60,1\n120,1,20\n", "1 rows have too many or too few cells"),
         ("time_s,spindle_rpm,room\n0,1,20\nx,1,20\n", "data row 2: column 'time_s' holds no readable time"),
         ("time_s,spindle_rpm,room\n0,1,20\n60,on,20\n", "'spindle_rpm' data row 2: got 'on', expected a number in rpm"),
-        ("time_s,spindle_rpm [kg],room\n0,1,20\n60,2,20\n", "column 'spindle_rpm': unknown unit 'kg'"),
+        ("time_s,spindle_rpm [kg],room\n0,1,20\n60,2,20\n", "column 'spindle_rpm': 'kg' is a mass and cannot become"),
         ("time_s,spindle_rpm,room\n0,1,20\n60,9000,20\n", "9000 rpm is outside the channel's range 0 to 8000 rpm"),
         ("time_s,spindle_rpm,room\n0,1,20\n60,,20\n400,,20\n500,1,20\n",
          "no value for 440 s from data row 2 (t = 60 s), more than the 300 s"),
