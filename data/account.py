@@ -123,7 +123,7 @@ def _lost(batch: Batch) -> list[Lost]:
             span = float(batch.time_s[rows[0]]), float(batch.time_s[rows[-1]])
             out.append(Lost(batch.batch_id, name, check, "masked", len(rows), len(rows) / batch.n_rows, *span))
     for f in batch.findings:
-        if f.check in OF_CELLS and f.channel in batch.table.columns:
+        if f.check in OF_CELLS and f.channel is not None and f.channel in batch.table.columns:
             rows = np.flatnonzero(~np.isfinite(batch.values(f.channel)))
             if len(rows):
                 span = float(batch.time_s[rows[0]]), float(batch.time_s[rows[-1]])
