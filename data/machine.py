@@ -236,7 +236,10 @@ class ChannelPart(Section):
 
 
 class Overrule(Section):
-    """An overruled check: matching findings lose their mask; `mask: true` adds a mask instead."""
+    """An overruled check: matching findings lose their mask.
+
+    `mask: true` adds one instead: with `check` over the matching findings, which it confirms; else over the interval
+    """
 
     batch: str = "*"  # id or pattern
     channel: str = "*"  # name or pattern

@@ -86,9 +86,10 @@ class Region:
         return out
 
     def outside(self, batch: Batch, inputs: Sequence[str]) -> dict[str, NDArray[np.bool_]]:
-        """For every watched quantity of the batch the rows (n,) beyond the region by more than 5 % of its width."""
-        with np.errstate(invalid="ignore"):
-            return {name: far > SLACK for name, far in self.beyond(watched(batch, inputs)).items()}
+        """For every watched quantity of the batch the rows (n,) beyond the region by more than 5 % of its width, and of
+        an input those without a value."""
+        far_of = self.beyond(watched(batch, inputs)).items()
+        return {name: (far > SLACK) | ((name in inputs) & np.isnan(far)) for name, far in far_of}
 
     def distance(self, values: Watched) -> Array:
         """The farthest of all quantities, (n,), in widths; 0 inside; NaN where none is recorded."""

@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
+from data.account import Account
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.files import check_folder, staged
@@ -270,7 +271,11 @@ def _diagnosed(
             last = step
 
     work = work or library_diagnosis()
-    return work(machine, batches, seed=seed, processes=os.cpu_count() or 1, progress=progress)
+    d = work(machine, batches, seed=seed, processes=os.cpu_count() or 1, progress=progress)
+    account = Account.of(batches)
+    lost = "".join(account.warning(n) for n in machine.names("error"))
+    stated = {"account": account.as_dict(), "statement": lost + d.findings.statement}
+    return replace(d, findings=d.findings.model_copy(update=stated))
 
 
 def library_diagnosis() -> Diagnose:

@@ -91,7 +91,8 @@ class Served:
             part = table.iloc[rows]
             self._check_step(part["time_s"].to_numpy(float))
             predicted[rows] = self._run(self.model, self.stated["channels"], part)[:, 0]
-            outside[rows] = self._beyond(self._run(self.region, self.stated["watched"], part)) > _SLACK
+            beyond = self._beyond(self._run(self.region, self.stated["watched"], part)) > _SLACK
+            outside[rows] = beyond | np.isnan(predicted[rows])
         return pd.DataFrame({"predicted_um": predicted, "outside_region": outside}, index=table.index)
 
     def _check_step(self, time_s: Any) -> None:

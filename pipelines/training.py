@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine
 from data.errors import InputError, WorkError, check_suffix, closest
@@ -109,6 +110,7 @@ class TrainOutcome:
     machine: str
     simulated: bool
     ingested: IngestReport | None = None
+    account: Account | None = None
     results: dict[str, GridResult] = field(default_factory=dict)
     training_ids: dict[str, str] = field(default_factory=dict)
     choices: dict[str, promotion.Choice] = field(default_factory=dict)
@@ -166,6 +168,7 @@ def train(
     with _naming_quarantine(outcome.ingested):
         batches = load_batches(lake, machine)
         _check_several(batches, machine)
+    outcome.account = Account.of(batches)
     if request.only_if_new and _seen_before(machine.machine, targets, batches, settings):
         outcome.stopped = "the last training saw the same batches; nothing new to learn"
         return outcome

@@ -218,6 +218,9 @@ def overruled(batch: Batch, rules: Sequence[Overrule]) -> Batch:
     for rule in rules:
         if not fnmatchcase(batch.batch_id, rule.batch):
             continue
+        if rule.mask and rule.check != "*":  # confirms what a check found, or masks what it only noted
+            findings += [Finding(USER, f.channel, rule.reason, f.start_s, f.end_s) for f in findings if _meant(f, rule)]
+            continue
         if rule.mask:
             named = [None] if rule.channel == "*" else [n for n in batch.channels if fnmatchcase(n, rule.channel)]
             findings += [Finding(USER, n, rule.reason, rule.start_s, rule.end_s) for n in named]

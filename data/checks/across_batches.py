@@ -9,6 +9,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import THERMAL, Array, Check, in_time, row_medians, smallest_step
+from data.checks.expected import unexplained
 from data.machine import Machine
 
 _BATCHES = 5
@@ -18,16 +19,17 @@ _SIGMAS = 8.0
 
 
 class Offset(Check):
-    """At the start a machine is nearly in equilibrium, so differences between neighbouring sensors repeat.
+    """At its start a machine is nearly in equilibrium, so differences between neighbouring sensors repeat; at its end
+    they repeat within what the load does.
 
-    For each sensor the three others with the steadiest start difference are its neighbours; a batch stands
-    out when the median difference to them is off its median over the batches by 3 K and 8 robust sigma.
-
-    Nothing is masked where the sensor returns during the run by more than half: a part that starts warm.
+    For each sensor the three others with the steadiest difference are its neighbours; a batch stands out when the
+    median difference to them is off its median over the batches by 3 K and 8 robust sigma, at the start or at the end.
+    It is masked where the channel follows the machine as in the other batches only if the straight line between the
+    two is taken off (`unexplained`), and where it does not return: a part that starts warm cools.
     """
 
     key = "offset"
-    summary = "start level far off the neighbours, unlike in other batches"
+    summary = "level far off the neighbours, unlike in other batches"
     common_cause = "a normal state of this part, such as being heated"
 
     def habit(self, batch: Batch, finding: Finding) -> str:
@@ -40,30 +42,39 @@ class Offset(Check):
         start, end = (np.array([[_level(b, n, at_end) for n in names] for b in batches]) for at_end in (False, True))
         found: dict[int, list[Finding]] = {}
         for j, name in enumerate(names):
-            difference = start[:, [j]] - np.delete(start, j, axis=1)
-            enough = np.isfinite(difference).sum(axis=0) >= _BATCHES
-            if not enough.any():
+            (first, limit, repeat), (last, most, _) = _off(start, j), _off(end, j)
+            far = np.flatnonzero((np.abs(first) > limit) | (np.abs(last) > most)).tolist()
+            if not far:
                 continue
-            difference = difference[:, enough]
-            centred = difference - np.nanmedian(difference, axis=0)
-            spread = 1.4826 * np.nanmedian(np.abs(centred), axis=0)
-            near = np.argsort(spread, kind="stable")[:_NEIGHBOURS]
-            limit = max(_FLOOR_K, _SIGMAS * float(np.median(spread[near])))
-            off = np.nan_to_num(row_medians(centred[:, near]))
-            far = np.abs(off) > limit
-            if not far.any():
-                continue
-            moved = row_medians(((end - start)[:, [j]] - np.delete(end - start, j, axis=1))[:, enough][:, near])
-            back = -np.sign(off) * np.nan_to_num(moved - np.nanmedian(moved)) > 0.5 * np.abs(off)
-            for k in np.flatnonzero(far):
+            as_read = np.abs(unexplained(batches, name, far))
+            corrected = np.abs(unexplained(batches, name, far, [(first[k], last[k]) for k in far]))
+            for k, read, line in zip(far, as_read.tolist(), corrected.tolist(), strict=True):
+                starts = abs(first[k]) > limit
+                stays = abs(last[k]) > (0.5 * abs(first[k]) if starts else most)
+                masks = stays and read > _FLOOR_K and line < read / (3.0 if starts else 10.0)  # load moves an end
+                if not starts and not masks:
+                    continue  # an end that the machine explains
                 message = (
-                    f"{name} starts {off[k]:+.1f} K off its level relative to its neighbours in the other batches "
-                    f"(they repeat within {float(np.median(spread[near])):.2f} K)"
+                    f"{name} {'starts' if starts else 'ends'} {first[k] if starts else last[k]:+.1f} K off its level "
+                    f"relative to its neighbours in the other batches (they repeat within {repeat:.2f} K)"
                 )
-                if back[k]:
-                    message += "; it returns during the run, so the part was warm or cold at the start: not masked"
-                found.setdefault(int(k), []).append(self.finding(name, message, masks=not back[k]))
+                if not masks:
+                    message += "; it then moves as the machine does, so the part was warm or cold: not masked"
+                found.setdefault(k, []).append(self.finding(name, message, masks=masks))
         return found
+
+
+def _off(level: Array, j: int) -> tuple[Array, float, float]:
+    """Level of sensor j in (batches, sensors) relative to its neighbours and to the other batches, K; limit, spread."""
+    difference = level[:, [j]] - np.delete(level, j, axis=1)
+    difference = difference[:, np.isfinite(difference).sum(axis=0) >= _BATCHES]
+    if not difference.shape[1]:
+        return np.zeros(len(level)), np.inf, np.inf
+    centred = difference - np.nanmedian(difference, axis=0)
+    spread = 1.4826 * np.nanmedian(np.abs(centred), axis=0)
+    near = np.argsort(spread, kind="stable")[:_NEIGHBOURS]
+    repeat = float(np.median(spread[near]))
+    return np.nan_to_num(row_medians(centred[:, near])), max(_FLOOR_K, _SIGMAS * repeat), repeat
 
 
 def _level(batch: Batch, name: str, at_end: bool) -> float:

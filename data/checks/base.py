@@ -23,13 +23,6 @@ from data.machine import Machine
 Bools = NDArray[np.bool_]
 
 EQUAL = 1e-9  # resampling leaves rounding errors in a repeated value
-# exchanges that leave the median in the middle (Devillard 1998, after Paeth 1990): 4 times faster than sorting
-_MEDIAN_7 = ((0, 5), (0, 3), (1, 6), (2, 4), (0, 1), (3, 5), (2, 6), (2, 3), (3, 6), (4, 5), (1, 4), (1, 3), (3, 4))
-_MEDIAN_9 = (
-    (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6), (1, 4),
-    (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
-)  # fmt: skip
-_EXCHANGES = {3: _MEDIAN_7, 4: _MEDIAN_9}
 
 
 class Signals:
@@ -126,22 +119,7 @@ def excess(values: Array, half: int = 4) -> Array:
 
 def rolling_median(values: Array, half: int, least: int = 1) -> Array:
     """Median of the finite values in rows ± half, shape (n,); NaN where fewer than `least` are finite."""
-    n, size = len(values), 2 * half + 1
-    if n < 2 * size or half not in _EXCHANGES or not np.isfinite(values).all():
-        return pd.Series(values).rolling(size, center=True, min_periods=least).median().to_numpy()
-    rows = [values[k : n - 2 * half + k].copy() for k in range(size)]
-    spare = np.empty_like(rows[0])
-    for a, b in _EXCHANGES[half]:
-        low, high = rows[a], rows[b]
-        np.minimum(low, high, out=spare)
-        np.maximum(low, high, out=high)
-        rows[a], spare = spare, low
-    out = np.full(n, np.nan)
-    out[half : n - half] = rows[half]
-    for k in range(max(0, least - half - 1), half):
-        out[k] = np.median(values[: k + half + 1])
-        out[n - 1 - k] = np.median(values[n - 1 - k - half :])
-    return out
+    return pd.Series(values).rolling(2 * half + 1, center=True, min_periods=least).median().to_numpy()
 
 
 def _any_run(flags: Bools, length: int) -> Bools:
@@ -160,7 +138,6 @@ THERMAL = ("temperature", "ambient")
 SIGMAS = 8.0  # a clean year has some 1e6 samples; 8 sigma leaves room for tails heavier than Gaussian
 STEPS = 5.0  # resolution steps that no rounding explains
 THIN_S = 10.0  # a sensor's own mass and a logger's filter spread a step over seconds
-SETTLE_S = 600.0  # after a start, stop or speed change the machine may move as fast as it likes
 
 
 class Check:
@@ -269,23 +246,6 @@ def row_medians(values: Array) -> Array:
 def smallest_step(batch: Batch, name: str) -> float:
     """The stated resolution, else 0."""
     return batch.channels[name].resolution or 0.0
-
-
-def load_changes(batch: Batch) -> Bools:
-    """Rows where a driver changes and the SETTLE_S after, and the batch's first SETTLE_S; shape (n,)."""
-    settle = max(2, int(np.ceil(SETTLE_S / batch.step_s))) if batch.step_s else 2
-    hit = np.zeros(batch.n_rows, bool)
-    hit[:1] = True
-    for name in batch.names("driver"):
-        v = np.nan_to_num(batch.values(name), nan=0.0)
-        span = float(np.ptp(v)) if len(v) else 0.0
-        if span > 0:
-            hit[1:] |= np.abs(np.diff(v)) > 0.05 * span
-    near = np.zeros(batch.n_rows + 1, np.int64)  # +1 where a stretch begins, -1 behind its end
-    rows = np.flatnonzero(hit)
-    np.add.at(near, np.maximum(rows - 1, 0), 1)
-    np.add.at(near, np.minimum(rows + settle + 1, batch.n_rows), -1)
-    return np.cumsum(near[:-1]) > 0
 
 
 def standing(batch: Batch) -> Bools:

@@ -15,20 +15,18 @@ from data.checks.base import (
     Check,
     constant_runs,
     in_time,
-    row_medians,
     signals,
     smallest_step,
     span_text,
     standing,
 )
+from data.checks.expected import movement, unexplained
 from data.checks.steps import JumpNoReturn, Spike
 from data.machine import Machine
 
 _STEPS = 30.0
 _FLOOR_K = 3.0
 _BATCHES = 5
-_NEIGHBOURS = 3
-_STEADY = 4.0
 
 
 class Dead(Check):
@@ -36,8 +34,8 @@ class Dead(Check):
 
     Within one batch: constant while the median of the others moves by 3 K and 30 of its resolution steps.
 
-    Against other batches: it moves by less than a tenth of what the three others with the steadiest ratio to it
-    let expect, where that ratio is steady (four times its scatter below 1).
+    Against other batches: it moves by less than a tenth of the median batch, and not as the drivers and the other
+    channels let expect from the other batches (`unexplained`).
     """
 
     key = "dead"
@@ -66,34 +64,23 @@ class Dead(Check):
         return high - low
 
     def across(self, batches: Sequence[Batch], machine: Machine) -> dict[int, list[Finding]]:
-        names = batches[0].names(*THERMAL) if batches else ()
-        if len(batches) < _BATCHES or len(names) < 3:
+        if len(batches) < _BATCHES:
             return {}
-        moved = np.array([[_range_K(b.masked(n)) if n in b.channels else np.nan for n in names] for b in batches])
         found: dict[int, list[Finding]] = {}
-        for j, name in enumerate(names):
-            rest = np.delete(moved, j, axis=1)
-            ratio = moved[:, [j]] / np.where(rest > 0, rest, np.nan)
-            enough = np.isfinite(ratio).sum(axis=0) >= _BATCHES
-            if not enough.any():
-                continue
-            ratio, rest = ratio[:, enough], rest[:, enough]
-            usual = np.nanmedian(ratio, axis=0)
-            scatter = 1.4826 * np.nanmedian(np.abs(ratio / np.maximum(usual, 1e-9) - 1.0), axis=0)
-            near = np.argsort(scatter, kind="stable")[:_NEIGHBOURS]
-            if _STEADY * float(np.median(scatter[near])) > 1.0:
-                continue
-            expected = row_medians(usual[near] * rest[:, near])
+        for name in batches[0].names("temperature"):
+            moved = np.array([_range_K(b.masked(name)) if name in b.channels else np.nan for b in batches])
+            usual = float(np.nanmedian(moved)) if np.isfinite(moved).any() else 0.0
             least = max(_FLOOR_K, _STEPS * smallest_step(batches[0], name))
-            for k, batch in enumerate(batches):
-                if any(f.check == self.key and f.channel == name for f in batch.findings):
+            still = np.flatnonzero(moved < 0.1 * usual).tolist() if usual > least else []
+            left = np.abs(unexplained(batches, name, still)) if still else ()
+            for k in [k for k, unmoved in zip(still, left, strict=True) if unmoved > usual]:
+                if any(f.check == self.key and f.channel == name for f in batches[k].findings):
                     continue
-                if expected[k] > least and moved[k, j] < 0.1 * expected[k]:
-                    message = (
-                        f"{name} moves by {moved[k, j]:.1f} K where its neighbours let expect {expected[k]:.1f} K from "
-                        "the other batches"
-                    )
-                    found.setdefault(k, []).append(self.finding(name, message))
+                message = (
+                    f"{name} moves by {moved[k]:.1f} K; by the drivers and the other channels it should move far more, "
+                    f"as in the other batches ({usual:.1f} K in the median batch)"
+                )
+                found.setdefault(k, []).append(self.finding(name, message))
         return found
 
 
@@ -168,8 +155,9 @@ class Frozen(Check):
         steps = d[outside & (np.abs(d) > 1e-9)]
         turning = float((steps[1:] * steps[:-1] < 0).mean()) if len(steps) > 10 else 0.0
         # a sensor that rounding holds for minutes may rest for an hour when the machine comes to rest
-        coarse = _STEP_OF_NOISE * (batch.channels[name].resolution or np.inf)
-        noisy = changing > 0.5 and len(steps) > 10 and float((np.abs(steps) > coarse).mean()) > _WIDE
+        coarse = np.abs(steps) > _STEP_OF_NOISE * (batch.channels[name].resolution or np.inf)
+        there_and_back = coarse[1:] & coarse[:-1] & (steps[1:] * steps[:-1] < 0)
+        noisy = changing > 0.5 and len(steps) > 10 and float(there_and_back.mean()) > _WIDE
         if (
             not (changing > _RESTLESS or noisy)
             or turning < _TURNING
@@ -185,22 +173,10 @@ class Frozen(Check):
         least, own = max(_FLAT_STEPS * smallest_step(batch, name), _FLOOR.get(unit, 0.0)), _own_movement(v, a, b)
         if own < least:
             return ""
-        seen = signals(batch)
-        inputs = [n for n in batch.names(*THERMAL) if n != name and n not in witnesses.jumping]
-        x = np.column_stack([seen.values(n) for n in inputs]) if inputs else np.empty((len(v), 0))
-        x = x[:, np.isfinite(x).all(axis=0) & (np.ptp(np.nan_to_num(x), axis=0) > 0)]
-        out = np.isfinite(v)
-        out[a : b + 1] = False
-        if x.shape[1] < 2 or out.sum() < max(30, b - a):
-            return ""
-        centre, scale = x[out].mean(axis=0), x[out].std(axis=0) + 1e-9
-        z = (x - centre) / scale
-        gram = z[out].T @ z[out] + 0.01 * out.sum() * np.eye(z.shape[1])
-        fit = z @ np.linalg.solve(gram, z[out].T @ (v[out] - v[out].mean()))
-        sigma = float(np.std(v[out] - v[out].mean() - fit[out]))
-        moved = float(np.ptp(fit[a : b + 1]))
-        least = max(least, _SIGMAS * sigma)
-        if moved < least or own < least:
+        if batch.time_s[max(a - 1, 0)] <= (witnesses.jumping.get(name) or -1.0) <= batch.time_s[a + 1]:
+            return ""  # it rests after a jump, which has a check of its own
+        moved, noise = movement(batch, name, a, b, witnesses.jumping)
+        if moved < max(least, _SIGMAS * noise):
             return ""
         return f"the other temperatures predict a change of {moved:.1f} {'K' if unit == 'degC' else unit} in this time"
 
@@ -212,8 +188,10 @@ class _Witnesses:
         self._batch, self._machine = batch, machine
 
     @cached_property
-    def jumping(self) -> set[str | None]:
-        return {f.channel for check in (JumpNoReturn(), Spike()) for f in check.batch(self._batch, self._machine)}
+    def jumping(self) -> dict[str | None, float | None]:
+        """Channel -> start of its first spike or jump, s."""
+        found = (f for check in (Spike(), JumpNoReturn()) for f in check.batch(self._batch, self._machine))
+        return {f.channel: f.start_s for f in found}
 
 
 def _own_movement(v: Array, a: int, b: int) -> float:
@@ -239,14 +217,14 @@ def _slope(v: Array) -> float:
 _HELD_ROWS = 5
 _HELD_SECONDS = 600.0
 _HELD_CHANCE = 1e-6
-_MOVED_K = 1.0
+_SHOWN = 2.0  # steps of the display: by so much the temperatures must let it move to contradict a value that rests
 
 
 class ErrorHeld(Check):
-    """Every error channel repeats one value, all together, while temperatures move on.
+    """Every error channel repeats one value, all together, while the temperatures let expect a change (`movement`).
 
     With p the share of rows where any error channel changes outside the stretch, n equal rows have the chance
-    (1 − p)^n; below 1e-6, with 1 K or more of temperature change meanwhile, nothing was measured.
+    (1 − p)^n; below 1e-6, with an expected change above its noise and two steps of the display, nothing was measured.
     """
 
     key = "error_held"
@@ -282,10 +260,11 @@ class ErrorHeld(Check):
                 if len(there) < 2:
                     continue
                 last = a + int(there[-1])
-                moved = _temperature_change(batch, a, last)
+                moved, _ = movement(batch, name, a, b)
+                unit = batch.channels[name].unit
                 message = (
-                    f"{name} repeats {batch.values(name)[a]:.1f} {batch.channels[name].unit} "
-                    f"{span_text(batch, a, last)} {state}, while temperatures change by up to {moved:.1f} K"
+                    f"{name} repeats {batch.values(name)[a]:.1f} {unit} {span_text(batch, a, last)} {state}, while the "
+                    f"temperatures let expect a change of {moved:.1f} {unit}"
                 )
                 found.append(self.finding(name, message, float(batch.time_s[a + 1]), float(batch.time_s[last])))
         return found
@@ -310,21 +289,10 @@ class ErrorHeld(Check):
         changing = float(np.nanmean(np.diff(code)[outside] > 0)) if outside.sum() > 20 else 0.5
         if n * np.log(max(1.0 - changing, 1e-3)) > np.log(_HELD_CHANCE):
             return False
-        coarse = max(smallest_step(batch, name) for name in names)
-        if _temperature_change(batch, a, b) < max(_MOVED_K, coarse):
+        moved = ((movement(batch, name, a, b), _SHOWN * smallest_step(batch, name)) for name in names)
+        if not any(change > max(noise, shown) for (change, noise), shown in moved):
             return False
         if still[a + 1 : b].mean() > 0.5:
             return True
         others = [d - c for c, d in runs if d - c < n / 2]
         return len(names) > 1 and n > 3 * max(others, default=_HELD_ROWS)
-
-
-def _temperature_change(batch: Batch, a: int, b: int) -> float:
-    """Largest net change of a temperature over rows a..b, K."""
-    changes = [0.0]
-    for name in batch.names(*THERMAL):
-        v = batch.masked(name)[a : b + 1]
-        v = v[np.isfinite(v)]
-        if len(v) > 1 and batch.channels[name].role == "temperature":
-            changes.append(abs(float(v[-1] - v[0])))
-    return max(changes)

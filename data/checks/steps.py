@@ -14,7 +14,6 @@ from data.checks.base import (
     Signals,
     clock,
     in_time,
-    load_changes,
     robust_sigma,
     rolling_median,
     signals,
@@ -22,6 +21,7 @@ from data.checks.base import (
     thinned,
     widened,
 )
+from data.checks.expected import Expected
 from data.machine import Machine
 
 _FLOOR = {"temperature": 1.0, "ambient": 3.0, "error": 8.0}  # K, K, µm: below, air and slip can do it
@@ -31,8 +31,8 @@ _HALF = 3  # rows on either side
 
 
 class Spike(Check):
-    """One or two samples that leave and come back: off the median of the seven rows around by 8 sigma,
-    5 resolution steps, three times the liveliest tenth of the channel and 1 K (air 3 K) or 8 µm.
+    """One or two samples that leave and come back: off the median of the seven rows around by 8 sigma, 5 resolution
+    steps and 1 K (air 3 K) or 8 µm, which drivers and the other channels do not explain (`Expected`).
     """
 
     key = "spike"
@@ -40,27 +40,30 @@ class Spike(Check):
 
     def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
         seen = signals(batch)
-        names = in_time(batch, "temperature", "ambient", "error")
-        # a deviation of the floor from the rows around takes at most three steps
-        names = tuple(n for n in names if seen.largest_step(n) * _HALF > _FLOOR[batch.channels[n].role])
-        loaded = load_changes(batch) if names else np.zeros(0, bool)
         found = []
-        for name in names:
+        for name in in_time(batch, "temperature", "ambient", "error"):
             channel, v = batch.channels[name], seen.values(name)
+            least = _FLOOR[channel.role]
+            # a deviation of the floor from the rows around takes at most three steps
+            if seen.largest_step(name) * _HALF <= least:
+                continue
             off = np.abs(v - rolling_median(v, _HALF, least=4))
-            quiet = off[np.isfinite(off) & ~loaded]
+            quiet = off[np.isfinite(off)]
             if len(quiet) < 12:
                 continue
             limit = max(
                 SIGMAS * robust_sigma(quiet, channel.resolution),
                 STEPS * (channel.resolution or 0.0),
                 _TYPICAL * float(np.quantile(quiet, 0.9)),
-                _FLOOR[channel.role],
+                least,
             )
-            with np.errstate(invalid="ignore"):
-                hit = [int(r) for r in np.flatnonzero((off > limit) & ~loaded)]
-            rows = [r for r in hit if self._single(r, set(hit)) and self._comes_back(v, r, off[r])]
+            hit = set(np.flatnonzero(np.nan_to_num(off) > limit).tolist())
+            rows = [r for r in sorted(hit) if self._single(r, hit) and abs(_net(seen.excess(name), r)) < 0.5 * off[r]]
+            rows = [r for r in rows if off[r] > 0.5 * np.nanmax(off[max(r - 1, 0) : r + 2])]  # a slope moves the median
+            expected = Expected(batch, name) if rows else None
             for r in rows:
+                if expected is None or not expected.contradicts(r - 1 if r - 1 in hit else r, least):
+                    continue
                 unit = "K" if channel.unit == "degC" else channel.unit
                 message = (
                     f"{name} reads {v[r]:.5g} {channel.unit} at {clock(batch.time_s[r])}, {off[r]:.1f} {unit} off the "
@@ -78,30 +81,19 @@ class Spike(Check):
             last += 1
         return last - first + 1 <= _ROWS
 
-    @staticmethod
-    def _comes_back(v: np.ndarray, row: int, size: float) -> bool:
-        """The rows on both sides agree with each other: a sample at the end of a slope is none."""
-        before, after = v[max(0, row - 4) : max(0, row - 1)], v[row + 2 : row + 5]
-        before, after = before[np.isfinite(before)], after[np.isfinite(after)]
-        return bool(len(before) and len(after) and abs(np.median(after) - np.median(before)) < 0.5 * size)
 
-
-_RATE_K_PER_MIN = 8.0  # 1 kW into the smallest instrumented body, about 7.5 kJ/K
-_FLOOR_K = 1.0  # less is within what a draught or a splash of coolant does
-_FLOOR_UM = 12.0  # slip of a joint and the shift of a spindle with speed stay below 10 µm
+_LEAST = {"temperature": 1.0, "error": 12.0}  # K: a draught, a splash of coolant; µm: slip of a joint, a speed shift
 _BACK_S = 900.0
-_MOST = 0.6
 
 
 class JumpNoReturn(Check):
-    """A step beyond noise, resolution and the channel's own liveliness, away from driver changes and not
-    shared by others; or a temperature that rises faster than noise and 1 kW into 7.5 kJ/K explain. Masked from the
-    first odd step to the batch's end, or to the step that brings it back. A fast recording is checked row by row and
-    over 10 s, where a step spread over seconds shows.
+    """A step beyond noise, resolution and the channel's own liveliness, not shared by others, which the drivers and the
+    other channels do not explain (`Expected`). Masked from the first odd step to the batch's end, or to the step that
+    brings it back. A fast recording is checked row by row and over 10 s, where a step spread over seconds shows.
     """
 
     key = "jump_no_return"
-    summary = "a step of one channel that noise, load and neighbours do not explain"
+    summary = "a step of one channel that noise, drivers and the other channels do not explain"
     common_cause = "the time unit (recording.time.unit: {0.recording.time.unit}) or a normal event of this machine"
 
     def habit(self, batch: Batch, finding: Finding) -> str:
@@ -121,76 +113,43 @@ class JumpNoReturn(Check):
 
     def _at(self, batch: Batch) -> list[Finding]:
         seen = signals(batch)
-        names = in_time(batch, "temperature", "error")
+        names = in_time(batch, *_LEAST)
         # a step less the median step around it is at most twice the largest step: the others cannot be odd
-        able = [n for n in names if seen.largest_step(n) > _floor(batch, n) / 2.0]
-        if batch.n_rows < 12 or not able:
+        able = [n for n in names if seen.largest_step(n) > _LEAST[batch.channels[n].role] / 2.0]
+        if batch.n_rows < 12:
             return []
-        loaded = load_changes(batch)
-        steps = {n: seen.excess(n) for n in able}
-        odd = {n: np.abs(np.nan_to_num(steps[n])) > self._limit(batch, n, steps[n], loaded) for n in able}
+        odd = {n: np.abs(np.nan_to_num(seen.excess(n))) > self._limit(batch, n, seen) for n in able}
         found = []
         for name in able:
             role = batch.channels[name].role
             same = [n for n in names if n != name and batch.channels[n].role == role]
             shared = np.sum([_near(odd[n]) for n in same if n in odd], axis=0, initial=0)
             # one companion is still a pair of wires in one plug; two are the machine itself
-            alone = odd[name] & (shared < max(2, 0.2 * len(same)))
-            alone &= ~loaded | (
-                np.abs(np.nan_to_num(steps[name])) > self._loaded_limit(batch, name, steps[name], loaded)
-            )
-            alone &= _grows(seen.values(name))
-            if role == "temperature":
-                # what most sensors do together is no sensor's fault: the recording was interrupted
-                alone |= self._too_fast(batch, name, seen) & (shared < max(2, _MOST * len(same)))
-            row = self._staying(seen.values(name), steps[name], alone)
-            if row is not None:
-                found.append(self._finding_at(batch, name, row, seen))
+            alone, e = odd[name] & (shared < max(2, 0.2 * len(same))), seen.excess(name)
+            rows = [r for r in np.flatnonzero(alone).tolist() if abs(_net(e, r)) > 0.5 * abs(e[r])]
+            expected = Expected(batch, name) if rows else None
+            for row in rows:
+                if expected and expected.contradicts(row, _LEAST[role]):
+                    found.append(self._finding_at(batch, name, row, seen, expected))
+                    break
         return found
 
-    def _limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
-        channel = batch.channels[name]
-        quiet = np.abs(e[~loaded & np.isfinite(e)])
-        lively = float(np.quantile(quiet, 0.9)) if len(quiet) else 0.0
-        floor = _floor(batch, name)
-        if channel.role == "error" and not batch.names("driver"):
-            floor *= 3.0  # starts and stops are then unknown
-        return max(step_limit(quiet, channel.resolution), _TYPICAL * lively, floor)
+    @staticmethod
+    def _limit(batch: Batch, name: str, seen: Signals) -> float:
+        channel, e = batch.channels[name], seen.excess(name)
+        known = np.abs(e[np.isfinite(e)])
+        lively = float(np.quantile(known, 0.9)) if len(known) else 0.0
+        return max(step_limit(known, channel.resolution), _TYPICAL * lively, _LEAST[channel.role])
 
-    def _loaded_limit(self, batch: Batch, name: str, e: Array, loaded: Bools) -> float:
-        """After a load change: three times the floor and the channel's own liveliness in such rows."""
-        rows = np.abs(e[loaded & np.isfinite(e)])
-        lively = float(np.quantile(rows, 0.9)) if len(rows) else 0.0
-        return _TYPICAL * max(lively, _floor(batch, name))
-
-    def _too_fast(self, batch: Batch, name: str, seen: Signals) -> Bools:
-        v, resolution = seen.values(name), batch.channels[name].resolution or 0.0
-        # from row to row of a fast recording the machine moves less than noise and draughts do
-        limit = max(_RATE_K_PER_MIN * batch.step_s / 60.0, _FLOOR_K) + 3.0 * resolution
-        limit = max(limit, SIGMAS * robust_sigma(seen.excess(name), resolution))
-        with np.errstate(invalid="ignore"):
-            return np.concatenate([[False], np.abs(np.diff(v)) > limit])
-
-    def _staying(self, v: Array, e: Array, alone: Bools) -> int | None:
-        """The first odd row whose step is still there two rows later; one that returns at once is a spike."""
-        for row in np.flatnonzero(alone):
-            after = v[row + 2 : row + 5]
-            after = after[np.isfinite(after)]
-            before = v[max(0, row - 4) : row]
-            before = before[np.isfinite(before)]
-            if len(after) and len(before) and abs(np.median(after) - np.median(before)) > 0.5 * abs(e[row]):
-                return int(row)
-        return None
-
-    def _finding_at(self, batch: Batch, name: str, row: int, seen: Signals) -> Finding:
+    def _finding_at(self, batch: Batch, name: str, row: int, seen: Signals, expected: Expected) -> Finding:
         channel, t, e = batch.channels[name], batch.time_s, seen.excess(name)
         unit = "K" if channel.unit == "degC" else channel.unit
         v = seen.values(name)
         small = step_limit(e, channel.resolution)
         earliest = max(0, row - int(_BACK_S / batch.step_s)) + 1
         with np.errstate(invalid="ignore"):
-            odd = np.flatnonzero(np.abs(e[earliest : row + 1]) > small)
-        first = earliest + int(odd[0]) if len(odd) else row
+            odd = (earliest + np.flatnonzero(np.abs(e[earliest:row]) > small)).tolist()
+        first = next((r for r in odd if expected.contradicts(r, small)), row)
         settled = min(len(v) - 1, row + max(3, int(_BACK_S / batch.step_s)))
         tail = v[row : settled + 1]
         size = float(tail[np.isfinite(tail)][-1] - v[first - 1])
@@ -198,15 +157,16 @@ class JumpNoReturn(Check):
         back = back[back > row + 1]
         end = int(back[0]) - 1 if len(back) else None
         message = (
-            f"{name} steps by {size:+.1f} {unit} at {clock(t[row])}, which noise ({small / 8:.2g} {unit}), load and "
+            f"{name} steps by {size:+.1f} {unit} at {clock(t[row])}, which noise ({small / 8:.2g} {unit}), drivers and "
             "the other channels do not explain, and "
         )
         message += "does not return" if end is None else f"comes back at {clock(t[end])}"
         return self.finding(name, message, float(t[first]), None if end is None else float(t[end]))
 
 
-def _floor(batch: Batch, name: str) -> float:
-    return _FLOOR_UM if batch.channels[name].role == "error" else _FLOOR_K
+def _net(e: Array, row: int) -> float:
+    """What an odd step and the rows next to it add up to: the step where it stays, nothing where it comes back."""
+    return float(np.nansum(e[max(row - 1, 0) : row + 3]))
 
 
 def _near(flags: Bools) -> Bools:
@@ -215,12 +175,3 @@ def _near(flags: Bools) -> Bools:
     out[1:] |= flags[:-1]
     out[:-1] |= flags[1:]
     return out
-
-
-def _grows(v: Array) -> Bools:
-    """Rows whose step is twice those of the rows before: what follows a load change only dies away."""
-    step = np.abs(np.nan_to_num(np.diff(v, prepend=v[:1])))
-    before = np.zeros_like(step)
-    before[2:] = step[:-2]
-    before[3:] = np.maximum(before[3:], step[:-3])
-    return step > 2.0 * before

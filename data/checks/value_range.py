@@ -6,6 +6,7 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks.base import (
+    EQUAL,
     THERMAL,
     Array,
     Check,
@@ -34,8 +35,9 @@ class OutOfRange(Check):
             if least >= channel.low and most <= channel.high:
                 continue
             v = batch.masked(name)  # an infinite value is out of range as well
+            rounded = _rounded(v)
             with np.errstate(invalid="ignore"):
-                out = (v < channel.low) | (v > channel.high)
+                out = (v < channel.low - rounded) | (v > channel.high + rounded)
             for a, b in stretches(out):
                 worst = v[a : b + 1][np.argmax(np.abs(v[a : b + 1] - 0.5 * (channel.low + channel.high)))]
                 found.append(
@@ -48,6 +50,13 @@ class OutOfRange(Check):
                     )
                 )
         return found
+
+
+def _rounded(values: Array) -> float:
+    """What rounding to the decimals that all values have can add to one of them; 0 for more than three decimals."""
+    known = values[np.isfinite(values)]
+    decimals = next((k for k in range(4) if np.abs(known - np.round(known, k)).max(initial=0.0) < EQUAL), None)
+    return 0.0 if decimals is None else 0.5 * 10.0**-decimals
 
 
 _ROWS = 5
@@ -189,9 +198,8 @@ class WrongUnit(Check):
 
 
 def _start(values: Array) -> float:
-    if len(ok := _finite(values[:50])) < 5:
-        ok = _finite(values)
-    return float(np.median(ok[:5])) if len(ok) else float("nan")
+    """The least of the first five values: a part that is heated at once starts where it was."""
+    return float(_finite(values)[:5].min(initial=np.inf)) if np.isfinite(values).any() else float("nan")
 
 
 def _finite(values: Array) -> Array:

@@ -148,6 +148,7 @@ class Findings(_Part):
     drafted: bool = False
     remarks: tuple[str, ...] = ()
     refinements: tuple[Refinement, ...] = ()
+    account: Mapping[str, Any] = {}  # rows read and dropped, and what each check took of each channel and batch
 
     @classmethod
     def from_json(cls, raw: Any, where: str = "findings") -> Findings:

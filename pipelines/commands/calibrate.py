@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from data.account import Account
 from data.errors import InputError
 from pipelines import console
 from pipelines.caller import Done, Say
@@ -48,6 +49,7 @@ class CalibrationOutcome:
     calibration: Calibration
     out: Path
     when: str
+    account: Account
     report: Path | None = None
 
 
@@ -78,13 +80,13 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: Done) -> Calibra
     found = calibrate(machine, batches, options, progress)
     when = write_calibrated(found, text, request.machine_file, request.out, request.overwrite)
     if not request.report:
-        return CalibrationOutcome(found, request.out, when)
+        return CalibrationOutcome(found, request.out, when, Account.of(batches))
     from reports.twin.page import twin_data, write_twin_report
 
     say("pictures")
     page = request.out.with_suffix(".html")
     write_twin_report(page, twin_data(machine, batches, found))
-    return CalibrationOutcome(found, request.out, when, page)
+    return CalibrationOutcome(found, request.out, when, Account.of(batches), page)
 
 
 def check_calibrated(machine_file: Path, out: Path, overwrite: bool) -> tuple[Machine, str]:
@@ -149,6 +151,7 @@ def calibration_dict(outcome: CalibrationOutcome) -> dict[str, Any]:
         "when": outcome.when,
         "report": str(outcome.report) if outcome.report else None,
         "batches": list(c.batches),
+        "account": outcome.account.as_dict(),
         "fit": {"words": c.fit.message, "converged": c.fit.converged, "cost": c.fit.cost, "rows": c.fit.rows,
                 "dof": c.fit.dof, "at_bound": list(c.fit.at_bound)},
         "parameters": [
@@ -175,6 +178,7 @@ def print_calibration(outcome: CalibrationOutcome) -> None:
     console.line(
         f"{c.machine.machine}: {len(c.unknowns)} parameters from {len(c.batches)} batches{label}; {c.fit.message}"
     )
+    console.line(outcome.account.summary)
     console.out.print(parameter_table(c))
     if c.undetermined:
         console.line("not determined by these recordings")

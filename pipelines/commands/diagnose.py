@@ -79,6 +79,8 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
         console.out.print(error_table(d))
     if f.findings:
         console.line(f"left-out batches that improve: {f.fit.batches_improved} of {f.fit.batches}")
+    if f.account:
+        console.line(f.account["summary"])
     if f.next_experiment is not None:
         console.line(f"next run: {experiment_sentence(f.next_experiment)}")
     for remark in d.remarks:

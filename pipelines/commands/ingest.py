@@ -71,19 +71,23 @@ def ingest(
     as_json: Json = False,
 ) -> None:
     """Read recordings into the lake; what cannot be used goes to quarantine with the reason."""
+    from data.account import Account
     from data.batch import finding_table
     from data.ingest import ingest as ingest_paths
     from data.machine import load_machine
-    from pipelines.recordings import home_lake
+    from pipelines.recordings import home_lake, load_batches
 
     described = load_machine(machine)
     with console.progress(as_json) as (say, _):
         report = ingest_paths(paths, described, home_lake(), progress=say)
+    stored = {r.stored_as for r in report.rows if r.stored_as}
     if as_json:
         console.print_json(console.records(report.as_frame()))
     else:
         print_ingest(report)
         print_findings(finding_table((r.batch_id, r.found) for r in report.batches))
+    for line in Account.of(load_batches(home_lake(), described)).large(stored) if stored else ():
+        console.note(line)
     if not report.rows:
         raise InputError(
             f"{', '.join(map(str, paths))}: no recording there, {len(report.ignored)} other files; the machine file "

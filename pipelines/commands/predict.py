@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from data.account import Account
 from data.errors import InputError, check_suffix
 from data.units import error_column, in_error_unit
 
@@ -80,9 +81,11 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
 
     model = load_model(model_uri, settings)
     batches = read_batches(Path(file), model.machine, need_error=False, channels=model.channels())
-    table = predict_batches(model, batches)
+    known = list(batches)
+    table = predict_batches(model, known)
     if table is None:
         raise InputError(f"recording {file}: no batch in it that machine {model.machine.machine} can read")
+    table.attrs["account"] = Account.of(known).as_dict()
     return table
 
 
@@ -171,3 +174,4 @@ def predict(
     else:
         table.to_csv(sys.stdout if to is None else to, index=False)
     console.note(summary(table))
+    console.note(table.attrs["account"]["summary"])

@@ -56,6 +56,7 @@ def rehearse(
 
     Each recording follows the other after a night. With --through it speaks to a compensation that runs elsewhere.
     """
+    from data.account import Account
     from pipelines.commands.predict import load_model
     from pipelines.compensating import Given, labelled, rehearse_models
     from pipelines.recordings import check_recordings, read_files
@@ -80,9 +81,11 @@ def rehearse(
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
     write_rehearsal(page, r, labelled(named, stored))
     remarks = {m.family.target: m.remark for m in stored if m.remark}
+    account = Account.of(batches)
     if as_json:
-        console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks})
+        console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks, "account": account.as_dict()})
         return
+    console.line(account.summary)
     for a, remark in remarks.items():
         console.line(f"{a:<10} {remark}")
     for a in r.before_um:

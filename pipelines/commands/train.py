@@ -10,7 +10,7 @@ import typer
 from data.errors import InputError, one_of
 from data.units import in_error_unit, unit_label
 from pipelines import console
-from pipelines.commands.ingest import ingest_totals, print_findings, print_ingest
+from pipelines.commands.ingest import ingest_totals, print_ingest
 from pipelines.options import Json, MachineFile, names, split
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
         "units": outcome.units,
         "simulated": outcome.simulated,
         "ingested": ingest_totals(outcome.ingested) if outcome.ingested else None,
+        "account": outcome.account.as_dict() if outcome.account else None,
         "trainings": outcome.training_ids,
         "expected": {t: o.as_dict() for t, o in outcome.outlooks.items()},
         "best": best,
@@ -53,19 +54,17 @@ def print_training(outcome: TrainOutcome) -> None:
     if outcome.stopped:
         console.line(outcome.stopped)
         return
-    import pandas as pd
-
-    found = [r.findings for r in outcome.results.values() if len(r.findings)]
-    if found:
-        console.line("findings")
-        print_findings(pd.concat(found).drop_duplicates())
+    account = outcome.account
     label = "  (simulated recordings)" if outcome.simulated else ""
     for target, expected in outcome.outlooks.items():
         choice = outcome.choices[target]
         badge = (
             "provisional; " if choice.standing == "provisional" else "no trustworthy model; " if choice.caution else ""
         )
-        console.line(in_error_unit(f"{target}: {badge}{expected.summary}", outcome.units[target]))
+        lost = account.warning(target) if account else ""
+        console.line(in_error_unit(f"{target}: {lost}{badge}{expected.summary}", outcome.units[target]))
+    if account:
+        console.line(account.summary)
     for target, result in outcome.results.items():
         _print_leaderboard(f"{outcome.machine} {target}{label}", result.cells, outcome.units[target])
     for target, training in outcome.training_ids.items():

@@ -34,7 +34,7 @@ def findings_of(results: Sequence[GridResult]) -> pd.DataFrame:
 def findings_summary(found: pd.DataFrame, n_batches: int) -> str:
     """One sentence about all findings."""
     if found.empty:
-        return f"The checks raised no finding in {count(n_batches, 'batch')}; every recorded sample was used."
+        return f"The checks raised no finding in {count(n_batches, 'batch')} and masked no sample."
     overruled = found["overruled"].map(_text).astype(bool)
     masked = int((found["masks"].map(_yes) & ~overruled).sum())
     with_any = found[["machine", "batch_id"]].drop_duplicates()

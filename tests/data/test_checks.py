@@ -246,11 +246,11 @@ def test_two_sensors_that_changed_places() -> None:
 
 def test_an_air_sensor_is_dead_by_its_own_history() -> None:
     batches = year()
-    still = batches[3].values("rear")[0] + 0.1 * np.random.default_rng(0).integers(0, 2, batches[3].n_rows)
-    batches[3] = changed(batches[3], "rear", np.round(still, 1))
+    still = batches[4].values("rear")[0] + 0.1 * np.random.default_rng(0).integers(0, 2, batches[4].n_rows)
+    batches[4] = changed(batches[4], "rear", np.round(still, 1))
     known = check_machine(batches, toy_machine())
-    assert ("dead", "rear") in [(f.check, f.channel) for f in known[3].findings]
-    assert not any(f.masks for k, b in enumerate(known) for f in b.findings if k != 3)
+    assert ("dead", "rear") in [(f.check, f.channel) for f in known[4].findings]
+    assert not any(f.masks for k, b in enumerate(known) for f in b.findings if k != 4)
 
 
 def test_a_drifting_probe_is_odd_but_not_masked() -> None:
@@ -334,7 +334,7 @@ def test_a_part_that_is_heated_in_some_runs_has_no_offset(hot: set[int]) -> None
     known = on_the_machine(batches)
     assert masks_of(known) == set()
     assert {k for k, b in enumerate(known) if b.findings} == hot
-    assert f"In {len(hot)} of 12 runs, in 3 separate periods, so probably" in known[min(hot)].findings[-1].message
+    assert all("not masked" in known[k].findings[-1].message for k in hot)
 
 
 def test_a_permanent_offset_stays_a_fault_where_other_masks_interrupt_it() -> None:
@@ -349,7 +349,7 @@ def test_a_part_that_starts_warm_and_cools_has_no_offset() -> None:
     warm = batches[4].values("bed") + 25.0 * np.exp(-batches[4].time_s / 6000.0)
     known = on_the_machine([*batches[:4], changed(batches[4], "bed", np.round(warm, 1)), *batches[5:]])
     assert masks_of(known) == set()
-    assert "returns during the run" in known[4].findings[0].message
+    assert "the part was warm or cold" in known[4].findings[0].message
 
 
 def test_a_run_much_shorter_than_the_others_is_noted() -> None:

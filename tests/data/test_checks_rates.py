@@ -10,7 +10,6 @@ import pytest
 
 from data.batch import Batch, Finding
 from data.checks import check_batch
-from data.checks.base import rolling_median
 from data.machine import parse_machine
 
 THERMAL = ("front", "rear", "head", "column", "bed")
@@ -88,11 +87,3 @@ def test_a_spike_is_masked_alone(step_s: float) -> None:
     found = findings(replace(batch, table=batch.table.assign(column=values)))
     assert [(f.check, f.channel) for f in found] == [("spike", "column")]
     assert found[0].start_s == found[0].end_s == batch.time_s[row]
-
-
-@pytest.mark.parametrize(("half", "least"), [(3, 4), (4, 1)])
-@pytest.mark.parametrize("n", [5, 18, 19, 200])
-def test_medians_by_exchange_are_medians(n: int, half: int, least: int) -> None:
-    values = np.round(np.random.default_rng(n).normal(size=n), 1)
-    plain = pd.Series(values).rolling(2 * half + 1, center=True, min_periods=least).median().to_numpy()
-    assert np.array_equal(rolling_median(values, half, least), plain, equal_nan=True)

@@ -199,8 +199,20 @@ def test_the_command_warns_on_standard_error_and_succeeds(stored, tmp_path):
     done = CliRunner().invoke(app, ["predict", str(tmp_path / "hot.csv"), "--model", str(stored)])
     assert done.exit_code == 0
     assert done.stderr.startswith("warning: 1 run: no expected error is stored; train again; run hot is unlike")
-    assert len(done.stderr.strip().splitlines()) == 1
+    _, account = done.stderr.strip().splitlines()
+    assert account == "rows: 60 read, 0 dropped; nothing masked"
     assert pd.read_csv(StringIO(done.stdout))["flagged"].notna().all()
+
+
+def test_a_row_of_nulls_is_outside_the_region(stored):
+    model = model_store.load(stored)
+    table = toy_batches("toy-folder", 1)[0].table
+    known = model_store.predict_frame(model, table)
+    table.loc[20, [c for c in table if c != "time_s"]] = np.nan
+    done = model_store.predict_frame(model, table)
+    assert np.isnan(done["predicted_um"][20]) and bool(done["outside_region"][20])
+    others = np.arange(len(table)) != 20
+    assert (done["outside_region"][others] == known["outside_region"][others]).all()
 
 
 def test_a_model_stored_without_bounds_still_predicts(stored):
