@@ -51,7 +51,7 @@ class Offset(Check):
             for k, read, line in zip(far, as_read.tolist(), corrected.tolist(), strict=True):
                 starts = abs(first[k]) > limit
                 stays = abs(last[k]) > (0.5 * abs(first[k]) if starts else most)
-                masks = stays and read > _FLOOR_K and line < read / (3.0 if starts else 10.0)  # load moves an end
+                masks = stays and read > _FLOOR_K and line < read / (2.0 if starts else 10.0)  # load moves an end
                 if not starts and not masks:
                     continue  # an end that the machine explains
                 message = (

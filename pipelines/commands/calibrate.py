@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from data.account import Account
 from data.errors import InputError
 from pipelines import console
 from pipelines.caller import Done, Say
@@ -20,6 +19,7 @@ from pipelines.options import Json, MachineFile, split
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from data.account import Account
     from data.machine import Machine
     from twin.calibration import Calibration
     from twin.calibration.identifiability import Interval
@@ -62,6 +62,7 @@ def calibrate_file(request: CalibrationRequest, say: Say, done: Done) -> Calibra
         InputError: a file, batch or option that cannot be used.
         WorkError: the fit did not converge, or the file cannot be written; what stood there is unchanged.
     """
+    from data.account import Account
     from pipelines.recordings import gather_batches
     from twin.calibration import CalibrationOptions, calibrate
 

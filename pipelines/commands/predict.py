@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from data.account import Account
 from data.errors import InputError, check_suffix
 from data.units import error_column, in_error_unit
 
@@ -77,6 +76,7 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     Raises:
         InputError: unknown model, a file that cannot be read, a missing input; one line each.
     """
+    from data.account import Account
     from data.recording import read_batches
 
     model = load_model(model_uri, settings)
