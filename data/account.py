@@ -10,9 +10,9 @@ import numpy as np
 
 from data.batch import Batch, Finding
 from data.checks import OF_CELLS, USER
-from data.checks.base import clock, overrule_line
+from data.checks.base import Bools, clock, overrule_line
 
-LARGE = 0.05  # of a channel's rows in a batch: more is not masked before `ingest` has said so
+LARGE = 0.05  # of a channel's rows in a batch: `ingest` says what masks more
 DECIDES = 0.1  # a result whose deciding channel lost more says so first
 
 
@@ -106,28 +106,22 @@ class Account:
 
 def _lost(batch: Batch) -> list[Lost]:
     out = []
+
+    def add(name: str, check: str, state: str, hit: Bools) -> None:
+        if len(rows := np.flatnonzero(hit)):
+            span = float(batch.time_s[rows[0]]), float(batch.time_s[rows[-1]])
+            out.append(Lost(batch.batch_id, name, check, state, len(rows), len(rows) / batch.n_rows, *span))
+
     taken: dict[tuple[str, str], list[Finding]] = {}
     for f in batch.findings:
         if f.masks and not f.overruled:
             for name in (f.channel,) if f.channel else batch.channels:
                 taken.setdefault((name, f.check), []).append(f)
     for (name, check), found in taken.items():
-        values = batch.values(name) if name in batch.table.columns else np.empty(0)
-        hit = (
-            np.isfinite(values) & ~np.isfinite(batch.with_findings(tuple(found)).masked(name))
-            if len(values)
-            else values
-        )
-        rows = np.flatnonzero(hit)
-        if len(rows):
-            span = float(batch.time_s[rows[0]]), float(batch.time_s[rows[-1]])
-            out.append(Lost(batch.batch_id, name, check, "masked", len(rows), len(rows) / batch.n_rows, *span))
+        if name in batch.table.columns:
+            left = batch.with_findings(tuple(found)).masked(name)
+            add(name, check, "masked", np.isfinite(batch.values(name)) & ~np.isfinite(left))
     for f in batch.findings:
         if f.check in OF_CELLS and f.channel is not None and f.channel in batch.table.columns:
-            rows = np.flatnonzero(~np.isfinite(batch.values(f.channel)))
-            if len(rows):
-                span = float(batch.time_s[rows[0]]), float(batch.time_s[rows[-1]])
-                out.append(
-                    Lost(batch.batch_id, f.channel, f.check, "missing", len(rows), len(rows) / batch.n_rows, *span)
-                )
+            add(f.channel, f.check, "missing", ~np.isfinite(batch.values(f.channel)))
     return out

@@ -5,14 +5,13 @@ from __future__ import annotations
 import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from zoneinfo import available_timezones
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from data.batch import Channel, Role
 from data.errors import InputError, closest
 from data.units import seconds
-from data.yaml_file import load_yaml, parse_yaml
+from data.yaml_file import TimeZone, load_yaml, parse_yaml
 
 RESERVED = ("batch", "simulated", "machine", "year")  # columns that the lake adds, and its partition keys
 TAKEN = (*RESERVED, "time_s", "batch_id")  # names of columns that stand next to the channels somewhere
@@ -162,16 +161,9 @@ class Form(Section):
     header: bool = True  # the file has a row of names
     header_rows: Annotated[int, Field(ge=0)] | None = None  # lines above the first data row
     units_row: Annotated[int, Field(ge=1)] | None = None  # the line of the units, counted from 1; for `describe`
-    timezone: str | None = None  # of time stamps without one, such as Europe/Berlin
+    timezone: TimeZone | None = None  # of time stamps without one, such as Europe/Berlin
     pivot: Pivot | None = None  # of a long table
     time: TimeColumn = TimeColumn()
-
-    @field_validator("timezone")
-    @classmethod
-    def _known_zone(cls, name: str | None) -> str | None:
-        if name is not None and name not in available_timezones():
-            raise ValueError(f"unknown time zone {name!r}; {closest(name, sorted(available_timezones()))}")
-        return name
 
 
 class Joined(Form):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
+from zoneinfo import available_timezones
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from data.errors import InputError, closest
 
@@ -15,6 +16,15 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
+
+
+def _time_zone(name: str) -> str:
+    if name not in available_timezones():
+        raise ValueError(f"unknown time zone {name!r}; {closest(name, sorted(available_timezones()))}")
+    return name
+
+
+TimeZone = Annotated[str, AfterValidator(_time_zone)]
 
 MAX_BYTES = 1_000_000  # ten times a machine file with a thousand channels; a file of this size takes ten seconds
 MAX_DEPTH = 50  # far below the depth at which Python's own recursion ends

@@ -14,13 +14,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
-from zoneinfo import ZoneInfo, available_timezones
+from zoneinfo import ZoneInfo
 
 from cronsim import CronSim, CronSimError
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from data.errors import InputError, closest
-from data.yaml_file import load_yaml
+from data.yaml_file import TimeZone, load_yaml
 from features.selectors import SELECTORS
 from models import FAMILIES
 
@@ -145,17 +145,10 @@ class _MachinePart(_Training):
 
 class _File(_Part):
     at_once: Annotated[int, Field(ge=1, le=64)] = 1
-    timezone: str | None = None
+    timezone: TimeZone | None = None
     alerts: AlertRules = AlertRules()
     defaults: _Training = _Training()
     machines: Annotated[list[_MachinePart], Field(min_length=1)]
-
-    @field_validator("timezone")
-    @classmethod
-    def _zone(cls, value: str | None) -> str | None:
-        if value is not None and value not in available_timezones():
-            raise ValueError(f"no such time zone; {closest(value, available_timezones()).partition('?')[0]}?")
-        return value
 
 
 @dataclass(frozen=True)

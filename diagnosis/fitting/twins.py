@@ -17,6 +17,7 @@ from data.arrays import Array
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
+from diagnosis.candidates.library import ends_of
 from diagnosis.fitting.carried import on_network
 from diagnosis.policy import POLICY
 from twin.calibration.problem import CalibrationProblem
@@ -141,7 +142,7 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
 
     near: dict[str, list[str]] = {}
     for link in part.links.values():
-        one, other = (at.partition("@")[0] for at in link.between)
+        one, other = ends_of(link)
         near.setdefault(one, []).append(other)
         near.setdefault(other, []).append(one)
     links = {
@@ -159,7 +160,7 @@ def refined(part: TwinPart, network: Network, values: Array, rng: Rng) -> tuple[
 
 
 def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, float], rng: Rng) -> dict[str, Link]:
-    """Ways within the castings besides the chain, in one draw of two."""
+    """Paths within the castings in addition to the chain, in one draw of two."""
     out = {}
     if rng.random() < POLICY.webbed_share:
         for name in cut:
@@ -173,7 +174,7 @@ def _webs(bodies: Mapping[str, Body], cut: Sequence[str], through: Mapping[str, 
 def _stray(
     near: Mapping[str, Sequence[str]], network: Network, total: Array, place: Callable[..., str], rng: Rng
 ) -> dict[str, Link]:
-    """Weak ways between bodies that have a neighbour in common."""
+    """Weak paths between bodies that have a neighbour in common."""
     out = {}
     second = {tuple(sorted((a, b))) for own in near.values() for a in own for b in own if a != b}
     for a, b in sorted(second):
@@ -204,10 +205,10 @@ def _placed(
     if not isinstance(into, Mapping):
         return given
     rest = next(k for k, v in into.items() if v == "rest")
-    beside = near.get(rest.partition("@")[0], ())
+    neighbours = near.get(rest.partition("@")[0], ())
     out: dict[str, Value | str] = {place(k) if v == "rest" else k: v for k, v in into.items()}
-    if beside and isinstance(given.into, str) and MECHANISMS[given.law].takes_from is None:
-        out[place(beside[int(rng.integers(len(beside)))])] = Value(
+    if neighbours and isinstance(given.into, str) and MECHANISMS[given.law].takes_from is None:
+        out[place(neighbours[int(rng.integers(len(neighbours)))])] = Value(
             value=float(f"{rng.uniform(0.0, POLICY.leak_share):.4g}")
         )
     return given.model_copy(update={"into": out})

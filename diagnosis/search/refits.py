@@ -50,22 +50,27 @@ def shortlist(now: Fitted, seen: Screen, odds: dict[str, float]) -> list[Scored]
             taken[s.candidate.mechanism] += 1
             out.append(s)
     cold = {body for i in impossible(now) for body in i.bodies}
-    out += [s for s in one_of_each(ranked_paths(now, seen, cold)) if s not in out and s.candidate.where.kind == "node"]
+    out += [s for s in ranked_paths(now, seen, cold) if s not in out]
     return out + [Scored(c) for c in suspected_swaps(now, [s.candidate for s in seen.scored])]
 
 
 def ranked_paths(now: Fitted, seen: Screen, cold: set[str]) -> list[Scored]:
-    """Candidates that bring heat to one of these bodies from another, the best first."""
+    """Candidates at a body that bring heat to one of these from another, the best first, one of each law and place."""
     bodies = set(now.part.bodies)
 
     def joined(s: Scored) -> set[str]:
-        part = s.candidate.part
-        if part is None or not {"heat_W", "expand"} & set(MECHANISMS[s.candidate.mechanism].effects()):
+        part, where = s.candidate.part, s.candidate.where
+        if (
+            part is None
+            or where.kind != "node"
+            or not {"heat_W", "expand"} & set(MECHANISMS[s.candidate.mechanism].effects())
+        ):
             return set()
         ports = part.at.values() if isinstance(part.at, Mapping) else [part.at]
         return {str(place) for place in (*ports, part.into)} & bodies
 
-    return [s for s in seen.scored if s.candidate.mechanism in MECHANISMS and len(j := joined(s)) > 1 and j & cold]
+    listed = [s for s in seen.scored if s.candidate.mechanism in MECHANISMS]
+    return one_of_each([s for s in listed if len(ends := joined(s)) > 1 and ends & cold])
 
 
 def refits(

@@ -80,12 +80,11 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
     from data.recording import read_batches
 
     model = load_model(model_uri, settings)
-    batches = read_batches(Path(file), model.machine, need_error=False, channels=model.channels())
-    known = list(batches)
-    table = predict_batches(model, known)
+    batches = list(read_batches(Path(file), model.machine, need_error=False, channels=model.channels()))
+    table = predict_batches(model, batches)
     if table is None:
         raise InputError(f"recording {file}: no batch in it that machine {model.machine.machine} can read")
-    table.attrs["account"] = Account.of(known).as_dict()
+    table.attrs["account"] = Account.of(batches).as_dict()
     return table
 
 
