@@ -80,6 +80,7 @@ class Batch:
     repairs: Mapping[str, int] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
+    place: int | None = None  # in the order that the machine file states, for batches without a start
 
     @property
     def n_rows(self) -> int:

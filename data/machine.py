@@ -193,6 +193,7 @@ class Recording(Form):
     step_s: Annotated[float, Field(gt=0)] = 60.0  # of the regular grid in the lake
     max_gap_s: Annotated[float, Field(gt=0)] = 300.0  # a longer hole stays a hole
     start_from_name: str | None = None  # strptime pattern of the file's stem or its sheet, e.g. "%Y%m%d"
+    order: Literal["name"] | list[str | int] | None = None  # of runs without a start: by id, or the ids, earliest first
     split: Split | None = None  # one long recording into runs
     schedule: Schedule | None = None  # drivers from a table
     joined: dict[str, Joined] = {}  # further files or sheets of the same runs, by a name of your choice

@@ -27,7 +27,7 @@ from features.stability import tsp_stability
 from models import FAMILIES
 from models.base import Family
 from models.judging import KEPT, FamilyScores, score_table
-from models.protocols import PROTOCOLS, Fold, folds_of, forward_obstacle
+from models.protocols import PROTOCOLS, Fold, folds_of, forward_obstacle, placed
 from models.result import CELL_KEYS
 
 Inputs = tuple[str, ...]
@@ -217,6 +217,7 @@ def prepare(batches: Sequence[Batch], target: str, plan: Plan, machine: Machine 
     Raises:
         InputError: fewer than two batches, no usable input channel, or no usable row of the target.
     """
+    batches = placed(batches, machine.recording.order) if machine else batches
     known = [b.channels[target] for b in batches[:1] if target in b.channels]
     plan = plan.suited(machine, () if plan.families else known)
     kept = with_target(batches, target)

@@ -19,7 +19,9 @@ _MUCH_WORSE = 1.5  # later runs against the same runs left out one by one; a fac
 class Outlook:
     """Expected S of a run in the next season, µm.
 
-    `S_um` is the mean left-out S under `protocol`, the one nearest to the next season that the recordings allow;
+    `S_um` is the mean left-out S under `protocol`, the one nearest to the next season that the recordings allow. Where
+    choosing among the cells costs, it is the nested score: every run by the cell that the other runs chose; `cell_S_um`
+    is that of the chosen cell itself, which the choice flatters.
     `bound_um` covers the S of the next run with 90 % (`models.conformal.expected_next`); `n_runs` under `protocol`.
     `leave_batch_out_um`, `leave_batch_out_std_um`: S_mean and S_std by leave-batch-out; NaN where it was not run.
     `warning`: the failing season, speed or block, where later runs are much worse than runs left out one by one.
@@ -34,23 +36,32 @@ class Outlook:
     leave_batch_out_std_um: float
     warning: str = ""
     note: str = ""
+    cell_S_um: float = float("nan")
 
     @property
     def summary(self) -> str:
         """The warning, the number with its bound, leave-batch-out, and the note."""
         where = "next season" if self.protocol == "forward" else f"by {self.protocol}"
         number = f"expected error {where}: S {self.S_um:.2f} µm, 90 % of runs below {self.bound_um:.2f} µm"
-        parts = [self.warning, f"{number} ({self.protocol}, {self.n_runs} runs)"]
+        nested = ", each by the cell that the others chose" if self.nested else ""
+        parts = [self.warning, f"{number} ({self.protocol}, {self.n_runs} runs{nested})"]
+        if self.nested:
+            parts.append(f"the chosen cell itself, flattered by the choice, {self.cell_S_um:.2f} µm")
         if self.protocol != "leave-batch-out" and np.isfinite(self.leave_batch_out_um):
             parts.append(f"leave-batch-out {self.leave_batch_out_um:.2f} ± {self.leave_batch_out_std_um:.2f} µm")
         return "; ".join(p for p in [*parts, self.note] if p)
+
+    @property
+    def nested(self) -> bool:
+        """Whether `S_um` is the nested score."""
+        return self.S_um > self.cell_S_um
 
     def as_dict(self) -> dict[str, Any]:
         return {**asdict(self), "summary": self.summary}
 
 
 def outlook(result: GridResult, choice: Choice) -> Outlook:
-    """The outlook of a chosen cell, from the left-out scores of its training."""
+    """The outlook of a chosen cell, from left-out scores; its bound grows as much as the nested score is larger."""
     s = result.scores
     own = s[(s["selector"] == choice.selector) & (s["family"] == choice.family) & (s["n_tsp"] == choice.n_tsp)]
     own = own[np.isfinite(own["S_um"])]
@@ -58,7 +69,12 @@ def outlook(result: GridResult, choice: Choice) -> Outlook:
     later, near = (own[own["protocol"] == p] for p in ("forward", "leave-batch-out"))
     mean, std = float(near["S_um"].mean()), float(near["S_um"].std())
     warning = _warning(result, later, near) if len(later) and len(near) else ""
-    return Outlook(led.protocol, led.S_um, led.bound_um, led.n_runs, mean, std, warning, _note(result, led.protocol))
+    nested_um = choice.nested_S_mean_um if choice.protocol == led.protocol else led.S_um
+    cost = max(nested_um / led.S_um, 1.0) if led.S_um > 0 and np.isfinite(nested_um) else 1.0
+    return Outlook(
+        led.protocol, cost * led.S_um, cost * led.bound_um, led.n_runs, mean, std, warning,
+        _note(result, led.protocol), led.S_um,
+    )  # fmt: skip
 
 
 def _note(result: GridResult, protocol: str) -> str:

@@ -305,7 +305,8 @@ def decide(result: GridResult, rule: PromotionRule, cell: str = "") -> Choice:
     summary = choice.summary
     if len(nested):
         mean, std = float(nested["S_um"].mean()), float(nested["S_um"].std())
-        summary += f"; each run by the cell that the others chose: {mean:.2f} ± {std:.2f} µm"
+        if mean > choice.S_mean_um:
+            summary = f"each run by the cell that the others chose: S {mean:.2f} ± {std:.2f} µm; {summary}"
         choice = replace(choice, nested_S_mean_um=mean, nested_S_std_um=std)
         own = nested.merge(result.batches[["batch_id", "digest"]].astype(str), on="batch_id")
     nothing = left_out(result, led, "none", "zero", 0)

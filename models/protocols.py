@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Self
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import pandas as pd
@@ -41,8 +42,8 @@ def train_on_one(batches: Sequence[Batch]) -> list[Fold]:
 
 
 def leave_season_out(batches: Sequence[Batch]) -> list[Fold]:
-    """One fold per season, defined by the start ambient: below 10, 10–18, 18–25, above 25 °C."""
-    return _leave_group_out([season(b) for b in batches])
+    """One fold per season, defined by the start ambient: below 10, 10–18, 18–25, above 25 °C; empty without dates."""
+    return [] if any(b.start is None for b in batches) else _leave_group_out([season(b) for b in batches])
 
 
 def leave_speed_out(batches: Sequence[Batch]) -> list[Fold]:
@@ -85,21 +86,45 @@ def _forward(batches: Sequence[Batch], gap_days: float) -> list[Fold]:
 
 def forward_obstacle(batches: Sequence[Batch]) -> str:
     """Why no later run can be predicted from earlier ones; empty where it can."""
-    undated = [b.batch_id for b in batches if b.start is None]
+    undated = [b.batch_id for b in batches if b.start is None and b.place is None]
     least = _LEAST_PAST + FORWARD_BLOCKS
     if undated and len({b.source for b in batches}) > 1:
-        return f"{len(undated)} of {len(batches)} batches have no start time (first: {undated[0]})"
+        return (
+            f"{len(undated)} of {len(batches)} batches have no start time (first: {undated[0]}); give their order in "
+            "the machine file, as recording: {order: name} or a list of batches"
+        )
     if len(batches) < least:
         return f"only {len(batches)} batches, need at least {least}"
     return ""
 
 
 def in_time(batches: Sequence[Batch]) -> list[int]:
-    """Indices in order of time; parts of one undated recording are in order as they come."""
+    """Indices in order of time: as stated, else by start; parts of one undated recording are in order as they come."""
     order = list(range(len(batches)))
+    if all(b.place is not None for b in batches):
+        return sorted(order, key=lambda k: batches[k].place or 0)
     if any(b.start is None for b in batches):
         return order
     return sorted(order, key=lambda k: (batches[k].start, batches[k].batch_id))
+
+
+def placed(batches: Sequence[Batch], order: Literal["name"] | Sequence[str | int] | None) -> list[Batch]:
+    """The batches with their places in the stated order; by name, numbers in an id count as numbers.
+
+    Raises:
+        InputError: a batch is not in the list, or stands there twice.
+    """
+    if order is None:
+        return list(batches)
+    ids = [str(i) for i in order]
+    if order == "name":
+        parts = {b.batch_id: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", b.batch_id)] for b in batches}
+        ids = sorted(parts, key=lambda batch_id: parts[batch_id])
+    for b in batches:
+        if ids.count(b.batch_id) != 1:
+            what = "repeats" if b.batch_id in ids else "lacks"
+            raise InputError(f"recording.order {what} {b.batch_id}; name each of the {len(batches)} batches once")
+    return [replace(b, place=ids.index(b.batch_id)) for b in batches]
 
 
 def _block_names(blocks: Sequence[Sequence[Batch]]) -> list[str]:

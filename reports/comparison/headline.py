@@ -39,7 +39,8 @@ def headline(name: str, training: Training, choice: Choice, verdict: Verdict, di
         (
             "Expected next season" if forward else "Expected error, optimistic",
             f"{number(expected.S_um, digits)} µm",
-            f"mean S of {count(expected.n_runs, 'later run' if forward else 'left-out run')}",
+            f"mean S of {count(expected.n_runs, 'later run' if forward else 'left-out run')}"
+            + (", each by the model that the others chose" if expected.nested else ""),
         ),
         ("9 of 10 runs stay below", f"{number(expected.bound_um, digits)} µm", "90 % bound, one run"),
         (

@@ -65,7 +65,7 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
         cells = scored(group[0].result, protocol)
         if cells.empty:
             raise InputError(f"report: training {group[0].training_id} has no cell with a finite score; train again")
-        choices = [promoted_cell(t, rule, t is group[0]) for t in group]
+        choices = [promoted_cell(t, rule) for t in group]
         digits = decimals(choices[0].S_std_um, choices[0].n_batches)
         said = verdict(name, group[0], choices[0])
         rows.append((name, group[0], choices[0], said, digits))

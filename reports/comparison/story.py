@@ -196,19 +196,17 @@ class Verdict:
     caution: str = ""
 
 
-def promoted_cell(training: Training, rule: PromotionRule, nested: bool = False) -> Choice:
+def promoted_cell(training: Training, rule: PromotionRule) -> Choice:
     """The cell that was promoted; without a promotion the one that the rule would take.
 
-    A grid without any of the rule's protocols is judged by the first that it has.
-
-    Args:
-        nested: with the score of choosing itself, as recorded at the promotion, else computed now.
+    A grid without any of the rule's protocols is judged by the first that it has. The nested score is as recorded at
+    the promotion, else computed now.
     """
     result = training.result
     if not rule.offered(set(result.cells["protocol"])):
         rule = rule.only(protocols_of(result)[0])
     mean, std = (float(training.promotion.get(f"nested_S_{n}_um", math.nan)) for n in ("mean", "std"))
-    if nested and not math.isfinite(mean):
+    if not math.isfinite(mean):
         own = decide(result, rule)
     else:
         own = replace(choose(result, rule), nested_S_mean_um=mean, nested_S_std_um=std)
@@ -226,10 +224,7 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
     p = training.promotion
     outcome = str(p.get("outcome", ""))
     digits = decimals(choice.S_std_um, choice.n_batches)
-    score = (
-        f"{plus_minus(choice.S_mean_um, choice.S_std_um, digits)} µm on left-out batches "
-        f"({choice.protocol}, {count(choice.n_batches, 'batch')}{_nested(choice, digits)})"
-    )
+    score = _score(choice, digits)
     model = cell_label(choice.selector, choice.family, choice.n_tsp)
     if outcome == "champion" and p["version"] == p.get("champion_version"):
         summary = f"Version {p['version']}, {model}, is champion: {score}; {_why_champion(p)}."
@@ -321,8 +316,13 @@ def _why_challenger(p: dict[str, Any]) -> str:
     )
 
 
-def _nested(choice: Choice, digits: int) -> str:
-    if not math.isfinite(choice.nested_S_mean_um):
-        return ""
-    score = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
-    return f"; {score} µm when a batch has no say in the choice of its model either"
+def _score(choice: Choice, digits: int) -> str:
+    """S on left-out batches; where choosing among the cells costs, first the score that the choice does not flatter."""
+    own, under = (
+        plus_minus(choice.S_mean_um, choice.S_std_um, digits),
+        f"{choice.protocol}, {count(choice.n_batches, 'batch')}",
+    )
+    if not choice.nested_S_mean_um > choice.S_mean_um:
+        return f"{own} µm on left-out batches ({under})"
+    nested = plus_minus(choice.nested_S_mean_um, choice.nested_S_std_um, digits)
+    return f"{nested} µm where the other batches choose the model of each ({under}); {own} µm for the model itself"

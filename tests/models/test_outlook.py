@@ -1,5 +1,7 @@
 """The error to expect in the next season."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -63,3 +65,12 @@ def test_without_forward_the_number_is_called_optimistic_with_the_reason() -> No
         "optimistic: no later run was predicted from earlier ones (6 of 6 batches have no start time (first: b00))"
     )
     assert "by leave-batch-out: S 2.00 µm" in got.summary
+
+
+def test_where_choosing_costs_the_nested_score_comes_first() -> None:
+    result = trained([2.0, 2.4, 2.2, 2.6])
+    choice = replace(pick(result, RULE.only("forward"), "none|mlr|2"), nested_S_mean_um=4.6)
+    got, own = outlook(result, choice), chosen(result)
+    assert (got.S_um, got.cell_S_um, got.bound_um) == pytest.approx((4.6, 2.3, 2.0 * own.bound_um))
+    assert "season: S 4.60 µm" in got.summary and "flattered by the choice, 2.30 µm" in got.summary
+    assert outlook(result, replace(choice, nested_S_mean_um=2.2)).S_um == pytest.approx(2.3)

@@ -8,7 +8,7 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
-from models.protocols import PROTOCOLS, folds_of, forward_obstacle, leave_batch_out, season, speed, train_on_one
+from models.protocols import PROTOCOLS, folds_of, forward_obstacle, leave_batch_out, placed, season, speed, train_on_one
 
 FORWARD = ("forward", "forward-gap")
 
@@ -58,11 +58,27 @@ def test_a_gap_leaves_out_the_weeks_before_the_block(toy_batches) -> None:
 def test_without_dates_forward_is_not_offered_unless_one_recording_gives_the_order(toy_batches) -> None:
     undated = [replace(b, start=None, source=f"{i}.csv") for i, b in enumerate(toy_batches(9))]
     assert folds_of("forward", undated) == []
-    assert forward_obstacle(undated) == f"9 of 9 batches have no start time (first: {undated[0].batch_id})"
+    assert forward_obstacle(undated).startswith(
+        f"9 of 9 batches have no start time (first: {undated[0].batch_id}); give"
+    )
+    assert folds_of("leave-season-out", undated) == [] != folds_of("leave-season-out", toy_batches(9))
     parts = [replace(b, source="one.csv") for b in undated]
     assert [f.test for f in folds_of("forward", parts)] == [(4,), (5,), (6,), (7,), (8,)]
     assert folds_of("forward-gap", parts) == []
     assert forward_obstacle(parts[:5]) == "only 5 batches, need at least 6"
+
+
+def test_a_stated_order_makes_forward_validation_of_undated_runs(toy_batches) -> None:
+    runs = [replace(b, batch_id=f"run {i + 1}", start=None, source=f"{i}.csv") for i, b in enumerate(toy_batches(12))]
+    later = [runs[i].batch_id for f in folds_of("forward", placed(runs, "name")) for i in f.test]
+    assert later == [f"run {i}" for i in range(7, 13)]  # run 10 after run 9
+    ids = [b.batch_id for b in runs]
+    last = folds_of("forward", placed(runs, ids[::-1]))[-1]
+    assert [runs[i].batch_id for i in last.test] == ["run 1"] and 11 in last.train
+    with pytest.raises(InputError, match=r"recording\.order lacks run 12; name each of the 12 batches once"):
+        placed(runs, ids[:-1])
+    with pytest.raises(InputError, match=r"recording\.order repeats run 1;"):
+        placed(runs, [*ids, "run 1"])
 
 
 def test_train_on_one_mirrors_leave_batch_out(toy_batches) -> None:

@@ -42,15 +42,15 @@ def test_the_price_of_choosing_is_told_as_recorded_or_computed(toy_batches: Make
     rule_cell = choose(result, RULE)
     nested = score_of_choice(result, RULE.only(rule_cell.protocol))
     nested = nested.loc[nested["protocol"] == rule_cell.protocol, "S_um"]
-    computed = promoted_cell(training(result), RULE, nested=True)
+    computed = promoted_cell(training(result), RULE)
     assert computed.nested_S_mean_um == pytest.approx(nested.mean())
     assert computed.nested_S_std_um == pytest.approx(nested.std())
     recorded = promotion(rule_cell.cell, nested_S_mean_um=9.44, nested_S_std_um=7.31)
-    choice = promoted_cell(training(result, recorded), RULE, nested=True)
+    choice = promoted_cell(training(result, recorded), RULE)
     assert (choice.cell, choice.nested_S_mean_um, choice.nested_S_std_um) == (rule_cell.cell, 9.44, 7.31)
     said = verdict("z", training(result, recorded), choice).summary
     assert re.search(
-        r"4 batches; 9\.4\d? ± 7\.31? µm when a batch has no say in the choice of its model either\)", said
+        r": 9\.4\d? ± 7\.31? µm where the other batches choose the model of each \(forward, 4 batches\); 0\.7", said
     )
 
 
