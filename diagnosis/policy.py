@@ -146,11 +146,12 @@ class Policy:
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
     claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
-    claim_offset: float = development(-3.1, "log odds", "near a logistic fit of 99 refits of 33 cases of four kinds")
+    claim_offset: float = development(-1.13, "log odds", "a logistic fit of 48 first claims of eight kinds, 14 true")
     claim_weights: tuple[float, ...] = development(
-        (0.63, 0.4, 0.7, 0.5, -0.9), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`"
+        (0.76, -3.43), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`, of the same fit"
     )
-    claim_min_probability: float = development(0.55, "probability", "the likeliest false claim had 0.51")
+    claim_floor_nats: float = development(10.0, "nats", "added to the null, which 100 draws know no better")
+    claim_min_probability: float = convention(0.5, "probability", "what is claimed is more probable than not")
     chance_quantile: float = convention(0.99, "probability", "what chance exceeds once in a hundred cases is no claim")
     temperature_null_share: float = development(0.25, "of the null threshold", "scale on which gains are compared")
     temperature_min_nats: float = development(3.0, "nats", "wrong explanations lead by as much")

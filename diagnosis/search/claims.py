@@ -1,7 +1,6 @@
-"""How probable a claim is: a logistic model of its gain, its margin, the runs that agree and its prior odds.
+"""How probable a claim is: a logistic model of its gain over what structure alone gains on the same machine.
 
-The weights stand near a fit to development cases of four kinds of machines. The gain is in nats: a machine whose
-refined twins miss what its castings do has larger gains with nothing missing.
+The weights are a fit to development cases of eight kinds of machines.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen
 from twin.mechanisms import MECHANISMS
 
-FEATURES = ("gain", "improved", "margin", "odds", "network")
+FEATURES = ("excess", "network")
 
 
 @dataclass(frozen=True)
@@ -57,22 +56,17 @@ def null_quantile(null: Array) -> float:
     return float(np.mean(null) - scale * (np.euler_gamma + np.log(-np.log(POLICY.chance_quantile))))
 
 
-def features(t: Tried, others: Sequence[Tried]) -> dict[str, float]:
-    """Of a claim, by `FEATURES`.
+def features(t: Tried, threshold: float) -> dict[str, float]:
+    """Of a claim, by `FEATURES`, at the nats that structure gains in one of a hundred refined twins.
 
-    gain: logarithm of its nats; improved: share of the runs on which it has a say that are predicted better when they
-    are left out; margin: nats to the best of another signature as a share of its own; odds: log prior, 0 of what no
-    list has; network: 1 for what may only say that a network is drawn too coarse, or follows no law.
+    excess: logarithm of its gain over them, which means the same on every machine; network: 1 for what may only say
+    that a network is drawn too coarse, or follows no law.
     """
-    telling = np.abs(t.by_run) > POLICY.telling_nats
-    margin = t.standing - max([0.0, *(o.standing for o in others if o.cluster != t.cluster)])
     c = t.candidate
     coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
+    least = max(threshold, 0.0) + POLICY.claim_floor_nats
     return {
-        "gain": float(np.log1p(max(t.gain, 0.0))),
-        "improved": float((t.by_run[telling] > 0).mean()) if telling.any() else 0.0,
-        "margin": float(np.clip(margin / max(t.gain, 1.0), -1.0, 1.0)),
-        "odds": 0.0 if c.kind.is_unlisted else t.log_prior,
+        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / least)),
         "network": float(c.kind.is_unlisted or coarse),
     }
 

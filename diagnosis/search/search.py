@@ -108,7 +108,7 @@ def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
 def _judged(done: Round, t: Tried, impossible_now: frozenset[str], vetoed: bool) -> Round:
     """The round with `t` as its claim: probable enough, and no channel predicted worse."""
     rest = [o for o in done.tried if o is not t]
-    own = features(t, rest)
+    own = features(t, done.threshold)
     resolved = _resolves(t, impossible_now)
     probable = POLICY.max_probability if resolved else trust(own)
     enough = probable >= POLICY.claim_min_probability
