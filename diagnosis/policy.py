@@ -134,6 +134,9 @@ class Policy:
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
     null_folds: int = cost(5, "folds", "of refined twins that are left out of the covariance in turn")
+    structure_steps: int = cost(
+        20, "steps", "of the size of structure on these recordings; it moves by a hundredth after them"
+    )
     label_swaps: int = cost(1, "pairs", "exchanged labels are rare; the plainest is tried")
     label_swap_min_gain_nats: float = development(
         60.0, "nats", "33 true swaps gained 70 or more, 37 of 40 false ones under 31"

@@ -160,6 +160,8 @@ def batch_table(batches: Sequence[Batch]) -> pd.DataFrame:
                 "source": b.source,
                 "simulated": b.simulated,
                 "n_rows": b.n_rows,
+                "rows_read": b.repairs.get("rows_in", b.n_rows),
+                "rows_dropped": b.repairs.get("rows_dropped", 0),
                 "speed": speed(b),
                 "start_ambient_degC": start_ambient_degC(b),
                 "season": season(b),

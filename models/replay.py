@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import cycle
 from typing import Any, Literal
 
@@ -157,6 +157,7 @@ class Replay:
     retrainings: tuple[Retraining, ...]
     runs: tuple[Run, ...]
     left_out: tuple[str, ...] = ()
+    account: Mapping[str, Any] = field(default_factory=dict)  # `data.account.Account` of the recordings, as plain data
 
     @property
     def targets(self) -> tuple[str, ...]:

@@ -19,7 +19,8 @@ CERTAINTY = ["coverage90", "sd_um"]
 class GridResult:
     """Everything one training found out about one error channel of one machine.
 
-    - `batches`: batch_id, start, digest, version, source, simulated, n_rows, speed_rpm, start_ambient_degC, season.
+    - `batches`: batch_id, start, digest, version, source, simulated, n_rows, rows_read, rows_dropped, speed_rpm,
+      start_ambient_degC, season.
     - `scores`: one row per protocol, selector, family, n_tsp, fold and tested batch_id with the columns `SCORES`
       (µm, or a ratio), fit_S_um (the fold's training batches) and n_rows. For train-on-one a row is a fold
       (fold = the training batch), batch_id "*", S_um the mean and S_std_um the std over the other batches. `CERTAINTY`:

@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
+from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine, checked
 from data.errors import InputError
@@ -173,6 +174,7 @@ def replay(
     return Replay(
         machine.machine, machine.simulated, request.seed, request.start, request.every, request.plan.effort, plan,
         tuple(progress.retrainings), tuple(progress.runs), tuple(left_out),
+        Account.of(check_machine([r.batch for r in recordings.values()], machine)).as_dict(),
     )  # fmt: skip
 
 

@@ -35,12 +35,16 @@ class RehearsalPage:
     pictures: tuple[Picture, ...]
 
 
-def write_rehearsal(path: Path, r: Rehearsal, model: str) -> None:
-    """Write the page; `model` names what ran. Raises: InputError, another suffix than .html, or no place to write."""
-    write_page(path, "rehearsal", rehearsal_page(r, model), (".html",))
+def write_rehearsal(path: Path, r: Rehearsal, model: str, used: str) -> None:
+    """Write the page; `model` names what ran, `used` is the account of the recordings in one line.
+
+    Raises:
+        InputError: another suffix than .html, or no place to write.
+    """
+    write_page(path, "rehearsal", rehearsal_page(r, model, used), (".html",))
 
 
-def rehearsal_page(r: Rehearsal, model: str) -> RehearsalPage:
+def rehearsal_page(r: Rehearsal, model: str, used: str) -> RehearsalPage:
     """The page's content."""
     axes = list(r.before_um)
     parts = []
@@ -52,7 +56,7 @@ def rehearsal_page(r: Rehearsal, model: str) -> RehearsalPage:
         f"{r.machine}: rehearsal of the compensation",
         r.simulated,
         f"Width of the band that holds 95 % of the rows, without and with compensation: {'; '.join(parts)}. "
-        f"{model} answered {len(r.time_s)} samples of {len(r.starts_s)} recordings{failed}.",
+        f"{model} answered {len(r.time_s)} samples of {len(r.starts_s)} recordings{failed}. Of the recordings: {used}.",
         _table(r),
         _events(r),
         tuple(_picture(r, a) for a in axes),

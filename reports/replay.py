@@ -67,7 +67,8 @@ def replay_page(r: Replay) -> ReplayPage:
     summary = (
         f"{count(runs, 'run')} arrived {plan}. The first training had {r.start}, each further one "
         f"{count(r.every, 'new run')} more; {count(trainings, 'training')}, effort {r.effort}. Every run was predicted "
-        "by the champion in force when it arrived, before any model learned it."
+        "by the champion in force when it arrived, before any model learned it. Of the recordings: "
+        f"{r.account['summary']}."
     )
     return ReplayPage(
         f"{r.machine}: replay of a year", r.simulated, summary, tuple(_channel(r, t) for t in r.targets), _arrivals(r)

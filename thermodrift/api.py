@@ -275,9 +275,10 @@ def rehearse(
     given = Given(max_um, rate_um_per_s, sample_s)
     done = rehearse_models(known, batches, given, failures=failures, readings=readings, readings_h=readings_h)
     if out is not None:
+        from data.account import Account
         from reports.rehearsal import write_rehearsal
 
-        write_rehearsal(Path(out), done, labelled([str(n) for n in names], known))
+        write_rehearsal(Path(out), done, labelled([str(n) for n in names], known), Account.of(batches).summary)
     return done
 
 

@@ -79,9 +79,9 @@ def rehearse(
             through=through, done=lambda n, of: done("rehearse", n, of),
         )  # fmt: skip
     page = out or home() / "rehearsal" / f"{machine.machine}.html"
-    write_rehearsal(page, r, labelled(named, stored))
-    remarks = {m.family.target: m.remark for m in stored if m.remark}
     account = Account.of(batches)
+    write_rehearsal(page, r, labelled(named, stored), account.summary)
+    remarks = {m.family.target: m.remark for m in stored if m.remark}
     if as_json:
         console.print_json(rehearsal_dict(r) | {"page": str(page), "remarks": remarks, "account": account.as_dict()})
         return

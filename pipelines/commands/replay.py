@@ -20,6 +20,7 @@ def print_replay(r: Replay) -> None:
     """One line per training, and what the champions were worth over the year."""
     for reason in r.left_out:
         console.line(f"left out: {reason}")
+    console.line(r.account["summary"])
     for t in r.targets:
         console.line(f"{r.machine} {t}{'  (simulated recordings)' if r.simulated else ''}")
         for g in r.retrainings_of(t):

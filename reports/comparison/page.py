@@ -123,6 +123,8 @@ def _name(training: Training, several: bool) -> str:
 
 def _facts(newest: Sequence[Training], n_batches: int) -> tuple[tuple[str, str], ...]:
     batches = pd.concat([t.result.batches for t in newest], ignore_index=True)
+    once = batches.drop_duplicates(["batch_id", "digest"])
+    read, dropped = (int(once[c].sum()) if c in once else 0 for c in ("rows_read", "rows_dropped"))
     starts = sorted(str(s)[:10] for s in batches.get("start", pd.Series(dtype=str)).dropna() if str(s))
     span = f", {starts[0]} to {starts[-1]}" if starts else ""
     ambient = batches.get("start_ambient_degC", pd.Series(dtype=float)).to_numpy(float)
@@ -131,6 +133,7 @@ def _facts(newest: Sequence[Training], n_batches: int) -> tuple[tuple[str, str],
     trained = sorted(f"{t.started:%Y-%m-%d %H:%M}" for t in newest)
     facts = [
         ("Recordings", f"{count(n_batches, 'batch')}{span}"),
+        ("Rows", f"{read} read, {dropped} dropped" if read else ""),
         ("Start ambient", f"{number(ambient.min())} to {number(ambient.max())} °C" if len(ambient) else ""),
         ("Spindle", listed([s for s in speeds if s != "unknown"])),
         ("Trained", trained[0] + (f" to {trained[-1]}" if trained[-1] != trained[0] else "") + " UTC"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from data.units import unit_label
 from diagnosis.findings.schema import Finding
 from diagnosis.result import Diagnosis
+from reports.account import account_table
 from reports.diagnosis import figures as evidence
 from reports.diagnosis import tables
 from reports.diagnosis.figures import before_after, by_run, left_out_batches
@@ -54,11 +55,20 @@ class Part:
 
 def diagnosis_parts(d: Diagnosis, pictures: bool = True) -> Iterator[Part]:
     """Every section that has something to show, in the page's order; without `pictures`, tables and text alone."""
-    makers = (_where, _better, _runs, _evidence, _flux, _limits, _next, _equations)
+    makers = (_where, _better, _runs, _evidence, _flux, _limits, _next, _equations, _account)
     for make in makers:
         part = make(d, pictures)
         if part is not None:
             yield part
+
+
+def _account(d: Diagnosis, pictures: bool) -> Part | None:
+    account = d.findings.account
+    if not account:
+        return None
+    table = account_table(account, d.simulated)
+    return Part("used", "Recordings used", "What of the recordings was used", f"{account['summary']}.".capitalize(),
+                folded=(table,) if table else ())  # fmt: skip
 
 
 def _where(d: Diagnosis, pictures: bool) -> Part | None:

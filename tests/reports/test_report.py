@@ -168,7 +168,7 @@ def test_the_first_screen_holds_the_number_its_bound_and_the_status(toy_batches:
     digits = len(str(own["expected S"]).split(".")[1])
     assert own["status"] == "provisional" and [r.mark for r in page.overview.rows] == ["", ""]
     assert own["expected S"] == f"{expected.S_um:.{digits}f}" and own["90 % bound"] == f"{expected.bound_um:.{digits}f}"
-    assert [label for label, _ in page.facts] == ["Recordings", "Start ambient", "Spindle", "Trained"]
+    assert [label for label, _ in page.facts] == ["Recordings", "Rows", "Start ambient", "Spindle", "Trained"]
     assert page.channels[0].headline.figures[0][1] == f"{expected.S_um:.{digits}f} µm"
     groups = page.channels[0].headline.groups
     assert groups is not None and [r.cells[0] for r in groups.rows] == [
