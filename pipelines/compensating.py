@@ -124,7 +124,13 @@ class Given:
     sample_s: float | None = None
 
     def of(self, stored: StoredModel) -> Limits:
-        """The limits of one axis. Raises: InputError, one that makes no sense."""
+        """The limits of one axis. Raises: InputError, one that makes no sense, or an error that moves no axis."""
+        unit = stored.machine.channels[stored.family.target].unit
+        if unit != "um":
+            raise InputError(
+                f"{stored.family.target}: its error is in {unit}; compensation and exports move an axis by um; "
+                "`predict` gives this error in its own unit"
+            )
         default, largest_um = Limits(), float(stored.info.get("largest_um", 0.0))
         usual_um = _ROOM * largest_um if largest_um > 0 else default.max_offset_um
         every_s = stored.machine.recording.step_s if self.sample_s is None else self.sample_s

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from data.errors import InputError, one_of
-from data.units import in_error_unit, unit_label
+from data.units import error_column, in_error_unit, unit_label
 from pipelines import console
 from pipelines.commands.ingest import ingest_totals, print_ingest
 from pipelines.options import Json, MachineFile, names, split
@@ -24,10 +24,11 @@ _SHOWN_PROTOCOLS = {"forward": "forward", "leave-season-out": "season out", "lea
 
 def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
     """The outcome for other programs: the error to expect in the next season, and the five best cells by S_mean."""
-    best = {
-        t: r.cells[r.cells["protocol"] == _shown_protocol(r.cells)].nsmallest(5, "S_mean_um").to_dict(orient="records")
-        for t, r in outcome.results.items()
-    }
+    best = {}
+    for t, r in outcome.results.items():
+        cells = r.cells[r.cells["protocol"] == _shown_protocol(r.cells)].nsmallest(5, "S_mean_um")
+        names = {c: error_column(c, outcome.units[t]) for c in cells if c.endswith("_um")}
+        best[t] = cells.rename(columns=names).to_dict(orient="records")
     return {
         "machine": outcome.machine,
         "units": outcome.units,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import subprocess
@@ -139,6 +140,11 @@ def test_limits_follow_the_training_and_how_often_samples_arrive(model: Path) ->
     stored = model_store.load(model)
     assert Given().of(stored).stale_s == 900.0 and Given(sample_s=1.0).of(stored).stale_s == 30.0
     assert Given().of(stored).max_offset_um == 50.0 and Given(7.0).of(stored).max_offset_um == 7.0
+    target = stored.family.target
+    weighed = stored.machine.channels[target].model_copy(update={"unit": "kg"})
+    machine = stored.machine.model_copy(update={"channels": {**stored.machine.channels, target: weighed}})
+    with pytest.raises(InputError, match=f"{target}: its error is in kg; compensation and exports move an axis by um"):
+        Given().of(dataclasses.replace(stored, machine=machine))
 
 
 def test_a_rehearsal_shows_before_and_after(year: Path, model: Path, tmp_path: Path) -> None:
