@@ -134,9 +134,6 @@ class Policy:
     refits_of_mechanism: int = cost(3, "refits", "of one mechanism at several places")
     same_signature_cosine: float = analytic(0.95, "|cos|", "beyond it recordings cannot distinguish two candidates")
     null_folds: int = cost(5, "folds", "of refined twins that are left out of the covariance in turn")
-    structure_steps: int = cost(
-        20, "steps", "of the size of structure on these recordings; it moves by a hundredth after them"
-    )
     label_swaps: int = cost(1, "pairs", "exchanged labels are rare; the plainest is tried")
     label_swap_min_gain_nats: float = development(
         60.0, "nats", "33 true swaps gained 70 or more, 37 of 40 false ones under 31"
@@ -149,11 +146,10 @@ class Policy:
     unseen_start_sd: float = analytic(2.0, "sd", "by which a body without a sensor may start off")
     settled: int = cost(4, "refits", "the likeliest, compared under the covariance that is likeliest for each")
     claims_judged: int = cost(3, "refits", "the likeliest, of which the first that may be claimed is")
-    claim_offset: float = development(-1.13, "log odds", "a logistic fit of 48 first claims of eight kinds, 14 true")
+    claim_offset: float = development(-1.85, "log odds", "a logistic fit of 48 first claims of eight kinds, 14 true")
     claim_weights: tuple[float, ...] = development(
-        (0.76, -3.43), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`, of the same fit"
+        (0.86, -3.26), "log odds per unit", "in the order of `diagnosis.search.claims.FEATURES`, of the same fit"
     )
-    claim_floor_nats: float = development(10.0, "nats", "added to the null, which 100 draws know no better")
     claim_min_probability: float = convention(0.5, "probability", "what is claimed is more probable than not")
     chance_quantile: float = convention(0.99, "probability", "what chance exceeds once in a hundred cases is no claim")
     temperature_null_share: float = development(0.25, "of the null threshold", "scale on which gains are compared")

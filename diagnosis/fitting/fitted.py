@@ -364,15 +364,19 @@ def worsened(before: LeftOutRows, after: LeftOutRows) -> dict[str, tuple[float, 
 def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[float, float]]]:
     """The fit after, calibrated so that no channel is predicted worse than before, and the channels that still are.
 
-    What it adds lets it predict every channel as well; which of them it favours is a matter of weights.
+    What it adds lets it predict every channel as well; which of them it favours is a matter of weights. At first each
+    channel counts as it did before: what is explained better would count for more, and the others for less.
     """
-    weight = np.ones(len(after.problem.channels))
     raised = worsened(left_out_rows(before), left_out_rows(after))
-    for _ in range(POLICY.weight_rounds if raised else 0):
-        weight[[after.problem.channels.index(c) for c in raised]] *= POLICY.weight_factor
+    if not raised:
+        return after, {}
+    weight, still = (plain(after).noise.factor / plain(before).noise.factor) ** 2, raised
+    for _ in range(POLICY.weight_rounds):
         fair = replace(after, weight=tuple(weight.tolist()))
-        if not worsened(left_out_rows(before), left_out_rows(fair)):
+        still = worsened(left_out_rows(before), left_out_rows(fair))
+        if not still:
             return fair, {}
+        weight[[after.problem.channels.index(c) for c in still]] *= POLICY.weight_factor
     return after, raised
 
 

@@ -124,10 +124,7 @@ def _gains(left: Array, with_residual: Array, prior: Array, positive: Array) -> 
 
 
 def _null(fitted: Fitted, mixed: Array, cross: Array, squares: Array, prior: Array, positive: Array) -> Array:
-    """Gains (T, C) where the recordings are those of a refined twin, left out of the directions in turn, and noise.
-
-    The twins differ from the lumped one as much as this machine does (`structure_size`).
-    """
+    """Gains (T, C) where the recordings are those of a refined twin, left out of the directions in turn, and noise."""
     p, twins = len(fitted.z), POLICY.refined_twins
     of_model = fitted.grams.cross.sum(axis=0)[:, :p]  # (K, p)
     inner = fitted.grams.inner.sum(axis=0)[:p, :p]
@@ -136,8 +133,6 @@ def _null(fitted: Fitted, mixed: Array, cross: Array, squares: Array, prior: Arr
     out = np.zeros((twins, cross.shape[1]))
     joint = np.block([[inner, of_model.T], [of_model, directions]])
     shared = np.vstack([mixed[:p], cross])
-    residual = np.append(fitted.grams.inner.sum(axis=0)[:p, p], fitted.grams.cross.sum(axis=0)[:, p])
-    machine = structure_size(joint, residual, slice(p, p + twins))
     for fold in range(POLICY.null_folds):
         dropped = np.arange(fold, twins, POLICY.null_folds)
         keep = np.ones(len(joint))
@@ -146,31 +141,10 @@ def _null(fitted: Fitted, mixed: Array, cross: Array, squares: Array, prior: Arr
         factor = cho_factor(joint * keep[:, None] * keep + np.eye(len(joint)))
         along = cho_solve(factor, shared * keep[:, None])
         left = np.maximum(squares - np.einsum("kc,kc->c", shared * keep[:, None], along), TINY)
-        size = machine * np.sqrt(twins)  # a direction is a draw of sd 1 / sqrt(twins)
+        size = np.sqrt(twins)  # a direction is a draw of sd 1 / sqrt(twins)
         shown = size * (cross[dropped] - (joint[p + dropped] * keep) @ along)
         out[dropped] = _gains(left, shown + rng.standard_normal(shown.shape) * np.sqrt(left), prior, positive)[0]
     return out
-
-
-def structure_size(joint: Array, residual: Array, of: slice) -> float:
-    """How large the coefficients of some directions are on these recordings; 1 as they were drawn.
-
-    The likeliest common sd of the coefficients, by expectation and maximisation (Dempster, Laird and Rubin 1977).
-
-    Args:
-        joint: products (n, n) of everything that is fitted, in units of its prior and of the noise.
-        residual: its products (n,) with what is left.
-        of: the directions.
-    """
-    size = 1.0
-    for _ in range(POLICY.structure_steps):
-        scale = np.ones(len(joint))
-        scale[of] = size
-        inverse = np.linalg.inv(joint * scale[:, None] * scale + np.eye(len(joint)))
-        mean = scale * (inverse @ (scale * residual))
-        spread = scale**2 * np.diag(inverse)
-        size = float(np.sqrt(np.mean(mean[of] ** 2 + spread[of])))
-    return size
 
 
 def _positive(every: Sequence[Candidate], seen: Signatures) -> Array:

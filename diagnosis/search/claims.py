@@ -64,9 +64,8 @@ def features(t: Tried, threshold: float) -> dict[str, float]:
     """
     c = t.candidate
     coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
-    least = max(threshold, 0.0) + POLICY.claim_floor_nats
     return {
-        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / least)),
+        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / max(threshold, 1.0))),
         "network": float(c.kind.is_unlisted or coarse),
     }
 

@@ -106,8 +106,13 @@ def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
 
 
 def _judged(done: Round, t: Tried, impossible_now: frozenset[str], vetoed: bool) -> Round:
-    """The round with `t` as its claim: probable enough, and no channel predicted worse."""
+    """The round with `t` as its claim: probable enough, and no channel predicted worse.
+
+    What structure alone gains is asked of the machine with the claim: without it, what it explains is in every twin.
+    """
     rest = [o for o in done.tried if o is not t]
+    seen = screen(t.fitted, [s.candidate for s in done.screen.scored], done.screen)
+    done = replace(done, null=seen.null_gains(odds_of(done.before, done.screen)))
     own = features(t, done.threshold)
     resolved = _resolves(t, impossible_now)
     probable = POLICY.max_probability if resolved else trust(own)
