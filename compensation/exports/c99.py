@@ -23,6 +23,8 @@ class C(Language):
         "single": "(double)(float)",
         "tanh": "tanh",
         "or": "||",
+        "less": "<",
+        "equal": "==",
     }
 
     def comment(self, text: str) -> str:
@@ -42,6 +44,9 @@ class C(Language):
 
     def number(self, value: float) -> str:
         return repr(value) if value >= 0 else f"({value!r})"
+
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        return f"{condition} ? {yes} : {no}"
 
     def power(self, base: str, exponent: float) -> str:
         return f"pow({base}, {exponent!r})"
@@ -307,7 +312,7 @@ def _table(name: str, values: np.ndarray) -> str:
 def _axis(a: AxisModel, prefix: str, places: Mapping[str, int]) -> str:
     """State, constants and row function of one axis."""
     p, w = a.program, Writer(C(), prefix)
-    outputs = lower(w, a)
+    outputs = [o("0") for o in lower(w, p)]
     count = len(p.channels)
     inputs = f"{prefix}v0"  # the last values
     w.memory.pop(inputs, None)

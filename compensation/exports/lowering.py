@@ -1,7 +1,8 @@
-"""Programs as statements of a language with arrays, loops and branches: shared by C and structured text.
+"""Programs as statements of a language with arrays, loops and branches: C, structured text and Python.
 
-Node k becomes one block that sets the array ``v<k>``; ``s<k>`` is what it carries from row to row, ``c<k>_<name>`` its
-constants. `first_row` is true in the first row, in which every block sets its own state: a reset needs no more.
+Node k becomes one block that sets the array ``v<k>``, or the number of that name where it has one element; ``s<k>`` is
+what it carries from row to row, ``c<k>_<name>`` its constants. All keep their values from row to row. `first_row` is
+true in the first row, in which every block sets its own state: a reset needs no more.
 """
 
 from __future__ import annotations
@@ -9,11 +10,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
-from compensation.exports.base import AxisModel
 from data.arrays import Array
 from models.program import Node, Program
 
@@ -23,9 +24,9 @@ Shape = tuple[str, int]  # "real", "whole" or "logical", and the length; 0 for a
 
 
 class Language(ABC):
-    """Spelling of statements; operators + - * / and indices x[i] are the same in both languages."""
+    """Spelling of statements; operators + - * / < and indices x[i] are the same in all languages."""
 
-    functions: ClassVar[Mapping[str, str]]  # abs, exp, min, max, single
+    functions: ClassVar[Mapping[str, str]]  # abs, exp, min, max, single; operators or, =
 
     @abstractmethod
     def comment(self, text: str) -> str: ...
@@ -48,6 +49,10 @@ class Language(ABC):
     @abstractmethod
     def number(self, value: float) -> str:
         """A number inside an expression."""
+
+    @abstractmethod
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        """An expression that is `yes` where the condition holds, else `no`; both are evaluated or free of effects."""
 
     @abstractmethod
     def power(self, base: str, exponent: float) -> str:
@@ -136,20 +141,22 @@ class _Lowered:
     def __init__(self, w: Writer, program: Program) -> None:
         self.w, self.language, self.program = w, w.language, program
 
-    def name(self, k: int) -> str:
-        """Array of node k."""
-        n = self.program.nodes[k]
-        if n.op == "constant":
-            return self.w.table(f"c{k}_value", n.data["value"])
-        return self.w.array(f"v{k}", n.size)
-
     def item(self, k: int, index: str) -> str:
         """Element of node k; that of a single value whatever the index is."""
-        return f"{self.name(k)}[{'0' if self.program.nodes[k].size == 1 else index}]"
+        n = self.program.nodes[k]
+        if n.op == "constant":
+            value = n.data["value"]
+            alike = bool((value == value[0]).all())
+            return self.language.number(float(value[0])) if alike else f"{self.w.table(f'c{k}_value', value)}[{index}]"
+        single = n.size == 1 and k > 0
+        name = self.w.array(f"v{k}", 0 if single else n.size)
+        return name if single else f"{name}[{'0' if n.size == 1 else index}]"
 
     def part(self, k: int, name: str, index: str, size: int) -> str:
         """Element of a constant of node k that has one number for each of `size` or one for all."""
         values = np.broadcast_to(self.program.nodes[k].data[name], size)
+        if (values == values[0]).all():
+            return self.language.number(float(values[0]))
         return f"{self.w.table(f'c{k}_{name}', values)}[{index}]"
 
     def block(self, k: int) -> None:
@@ -167,25 +174,25 @@ class _Lowered:
             if size:
                 with self.w.loop(size) as i:
                     place = str(at) if i == "0" else f"{at} + {i}" if at else i
-                    self.w.put(f"{self.name(k)}[{place}]", self.item(a, i))
+                    self.w.put(self.item(k, place), self.item(a, i))
             at += size
 
     def pick(self, k: int, n: Node) -> None:
         places = n.data["places"].astype(int)
-        if n.size <= _UNROLLED:
+        if n.size <= _UNROLLED or len(set(places)) == 1:
             for to, place in enumerate(places):
-                self.w.put(f"{self.name(k)}[{to}]", f"{self.name(n.args[0])}[{place}]")
+                self.w.put(self.item(k, str(to)), self.item(n.args[0], str(place)))
             return
         table = self.w.table(f"c{k}_places", places)
         with self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", f"{self.name(n.args[0])}[{table}[{i}]]")
+            self.w.put(self.item(k, i), self.item(n.args[0], f"{table}[{i}]"))
 
     def affine(self, k: int, n: Node) -> None:
         width = self.program.nodes[n.args[0]].size
         with self.w.loop(n.size) as i:
             offset = self.part(k, "offset", i, n.size)
             if not width:
-                self.w.put(f"{self.name(k)}[{i}]", offset)
+                self.w.put(self.item(k, i), offset)
                 return
             total = self.w.scalar("total")
             self.w.put(total, offset)
@@ -193,18 +200,36 @@ class _Lowered:
             with self.w.loop(width, "j") as j:
                 place = j if i == "0" else f"{i} * {width} + {j}" if width > 1 else i
                 self.w.put(total, f"{total} + {matrix}[{place}] * {self.item(n.args[0], j)}")
-            self.w.put(f"{self.name(k)}[{i}]", total)
+            self.w.put(self.item(k, i), total)
 
     def two(self, k: int, n: Node) -> None:
-        a, b = n.args
+        one, zero = self.language.number(1.0), self.language.number(0.0)
         with self.w.loop(n.size) as i:
-            sign = "-" if n.op == "sub" else "*"
-            self.w.put(f"{self.name(k)}[{i}]", f"{self.item(a, i)} {sign} {self.item(b, i)}")
+            a, b = (self.item(x, i) for x in n.args)
+            if n.op in ("min", "max"):
+                value = self.language.call(n.op, a, b)
+            elif n.op in ("less", "equal"):
+                value = self.language.choice(f"{a} {self.language.functions[n.op]} {b}", one, zero)
+            else:
+                value = f"{a} {_SIGNS[n.op]} {b}"
+            self.w.put(self.item(k, i), value)
+
+    def select(self, k: int, n: Node) -> None:
+        half = self.language.number(0.5)  # a condition is 0 or 1
+        with self.w.loop(n.size) as i:
+            c, a, b = (self.item(x, i) for x in n.args)
+            self.w.put(self.item(k, i), self.language.choice(f"{c} > {half}", a, b))
+
+    def previous(self, k: int, n: Node) -> None:
+        with self.w.loop(n.size) as i:  # its argument is computed below, and still has the value of the row before
+            self.w.put(self.item(k, i), self.item(n.args[0], i))
+        with self.w.when("first_row"), self.w.loop(n.size) as i:
+            self.w.put(self.item(k, i), self.part(k, "initial", i, n.size))
 
     def power(self, k: int, n: Node) -> None:
         exponents = np.broadcast_to(n.data["exponents"], n.size)
         for i, exponent in enumerate(exponents.tolist()):
-            target, x = f"{self.name(k)}[{i}]", self.language.call("abs", self.item(n.args[0], str(i)))
+            target, x = self.item(k, str(i)), self.language.call("abs", self.item(n.args[0], str(i)))
             if exponent == 1.0:
                 self.w.put(target, x)
                 continue
@@ -216,7 +241,7 @@ class _Lowered:
     def median(self, k: int, n: Node) -> None:
         (a,), size = n.args, self.program.nodes[n.args[0]].size
         if size == 1:
-            self.w.put(f"{self.name(k)}[0]", self.item(a, "0"))
+            self.w.put(self.item(k, "0"), self.item(a, "0"))
             return
         order = self.w.array(f"o{k}", size)
         with self.w.loop(size) as i:
@@ -231,15 +256,15 @@ class _Lowered:
             self.w.put(f"{order}[{i}]", f"{order}[{j}]")
             self.w.put(f"{order}[{j}]", held)
         half = self.language.number(0.5)
-        self.w.put(f"{self.name(k)}[0]", f"{half} * ({order}[{(size - 1) // 2}] + {order}[{size // 2}])")
+        self.w.put(self.item(k, "0"), f"{half} * ({order}[{(size - 1) // 2}] + {order}[{size // 2}])")
 
     def first(self, k: int, n: Node) -> None:
         with self.w.when("first_row"), self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+            self.w.put(self.item(k, i), self.item(n.args[0], i))
 
     def lag(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            v, x, keep = f"{self.name(k)}[{i}]", self.item(n.args[0], i), self.part(k, "keep", i, n.size)
+            v, x, keep = self.item(k, i), self.item(n.args[0], i), self.part(k, "keep", i, n.size)
             with self.w.when("first_row"):
                 self.w.put(v, f"{self.part(k, 'begin', i, n.size)} * {x}")
             with self.w.otherwise():
@@ -280,7 +305,7 @@ class _Lowered:
             if part:
                 shares = self.language.number(1.0 - part), self.language.number(part)
                 value = f"{shares[0]} * {value} + {shares[1]} * {ring}[{self._at(far, n, i)}]"
-            self.w.put(f"{self.name(k)}[{i}]", value)
+            self.w.put(self.item(k, i), value)
 
     def _at(self, row: str, n: Node, i: str) -> str:
         return row if n.size == 1 else f"{row} * {n.size} + {i}"
@@ -299,17 +324,17 @@ class _Lowered:
         with self.w.when(f"{far} < 0"):
             self.w.put(far, f"{far} + {rows + 1}")
         with self.w.when("first_row"), self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", self.language.number(0.0))
+            self.w.put(self.item(k, i), self.language.number(0.0))
         with self.w.otherwise(), self.w.loop(n.size) as i:
             rise = f"{self.item(n.args[0], i)} - {ring}[{self._at(far, n, i)}]"
             hours = self.language.number(self.program.step_s / 3600.0)
-            self.w.put(f"{self.name(k)}[{i}]", f"({rise}) / ({seen} * {hours})")
+            self.w.put(self.item(k, i), f"({rise}) / ({seen} * {hours})")
 
     def clock(self, k: int, n: Node) -> None:
         with self.w.when("first_row"):
-            self.w.put(f"{self.name(k)}[0]", self.language.number(0.0))
+            self.w.put(self.item(k, "0"), self.language.number(0.0))
         with self.w.otherwise():
-            self.w.put(f"{self.name(k)}[0]", f"{self.name(k)}[0] + {self.language.number(self.program.step_s)}")
+            self.w.put(self.item(k, "0"), f"{self.item(k, '0')} + {self.language.number(self.program.step_s)}")
 
     def curve(self, k: int, n: Node) -> None:
         knots, values = n.data["knots"], n.data["values"]
@@ -324,11 +349,11 @@ class _Lowered:
                     beyond = f"{self.item(n.args[0], i)} - {names[0]}[{j}]"
                     inside = self.language.call("min", self.language.call("max", beyond, zero), f"{names[1]}[{j}]")
                     self.w.put(total, f"{total} + {names[2]}[{j}] * {inside}")
-            self.w.put(f"{self.name(k)}[{i}]", total)
+            self.w.put(self.item(k, i), total)
 
     def tanh(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            self.language.tanh(self.w, f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+            self.language.tanh(self.w, self.item(k, i), self.item(n.args[0], i))
 
     def kernel(self, k: int, n: Node) -> None:
         support, weights = np.atleast_2d(n.data["support"]), n.data["weights"]
@@ -346,17 +371,17 @@ class _Lowered:
             exponent = f"{self.language.number(-float(n.data['sharpness'][0]))} * {away}"
             weight = f"{self.w.table(f'c{k}_weights', weights)}[{i}]"
             self.w.put(total, f"{total} + {weight} * {self.language.call('exp', exponent)}")
-        self.w.put(f"{self.name(k)}[0]", total)
+        self.w.put(self.item(k, "0"), total)
 
     def trees(self, k: int, n: Node) -> None:
         d, w = n.data, self.w
         whole = {name: w.table(f"c{k}_{name}", d[name].astype(int)) for name in ("roots", "feature", "left", "right")}
         real = {name: w.table(f"c{k}_{name}", d[name]) for name in ("threshold", "value")}
-        (a,), seen = n.args, self.name(n.args[0])
-        if d["single"][0] and self.program.nodes[a].size:
-            seen = w.array(f"o{k}", self.program.nodes[a].size)
-            with w.loop(self.program.nodes[a].size) as i:
-                w.put(f"{seen}[{i}]", self.language.call("single", self.item(a, i)))
+        (a,) = n.args
+        seen = w.array(f"o{k}", max(self.program.nodes[a].size, 1))
+        with w.loop(self.program.nodes[a].size) as i:
+            x = self.item(a, i)
+            w.put(f"{seen}[{i}]", self.language.call("single", x) if d["single"][0] else x)
         total, node = w.scalar("total"), w.scalar("node", "whole")
         w.put(total, self.language.number(0.0))
         with w.loop(len(d["roots"])) as i:
@@ -367,15 +392,16 @@ class _Lowered:
                 with w.otherwise():
                     w.put(node, f"{whole['right']}[{node}]")
             w.put(total, f"{total} + {real['value']}[{node}]")
-        w.put(f"{self.name(k)}[0]", total)
+        w.put(self.item(k, "0"), total)
 
 
 _BLOCKS: Mapping[str, Callable[[_Lowered, int, Node], None]] = {
     "join": _Lowered.join,
     "pick": _Lowered.pick,
     "affine": _Lowered.affine,
-    "sub": _Lowered.two,
-    "mul": _Lowered.two,
+    **dict.fromkeys(("add", "sub", "mul", "min", "max", "less", "equal"), _Lowered.two),
+    "select": _Lowered.select,
+    "previous": _Lowered.previous,
     "power": _Lowered.power,
     "median": _Lowered.median,
     "first": _Lowered.first,
@@ -388,7 +414,15 @@ _BLOCKS: Mapping[str, Callable[[_Lowered, int, Node], None]] = {
     "kernel": _Lowered.kernel,
     "trees": _Lowered.trees,
 }
+_SIGNS: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*"}
 _TITLES: Mapping[str, str] = {
+    "add": "sum",
+    "min": "the smaller",
+    "max": "the larger",
+    "less": "1 where less, else 0",
+    "equal": "1 where equal, else 0",
+    "select": "choice",
+    "previous": "value in the row before",
     "join": "values joined",
     "pick": "values picked",
     "affine": "offset plus matrix times values",
@@ -415,12 +449,12 @@ def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
     return knots[:-1], wide, np.divide(np.diff(values), wide, out=np.zeros_like(wide), where=wide > 0)
 
 
-def lower(w: Writer, axis: AxisModel) -> list[str]:
-    """Writes the blocks of all nodes; the outputs as expressions, one for each."""
-    lowered = _Lowered(w, axis.program)
-    for k in range(len(axis.program.nodes)):
+def lower(w: Writer, program: Program) -> list[Callable[[str], str]]:
+    """Writes the blocks of all nodes; for each output its element at an index, as an expression."""
+    lowered = _Lowered(w, program)
+    for k in range(len(program.nodes)):
         lowered.block(k)
-    return [lowered.item(o, "0") for o in axis.program.outputs]
+    return [partial(lowered.item, o) for o in program.outputs]
 
 
 def number_lines(values: Array, number: Callable[[float], str]) -> list[str]:

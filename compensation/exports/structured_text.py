@@ -18,7 +18,9 @@ _TEXT = 120  # characters of a string
 class StructuredText(Language):
     """IEC 61131-3."""
 
-    functions: ClassVar[Mapping[str, str]] = {"abs": "ABS", "exp": "EXP", "min": "MIN", "max": "MAX", "or": "OR"}
+    functions: ClassVar[Mapping[str, str]] = {
+        "abs": "ABS", "exp": "EXP", "min": "MIN", "max": "MAX", "or": "OR", "less": "<", "equal": "=",
+    }  # fmt: skip
 
     def comment(self, text: str) -> str:
         return f"(* {ascii_text(text)} *)"
@@ -39,6 +41,9 @@ class StructuredText(Language):
 
     def number(self, value: float) -> str:
         return real(value) if value >= 0 else f"({real(value)})"
+
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        return f"SEL({condition}, {no}, {yes})"
 
     def power(self, base: str, exponent: float) -> str:
         return f"EXPT({base}, {self.number(exponent)})"
@@ -183,8 +188,8 @@ def _row(w: Writer, a: AxisModel, names: Sequence[str]) -> None:
     with w.when("complete"):
         w.put("first_row", "NOT begun")
         w.put("begun", "TRUE")
-        for output, value in zip(a.output_units, lower(w, a), strict=True):
-            w.put(output, value)
+        for output, value in zip(a.output_units, lower(w, a.program), strict=True):
+            w.put(output, value("0"))
     with w.when("valid"):
         w.put("quiet_s", "0.0")
         for (output, factor, (largest, _, _)), error in zip(_corrected(a), a.output_units, strict=True):

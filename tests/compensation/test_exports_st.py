@@ -22,7 +22,7 @@ from thermodrift.testing.exports import SomeLimits, export_of, offset_only, stra
 
 WORDS = {
     "IF", "THEN", "ELSE", "END_IF", "FOR", "TO", "DO", "END_FOR", "WHILE", "END_WHILE", "AND", "OR", "NOT", "TRUE",
-    "FALSE", "ABS", "EXP", "EXPT", "MIN", "MAX", "REAL_TO_LREAL", "LREAL_TO_REAL",
+    "FALSE", "ABS", "EXP", "EXPT", "MIN", "MAX", "SEL", "REAL_TO_LREAL", "LREAL_TO_REAL",
 }  # fmt: skip
 DEFAULTS: dict[str, Callable[[], Any]] = {"LREAL": float, "DINT": int, "BOOL": bool, "STRING": str}
 
@@ -32,6 +32,10 @@ def expression(text: str) -> str:
     for word, python in {"AND": "and", "OR": "or", "NOT": "not", "TRUE": "True", "FALSE": "False"}.items():
         text = re.sub(rf"\b{word}\b", python, text)
     return text
+
+
+def sel(chosen: bool, no: float, yes: float) -> float:
+    return yes if chosen else no
 
 
 class Block:
@@ -59,7 +63,7 @@ class Block:
                     assert len(self.values[name]) == int(array) + 1
         self.code = compile(self._python(), "st", "exec")
         single = {"REAL_TO_LREAL": float, "LREAL_TO_REAL": lambda x: float(np.float32(x))}
-        self.space = {"ABS": abs, "EXP": exp, "EXPT": pow, "MIN": min, "MAX": max, **single, **self.values}
+        self.space = {"ABS": abs, "EXP": exp, "EXPT": pow, "MIN": min, "MAX": max, "SEL": sel, **single, **self.values}
 
     def _python(self) -> str:
         out, depth = [], 0
