@@ -6,9 +6,11 @@ the program for one value as compiled Python; exports lower the same program to 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
+
+import numpy as np
 
 from compensation.exports.lowering import Language, Writer, lower
 from data.batch import Channel
@@ -104,6 +106,22 @@ def core(size: int = 1) -> Program:
     return b.program(list(after.values()), zero_start=False)
 
 
+def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[Sequence[float]]) -> list[list[str]]:
+    """Writes the core behind what sets its inputs, and gives `CARRIED` as expressions, an element for each value.
+
+    Args:
+        given: expressions of the inputs in front of the limits, one for each value.
+        limits: for each value its limits in the order of `LIMITS`.
+    """
+    before = [expression for name in list(INPUTS)[: -len(LIMITS)] for expression in given[name]]
+    for k, expression in enumerate(before):
+        w.put(f"{w.prefix}core_v0[{k}]", expression)
+    table = w.table("core_limits", np.array(limits, float).T.ravel())
+    with w.loop(len(LIMITS) * len(limits)) as i:
+        w.put(f"{w.prefix}core_v0[{len(before)} + {i}]", f"{table}[{i}]")
+    return lower(w, core(len(limits)), "core_")
+
+
 class Python(Language):
     """Python, for programs whose nodes have one element each."""
 
@@ -140,7 +158,7 @@ class Python(Language):
 def run() -> Callable[..., tuple[float, ...]]:
     """`step(inputs, *carried) -> carried`: the core for one value; `inputs` in the order of `INPUTS`."""
     program, w = core(), Writer(Python())
-    results = ", ".join(item("0") for item in lower(w, program))
+    results = ", ".join(element for (element,) in lower(w, program))
     carried = [f"v{program.outputs[k]}" for k in range(len(CARRIED))]
     text = "\n".join([f"def step(v0, {', '.join(carried)}, first_row=False):", *w.lines, f"    return {results}"])
     space: dict[str, Any] = {}

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -236,7 +235,9 @@ class _Lowered:
             with self.w.when(f"{x} > {self.language.number(0.0)}"):
                 self.w.put(target, self.language.power(x, exponent))
             with self.w.otherwise():  # not every language defines a power of 0
-                self.w.put(target, self.language.number(0.0**exponent))
+                self.w.put(
+                    target, self.language.number(0.0**exponent if exponent >= 0.0 else float(np.finfo(float).max))
+                )
 
     def median(self, k: int, n: Node) -> None:
         (a,), size = n.args, self.program.nodes[n.args[0]].size
@@ -449,12 +450,15 @@ def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
     return knots[:-1], wide, np.divide(np.diff(values), wide, out=np.zeros_like(wide), where=wide > 0)
 
 
-def lower(w: Writer, program: Program) -> list[Callable[[str], str]]:
-    """Writes the blocks of all nodes; for each output its element at an index, as an expression."""
+def lower(w: Writer, program: Program, prefix: str = "") -> list[list[str]]:
+    """Writes the blocks of all nodes, named with a prefix; the elements of each output as expressions."""
+    outer, w.prefix = w.prefix, w.prefix + prefix
     lowered = _Lowered(w, program)
     for k in range(len(program.nodes)):
         lowered.block(k)
-    return [partial(lowered.item, o) for o in program.outputs]
+    elements = [[lowered.item(o, str(i)) for i in range(program.nodes[o].size)] for o in program.outputs]
+    w.prefix = outer
+    return elements
 
 
 def number_lines(values: Array, number: Callable[[float], str]) -> list[str]:

@@ -12,7 +12,7 @@ LIMITS = Limits(max_offset_um=20.0, rate_um_per_s=0.5, step_um=2.0, hold_s=10.0,
 
 
 def hostile(n: int, seed: int) -> np.ndarray:
-    """Rows (n, inputs) with limits: runs of good seconds, of silence, of faults and of stops; pauses and clock steps."""
+    """Rows (n, inputs) with limits: runs of good seconds, silence, faults and stops; pauses and clock steps."""
     rng = np.random.default_rng(seed)
     kind = np.repeat(rng.choice(["good", "good", "good", "silent", "faulty", "stopped"], n), rng.integers(1, 30, n))[:n]
     elapsed_s = rng.choice(
