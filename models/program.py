@@ -274,7 +274,7 @@ class Builder:
         centred = self.sub(x, self.constant(np.broadcast_to(shift, self.size(x)))) if np.any(shift) else x
         return self.add("mul", [centred, self.constant(1.0 / np.broadcast_to(scale, self.size(x)))], self.size(x))
 
-    def constant(self, value: Array | float) -> int:
+    def constant(self, value: Array | Sequence[float] | float) -> int:
         value = np.atleast_1d(value)
         return self.add("constant", [], len(value), value=value)
 
@@ -465,7 +465,7 @@ _STEPS: Mapping[str, Callable[[Node, float], Step]] = {
     "max": lambda n, step_s: lambda s, begin, a, b: np.maximum(a, b),
     "less": lambda n, step_s: lambda s, begin, a, b: (a < b).astype(float),
     "equal": lambda n, step_s: lambda s, begin, a, b: (a == b).astype(float),
-    "select": lambda n, step_s: lambda s, begin, c, a, b: np.where(c > 0.5, a, b),
+    "select": lambda n, step_s: lambda s, begin, c, a, b: np.asarray(np.where(c > 0.5, a, b), float),
     "previous": lambda n, step_s: lambda s, begin: n.data["initial"] if begin else s,
     "power": lambda n, step_s: lambda s, begin, x: np.abs(x) ** n.data["exponents"],
     "median": lambda n, step_s: lambda s, begin, x: np.array([np.median(x)]),

@@ -253,6 +253,10 @@ def rehearse_models(
         return rehearse(batches, axes, exchange, sample_s, failing, reads, done)
 
 
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
 def write_export(
     models: Mapping[str, Path],
     to: str,
@@ -299,11 +303,7 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
         program = made.program if made.share == 1.0 else made.program.scaled(made.share)
         remark = made.remark + ("; its outputs are that share" if made.share < 1.0 else "")
         channels = stored.machine.batch_channels()
-        plausible = {
-            c: (-math.inf if channels[c].low is None else channels[c].low,
-                math.inf if channels[c].high is None else channels[c].high)
-            for c in program.channels
-        }  # fmt: skip
+        plausible = {c: (_or(channels[c].low, -math.inf), _or(channels[c].high, math.inf)) for c in program.channels}
         trust = trust_program(made, channels)
         axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark, plausible, trust))
     first = next(iter(models.values()))

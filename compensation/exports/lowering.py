@@ -134,8 +134,11 @@ class Writer:
         self.line(tail)
 
 
+_SIGNS: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*"}
+
+
 class _Lowered:
-    """The blocks of one program."""
+    """The blocks of one program: a method for each operation, by its name."""
 
     def __init__(self, w: Writer, program: Program) -> None:
         self.w, self.language, self.program = w, w.language, program
@@ -163,8 +166,8 @@ class _Lowered:
         if n.size == 0 or n.op in ("input", "constant"):
             return
         of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
-        self.w.comment(f"v{k}: {_TITLES[n.op]}{of}")
-        _BLOCKS[n.op](self, k, n)
+        self.w.comment(f"v{k}: {n.op}{of}")
+        getattr(self, n.op)(k, n)
 
     def join(self, k: int, n: Node) -> None:
         at = 0
@@ -212,6 +215,8 @@ class _Lowered:
             else:
                 value = f"{a} {_SIGNS[n.op]} {b}"
             self.w.put(self.item(k, i), value)
+
+    add = sub = mul = min = max = less = equal = two
 
     def select(self, k: int, n: Node) -> None:
         half = self.language.number(0.5)  # a condition is 0 or 1
@@ -394,53 +399,6 @@ class _Lowered:
                     w.put(node, f"{whole['right']}[{node}]")
             w.put(total, f"{total} + {real['value']}[{node}]")
         w.put(self.item(k, "0"), total)
-
-
-_BLOCKS: Mapping[str, Callable[[_Lowered, int, Node], None]] = {
-    "join": _Lowered.join,
-    "pick": _Lowered.pick,
-    "affine": _Lowered.affine,
-    **dict.fromkeys(("add", "sub", "mul", "min", "max", "less", "equal"), _Lowered.two),
-    "select": _Lowered.select,
-    "previous": _Lowered.previous,
-    "power": _Lowered.power,
-    "median": _Lowered.median,
-    "first": _Lowered.first,
-    "lag": _Lowered.lag,
-    "delay": _Lowered.delay,
-    "rate": _Lowered.rate,
-    "clock": _Lowered.clock,
-    "curve": _Lowered.curve,
-    "tanh": _Lowered.tanh,
-    "kernel": _Lowered.kernel,
-    "trees": _Lowered.trees,
-}
-_SIGNS: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*"}
-_TITLES: Mapping[str, str] = {
-    "add": "sum",
-    "min": "the smaller",
-    "max": "the larger",
-    "less": "1 where less, else 0",
-    "equal": "1 where equal, else 0",
-    "select": "choice",
-    "previous": "value in the row before",
-    "join": "values joined",
-    "pick": "values picked",
-    "affine": "offset plus matrix times values",
-    "sub": "difference",
-    "mul": "product",
-    "power": "power of the absolute value",
-    "median": "median",
-    "first": "value in the first row",
-    "lag": "first-order lag",
-    "delay": "delay",
-    "rate": "slope per hour",
-    "clock": "s since the first row",
-    "curve": "piecewise linear curve",
-    "tanh": "tanh",
-    "kernel": "weighted sum of Gaussian kernels",
-    "trees": "weighted sum of regression trees",
-}
 
 
 def curve_pieces(n: Node) -> tuple[Array, Array, Array]:

@@ -208,16 +208,16 @@ def _trees(g: Graph, p: Program, n: Node, s: str, x: tuple[str, ...]) -> tuple[s
     return g.op("ReduceSum", g.op("Gather", g.real(d["value"]), node, axis=0), g.whole([0]), keepdims=1), ""
 
 
+def _two(op: str) -> Step:
+    return lambda g, p, n, s, x: (g.op(op, *x), "")
+
+
 _STEPS: Mapping[str, Step] = {
     "constant": lambda g, p, n, s, x: (g.real(n.data["value"]), ""),
     "join": _join,
     "pick": _pick,
     "affine": _affine,
-    "add": lambda g, p, n, s, x: (g.op("Add", *x), ""),
-    "sub": lambda g, p, n, s, x: (g.op("Sub", *x), ""),
-    "mul": lambda g, p, n, s, x: (g.op("Mul", *x), ""),
-    "min": lambda g, p, n, s, x: (g.op("Min", *x), ""),
-    "max": lambda g, p, n, s, x: (g.op("Max", *x), ""),
+    **{op.lower(): _two(op) for op in ("Add", "Sub", "Mul", "Min", "Max")},
     "less": lambda g, p, n, s, x: (g.op("Cast", g.op("Less", *x), to=TensorProto.DOUBLE), ""),
     "equal": lambda g, p, n, s, x: (g.op("Cast", g.op("Equal", *x), to=TensorProto.DOUBLE), ""),
     "select": lambda g, p, n, s, x: (g.op("Where", g.op("Less", g.real(0.5), x[0]), *x[1:]), ""),

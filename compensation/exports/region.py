@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from compensation.runtime import AxisModel
+from data.arrays import Array
 from data.batch import Channel
 from models.program import Builder, Program
 from models.trust import SLACK
@@ -45,8 +46,7 @@ def trust_program(a: AxisModel, known: Mapping[str, Channel]) -> Program | None:
     return b.program([trust], zero_start=False)
 
 
-def _excess(b: Builder, x: int, low: Sequence[float], high: Sequence[float], width: Sequence[float]) -> int:
+def _excess(b: Builder, x: int, low: Array, high: Array, width: Array) -> int:
     """How far outside, in widths."""
-    least, most = b.constant(np.asarray(low)), b.constant(np.asarray(high))
-    outside = b.two("max", b.sub(least, x), b.sub(x, most), b.constant(np.zeros(len(np.asarray(low)))))
-    return b.scaled(outside, np.asarray(width))
+    outside = b.two("max", b.sub(b.constant(low), x), b.sub(x, b.constant(high)), b.constant(np.zeros(len(low))))
+    return b.scaled(outside, width)

@@ -45,7 +45,7 @@ def _commented(lines: list[str]) -> str:
 
 def _axis(a: AxisModel) -> str:
     p, name = a.program, a.axis.upper()
-    factor, remarks = _factor(a)
+    factor = _factor(a)
     most_um = factor * MOST_VELOCITY_MM_PER_MIN * 1000.0 / 60.0 * CYCLE_S
     data = [
         (f"$MA_TEMP_COMP_TYPE[{name}] = {'3' if p.along else '1'}", "MD32750: bit 0 offset, bit 1 slope"),
@@ -61,24 +61,11 @@ def _axis(a: AxisModel) -> str:
         writes.append(f"SD43910[{name}] := SIGN * slope_um_per_m / 1000000.0, in mm/mm")
     lines = "\n".join(f"{text} ; {note}" for text, note in data)
     code = ["From the receiver, in every cycle of the PLC:", *(f"  {text}" for text in writes)]
-    return f"{_commented([f'Axis {name}', *remarks])}\n{lines}\n{_commented(code)}"
+    return f"{_commented([f'Axis {name}'])}\n{lines}\n{_commented(code)}"
 
 
-def _factor(a: AxisModel) -> tuple[float, list[str]]:
-    """MD32760, and what is to be said of it: the rate limit, raised where it would cut tan β."""
-    factor = a.limits.rate_um_per_s * 60.0 / 1000.0 / MOST_VELOCITY_MM_PER_MIN
-    remarks = [
-        f"The rate limit of {a.limits.rate_um_per_s:g} um/s is {a.limits.rate_um_per_s * CYCLE_S:.4g} um per cycle, a "
-        f"factor of {factor:.3g}."
-    ]
-    needed = _MARGIN * a.max_slope_um_per_m * 1e-6 if a.program.along else 0.0
-    if max(needed, _LEAST_FACTOR) > factor:
-        remarks.append(
-            "MD32760 is larger, since it also caps tan beta and has few digits; the receiver keeps the rate limit."
-        )
-    chosen = max(factor, needed, _LEAST_FACTOR)
-    if chosen > _MOST_FACTOR:
-        remarks.append(
-            f"WARNING: axis {a.axis}: MD32760 would be {chosen:.3g}, above {_MOST_FACTOR:g}; it is cut there"
-        )
-    return min(chosen, _MOST_FACTOR), remarks
+def _factor(a: AxisModel) -> float:
+    """MD32760: the rate limit, raised where it would cut tan β."""
+    rate = a.limits.rate_um_per_s * 60.0 / 1000.0 / MOST_VELOCITY_MM_PER_MIN
+    slope = _MARGIN * a.max_slope_um_per_m * 1e-6 if a.program.along else 0.0
+    return min(max(rate, slope, _LEAST_FACTOR), _MOST_FACTOR)

@@ -14,13 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_exports_st import Block
+from test_runtime import INPUTS, model_of
 
 from compensation import core
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
+from compensation.exports.region import trust_program
 from compensation.safety import Limits
 from data.batch import Channel
-from models.program import Builder
+from features.rises import feature
+from models.conformal import RunBound
+from models.program import Builder, replay
+from tests.conftest import make_toy_batches
 from thermodrift.testing.exports import export_of, offset_only, straight
 
 LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.5, step_um=2.0, hold_s=60.0, stale_s=900.0, warm_up_s=20.0)
@@ -199,6 +204,24 @@ def test_a_model_at_the_control_sends_what_the_core_does(seed: int, tmp_path: Pa
         assert done["state"] == made.call("state", 0) == expected.state(0)
         seen.add(done["state"])
     assert seen >= {1, 2, 3, 4}
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_the_trust_of_an_export_is_that_of_the_runtime(share: float) -> None:
+    *train, left = make_toy_batches(8, 60)
+    far_away = replace(left, table=left.table.assign(t0=left.table["t0"] * 1.4, room=left.table["room"] + 15.0))
+    for bound in (None, RunBound(1.0, 2.0, (0.3, 1.7), 1.0, 0.1, 5.0, 0.9, 8)):
+        model = replace(model_of(train), share=share, bound=bound)
+        program = trust_program(model, left.channels)
+        assert program is not None and set(program.channels) <= set(model.program.channels)
+        seen = set()
+        for batch in (train[0], left, far_away):
+            values = {name: feature(batch, name) for name in model.region.ranges if name.partition("@")[0] in INPUTS}
+            distance = model.region.distance(values)
+            got = replay(program, np.column_stack([batch.values(c) for c in program.channels]))[:, 0]
+            assert np.abs(got - [model.authority(d) / share for d in distance]).max() < 1e-9
+            seen |= set(np.round(got, 3))
+        assert 1.0 in seen and min(seen) < 0.9
 
 
 def test_a_value_beyond_what_a_sensor_can_have_is_a_fault() -> None:
