@@ -106,17 +106,17 @@ def core(size: int = 1) -> Program:
     return b.program(list(after.values()), zero_start=False)
 
 
-def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[Sequence[float]]) -> list[list[str]]:
+def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[object]) -> list[list[str]]:
     """Writes the core behind what sets its inputs, and gives `CARRIED` as expressions, an element for each value.
 
     Args:
         given: expressions of the inputs in front of the limits, one for each value.
-        limits: for each value its limits in the order of `LIMITS`.
+        limits: `safety.Limits` of each value.
     """
     before = [expression for name in list(INPUTS)[: -len(LIMITS)] for expression in given[name]]
     for k, expression in enumerate(before):
         w.put(f"{w.prefix}core_v0[{k}]", expression)
-    table = w.table("core_limits", np.array(limits, float).T.ravel())
+    table = w.table("core_limits", np.array([float(getattr(each, name)) for name in LIMITS for each in limits]))
     with w.loop(len(LIMITS) * len(limits)) as i:
         w.put(f"{w.prefix}core_v0[{len(before)} + {i}]", f"{table}[{i}]")
     return lower(w, core(len(limits)), "core_")

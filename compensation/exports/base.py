@@ -71,10 +71,6 @@ class AxisModel:
         return [("offset_um", "um", 1.0), *slope]
 
     @property
-    def limit_values(self) -> list[float]:
-        return [float(getattr(self.limits, name)) for name in LIMITS]
-
-    @property
     def output_units(self) -> Mapping[str, str]:
         return {"error_um": "um"} | ({"slope_um_per_mm": "um/mm"} if self.program.along else {})
 
@@ -107,10 +103,8 @@ class AxisModel:
         ]
         position = {"along": p.along, "reference_mm": p.reference_mm, "line": _line(p)} if p.along else None
         limits = {
-            "max_offset_um": float(self.limits.max_offset_um),
+            **{name: float(getattr(self.limits, name)) for name in LIMITS},
             "max_slope_um_per_m": self.max_slope_um_per_m if p.along else None,
-            "rate_um_per_s": float(self.limits.rate_um_per_s),
-            **{name: float(getattr(self.limits, name)) for name in LIMITS[2:]},
         }
         return {
             "axis": self.axis,

@@ -168,8 +168,9 @@ int {name}_state(int axis);
 """
 
 
-def move_source(export: Export) -> str:
-    """What both sources share: the state machine of what is sent, moved by its inputs in static arrays."""
+def move_source(export: Export, function: str) -> str:
+    """What both sources share: the state machine of what is sent, moved by its inputs in static arrays by a
+    function whose head is `function` and the arguments of a movement."""
     name, sent = export.stem, [(k, a, *out) for k, a in enumerate(export.axes) for out in a.sent]
     w, count = Writer(C()), len(sent)
     given = {
@@ -178,14 +179,14 @@ def move_source(export: Export) -> str:
         "stopped": [f"stopped[{k}]" for k, *_ in sent],
     }
     w.scalar("i", "whole")
-    state, now_um, *_ = lower_core(w, given, [a.limit_values for _, a, *_ in sent])
+    state, now_um, *_ = lower_core(w, given, [a.limits for _, a, *_ in sent])
     w.memory["core_v0"] = ("real", len(INPUTS) * count)
-    results = [f"        slope_um_per_m[{k}] = 0.0;" for k in range(len(export.axes))]
+    results = [f"    slope_um_per_m[{k}] = 0.0;" for k in range(len(export.axes))]
     states = []
     for (k, _, output, _, um), value, number in zip(sent, now_um, state, strict=True):
-        results.append(f"        {output}[{k}] = {value}{'' if um == 1.0 else f' / {um!r}'};")
+        results.append(f"    {output}[{k}] = {value}{'' if um == 1.0 else f' / {um!r}'};")
         states += [number] if output == "offset_um" else []
-    lines, joined, where = "\n".join(w.lines), "\n".join(results).replace("        ", "    "), ", ".join(states)
+    lines, joined, where = "\n".join(w.lines), "\n".join(results), ", ".join(states)
     return f"""/* What is sent, by its state machine: movements within the limits of size, rate and step. */
 {_declared(w)}
 static double wanted_um[{count}]; /* at the tool */
@@ -194,7 +195,7 @@ static double faulty[{count}]; /* 1 where one has come that is not */
 static double stopped[{len(export.axes)}];
 static int core_begun;
 
-static void move(double elapsed_s, double offset_um[], double slope_um_per_m[])
+{function}(double elapsed_s, double offset_um[], double slope_um_per_m[])
 {{
     int first_row = !core_begun;
 {_locals(w)}
@@ -268,7 +269,7 @@ void {name}_reset(void)
 {joined_resets}
 }}
 
-{move_source(export)}
+{move_source(export, f"void {name}_correction_move")}
 /* In the order of error_um[]. */
 {tables}
 
@@ -287,15 +288,10 @@ int {name}_correction_row(const double inputs[])
     return lacking;
 }}
 
-void {name}_correction_move(double elapsed_s, double offset_um[], double slope_um_per_m[])
-{{
-    move(elapsed_s, offset_um, slope_um_per_m);
-}}
-
 int {name}_correction_step(const double inputs[], double offset_um[], double slope_um_per_m[])
 {{
     int lacking = {name}_correction_row(inputs);
-    move({upper}_STEP_S, offset_um, slope_um_per_m);
+    {name}_correction_move({upper}_STEP_S, offset_um, slope_um_per_m);
     return lacking;
 }}
 """

@@ -280,13 +280,9 @@ class _Lowered:
         """Advances a ring of rows to the place of the newest, 0 in the first row: its array and that place."""
         ring, head = self.w.array(f"s{k}", rows * n.size), self.w.array(f"n{k}", 0, "whole")
         self.w.put(head, f"{head} + 1")
-        with self.w.when(f"first_row {self._or} {head} >= {rows}"):
+        with self.w.when(f"first_row {self.language.functions['or']} {head} >= {rows}"):
             self.w.put(head, "0")
         return ring, head
-
-    @property
-    def _or(self) -> str:
-        return self.language.functions["or"]
 
     def _earlier(self, head: str, rows: int, ahead: int, name: str) -> str:
         """The place `ahead` of the newest, which is the oldest for 1."""

@@ -39,6 +39,7 @@ class ReceiverExport(Exporter):
 def _block(export: Export, a: AxisModel, name: str) -> str:
     w = Writer(StructuredText(), indent=0)
     finite = [structured_text.within(f"received_{output}", -MOST, MOST) for output, _, _ in a.sent]
+    structured_text.elapsed(w)
     w.put("received_ok", " AND ".join(["valid", *finite]))
     w.put("alive", "core_begun AND (heartbeat <> last_heartbeat)")
     w.put("last_heartbeat", "heartbeat")
@@ -56,7 +57,7 @@ def _block(export: Export, a: AxisModel, name: str) -> str:
         *(f"received_{output} : LREAL; (* {unit} *)" for output, unit, _ in a.sent),
     ]
     own = ["last_heartbeat : DINT;", "received_ok : BOOL;", "alive : BOOL;"]
-    heading = [*export.heading([a]), "", f"Receiver. Call this in every cycle. {_HOW}", *structured_text.STATED]
+    heading = [*export.heading([a]), "", f"Receiver. Call this in every cycle. {_HOW}"]
     return function_block(name, w, given, structured_text.sent_outputs(a), own, heading)
 
 
@@ -124,7 +125,7 @@ def _source(export: Export) -> str:
 
 #include <math.h>
 
-{c99.move_source(export)}
+{c99.move_source(export, "static void move")}
 static void take(int place, double value_um, int good, int alive)
 {{
     wanted_um[place] = good ? value_um : 0.0;

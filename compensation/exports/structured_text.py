@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import ClassVar
 
 import numpy as np
@@ -95,6 +96,7 @@ class StructuredTextExport(Exporter):
 def _block(export: Export, a: AxisModel, name: str) -> str:
     p, w = a.program, Writer(StructuredText(), indent=0)
     names = identifiers(p.channels)
+    elapsed(w)
     with w.when("reset"):
         w.put("since_s", real(p.step_s))
         for variable in ("begun", "valid", *(f"seen[{k}]" for k in range(len(p.channels)))):
@@ -108,7 +110,7 @@ def _block(export: Export, a: AxisModel, name: str) -> str:
     with w.when("due"):
         w.put("since_s", f"MAX(MIN(since_s - {real(p.step_s)}, {real(p.step_s)}), 0.0)")
         _row(w, a, names)
-    w.put("since_s", "since_s + MAX(elapsed_s, 0.0)")
+    w.put("since_s", "since_s + moved_s")
     move(w, a)
 
     w.memory.pop("v0", None)
@@ -141,7 +143,7 @@ def _block(export: Export, a: AxisModel, name: str) -> str:
         *export.heading([a]), "",
         "Call this in every cycle with the time since the last call: it runs the model every "
         f"{p.step_s:g} s and moves the outputs at most as far as the limits allow. The first row, at the start and "
-        "after a reset, is that at which every input has been seen.", *STATED,
+        "after a reset, is that at which every input has been seen.",
     ])  # fmt: skip
 
 
@@ -149,15 +151,18 @@ MOVED = (
     "elapsed_s : LREAL; (* time since the last call, s *)",
     "enable : BOOL := TRUE; (* FALSE: the outputs fade to 0 and stay there *)",
 )
-STATED = ("state: 0 off, 1 warm-up, 2 active, 3 hold, 4 fade-out.",)
 
 
 def sent_outputs(a: AxisModel) -> list[str]:
     """Declarations of what the control adds."""
     return [
-        "state : DINT;",
+        "state : DINT; (* 0 off, 1 warm-up, 2 active, 3 hold, 4 fade-out *)",
         *(f"{output} : LREAL; (* {unit}, what the control adds *)" for output, unit, _ in a.sent),
     ]
+
+
+def elapsed(w: Writer) -> None:
+    w.put("moved_s", f"SEL({within('elapsed_s', 0.0, inf)}, 0.0, elapsed_s)")
 
 
 def move(w: Writer, a: AxisModel) -> None:
@@ -168,8 +173,10 @@ def move(w: Writer, a: AxisModel) -> None:
     w.put("core_begun", "TRUE")
     w.put("stopped", "SEL(enable, 1.0, 0.0)")
     wanted = [f"{w.array('wanted_um', count)}[{k}]" for k in range(count)]
-    events = {name: [name] * count for name in ("elapsed_s", "usable", "faulty", "stopped")}
-    state, now_um, *_ = lower_core(w, {**events, "wanted_um": wanted}, [a.limit_values] * count)
+    events = {name: [name] * count for name in ("usable", "faulty", "stopped")}
+    state, now_um, *_ = lower_core(
+        w, {**events, "elapsed_s": ["moved_s"] * count, "wanted_um": wanted}, [a.limits] * count
+    )
     w.memory["core_v0"] = ("real", len(INPUTS) * count)
     for (output, _, um), value in zip(a.sent, now_um, strict=True):
         w.put(output, value if um == 1.0 else f"{value} / {real(um)}")
@@ -182,7 +189,7 @@ def function_block(
     """The block of what a writer holds, with declarations and a comment of its own."""
     variables = [
         *own,
-        *(f"{n} : LREAL;" for n in ("usable", "faulty", "stopped")),
+        *(f"{n} : LREAL;" for n in ("moved_s", "usable", "faulty", "stopped")),
         *(f"{n} : BOOL;" for n in ("first_row", "core_begun")),
         *(f"{n} : {_KINDS[kind]};" for n, kind in w.scalars.items()),
         *(f"{n} : {_array(shape)};" for n, shape in w.memory.items()),

@@ -53,7 +53,9 @@ class Sender:
         for i, (_, _, um) in enumerate(a.sent):
             usable = wanted_um is not None
             event = (elapsed_s, wanted_um[i] if usable else 0.0, float(usable), float(faulty), float(stopped))
-            self.carried[k][i] = core.run()((*event, *a.limit_values), *self.carried[k][i])
+            self.carried[k][i] = core.run()(
+                (*event, *(getattr(a.limits, name) for name in core.LIMITS)), *self.carried[k][i]
+            )
             out.append(self.carried[k][i][1] / um)
         return out
 
@@ -121,7 +123,7 @@ def test_the_receiver_is_the_core_whatever_arrives(seed: int, tmp_path: Path) ->
             given = {"received_offset_um": sent[0 if k == 0 else 2]} | (
                 {"received_slope_um_per_m": sent[1]} if k == 0 else {}
             )
-            done = block.call(elapsed_s=credited_s, enable=enable, heartbeat=heartbeat, valid=valid, **given)
+            done = block.call(elapsed_s=elapsed_s, enable=enable, heartbeat=heartbeat, valid=valid, **given)
             got_st += [done[output] for output, _, _ in a.sent]
             assert done["state"] == expected.state(k)
             states.add(done["state"])
