@@ -7,7 +7,7 @@ the program for one value as compiled Python; exports lower the same program to 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -44,19 +44,8 @@ def core(size: int = 1) -> Program:
         b.constant([number] * size) for number in (OFF, WARM_UP, ACTIVE, HOLD, FADE_OUT)
     )
     longest = b.constant([LONGEST_S] * size)
-
-    def inverse(x: int) -> int:
-        return b.sub(one, x)
-
-    def both(*x: int) -> int:
-        return b.two("mul", *x)
-
-    def either(*x: int) -> int:
-        return b.two("max", *x)
-
-    def same(x: int, y: int) -> int:
-        return b.two("equal", x, y)
-
+    inverse, same = partial(b.sub, one), partial(b.two, "equal")
+    both, either = partial(b.two, "mul"), partial(b.two, "max")  # of numbers that are 0 or 1
     elapsed, usable, stopped = b.clamp(given["elapsed_s"], zero, longest), given["usable"], given["stopped"]
     sent, running = was["sent_um"], inverse(stopped)
     at_zero = same(sent, zero)

@@ -1,30 +1,8 @@
 """A fitted model as a program: a short list of vector operations with carried state, plain data.
 
 From a program come single steps in process, the ONNX file and the code for controls, so that all of them compute the
-same. A family gives one by `Family.program`; `Builder` has the features of `features.rises`.
-
-| operation | output row k | state |
-|---|---|---|
-| `input` | channels in their order, a missing one at its last value | last values |
-| `constant` | `value` | |
-| `join` | all arguments, one behind the other | |
-| `pick` | `x[places]` | |
-| `affine` | `matrix @ x + offset` | |
-| `add`, `sub`, `mul`, `min`, `max` | `a + b`, `a − b`, `a · b`, the smaller, the larger | |
-| `less`, `equal` | 1 where `a < b`, `a = b`, else 0 | |
-| `select` | b where a is 1, c where a is 0 | |
-| `previous` | what the argument, a later node, was in the row before; `initial` in the first | that value |
-| `power` | `\\|x\\|^exponents` | |
-| `median` | median of x, one value | |
-| `first` | x of the first row | that value |
-| `lag` | `keep · v + (1 − keep) · x`, from x of the first row times `begin` | v |
-| `delay` | x `rows` earlier, linear between two; before the first row x of the first row times `begin` | those rows |
-| `rate` | slope per hour to the row `rows` earlier, or to the first | those rows |
-| `clock` | seconds since the first row | rows |
-| `curve` | `values` at x, linear between `knots`, held beyond | |
-| `tanh` | tanh x | |
-| `kernel` | `weights @ exp(−\\|support − x\\|² · sharpness)` | |
-| `trees` | weighted sum of the trees' values at x | |
+same. A family gives one by `Family.program`; `Builder` has the features of `features.rises`. `OPERATIONS` states what
+each operation gives; `Node.state_size` which of them carry state.
 """
 
 from __future__ import annotations
@@ -40,6 +18,36 @@ from data.batch import Channel
 from data.checks.base import THERMAL
 from data.errors import InputError
 from features.rises import RATE_WINDOW_S, parsed_feature
+
+OPERATIONS: Mapping[str, str] = {
+    "input": "the row's channels in their order, a missing one at its last value",
+    "constant": "value",
+    "join": "all arguments, one behind the other",
+    "pick": "x[places], counted from 0",
+    "affine": "matrix @ x + offset",
+    "add": "a + b, element by element",
+    "sub": "a - b, element by element",
+    "min": "the smaller of a and b, element by element",
+    "max": "the larger of a and b, element by element",
+    "less": "1 where a < b, else 0",
+    "equal": "1 where a = b, else 0",
+    "select": "b where a is 1, c where a is 0",
+    "previous": "what the argument, a later node, was in the row before; `initial` in the first row",
+    "mul": "a * b, element by element",
+    "power": "|x| ** exponents, element by element",
+    "median": "median of x, one value",
+    "first": "x of the first row",
+    "lag": "v = keep * v + (1 - keep) * x; in the first row v = begin * x",
+    "delay": "(1 - part) * (x `rows` rows earlier) + part * (x one more row earlier); before the first row begin * "
+    "(x of the first row)",
+    "rate": "(x - x `rows` rows earlier) per hour; from the first row while that is nearer; 0 in the first row",
+    "clock": "s since the first row",
+    "curve": "values at x, linear between knots, held beyond",
+    "tanh": "tanh x",
+    "kernel": "weights @ exp(-|support - x|^2 * sharpness)",
+    "trees": "sum over roots: from node = root, node = left[node] if x[feature[node]] <= threshold[node] else "
+    "right[node], until node is its own child; value[node]. With single, x is rounded to single precision first",
+}
 
 
 @dataclass(frozen=True)

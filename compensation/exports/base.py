@@ -284,10 +284,9 @@ def _axis_lines(a: AxisModel) -> list[str]:
     lines = [f"Axis {a.axis}: one row every {p.step_s:g} s", "Inputs:"]
     for name, unit, required, usable in zip(p.channels, p.units, p.required, a.usable(), strict=True):
         need = "required" if required else "bridged at its last value where it is missing"
-        known = name in a.region
-        trained = f"trained {a.region[name][0]:.6g} to {a.region[name][1]:.6g}" if known else "no trained region"
-        acts = f", usable {usable[0]:.6g} to {usable[1]:.6g}"
-        lines.append(f"  {name} in {unit}, {need}, {trained}{acts}")
+        ends = a.region.get(name)
+        trained = f"trained {ends[0]:.6g} to {ends[1]:.6g}" if ends else "no trained region"
+        lines.append(f"  {name} in {unit}, {need}, {trained}, usable {usable[0]:.6g} to {usable[1]:.6g}")
     if not p.channels:
         lines.append("  none")
     others = [f"{n} {low:.6g} to {high:.6g}" for n, (low, high) in a.region.items() if n not in p.channels]

@@ -63,6 +63,7 @@ def _block(export: Export, a: AxisModel, name: str) -> str:
 
 def _twincat(name: str, block: str) -> str:
     """The same block as the file of a TwinCAT project: declaration and body apart."""
+    block = block.replace("]]>", "]] >")  # which would end the section
     at = block.rindex("END_VAR") + len("END_VAR")
     body = block[at:].replace("END_FUNCTION_BLOCK", "").strip()
     number = uuid.uuid5(uuid.NAMESPACE_URL, f"thermodrift/{name}")

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from compensation.exports import EXPORTS
 from compensation.substitutes import Substitutes
 from data.errors import InputError
 from data.machine import load_machine
@@ -166,7 +167,7 @@ def test_a_rehearsal_shows_before_and_after(year: Path, model: Path, tmp_path: P
     assert isinstance(done.exception, InputError) and "SENSOR:HOW@START+DURATION" in str(done.exception)
 
 
-@pytest.mark.parametrize("kind", ["json", "c", "st", "onnx"])
+@pytest.mark.parametrize("kind", list(EXPORTS))
 def test_an_export_states_model_and_limits(model: Path, tmp_path: Path, kind: str) -> None:
     done = CliRunner().invoke(app, ["export", str(model), "--to", kind, "--out", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
@@ -241,7 +242,7 @@ def test_a_rehearsal_runs_a_provisional_model_at_its_share(year: Path, provision
     assert 0.3 < left < 0.6
 
 
-@pytest.mark.parametrize("kind", ["json", "c", "st", "onnx"])
+@pytest.mark.parametrize("kind", list(EXPORTS))
 def test_an_export_of_a_provisional_model_has_its_share_and_says_so(
     model: Path, provisional: Path, tmp_path: Path, kind: str
 ) -> None:
