@@ -108,7 +108,20 @@ def lower_core(w: Writer, given: Mapping[str, Sequence[str]], limits: Sequence[o
     table = w.table("core_limits", np.array([float(getattr(each, name)) for name in LIMITS for each in limits]))
     with w.loop(len(LIMITS) * len(limits)) as i:
         w.put(f"{w.prefix}core_v0[{len(before)} + {i}]", f"{table}[{i}]")
-    return lower(w, core(len(limits)), "core_")
+    program = core(len(limits))
+    return lower(w, program, "core_", _labels(program))
+
+
+def _labels(program: Program) -> dict[int, str]:
+    """Names of the nodes that are inputs, outputs, and outputs of the row before."""
+    names = dict(zip(program.outputs, CARRIED, strict=True))
+    size = len(program.channels) // len(INPUTS)
+    for k, n in enumerate(program.nodes):
+        if n.op == "pick":
+            names[k] = list(INPUTS)[int(n.data["places"][0]) // size]
+        elif n.op == "previous":
+            names[k] = f"{names[n.args[0]]}_before"
+    return names
 
 
 class Python(Language):

@@ -8,8 +8,10 @@ true in the first row, in which every block sets its own state: a reset needs no
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
@@ -135,13 +137,20 @@ class Writer:
 
 
 _SIGNS: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*"}
+_COMPARED = ("less", "equal")
+_EACH = {*_SIGNS, *_COMPARED, "min", "max", "select"}  # computed element by element
+_FOLDED = 60  # characters of an expression that is written where it is used
 
 
 class _Lowered:
     """The blocks of one program: a method for each operation, by its name."""
 
-    def __init__(self, w: Writer, program: Program) -> None:
-        self.w, self.language, self.program = w, w.language, program
+    def __init__(self, w: Writer, program: Program, labels: Mapping[int, str]) -> None:
+        self.w, self.language, self.program, self.labels = w, w.language, program, labels
+        uses = Counter(a for n in program.nodes for a in n.args)
+        later = {a for n in program.nodes for a in n.args if n.op == "previous"}
+        self.single = {k for k, count in uses.items() if count == 1} - {*labels, *later, *program.outputs}
+        self.folded: set[int] = set()  # nodes that are written where they are used
 
     def item(self, k: int, index: str) -> str:
         """Element of node k; that of a single value whatever the index is."""
@@ -150,8 +159,10 @@ class _Lowered:
             value = n.data["value"]
             alike = bool((value == value[0]).all())
             return self.language.number(float(value[0])) if alike else f"{self.w.table(f'c{k}_value', value)}[{index}]"
+        if k in self.folded:
+            return f"({self.value(k, index)})"
         single = n.size == 1 and k > 0
-        name = self.w.array(f"v{k}", 0 if single else n.size)
+        name = self.w.array(self.labels.get(k, f"v{k}"), 0 if single else n.size)
         return name if single else f"{name}[{'0' if n.size == 1 else index}]"
 
     def part(self, k: int, name: str, index: str, size: int) -> str:
@@ -165,8 +176,13 @@ class _Lowered:
         n = self.program.nodes[k]
         if n.size == 0 or n.op in ("input", "constant"):
             return
-        of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
-        self.w.comment(f"v{k}: {n.op}{of}")
+        if n.op in _EACH:
+            if k in self.single and len(self.value(k, "i")) <= _FOLDED:
+                self.folded.add(k)
+                return
+        elif k not in self.labels:
+            of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
+            self.w.comment(f"v{k}: {n.op}{of}")
         getattr(self, n.op)(k, n)
 
     def join(self, k: int, n: Node) -> None:
@@ -204,25 +220,31 @@ class _Lowered:
                 self.w.put(total, f"{total} + {matrix}[{place}] * {self.item(n.args[0], j)}")
             self.w.put(self.item(k, i), total)
 
-    def two(self, k: int, n: Node) -> None:
-        one, zero = self.language.number(1.0), self.language.number(0.0)
-        with self.w.loop(n.size) as i:
-            a, b = (self.item(x, i) for x in n.args)
-            if n.op in ("min", "max"):
-                value = self.language.call(n.op, a, b)
-            elif n.op in ("less", "equal"):
-                value = self.language.choice(f"{a} {self.language.functions[n.op]} {b}", one, zero)
-            else:
-                value = f"{a} {_SIGNS[n.op]} {b}"
-            self.w.put(self.item(k, i), value)
+    def value(self, k: int, i: str) -> str:
+        """An element of a node that computes each of its own from those of its arguments."""
+        n, one, zero = self.program.nodes[k], self.language.number(1.0), self.language.number(0.0)
+        if n.op == "select":
+            yes, no = (self.item(x, i) for x in n.args[1:])
+            return self.language.choice(self.condition(n.args[0], i), yes, no)
+        if n.op in _COMPARED:
+            return self.language.choice(self.compared(k, i), one, zero)
+        a, b = (self.item(x, i) for x in n.args)
+        return self.language.call(n.op, a, b) if n.op in ("min", "max") else f"{a} {_SIGNS[n.op]} {b}"
 
-    add = sub = mul = min = max = less = equal = two
+    def compared(self, k: int, i: str) -> str:
+        n = self.program.nodes[k]
+        return f" {self.language.functions[n.op]} ".join(self.item(x, i) for x in n.args)
 
-    def select(self, k: int, n: Node) -> None:
-        half = self.language.number(0.5)  # a condition is 0 or 1
+    def condition(self, k: int, i: str) -> str:
+        """Whether a node that is 0 or 1 is 1."""
+        folded = k in self.folded and self.program.nodes[k].op in _COMPARED
+        return self.compared(k, i) if folded else f"{self.item(k, i)} > {self.language.number(0.5)}"
+
+    def each(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            c, a, b = (self.item(x, i) for x in n.args)
-            self.w.put(self.item(k, i), self.language.choice(f"{c} > {half}", a, b))
+            self.w.put(self.item(k, i), self.value(k, i))
+
+    add = sub = mul = min = max = less = equal = select = each
 
     def previous(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:  # its argument is computed below, and still has the value of the row before
@@ -404,10 +426,13 @@ def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
     return knots[:-1], wide, np.divide(np.diff(values), wide, out=np.zeros_like(wide), where=wide > 0)
 
 
-def lower(w: Writer, program: Program, prefix: str = "") -> list[list[str]]:
-    """Writes the blocks of all nodes, named with a prefix; the elements of each output as expressions."""
+def lower(
+    w: Writer, program: Program, prefix: str = "", labels: Mapping[int, str] = MappingProxyType({})
+) -> list[list[str]]:
+    """Writes the blocks of all nodes, named with a prefix and by their labels; the elements of each output as
+    expressions."""
     outer, w.prefix = w.prefix, w.prefix + prefix
-    lowered = _Lowered(w, program)
+    lowered = _Lowered(w, program, labels)
     for k in range(len(program.nodes)):
         lowered.block(k)
     elements = [[lowered.item(o, str(i)) for i in range(program.nodes[o].size)] for o in program.outputs]
