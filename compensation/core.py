@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -124,42 +124,10 @@ def _labels(program: Program) -> dict[int, str]:
     return names
 
 
-class Python(Language):
-    """Python, for programs whose nodes have one element each."""
-
-    functions: ClassVar[Mapping[str, str]] = {
-        "abs": "abs", "min": "min", "max": "max", "or": "or", "less": "<", "equal": "==",
-    }  # fmt: skip
-
-    def comment(self, text: str) -> str:
-        return f"# {text}"
-
-    def put(self, target: str, value: str) -> str:
-        return f"{target} = {value}"
-
-    def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
-        return f"for {index} in range({first}, {count}):", ""
-
-    def when(self, condition: str) -> tuple[str, str, str]:
-        return f"if {condition}:", "else:", ""
-
-    def repeat(self, left: str, right: str) -> tuple[str, str]:
-        return f"while {left} != {right}:", ""
-
-    def number(self, value: float) -> str:
-        return f"({value!r})"
-
-    def choice(self, condition: str, yes: str, no: str) -> str:
-        return f"{yes} if {condition} else {no}"
-
-    def power(self, base: str, exponent: float) -> str:
-        return f"{base} ** {exponent!r}"
-
-
 @cache
 def run() -> Callable[..., tuple[float, ...]]:
     """`step(inputs, *carried) -> carried`: the core for one value; `inputs` in the order of `INPUTS`."""
-    program, w = core(), Writer(Python())
+    program, w = core(), Writer(Language())
     results = ", ".join(element for (element,) in lower(w, program))
     carried = [f"v{program.outputs[k]}" for k in range(len(CARRIED))]
     text = "\n".join([f"def step(v0, {', '.join(carried)}, first_row=False):", *w.lines, f"    return {results}"])

@@ -7,7 +7,6 @@ true in the first row, in which every block sets its own state: a reset needs no
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,40 +23,43 @@ _NUMBERS_A_LINE = 5
 Shape = tuple[str, int]  # "real", "whole" or "logical", and the length; 0 for a single value
 
 
-class Language(ABC):
-    """Spelling of statements; operators + - * / < and indices x[i] are the same in all languages."""
+class Language:
+    """Spelling of statements, here of Python for nodes of one element; others override what differs.
 
-    functions: ClassVar[Mapping[str, str]]  # abs, exp, min, max, single; operators or, =
+    Operators + - * / < and indices x[i] are the same in all languages.
+    """
 
-    @abstractmethod
-    def comment(self, text: str) -> str: ...
+    functions: ClassVar[Mapping[str, str]] = {"abs": "abs", "min": "min", "max": "max", "less": "<", "equal": "=="}
 
-    @abstractmethod
-    def put(self, target: str, value: str) -> str: ...
+    def comment(self, text: str) -> str:
+        return f"# {text}"
 
-    @abstractmethod
+    def put(self, target: str, value: str) -> str:
+        return f"{target} = {value}"
+
     def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
         """First and last line of a loop over first … count − 1."""
+        return f"for {index} in range({first}, {count}):", ""
 
-    @abstractmethod
     def when(self, condition: str) -> tuple[str, str, str]:
         """First line, line before what else is done, and last line of a branch."""
+        return f"if {condition}:", "else:", ""
 
-    @abstractmethod
     def repeat(self, left: str, right: str) -> tuple[str, str]:
         """First and last line of a loop while two whole numbers differ."""
+        return f"while {left} != {right}:", ""
 
-    @abstractmethod
     def number(self, value: float) -> str:
         """A number inside an expression."""
+        return f"({value!r})"
 
-    @abstractmethod
     def choice(self, condition: str, yes: str, no: str) -> str:
         """An expression that is `yes` where the condition holds, else `no`; both are evaluated or free of effects."""
+        return f"{yes} if {condition} else {no}"
 
-    @abstractmethod
     def power(self, base: str, exponent: float) -> str:
         """base ** exponent for a base above 0."""
+        return f"{base} ** {exponent!r}"
 
     def call(self, function: str, *args: str) -> str:
         return f"{self.functions[function]}({', '.join(args)})"

@@ -39,7 +39,6 @@ class ReceiverExport(Exporter):
 def _block(export: Export, a: AxisModel, name: str) -> str:
     w = Writer(StructuredText(), indent=0)
     finite = [structured_text.within(f"received_{output}", -MOST, MOST) for output, _, _ in a.sent]
-    structured_text.elapsed(w)
     w.put("received_ok", " AND ".join(["valid", *finite]))
     w.put("alive", "core_begun AND (heartbeat <> last_heartbeat)")
     w.put("last_heartbeat", "heartbeat")

@@ -96,7 +96,6 @@ class StructuredTextExport(Exporter):
 def _block(export: Export, a: AxisModel, name: str) -> str:
     p, w = a.program, Writer(StructuredText(), indent=0)
     names = identifiers(p.channels)
-    elapsed(w)
     with w.when("reset"):
         w.put("since_s", real(p.step_s))
         for variable in ("begun", "valid", *(f"seen[{k}]" for k in range(len(p.channels)))):
@@ -161,10 +160,6 @@ def sent_outputs(a: AxisModel) -> list[str]:
     ]
 
 
-def elapsed(w: Writer) -> None:
-    w.put("moved_s", f"SEL({within('elapsed_s', 0.0, inf)}, 0.0, elapsed_s)")
-
-
 def move(w: Writer, a: AxisModel) -> None:
     """Moves what is sent towards `wanted_um`, as `usable` and `faulty` of this call say."""
     w.comment("what is sent, within the limits of size, rate and step; held, then faded to 0, without usable input")
@@ -198,12 +193,14 @@ def function_block(
     parts = [("VAR_INPUT", given), ("VAR_OUTPUT", sent), ("VAR", variables), ("VAR CONSTANT", constants)]
     declared = "\n".join(_section(title, lines) for title, lines in parts if lines)
     comment, body = "\n".join(f"   {line}".rstrip() for line in wrapped(heading)), "\n".join(w.lines)
+    moved = f"moved_s := SEL({within('elapsed_s', 0.0, inf)}, 0.0, elapsed_s);"
     return f"""(*
 {comment}
 *)
 FUNCTION_BLOCK {name}
 {declared}
 
+{moved}
 {body}
 END_FUNCTION_BLOCK
 """
