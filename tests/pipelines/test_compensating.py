@@ -177,6 +177,17 @@ def test_an_export_states_model_and_limits(model: Path, tmp_path: Path, kind: st
     assert b"SIMULATED" in content and told["sha256"].encode() in content
 
 
+@pytest.mark.parametrize(("given", "stale_s"), [([], 900.0), (["--stale-s", "700"], 700.0)])
+def test_the_stale_time_of_an_export_is_three_steps_or_as_given(
+    model: Path, tmp_path: Path, given: list[str], stale_s: float
+) -> None:
+    options = ["export", str(model), "--to", "json", "--out", str(tmp_path), "--period-s", "300", *given]
+    assert CliRunner().invoke(app, options).exit_code == 0
+    (path,) = tmp_path.glob("*.json")
+    (axis,) = json.loads(path.read_text())["axes"]
+    assert axis["limits"]["stale_s"] == stale_s and axis["trust"]["channels"]
+
+
 @pytest.fixture(scope="module")
 def provisional(year: Path) -> Path:
     known = {"standing": "provisional", "authority": 0.6, "expected_S_um": 3.21, "expected_S_bound90_um": 5.43}
