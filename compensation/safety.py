@@ -10,7 +10,8 @@ output by at most
     min(rate_um_per_s · min(max(Δclock_s, 0), stale_s), step_um),
 
 so no time stamp of a sample can buy a larger step, and neither can a pause of the runtime. The time stamps of the
-samples (`time_s`) only decide whether a sample is used.
+samples (`time_s`) only decide whether a sample is used. `compensation.core` has the transitions and the movement; this
+module judges time stamps, and says why an axis does not act.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any, Literal, Self, get_args
 
+from compensation import core
 from compensation.contracts import check_limits
 from data.errors import InputError, one_of
 
 State = Literal["off", "warm-up", "active", "hold", "fade-out"]
-STATES: tuple[State, ...] = get_args(State)
+STATES: tuple[State, ...] = get_args(State)  # the core numbers them from 0
+_NUMBER = {state: float(number) for number, state in enumerate(STATES)}
 
 STOPPED = "stopped by the operator"
-_LONGEST_S = 1e9  # an elapsed time of thirty years: keeps sums finite
 _CLOCK_DRIFT = 1e-3  # s per s that two healthy clocks may differ: a quartz stays below 1e-4
 
 
@@ -173,10 +175,10 @@ def step(
         trust: authority of the model, clipped to [0, 1]; multiplies `wanted_um`.
         fault: why the sample or the model cannot be used; None where it can.
     """
-    axis, elapsed_s = _at_clock(axis, clock_s)
     if fault is None and time_s == axis.samples.last_s:
-        return _sent(_silent(axis, limits, elapsed_s), limits, elapsed_s)
-    samples, problem = _judged(axis.samples, limits, axis.clock_s or 0.0, time_s)
+        return silence(axis, limits, clock_s)
+    at_s = clock_s if isfinite(clock_s) else axis.clock_s or 0.0
+    samples, problem = _judged(axis.samples, limits, at_s, time_s)
     if fault is not None:
         problem = fault or "unnamed fault"
     elif problem is None and not isfinite(wanted_um):
@@ -184,16 +186,9 @@ def step(
     elif problem is None and trust != trust:
         problem = "the trust in the model is not a number"
     axis = replace(axis, samples=samples)
-    if axis.stopped:
-        return _sent(replace(axis, quiet_s=0.0) if problem is None else axis, limits, elapsed_s)
-    gap = axis.quiet_s > limits.stale_s
-    if gap:
-        axis = _silent(axis, limits, elapsed_s)
-    if problem is None:
-        axis = _with(axis, limits, wanted_um, min(max(trust, 0.0), 1.0))
-    else:
-        axis = replace(axis, reason=problem) if gap else _without(axis, limits, elapsed_s, 0.0, problem)
-    return _sent(axis, limits, elapsed_s)
+    if problem is not None:
+        return _moved(axis, limits, clock_s, faulty=True, reason=problem)
+    return _moved(axis, limits, clock_s, wanted_um, min(max(trust, 0.0), 1.0))
 
 
 def silence(axis: Axis, limits: Limits, clock_s: float) -> tuple[Axis, float, str]:
@@ -201,8 +196,9 @@ def silence(axis: Axis, limits: Limits, clock_s: float) -> tuple[Axis, float, st
 
     Within stale_s an active axis goes on towards its target; then it holds, fades out and is off.
     """
-    axis, elapsed_s = _at_clock(axis, clock_s)
-    return _sent(_silent(axis, limits, elapsed_s), limits, elapsed_s)
+    known = axis.state not in ("active", "warm-up") and axis.reason
+    reason = axis.reason if known else f"no valid sample for more than {limits.stale_s:g} s"
+    return _moved(axis, limits, clock_s, reason=reason)
 
 
 def stop(axis: Axis) -> Axis:
@@ -216,12 +212,37 @@ def start(axis: Axis) -> Axis:
     return replace(axis, stopped=False, reason="started by the operator") if axis.stopped else axis
 
 
-def _at_clock(axis: Axis, clock_s: float) -> tuple[Axis, float]:
-    """The axis at that monotonic clock and the time elapsed, s: 0 at the first step and where the clock steps back."""
-    if not isfinite(clock_s):
-        return axis, 0.0
-    elapsed_s = 0.0 if axis.clock_s is None else min(max(clock_s - axis.clock_s, 0.0), _LONGEST_S)
-    return replace(axis, clock_s=clock_s, quiet_s=min(axis.quiet_s + elapsed_s, _LONGEST_S)), elapsed_s
+def _moved(
+    axis: Axis,
+    limits: Limits,
+    clock_s: float,
+    wanted_um: float | None = None,
+    trust: float = 1.0,
+    faulty: bool = False,
+    reason: str = "",
+) -> tuple[Axis, float, str]:
+    """One step of the core: with a usable sample where `wanted_um` is given, else `reason` says why there is none."""
+    now_s = clock_s if isfinite(clock_s) else axis.clock_s
+    elapsed_s = 0.0 if axis.clock_s is None or now_s is None else now_s - axis.clock_s
+    asked_um = 0.0 if wanted_um is None else float(trust * wanted_um)
+    inputs = (elapsed_s, asked_um, float(wanted_um is not None), float(faulty), float(axis.stopped),
+              *(getattr(limits, name) for name in core.LIMITS))  # fmt: skip
+    good_s = -1.0 if axis.good_s is None else axis.good_s
+    number, sent_um, held_s, target_um, warmed, good_s, quiet_s = core.run()(
+        inputs, _NUMBER[axis.state], axis.sent_um, axis.held_s, axis.target_um, float(axis.warmed), good_s, axis.quiet_s
+    )
+    if axis.stopped or (wanted_um is None and not faulty and quiet_s <= limits.stale_s):
+        reason = axis.reason
+    elif wanted_um is not None and not warmed:
+        reason = f"valid input for {good_s:.0f} s of {limits.warm_up_s:.0f} s"
+    elif wanted_um is not None:
+        notes = [f"authority {trust:.0%}"] if trust < 1.0 else []
+        if target_um != asked_um:
+            notes.append(f"request of {asked_um:.4g} µm limited to {target_um:.4g} µm")
+        reason = "; ".join(notes)
+    axis = Axis(STATES[int(number)], sent_um, reason, axis.stopped, held_s, target_um, bool(warmed),
+                None if good_s < 0.0 else good_s, quiet_s, now_s, axis.samples)  # fmt: skip
+    return axis, sent_um, reason
 
 
 def _judged(samples: SampleClock, limits: Limits, clock_s: float, time_s: float) -> tuple[SampleClock, str | None]:
@@ -252,57 +273,3 @@ def _judged(samples: SampleClock, limits: Limits, clock_s: float, time_s: float)
             return replace(seen, newest_s=time_s, lead_s=lead_s, other_s=None, other_for_s=0.0), None
     off_s = jump_s if abs(jump_s) > limits.stale_s else -behind_s
     return seen, f"clock: the sample is {abs(off_s):.3g} s {'ahead of' if off_s > 0 else 'behind'} the clock so far"
-
-
-def _silent(axis: Axis, limits: Limits, elapsed_s: float) -> Axis:
-    """After time without a valid input. Within stale_s nothing changes, except that the time in `hold` counts on."""
-    if axis.stopped:
-        return axis
-    known = axis.state not in ("active", "warm-up") and axis.reason
-    if axis.quiet_s > limits.stale_s:
-        reason = axis.reason if known else f"no valid sample for more than {limits.stale_s:g} s"
-        return _without(axis, limits, elapsed_s, axis.quiet_s - limits.stale_s, reason)
-    return _without(axis, limits, elapsed_s, 0.0, axis.reason) if axis.state == "hold" else axis
-
-
-def _without(axis: Axis, limits: Limits, elapsed_s: float, late_s: float, reason: str) -> Axis:
-    """Transitions without valid input: to hold, `late_s` after it should have begun, and from hold to fade-out."""
-    axis = replace(axis, good_s=None, reason=reason)
-    if axis.state == "warm-up" and axis.sent_um == 0.0:
-        return replace(axis, state="off", held_s=0.0)
-    if axis.state in ("warm-up", "active"):
-        axis = replace(axis, state="hold", held_s=min(axis.held_s + late_s, _LONGEST_S))
-    elif axis.state == "hold":
-        axis = replace(axis, held_s=min(axis.held_s + elapsed_s, _LONGEST_S))
-    if axis.state == "hold" and axis.held_s > limits.hold_s:
-        return replace(axis, state="fade-out", warmed=False)
-    return axis
-
-
-def _with(axis: Axis, limits: Limits, wanted_um: float, trust: float) -> Axis:
-    """Transitions with a valid input."""
-    unbroken = axis.good_s is not None and axis.quiet_s <= limits.stale_s
-    good_s = min((axis.good_s or 0.0) + axis.quiet_s, _LONGEST_S) if unbroken else 0.0
-    axis = replace(axis, good_s=good_s, quiet_s=0.0, warmed=axis.warmed or good_s >= limits.warm_up_s)
-    if not axis.warmed:
-        reason = f"valid input for {good_s:.0f} s of {limits.warm_up_s:.0f} s"
-        return replace(axis, state=axis.state if axis.state == "fade-out" else "warm-up", reason=reason)
-    asked_um = float(trust * wanted_um)
-    target_um = min(max(asked_um, -limits.max_offset_um), limits.max_offset_um)
-    notes = [f"authority {trust:.0%}"] if trust < 1.0 else []
-    if target_um != asked_um:
-        notes.append(f"request of {asked_um:.4g} µm limited to {target_um:.4g} µm")
-    return replace(axis, state="active", target_um=target_um, held_s=0.0, reason="; ".join(notes))
-
-
-def _sent(axis: Axis, limits: Limits, elapsed_s: float) -> tuple[Axis, float, str]:
-    """Moves the output as far as the limits allow; a fade-out that has arrived at 0 ends."""
-    goal_um = {"active": axis.target_um, "fade-out": 0.0}.get(axis.state, axis.sent_um)
-    goal_um = min(max(goal_um, -limits.max_offset_um), limits.max_offset_um)
-    reach_um = min(limits.rate_um_per_s * min(elapsed_s, limits.stale_s), limits.step_um)
-    move_um = goal_um - axis.sent_um
-    sent_um = goal_um if abs(move_um) <= reach_um else axis.sent_um + (reach_um if move_um > 0 else -reach_um)
-    axis = replace(axis, sent_um=sent_um)
-    if axis.state == "fade-out" and sent_um == 0.0:
-        axis = replace(axis, state="off" if axis.good_s is None else "warm-up", held_s=0.0)
-    return axis, axis.sent_um, axis.reason

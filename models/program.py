@@ -1,27 +1,8 @@
 """A fitted model as a program: a short list of vector operations with carried state, plain data.
 
 From a program come single steps in process, the ONNX file and the code for controls, so that all of them compute the
-same. A family gives one by `Family.program`; `Builder` has the features of `features.rises`.
-
-| operation | output row k | state |
-|---|---|---|
-| `input` | channels in their order, a missing one at its last value | last values |
-| `constant` | `value` | |
-| `join` | all arguments, one behind the other | |
-| `pick` | `x[places]` | |
-| `affine` | `matrix @ x + offset` | |
-| `sub`, `mul` | `a − b`, `a · b` | |
-| `power` | `\\|x\\|^exponents` | |
-| `median` | median of x, one value | |
-| `first` | x of the first row | that value |
-| `lag` | `keep · v + (1 − keep) · x`, from x of the first row times `begin` | v |
-| `delay` | x `rows` earlier, linear between two; before the first row x of the first row times `begin` | those rows |
-| `rate` | slope per hour to the row `rows` earlier, or to the first | those rows |
-| `clock` | seconds since the first row | rows |
-| `curve` | `values` at x, linear between `knots`, held beyond | |
-| `tanh` | tanh x | |
-| `kernel` | `weights @ exp(−\\|support − x\\|² · sharpness)` | |
-| `trees` | weighted sum of the trees' values at x | |
+same. A family gives one by `Family.program`; `Builder` has the features of `features.rises`. `OPERATIONS` states what
+each operation gives; `Node.state_size` which of them carry state.
 """
 
 from __future__ import annotations
@@ -38,10 +19,41 @@ from data.checks.base import THERMAL
 from data.errors import InputError
 from features.rises import RATE_WINDOW_S, parsed_feature
 
+OPERATIONS: Mapping[str, str] = {
+    "input": "the row's channels in their order, a missing one at its last value",
+    "constant": "value",
+    "join": "all arguments, one behind the other",
+    "pick": "x[places], counted from 0",
+    "affine": "matrix @ x + offset",
+    "add": "a + b, element by element",
+    "sub": "a - b, element by element",
+    "min": "the smaller of a and b, element by element",
+    "max": "the larger of a and b, element by element",
+    "less": "1 where a < b, else 0",
+    "equal": "1 where a = b, else 0",
+    "select": "b where a is 1, c where a is 0",
+    "previous": "what the argument, a later node, was in the row before; `initial` in the first row",
+    "mul": "a * b, element by element",
+    "power": "|x| ** exponents, element by element",
+    "median": "median of x, one value",
+    "first": "x of the first row",
+    "lag": "v = keep * v + (1 - keep) * x; in the first row v = begin * x",
+    "delay": "(1 - part) * (x `rows` rows earlier) + part * (x one more row earlier); before the first row begin * "
+    "(x of the first row)",
+    "rate": "(x - x `rows` rows earlier) per hour; from the first row while that is nearer; 0 in the first row",
+    "clock": "s since the first row",
+    "curve": "values at x, linear between knots, held beyond",
+    "tanh": "tanh x",
+    "kernel": "weights @ exp(-|support - x|^2 * sharpness)",
+    "trees": "sum over roots: from node = root, node = left[node] if x[feature[node]] <= threshold[node] else "
+    "right[node], until node is its own child; value[node]. With single, x is rounded to single precision first",
+}
+
 
 @dataclass(frozen=True)
 class Node:
-    """One operation: `args` are numbers of earlier nodes, `size` the length of its output, `data` its constants."""
+    """One operation: `args` are numbers of earlier nodes, of `previous` of a later one; `size` is the length of its
+    output, `data` its constants."""
 
     op: str
     args: tuple[int, ...]
@@ -51,7 +63,7 @@ class Node:
     def state_size(self) -> int:
         """Numbers that it carries from row to row."""
         match self.op:
-            case "input" | "first" | "lag":
+            case "input" | "first" | "lag" | "previous":
                 return self.size
             case "delay" | "rate":
                 return self.size * (int(self.data["rows"][0]) + (2 if self.op == "delay" else 1))
@@ -94,7 +106,8 @@ class Program:
         row without a required channel, which the state passes over at the last value.
         """
         made = [_STEPS[n.op](n, self.step_s) for n in self.nodes[1:]]
-        args = [n.args for n in self.nodes[1:]]
+        args = [() if n.op == "previous" else n.args for n in self.nodes[1:]]
+        later = [(k, n.args[0]) for k, n in enumerate(self.nodes) if n.op == "previous"]
         required = np.array(self.required, bool)
         every = bool(required.all())
         outputs = list(self.outputs)
@@ -113,6 +126,8 @@ class Program:
             begin = not state.started
             for k, (step, places) in enumerate(zip(made, args, strict=True), 1):
                 values[k] = step(state.carried[k], begin, *[values[a] for a in places])
+            for k, place in later:
+                state.carried[k] = values[place]
             state.started = True
             if lacking and (every or bool(missing[required].any())):
                 return nothing
@@ -238,6 +253,26 @@ class Builder:
     def sub(self, a: int, b: int) -> int:
         return self.add("sub", [a, b], self.size(a))
 
+    def two(self, op: str, a: int, *others: int) -> int:
+        """`add`, `mul`, `min`, `max`, `less` or `equal`, element by element; of more than two from the left."""
+        for b in others:
+            a = self.add(op, [a, b], self.size(a))
+        return a
+
+    def select(self, condition: int, a: int, b: int) -> int:
+        return self.add("select", [condition, a, b], self.size(a))
+
+    def clamp(self, x: int, low: int, high: int) -> int:
+        return self.two("min", self.two("max", x, low), high)
+
+    def previous(self, size: int, initial: float = 0.0) -> int:
+        """What a node that `feed` names later was in the row before, and `initial` in the first row."""
+        self.nodes.append(Node("previous", (), size, {"initial": np.full(size, float(initial))}))
+        return len(self.nodes) - 1
+
+    def feed(self, previous: int, later: int) -> None:
+        self.nodes[previous] = replace(self.nodes[previous], args=(later,))
+
     def affine(self, x: int, matrix: Array, offset: Array | float = 0.0) -> int:
         matrix = np.atleast_2d(matrix)
         return self.add("affine", [x], len(matrix), matrix=matrix, offset=np.broadcast_to(offset, len(matrix)))
@@ -247,7 +282,7 @@ class Builder:
         centred = self.sub(x, self.constant(np.broadcast_to(shift, self.size(x)))) if np.any(shift) else x
         return self.add("mul", [centred, self.constant(1.0 / np.broadcast_to(scale, self.size(x)))], self.size(x))
 
-    def constant(self, value: Array | float) -> int:
+    def constant(self, value: Array | Sequence[float] | float) -> int:
         value = np.atleast_1d(value)
         return self.add("constant", [], len(value), value=value)
 
@@ -314,9 +349,11 @@ class Builder:
         """The program of these outputs; each is 0 in the first row with `zero_start`."""
         ends = [self.since_first(o) for o in outputs] if zero_start else list(outputs)
         nodes = [Node("input", (), len(self.names)), *self.nodes[1:]]
-        used = {0, *ends}
-        for number in range(len(nodes) - 1, 0, -1):
-            used |= set(nodes[number].args) if number in used else set()
+        used: set[int] = set()
+        found = {0, *ends}
+        while found:
+            used |= found
+            found = {a for number in found for a in nodes[number].args} - used
         place = {number: k for k, number in enumerate(sorted(used))}
         kept = tuple(replace(nodes[n], args=tuple(place[a] for a in nodes[n].args)) for n in place)
         units = tuple(self.known[n].unit for n in self.names)
@@ -429,8 +466,15 @@ _STEPS: Mapping[str, Callable[[Node, float], Step]] = {
     "join": _join,
     "pick": _pick,
     "affine": _affine,
+    "add": lambda n, step_s: lambda s, begin, a, b: a + b,
     "sub": lambda n, step_s: lambda s, begin, a, b: a - b,
     "mul": lambda n, step_s: lambda s, begin, a, b: a * b,
+    "min": lambda n, step_s: lambda s, begin, a, b: np.minimum(a, b),
+    "max": lambda n, step_s: lambda s, begin, a, b: np.maximum(a, b),
+    "less": lambda n, step_s: lambda s, begin, a, b: (a < b).astype(float),
+    "equal": lambda n, step_s: lambda s, begin, a, b: (a == b).astype(float),
+    "select": lambda n, step_s: lambda s, begin, c, a, b: np.asarray(np.where(c > 0.5, a, b), float),
+    "previous": lambda n, step_s: lambda s, begin: n.data["initial"] if begin else s,
     "power": lambda n, step_s: lambda s, begin, x: np.abs(x) ** n.data["exponents"],
     "median": lambda n, step_s: lambda s, begin, x: np.array([np.median(x)]),
     "first": _first,

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel as ExportedAxis
 from compensation.exports.base import Export
+from compensation.exports.region import trust_program
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
@@ -117,11 +118,13 @@ class Given:
         max_um: largest offset, µm; None: a quarter more than the largest error of the model's training.
         rate_um_per_s: largest rate, µm/s.
         sample_s: how often samples arrive, s; None: the step of the machine file.
+        stale_s: time without a usable input that is a fault, s; None: three samples, at least the default of `Limits`.
     """
 
     max_um: float | None = None
     rate_um_per_s: float = 0.1
     sample_s: float | None = None
+    stale_s: float | None = None
 
     def of(self, stored: StoredModel) -> Limits:
         """The limits of one axis. Raises: InputError, one that makes no sense, or an error that moves no axis."""
@@ -137,7 +140,7 @@ class Given:
         return Limits(
             max_offset_um=usual_um if self.max_um is None else self.max_um,
             rate_um_per_s=self.rate_um_per_s,
-            stale_s=max(default.stale_s, _LOST_SAMPLES * (every_s or 0.0)),
+            stale_s=max(default.stale_s, _LOST_SAMPLES * (every_s or 0.0)) if self.stale_s is None else self.stale_s,
         )
 
 
@@ -256,6 +259,10 @@ def rehearse_models(
         return rehearse(batches, axes, exchange, sample_s, failing, reads, done)
 
 
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
 def write_export(
     models: Mapping[str, Path],
     to: str,
@@ -289,7 +296,8 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
     Raises:
         InputError: see `compensator` and `Family.program`.
     """
-    running = compensator(list(models.values()), limits, period_s)
+    # A control samples at the step of the program.
+    running = compensator(list(models.values()), replace(limits, sample_s=limits.sample_s or period_s), period_s)
     digest = hashlib.sha256()
     for folder in folders.values():
         for name in FILES:
@@ -300,7 +308,10 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
         # A file for a control has no place for a share: its outputs are the share of the error.
         program = made.program if made.share == 1.0 else made.program.scaled(made.share)
         remark = made.remark + ("; its outputs are that share" if made.share < 1.0 else "")
-        axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark))
+        channels = stored.machine.batch_channels()
+        plausible = {c: (_or(channels[c].low, -math.inf), _or(channels[c].high, math.inf)) for c in program.channels}
+        trust = trust_program(made, channels)
+        axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark, plausible, trust))
     first = next(iter(models.values()))
     return Export(
         machine=first.machine.machine, model=", ".join(models), version=str(first.info.get("training_id", "")),

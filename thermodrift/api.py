@@ -323,7 +323,7 @@ def replay(
 
 
 def export(models: Paths, to: str, out: Path | str | None = None, *, provisional: bool = False) -> list[Path]:
-    """Write models for a control or another program: c, st, onnx, json, sinumerik, heidenhain or fanuc.
+    """Write models for a control or another program: receiver, c, st, onnx, json or sinumerik.
 
     Args:
         models: what `load_model` takes, one for each axis of one machine.

@@ -1,4 +1,5 @@
-"""A fitted model as a file for controls and other programs: generic JSON, C, structured text, ONNX, control data.
+"""A fitted model as a file for controls and other programs: generic JSON, C, structured text, ONNX, control data; and
+the receiver at the control.
 
 An export is one class below `compensation.exports.base.Exporter` in one file and one line in `EXPORTS`.
 """
@@ -12,8 +13,7 @@ EXPORTS = Registry(
         "c": "compensation.exports.c99:CExport",
         "st": "compensation.exports.structured_text:StructuredTextExport",
         "onnx": "compensation.exports.onnx_graph:OnnxExport",
+        "receiver": "compensation.exports.receiver:ReceiverExport",
         "sinumerik": "compensation.exports.sinumerik:SinumerikExport",
-        "heidenhain": "compensation.exports.heidenhain:HeidenhainExport",
-        "fanuc": "compensation.exports.fanuc:FanucExport",
     },
 )

@@ -6,13 +6,15 @@ import re
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
+from compensation.core import LIMITS
+from compensation.safety import Limits
 from data.errors import InputError
 from data.files import check_folder, staged
 from models.program import Program
@@ -24,23 +26,7 @@ SIGN = (
 )
 _LEAST_LEVER_M = 1e-3  # a slope acts over at least 1 mm, so that its limit stays finite
 _LINE = 110
-
-
-class Limits(Protocol):
-    """Limits of one axis, see `compensation.safety.Limits`; its `step_um`, where there is one, is kept too.
-
-    max_offset_um: largest |offset|, µm; rate_um_per_s: largest rate, µm/s; hold_s: how long the offset is held after a
-    fault, s; stale_s: time without a valid input that is a fault, s.
-    """
-
-    @property
-    def max_offset_um(self) -> float: ...
-    @property
-    def rate_um_per_s(self) -> float: ...
-    @property
-    def hold_s(self) -> float: ...
-    @property
-    def stale_s(self) -> float: ...
+MOST = 1e30  # a larger value is no number: NaN, infinity, or a model that has diverged
 
 
 @dataclass(frozen=True)
@@ -53,6 +39,9 @@ class AxisModel:
         region: channel → least and greatest trained value as recorded (not as a rise), in the program's unit.
         limits: of the correction.
         remark: on the model; empty: none.
+        plausible: channel → least and greatest value that it can have, ±inf where an end is not known.
+        trust: share of the correction that the distance from the trained region leaves, see `exports.region`, over
+            channels of the program; None: 1.
     """
 
     axis: str
@@ -60,16 +49,8 @@ class AxisModel:
     region: Mapping[str, tuple[float, float]]
     limits: Limits
     remark: str = ""
-
-    @property
-    def step_um(self) -> float:
-        """Largest change of the offset from one transmission to the next, µm; inf where the limits state none."""
-        return float(getattr(self.limits, "step_um", inf))
-
-    @property
-    def stale_s(self) -> float:
-        """Time without a valid row that is a fault, s: at least three steps, so that one lost row is none."""
-        return max(self.limits.stale_s, 3.0 * self.program.step_s)
+    plausible: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    trust: Program | None = None
 
     @property
     def lever_m(self) -> float:
@@ -84,11 +65,17 @@ class AxisModel:
         return self.limits.max_offset_um / self.lever_m
 
     @property
+    def sent(self) -> list[tuple[str, str, float]]:
+        """What the control adds: name, unit, and µm at the tool for one unit of it, at the lever for a slope."""
+        slope = [("slope_um_per_m", "um/m", self.lever_m)] if self.program.along else []
+        return [("offset_um", "um", 1.0), *slope]
+
+    @property
     def output_units(self) -> Mapping[str, str]:
         return {"error_um": "um"} | ({"slope_um_per_mm": "um/mm"} if self.program.along else {})
 
     def usable(self) -> list[tuple[float, float]]:
-        """Least and greatest value of each channel with which the correction acts; ±inf for one without a region.
+        """Least and greatest value of each channel with which the correction acts; ±inf for one without any.
 
         A value further outside the trained region than the region is wide counts as a fault of the sensor: up to there
         the model extrapolates, as it does in `models.trust`. Narrow regions count as 5 K, 1000 rpm or 1000 mm/min wide.
@@ -97,7 +84,8 @@ class AxisModel:
         for name, unit in zip(self.program.channels, self.program.units, strict=True):
             low, high = self.region.get(name, (-inf, inf))
             width = max(high - low, LEAST_WIDTH.get(unit, 0.0))
-            out.append((low - width, high + width) if isfinite(width) else (-inf, inf))
+            least, most = self.plausible.get(name, (-inf, inf))
+            out.append((max(low - width, least), min(high + width, most)))
         return out
 
     def described(self) -> dict[str, Any]:
@@ -109,18 +97,14 @@ class AxisModel:
                 "unit": unit,
                 "required": bool(required),
                 "trained": list(map(float, self.region[name])) if name in self.region else None,
-                "usable": [low, high] if isfinite(low) else None,
+                "usable": [end if isfinite(end) else None for end in (low, high)],
             }
             for name, unit, required, (low, high) in zip(p.channels, p.units, p.required, self.usable(), strict=True)
         ]
         position = {"along": p.along, "reference_mm": p.reference_mm, "line": _line(p)} if p.along else None
         limits = {
-            "max_offset_um": float(self.limits.max_offset_um),
+            **{name: float(getattr(self.limits, name)) for name in LIMITS},
             "max_slope_um_per_m": self.max_slope_um_per_m if p.along else None,
-            "rate_um_per_s": float(self.limits.rate_um_per_s),
-            "step_um": self.step_um if isfinite(self.step_um) else None,
-            "hold_s": float(self.limits.hold_s),
-            "stale_s": self.stale_s,
         }
         return {
             "axis": self.axis,
@@ -131,6 +115,7 @@ class AxisModel:
             "step_s": p.step_s,
             "trained_region": {name: list(map(float, ends)) for name, ends in self.region.items()},
             "limits": limits,
+            "trust": self.trust.as_plain() if self.trust is not None else None,
             "fallback": _fallback(self),
         }
 
@@ -236,9 +221,6 @@ def check_export(export: Export) -> None:
     if not names or len(set(names)) != len(names):
         raise InputError(f"{where}: got axes {names}; expected at least one, each once")
     for a in export.axes:
-        limits = (a.limits.max_offset_um, a.limits.rate_um_per_s, a.step_um, a.stale_s)
-        if not (min(limits) > 0 and all(map(isfinite, limits[:2])) and 0 <= a.limits.hold_s < inf):
-            raise InputError(f"{where}: axis {a.axis}: got limits {a.limits}; expected finite ones above 0")
         for name, (low, high) in a.region.items():
             if not (isfinite(low) and isfinite(high) and low <= high):
                 raise InputError(
@@ -252,6 +234,17 @@ def check_export(export: Export) -> None:
         for number, n in enumerate(a.program.nodes):
             if not all(np.isfinite(values).all() for values in n.data.values()):
                 raise InputError(f"{where}: axis {a.axis}: operation {number} ({n.op}) is not finite; train again")
+
+
+def stale_rows(export: Export) -> str | None:
+    """Why a file that runs the models cannot, where a row comes later than the one before is stale."""
+    for a in export.axes:
+        if a.limits.stale_s < a.program.step_s:
+            return (
+                f"axis {a.axis} has stale_s {a.limits.stale_s:g} s, below its step of {a.program.step_s:g} s; give "
+                "--stale-s of at least three steps"
+            )
+    return None
 
 
 def ascii_text(text: str) -> str:
@@ -291,10 +284,9 @@ def _axis_lines(a: AxisModel) -> list[str]:
     lines = [f"Axis {a.axis}: one row every {p.step_s:g} s", "Inputs:"]
     for name, unit, required, usable in zip(p.channels, p.units, p.required, a.usable(), strict=True):
         need = "required" if required else "bridged at its last value where it is missing"
-        known = name in a.region
-        trained = f"trained {a.region[name][0]:.6g} to {a.region[name][1]:.6g}" if known else "no trained region"
-        acts = f", usable {usable[0]:.6g} to {usable[1]:.6g}" if known else ""
-        lines.append(f"  {name} in {unit}, {need}, {trained}{acts}")
+        ends = a.region.get(name)
+        trained = f"trained {ends[0]:.6g} to {ends[1]:.6g}" if ends else "no trained region"
+        lines.append(f"  {name} in {unit}, {need}, {trained}, usable {usable[0]:.6g} to {usable[1]:.6g}")
     if not p.channels:
         lines.append("  none")
     others = [f"{n} {low:.6g} to {high:.6g}" for n, (low, high) in a.region.items() if n not in p.channels]
@@ -302,7 +294,7 @@ def _axis_lines(a: AxisModel) -> list[str]:
     lines += ["Outputs:", "  error_um in um" + (f" at P0 = {p.reference_mm:g} mm of {p.along}" if p.along else "")]
     if p.along:
         lines.append(f"  slope_um_per_mm in um/mm: {_line(p)}")
-    step = f", {a.step_um:g} um from one transmission to the next" if isfinite(a.step_um) else ""
+    step = f", {a.limits.step_um:g} um from one transmission to the next"
     slope = f", |slope| <= {a.max_slope_um_per_m:.6g} um/m" if p.along else ""
     lines.append(f"Limits: |offset| <= {a.limits.max_offset_um:g} um{slope}, {a.limits.rate_um_per_s:g} um/s{step}")
     return [*lines, f"Fallback: {_fallback(a)}"]
@@ -314,6 +306,7 @@ def _line(p: Program) -> str:
 
 def _fallback(a: AxisModel) -> str:
     return (
-        f"a required input that is missing or not usable, or {a.stale_s:g} s without a row: hold the offset for "
-        f"{a.limits.hold_s:g} s, then fade to 0 at {a.limits.rate_um_per_s:g} um/s"
+        f"a required input that is missing or not usable, or {a.limits.stale_s:g} s without a row: hold the offset for "
+        f"{a.limits.hold_s:g} s, then fade to 0 at {a.limits.rate_um_per_s:g} um/s; valid for "
+        f"{a.limits.warm_up_s:g} s before it acts"
     )

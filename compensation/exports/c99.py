@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from math import isfinite
 from typing import ClassVar
 
 import numpy as np
 
-from compensation.exports.base import AxisModel, Export, Exporter, ascii_text, identifiers
+from compensation.core import INPUTS, lower_core
+from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows
 from compensation.exports.lowering import Language, Writer, lower, number_lines
 
 
@@ -23,6 +23,8 @@ class C(Language):
         "single": "(double)(float)",
         "tanh": "tanh",
         "or": "||",
+        "less": "<",
+        "equal": "==",
     }
 
     def comment(self, text: str) -> str:
@@ -43,6 +45,9 @@ class C(Language):
     def number(self, value: float) -> str:
         return repr(value) if value >= 0 else f"({value!r})"
 
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        return f"{condition} ? {yes} : {no}"
+
     def power(self, base: str, exponent: float) -> str:
         return f"pow({base}, {exponent!r})"
 
@@ -59,7 +64,7 @@ class CExport(Exporter):
     suffix: ClassVar[str] = ".c, .h"
 
     def refusal(self, export: Export) -> str | None:
-        return one_step(export)
+        return one_step(export) or stale_rows(export)
 
     def files(self, export: Export) -> dict[str, str | bytes]:
         return {f"{export.stem}.h": _header(export), f"{export.stem}.c": _source(export)}
@@ -119,7 +124,7 @@ def _header(export: Export) -> str:
 /* axes */
 {axes}
 
-/* Forgets all rows and the correction: before the first row, and after the machine was off. */
+/* Forgets all rows: before the first row, and after the machine was off. What is sent goes on from where it is. */
 void {name}_reset(void);
 
 /* One row: error_um[{upper}_N_OUTPUTS] is set. Returns 0, or the sum of 1 << axis over the axes without an output,
@@ -135,6 +140,7 @@ int {name}_correction_step(const double inputs[], double offset_um[], double slo
 int {name}_correction_row(const double inputs[]);
 void {name}_correction_move(double elapsed_s, double offset_um[], double slope_um_per_m[]);
 
+{SHARED.format(name=name)}
 #endif
 """
 
@@ -154,36 +160,86 @@ def _string(text: str) -> str:
     return f'"{plain}"'
 
 
+SHARED = """/* 0 stops an axis: it fades out and stays off; 1 starts it again. */
+void {name}_enable(int axis, int enabled);
+
+/* State of an axis: 0 off, 1 warm-up, 2 active, 3 hold, 4 fade-out. */
+int {name}_state(int axis);
+"""
+
+
+def move_source(export: Export, function: str) -> str:
+    """What both sources share: the state machine of what is sent, moved by its inputs in static arrays by a
+    function whose head is `function` and the arguments of a movement."""
+    name, sent = export.stem, [(k, a, *out) for k, a in enumerate(export.axes) for out in a.sent]
+    w, count = Writer(C()), len(sent)
+    given = {
+        "elapsed_s": ["elapsed_s"] * count,
+        **{n: [f"{n}[{i}]" for i in range(count)] for n in ("wanted_um", "usable", "faulty")},
+        "stopped": [f"stopped[{k}]" for k, *_ in sent],
+    }
+    w.scalar("i", "whole")
+    state, now_um, *_ = lower_core(w, given, [a.limits for _, a, *_ in sent])
+    w.memory["core_v0"] = ("real", len(INPUTS) * count)
+    results = [f"    slope_um_per_m[{k}] = 0.0;" for k in range(len(export.axes))]
+    states = []
+    for (k, _, output, _, um), value, number in zip(sent, now_um, state, strict=True):
+        results.append(f"    {output}[{k}] = {value}{'' if um == 1.0 else f' / {um!r}'};")
+        states += [number] if output == "offset_um" else []
+    lines, joined, where = "\n".join(w.lines), "\n".join(results), ", ".join(states)
+    return f"""/* What is sent, by its state machine: movements within the limits of size, rate and step. */
+{_declared(w)}
+static double wanted_um[{count}]; /* at the tool */
+static double usable[{count}]; /* 1 where a usable value has come since the last movement */
+static double faulty[{count}]; /* 1 where one has come that is not */
+static double stopped[{len(export.axes)}];
+static int core_begun;
+
+{function}(double elapsed_s, double offset_um[], double slope_um_per_m[])
+{{
+    int first_row = !core_begun;
+{_locals(w)}
+    core_begun = 1;
+    if (!(elapsed_s > 0.0)) {{
+        elapsed_s = 0.0;
+    }}
+{lines}
+    for (i = 0; i < {count}; i++) {{
+        usable[i] = 0.0;
+        faulty[i] = 0.0;
+    }}
+{joined}
+}}
+
+void {name}_enable(int axis, int enabled)
+{{
+    stopped[axis] = enabled ? 0.0 : 1.0;
+}}
+
+int {name}_state(int axis)
+{{
+    const double states[{len(states)}] = {{{where}}};
+    return core_begun ? (int)states[axis] : 0;
+}}
+"""
+
+
 def _source(export: Export) -> str:
     name, upper = export.stem, export.stem.upper()
     prefixes = [f"{p}_" for p in identifiers(a.axis for a in export.axes)]
     places = {channel: k for k, channel in enumerate(channels_of(export))}
     axes = "\n".join(_axis(a, p, places) for a, p in zip(export.axes, prefixes, strict=True))
     statement = "\n".join(f" * {line}".rstrip() for line in export.heading(axes=()))
-    first, rows, resets, at = [], [], [], 0
+    rows, resets, at = [], [], 0
     for k, (a, p) in enumerate(zip(export.axes, prefixes, strict=True)):
-        first.append(at)
-        rows.append(f"    lacking += {p}row(inputs, usable_only, error_um + {at}) << {k};")
+        rows.append(f"    lacking += {p}row(inputs, usable_only, error_um + {at}, trust + {k}) << {k};")
         resets.append(f"    {p}begun = 0;")
-        if a.program.channels:
-            resets += [f"    for (i = 0; i < {len(a.program.channels)}; i++) {{", f"        {p}seen[i] = 0;", "    }"]
+        resets += [f"    {p}seen[{c}] = 0;" for c in range(len(a.program.channels))]
         at += len(a.program.outputs)
-    limits = [_limit_rows(a) for a in export.axes]
-    caps, rates, steps = ([value for rows_ in limits for value in rows_[part]] for part in range(3))
-    owner = np.repeat(np.arange(len(export.axes)), [len(a.program.outputs) for a in export.axes])
-    per_mm = [-1.0 if not part else -1000.0 for a in export.axes for part in range(len(a.program.outputs))]
-    one = [a.limits for a in export.axes]
-    tables = "\n".join(
-        [
-            _table("axis_of", owner),
-            _table("is_slope", np.array([int(x != -1.0) for x in per_mm])),
-            _table("largest", np.array(caps)),
-            _table("rate_per_s", np.array(rates)),
-            _table("largest_step", np.array(steps)),
-            _table("hold_s", np.array([float(x.hold_s) for x in one])),
-            _table("stale_s", np.array([a.stale_s for a in export.axes])),
-        ]
-    )
+    owner = np.repeat(np.arange(len(export.axes)), [len(a.sent) for a in export.axes])
+    # The model's outputs are um and um/mm.
+    scale = np.array([-um * (1000.0 if unit != "um" else 1.0) for a in export.axes for _, unit, um in a.sent])
+    tables = "\n".join([_table("axis_of", owner), _table("um_at_the_tool", scale)])
     joined_rows, joined_resets = "\n".join(rows), "\n".join(resets)
     return f"""/*
 {statement}
@@ -195,7 +251,7 @@ def _source(export: Export) -> str:
 #include <math.h>
 
 {axes}
-static int all_rows(const double inputs[], int usable_only, double error_um[])
+static int all_rows(const double inputs[], int usable_only, double error_um[], double trust[])
 {{
     int lacking = 0;
 {joined_rows}
@@ -204,78 +260,32 @@ static int all_rows(const double inputs[], int usable_only, double error_um[])
 
 int {name}_step(const double inputs[], double error_um[])
 {{
-    return all_rows(inputs, 0, error_um);
+    double trust[{upper}_N_AXES];
+    return all_rows(inputs, 0, error_um, trust);
 }}
-
-/* Correction. Outputs are offsets in um and slopes in um/m, in the order of error_um[]. */
-{tables}
-static double target[{upper}_N_OUTPUTS];
-static double sent[{upper}_N_OUTPUTS];
-static int valid[{upper}_N_AXES];
-static int fresh[{upper}_N_AXES]; /* a valid row has come since the last movement */
-static int faulty[{upper}_N_AXES];
-static double quiet_s[{upper}_N_AXES]; /* since the last valid row */
-static double held_s[{upper}_N_AXES]; /* since the fault began */
 
 void {name}_reset(void)
 {{
-    int i;
 {joined_resets}
-    for (i = 0; i < {upper}_N_OUTPUTS; i++) {{
-        target[i] = 0.0;
-        sent[i] = 0.0;
-    }}
-    for (i = 0; i < {upper}_N_AXES; i++) {{
-        valid[i] = 0;
-        fresh[i] = 0;
-        faulty[i] = 0;
-        quiet_s[i] = 0.0;
-        held_s[i] = 0.0;
-    }}
 }}
+
+{move_source(export, f"void {name}_correction_move")}
+/* In the order of error_um[]. */
+{tables}
 
 int {name}_correction_row(const double inputs[])
 {{
-    double error_um[{upper}_N_OUTPUTS];
-    int lacking = all_rows(inputs, 1, error_um);
+    double error_um[{upper}_N_OUTPUTS], trust[{upper}_N_AXES];
+    int lacking = all_rows(inputs, 1, error_um, trust);
     int i;
     for (i = 0; i < {upper}_N_OUTPUTS; i++) {{
         int axis = axis_of[i];
-        valid[axis] = !(lacking >> axis & 1);
-        if (valid[axis]) {{
-            fresh[axis] = 1;
-            target[i] = fmin(fmax((is_slope[i] ? -1000.0 : -1.0) * error_um[i], -largest[i]), largest[i]);
-        }}
+        int valid = !(lacking >> axis & 1);
+        wanted_um[i] = valid ? um_at_the_tool[i] * error_um[i] * trust[axis] : 0.0;
+        usable[i] = valid ? 1.0 : 0.0;
+        faulty[i] = valid ? 0.0 : 1.0;
     }}
     return lacking;
-}}
-
-void {name}_correction_move(double elapsed_s, double offset_um[], double slope_um_per_m[])
-{{
-    int i;
-    if (!(elapsed_s > 0.0)) {{
-        elapsed_s = 0.0;
-    }}
-    for (i = 0; i < {upper}_N_AXES; i++) {{
-        slope_um_per_m[i] = 0.0;
-        quiet_s[i] = fresh[i] ? 0.0 : quiet_s[i] + elapsed_s;
-        fresh[i] = 0;
-        held_s[i] = faulty[i] ? held_s[i] + elapsed_s : 0.0;
-        faulty[i] = !valid[i] || quiet_s[i] > stale_s[i];
-    }}
-    for (i = 0; i < {upper}_N_OUTPUTS; i++) {{
-        int axis = axis_of[i];
-        double reach = fmin(rate_per_s[i] * fmin(elapsed_s, stale_s[axis]), largest_step[i]);
-        if (faulty[axis]) {{
-            target[i] = held_s[axis] > hold_s[axis] ? 0.0 : sent[i];
-        }}
-        sent[i] += fmin(fmax(target[i] - sent[i], -reach), reach);
-        if (is_slope[i]) {{
-            slope_um_per_m[axis] = sent[i];
-        }} else {{
-            offset_um[axis] = sent[i];
-        }}
-    }}
 }}
 
 int {name}_correction_step(const double inputs[], double offset_um[], double slope_um_per_m[])
@@ -287,12 +297,18 @@ int {name}_correction_step(const double inputs[], double offset_um[], double slo
 """
 
 
-def _limit_rows(a: AxisModel) -> tuple[list[float], list[float], list[float]]:
-    """Largest value, rate and change of each output: the slope's keep the same limits at the lever of the axis."""
-    levers = [1.0, a.lever_m][: len(a.program.outputs)]
-    kept = (a.limits.max_offset_um, a.limits.rate_um_per_s, a.step_um if isfinite(a.step_um) else 1e30)
-    largest, rate, step = ([float(value) / lever for lever in levers] for value in kept)
-    return largest, rate, step
+_KINDS: Mapping[str, str] = {"real": "double", "whole": "int"}
+
+
+def _declared(w: Writer) -> str:
+    """Constants and state."""
+    constants = [_table(name, values) for name, values in w.tables.items()]
+    state = [f"static {_KINDS[kind]} {name}{f'[{size}]' if size else ''};" for name, (kind, size) in w.memory.items()]
+    return "\n".join([*constants, *state])
+
+
+def _locals(w: Writer) -> str:
+    return "\n".join(f"    {_KINDS[kind]} {name};" for name, kind in w.scalars.items())
 
 
 def _table(name: str, values: np.ndarray) -> str:
@@ -307,7 +323,13 @@ def _table(name: str, values: np.ndarray) -> str:
 def _axis(a: AxisModel, prefix: str, places: Mapping[str, int]) -> str:
     """State, constants and row function of one axis."""
     p, w = a.program, Writer(C(), prefix)
-    outputs = lower(w, a)
+    outputs = [element for (element,) in lower(w, p)]
+    trust = "1.0"
+    if a.trust is not None:
+        w.memory[f"{prefix}trust_v0"] = ("real", len(a.trust.channels))
+        for k, channel in enumerate(a.trust.channels):
+            w.put(f"{prefix}trust_v0[{k}]", f"{prefix}v0[{p.channels.index(channel)}]")
+        ((trust,),) = lower(w, a.trust, "trust_")
     count = len(p.channels)
     inputs = f"{prefix}v0"  # the last values
     w.memory.pop(inputs, None)
@@ -334,24 +356,19 @@ def _axis(a: AxisModel, prefix: str, places: Mapping[str, int]) -> str:
         w.scalar("i", "whole")
     else:
         gather = "    (void)inputs;\n    (void)usable_only;"
-    kinds = {"real": "double", "whole": "int"}
-    constants = "\n".join(_table(name, values) for name, values in w.tables.items())
-    state = "\n".join(
-        f"static {kinds[kind]} {name}{f'[{size}]' if size else ''};" for name, (kind, size) in w.memory.items()
-    )
-    local = "\n".join(f"    {kinds[kind]} {name};" for name, kind in w.scalars.items())
+    checks = "\n".join(f"    lacking |= !(fabs({o}) <= {MOST!r});" for o in outputs)
     results = "\n".join(f"    error_um[{k}] = lacking ? NAN : {o};" for k, o in enumerate(outputs))
     nothing = "\n".join(f"        error_um[{k}] = NAN;" for k in range(len(outputs)))
     blocks = "\n".join(w.lines)
     return f"""/* Axis {ascii_text(a.axis)} */
-{constants}
-{state}
+{_declared(w)}
 
-static int {prefix}row(const double inputs[], int usable_only, double error_um[])
+static int {prefix}row(const double inputs[], int usable_only, double error_um[], double *trust)
 {{
     int first_row, lacking = 0, complete = 1;
-{local}
+{_locals(w)}
 {gather}
+    *trust = 1.0;
     if (!complete) {{
 {nothing}
         return 1;
@@ -360,6 +377,8 @@ static int {prefix}row(const double inputs[], int usable_only, double error_um[]
     {prefix}begun = 1;
 {blocks}
     (void)first_row;
+    *trust = {trust};
+{checks}
 {results}
     return lacking;
 }}

@@ -4,34 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from typing import ClassVar
 
 from compensation.exports.base import Export, Exporter
+from models.program import OPERATIONS
 
 SCHEMA = "thermodrift.export/1"
-OPERATIONS: Mapping[str, str] = {
-    "input": "the row's channels in their order, a missing one at its last value",
-    "constant": "value",
-    "join": "all arguments, one behind the other",
-    "pick": "x[places], counted from 0",
-    "affine": "matrix @ x + offset",
-    "sub": "a - b",
-    "mul": "a * b, element by element",
-    "power": "|x| ** exponents, element by element",
-    "median": "median of x, one value",
-    "first": "x of the first row",
-    "lag": "v = keep * v + (1 - keep) * x; in the first row v = begin * x",
-    "delay": "(1 - part) * (x `rows` rows earlier) + part * (x one more row earlier); before the first row begin * "
-    "(x of the first row)",
-    "rate": "(x - x `rows` rows earlier) per hour; from the first row while that is nearer; 0 in the first row",
-    "clock": "s since the first row",
-    "curve": "values at x, linear between knots, held beyond",
-    "tanh": "tanh x",
-    "kernel": "weights @ exp(-|support - x|^2 * sharpness)",
-    "trees": "sum over roots: from node = root, node = left[node] if x[feature[node]] <= threshold[node] else "
-    "right[node], until node is its own child; value[node]. With single, x is rounded to single precision first",
-}
 _NUMBERS = re.compile(r"\[\n([-+\d.eE,\s]+)\]")  # a list of numbers over several lines, which no string has
 ROWS = (
     "The first row is that at which every channel has been seen. The state passes over a missing channel at its last "

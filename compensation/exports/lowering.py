@@ -1,19 +1,20 @@
-"""Programs as statements of a language with arrays, loops and branches: shared by C and structured text.
+"""Programs as statements of a language with arrays, loops and branches: C, structured text and Python.
 
-Node k becomes one block that sets the array ``v<k>``; ``s<k>`` is what it carries from row to row, ``c<k>_<name>`` its
-constants. `first_row` is true in the first row, in which every block sets its own state: a reset needs no more.
+Node k becomes one block that sets the array ``v<k>``, or the number of that name where it has one element; ``s<k>`` is
+what it carries from row to row, ``c<k>_<name>`` its constants. All keep their values from row to row. `first_row` is
+true in the first row, in which every block sets its own state: a reset needs no more.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
-from compensation.exports.base import AxisModel
 from data.arrays import Array
 from models.program import Node, Program
 
@@ -22,36 +23,43 @@ _NUMBERS_A_LINE = 5
 Shape = tuple[str, int]  # "real", "whole" or "logical", and the length; 0 for a single value
 
 
-class Language(ABC):
-    """Spelling of statements; operators + - * / and indices x[i] are the same in both languages."""
+class Language:
+    """Spelling of statements, here of Python for nodes of one element; others override what differs.
 
-    functions: ClassVar[Mapping[str, str]]  # abs, exp, min, max, single
+    Operators + - * / < and indices x[i] are the same in all languages.
+    """
 
-    @abstractmethod
-    def comment(self, text: str) -> str: ...
+    functions: ClassVar[Mapping[str, str]] = {"abs": "abs", "min": "min", "max": "max", "less": "<", "equal": "=="}
 
-    @abstractmethod
-    def put(self, target: str, value: str) -> str: ...
+    def comment(self, text: str) -> str:
+        return f"# {text}"
 
-    @abstractmethod
+    def put(self, target: str, value: str) -> str:
+        return f"{target} = {value}"
+
     def loop(self, index: str, count: int | str, first: int | str = 0) -> tuple[str, str]:
         """First and last line of a loop over first … count − 1."""
+        return f"for {index} in range({first}, {count}):", ""
 
-    @abstractmethod
     def when(self, condition: str) -> tuple[str, str, str]:
         """First line, line before what else is done, and last line of a branch."""
+        return f"if {condition}:", "else:", ""
 
-    @abstractmethod
     def repeat(self, left: str, right: str) -> tuple[str, str]:
         """First and last line of a loop while two whole numbers differ."""
+        return f"while {left} != {right}:", ""
 
-    @abstractmethod
     def number(self, value: float) -> str:
         """A number inside an expression."""
+        return f"({value!r})"
 
-    @abstractmethod
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        """An expression that is `yes` where the condition holds, else `no`; both are evaluated or free of effects."""
+        return f"{yes} if {condition} else {no}"
+
     def power(self, base: str, exponent: float) -> str:
         """base ** exponent for a base above 0."""
+        return f"{base} ** {exponent!r}"
 
     def call(self, function: str, *args: str) -> str:
         return f"{self.functions[function]}({', '.join(args)})"
@@ -130,35 +138,54 @@ class Writer:
         self.line(tail)
 
 
+_SIGNS: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*"}
+_COMPARED = ("less", "equal")
+_EACH = {*_SIGNS, *_COMPARED, "min", "max", "select"}  # computed element by element
+_FOLDED = 60  # characters of an expression that is written where it is used
+
+
 class _Lowered:
-    """The blocks of one program."""
+    """The blocks of one program: a method for each operation, by its name."""
 
-    def __init__(self, w: Writer, program: Program) -> None:
-        self.w, self.language, self.program = w, w.language, program
-
-    def name(self, k: int) -> str:
-        """Array of node k."""
-        n = self.program.nodes[k]
-        if n.op == "constant":
-            return self.w.table(f"c{k}_value", n.data["value"])
-        return self.w.array(f"v{k}", n.size)
+    def __init__(self, w: Writer, program: Program, labels: Mapping[int, str]) -> None:
+        self.w, self.language, self.program, self.labels = w, w.language, program, labels
+        uses = Counter(a for n in program.nodes for a in n.args)
+        later = {a for n in program.nodes for a in n.args if n.op == "previous"}
+        self.single = {k for k, count in uses.items() if count == 1} - {*labels, *later, *program.outputs}
+        self.folded: set[int] = set()  # nodes that are written where they are used
 
     def item(self, k: int, index: str) -> str:
         """Element of node k; that of a single value whatever the index is."""
-        return f"{self.name(k)}[{'0' if self.program.nodes[k].size == 1 else index}]"
+        n = self.program.nodes[k]
+        if n.op == "constant":
+            value = n.data["value"]
+            alike = bool((value == value[0]).all())
+            return self.language.number(float(value[0])) if alike else f"{self.w.table(f'c{k}_value', value)}[{index}]"
+        if k in self.folded:
+            return f"({self.value(k, index)})"
+        single = n.size == 1 and k > 0
+        name = self.w.array(self.labels.get(k, f"v{k}"), 0 if single else n.size)
+        return name if single else f"{name}[{'0' if n.size == 1 else index}]"
 
     def part(self, k: int, name: str, index: str, size: int) -> str:
         """Element of a constant of node k that has one number for each of `size` or one for all."""
         values = np.broadcast_to(self.program.nodes[k].data[name], size)
+        if (values == values[0]).all():
+            return self.language.number(float(values[0]))
         return f"{self.w.table(f'c{k}_{name}', values)}[{index}]"
 
     def block(self, k: int) -> None:
         n = self.program.nodes[k]
         if n.size == 0 or n.op in ("input", "constant"):
             return
-        of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
-        self.w.comment(f"v{k}: {_TITLES[n.op]}{of}")
-        _BLOCKS[n.op](self, k, n)
+        if n.op in _EACH:
+            if k in self.single and len(self.value(k, "i")) <= _FOLDED:
+                self.folded.add(k)
+                return
+        elif k not in self.labels:
+            of = f" of {', '.join(f'v{a}' for a in n.args)}" if n.args else ""
+            self.w.comment(f"v{k}: {n.op}{of}")
+        getattr(self, n.op)(k, n)
 
     def join(self, k: int, n: Node) -> None:
         at = 0
@@ -167,25 +194,25 @@ class _Lowered:
             if size:
                 with self.w.loop(size) as i:
                     place = str(at) if i == "0" else f"{at} + {i}" if at else i
-                    self.w.put(f"{self.name(k)}[{place}]", self.item(a, i))
+                    self.w.put(self.item(k, place), self.item(a, i))
             at += size
 
     def pick(self, k: int, n: Node) -> None:
         places = n.data["places"].astype(int)
-        if n.size <= _UNROLLED:
+        if n.size <= _UNROLLED or len(set(places)) == 1:
             for to, place in enumerate(places):
-                self.w.put(f"{self.name(k)}[{to}]", f"{self.name(n.args[0])}[{place}]")
+                self.w.put(self.item(k, str(to)), self.item(n.args[0], str(place)))
             return
         table = self.w.table(f"c{k}_places", places)
         with self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", f"{self.name(n.args[0])}[{table}[{i}]]")
+            self.w.put(self.item(k, i), self.item(n.args[0], f"{table}[{i}]"))
 
     def affine(self, k: int, n: Node) -> None:
         width = self.program.nodes[n.args[0]].size
         with self.w.loop(n.size) as i:
             offset = self.part(k, "offset", i, n.size)
             if not width:
-                self.w.put(f"{self.name(k)}[{i}]", offset)
+                self.w.put(self.item(k, i), offset)
                 return
             total = self.w.scalar("total")
             self.w.put(total, offset)
@@ -193,30 +220,58 @@ class _Lowered:
             with self.w.loop(width, "j") as j:
                 place = j if i == "0" else f"{i} * {width} + {j}" if width > 1 else i
                 self.w.put(total, f"{total} + {matrix}[{place}] * {self.item(n.args[0], j)}")
-            self.w.put(f"{self.name(k)}[{i}]", total)
+            self.w.put(self.item(k, i), total)
 
-    def two(self, k: int, n: Node) -> None:
-        a, b = n.args
+    def value(self, k: int, i: str) -> str:
+        """An element of a node that computes each of its own from those of its arguments."""
+        n, one, zero = self.program.nodes[k], self.language.number(1.0), self.language.number(0.0)
+        if n.op == "select":
+            yes, no = (self.item(x, i) for x in n.args[1:])
+            return self.language.choice(self.condition(n.args[0], i), yes, no)
+        if n.op in _COMPARED:
+            return self.language.choice(self.compared(k, i), one, zero)
+        a, b = (self.item(x, i) for x in n.args)
+        return self.language.call(n.op, a, b) if n.op in ("min", "max") else f"{a} {_SIGNS[n.op]} {b}"
+
+    def compared(self, k: int, i: str) -> str:
+        n = self.program.nodes[k]
+        return f" {self.language.functions[n.op]} ".join(self.item(x, i) for x in n.args)
+
+    def condition(self, k: int, i: str) -> str:
+        """Whether a node that is 0 or 1 is 1."""
+        folded = k in self.folded and self.program.nodes[k].op in _COMPARED
+        return self.compared(k, i) if folded else f"{self.item(k, i)} > {self.language.number(0.5)}"
+
+    def each(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            sign = "-" if n.op == "sub" else "*"
-            self.w.put(f"{self.name(k)}[{i}]", f"{self.item(a, i)} {sign} {self.item(b, i)}")
+            self.w.put(self.item(k, i), self.value(k, i))
+
+    add = sub = mul = min = max = less = equal = select = each
+
+    def previous(self, k: int, n: Node) -> None:
+        with self.w.loop(n.size) as i:  # its argument is computed below, and still has the value of the row before
+            self.w.put(self.item(k, i), self.item(n.args[0], i))
+        with self.w.when("first_row"), self.w.loop(n.size) as i:
+            self.w.put(self.item(k, i), self.part(k, "initial", i, n.size))
 
     def power(self, k: int, n: Node) -> None:
         exponents = np.broadcast_to(n.data["exponents"], n.size)
         for i, exponent in enumerate(exponents.tolist()):
-            target, x = f"{self.name(k)}[{i}]", self.language.call("abs", self.item(n.args[0], str(i)))
+            target, x = self.item(k, str(i)), self.language.call("abs", self.item(n.args[0], str(i)))
             if exponent == 1.0:
                 self.w.put(target, x)
                 continue
             with self.w.when(f"{x} > {self.language.number(0.0)}"):
                 self.w.put(target, self.language.power(x, exponent))
             with self.w.otherwise():  # not every language defines a power of 0
-                self.w.put(target, self.language.number(0.0**exponent))
+                self.w.put(
+                    target, self.language.number(0.0**exponent if exponent >= 0.0 else float(np.finfo(float).max))
+                )
 
     def median(self, k: int, n: Node) -> None:
         (a,), size = n.args, self.program.nodes[n.args[0]].size
         if size == 1:
-            self.w.put(f"{self.name(k)}[0]", self.item(a, "0"))
+            self.w.put(self.item(k, "0"), self.item(a, "0"))
             return
         order = self.w.array(f"o{k}", size)
         with self.w.loop(size) as i:
@@ -231,15 +286,15 @@ class _Lowered:
             self.w.put(f"{order}[{i}]", f"{order}[{j}]")
             self.w.put(f"{order}[{j}]", held)
         half = self.language.number(0.5)
-        self.w.put(f"{self.name(k)}[0]", f"{half} * ({order}[{(size - 1) // 2}] + {order}[{size // 2}])")
+        self.w.put(self.item(k, "0"), f"{half} * ({order}[{(size - 1) // 2}] + {order}[{size // 2}])")
 
     def first(self, k: int, n: Node) -> None:
         with self.w.when("first_row"), self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+            self.w.put(self.item(k, i), self.item(n.args[0], i))
 
     def lag(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            v, x, keep = f"{self.name(k)}[{i}]", self.item(n.args[0], i), self.part(k, "keep", i, n.size)
+            v, x, keep = self.item(k, i), self.item(n.args[0], i), self.part(k, "keep", i, n.size)
             with self.w.when("first_row"):
                 self.w.put(v, f"{self.part(k, 'begin', i, n.size)} * {x}")
             with self.w.otherwise():
@@ -249,13 +304,9 @@ class _Lowered:
         """Advances a ring of rows to the place of the newest, 0 in the first row: its array and that place."""
         ring, head = self.w.array(f"s{k}", rows * n.size), self.w.array(f"n{k}", 0, "whole")
         self.w.put(head, f"{head} + 1")
-        with self.w.when(f"first_row {self._or} {head} >= {rows}"):
+        with self.w.when(f"first_row {self.language.functions['or']} {head} >= {rows}"):
             self.w.put(head, "0")
         return ring, head
-
-    @property
-    def _or(self) -> str:
-        return self.language.functions["or"]
 
     def _earlier(self, head: str, rows: int, ahead: int, name: str) -> str:
         """The place `ahead` of the newest, which is the oldest for 1."""
@@ -280,7 +331,7 @@ class _Lowered:
             if part:
                 shares = self.language.number(1.0 - part), self.language.number(part)
                 value = f"{shares[0]} * {value} + {shares[1]} * {ring}[{self._at(far, n, i)}]"
-            self.w.put(f"{self.name(k)}[{i}]", value)
+            self.w.put(self.item(k, i), value)
 
     def _at(self, row: str, n: Node, i: str) -> str:
         return row if n.size == 1 else f"{row} * {n.size} + {i}"
@@ -299,17 +350,17 @@ class _Lowered:
         with self.w.when(f"{far} < 0"):
             self.w.put(far, f"{far} + {rows + 1}")
         with self.w.when("first_row"), self.w.loop(n.size) as i:
-            self.w.put(f"{self.name(k)}[{i}]", self.language.number(0.0))
+            self.w.put(self.item(k, i), self.language.number(0.0))
         with self.w.otherwise(), self.w.loop(n.size) as i:
             rise = f"{self.item(n.args[0], i)} - {ring}[{self._at(far, n, i)}]"
             hours = self.language.number(self.program.step_s / 3600.0)
-            self.w.put(f"{self.name(k)}[{i}]", f"({rise}) / ({seen} * {hours})")
+            self.w.put(self.item(k, i), f"({rise}) / ({seen} * {hours})")
 
     def clock(self, k: int, n: Node) -> None:
         with self.w.when("first_row"):
-            self.w.put(f"{self.name(k)}[0]", self.language.number(0.0))
+            self.w.put(self.item(k, "0"), self.language.number(0.0))
         with self.w.otherwise():
-            self.w.put(f"{self.name(k)}[0]", f"{self.name(k)}[0] + {self.language.number(self.program.step_s)}")
+            self.w.put(self.item(k, "0"), f"{self.item(k, '0')} + {self.language.number(self.program.step_s)}")
 
     def curve(self, k: int, n: Node) -> None:
         knots, values = n.data["knots"], n.data["values"]
@@ -324,11 +375,11 @@ class _Lowered:
                     beyond = f"{self.item(n.args[0], i)} - {names[0]}[{j}]"
                     inside = self.language.call("min", self.language.call("max", beyond, zero), f"{names[1]}[{j}]")
                     self.w.put(total, f"{total} + {names[2]}[{j}] * {inside}")
-            self.w.put(f"{self.name(k)}[{i}]", total)
+            self.w.put(self.item(k, i), total)
 
     def tanh(self, k: int, n: Node) -> None:
         with self.w.loop(n.size) as i:
-            self.language.tanh(self.w, f"{self.name(k)}[{i}]", self.item(n.args[0], i))
+            self.language.tanh(self.w, self.item(k, i), self.item(n.args[0], i))
 
     def kernel(self, k: int, n: Node) -> None:
         support, weights = np.atleast_2d(n.data["support"]), n.data["weights"]
@@ -346,17 +397,17 @@ class _Lowered:
             exponent = f"{self.language.number(-float(n.data['sharpness'][0]))} * {away}"
             weight = f"{self.w.table(f'c{k}_weights', weights)}[{i}]"
             self.w.put(total, f"{total} + {weight} * {self.language.call('exp', exponent)}")
-        self.w.put(f"{self.name(k)}[0]", total)
+        self.w.put(self.item(k, "0"), total)
 
     def trees(self, k: int, n: Node) -> None:
         d, w = n.data, self.w
         whole = {name: w.table(f"c{k}_{name}", d[name].astype(int)) for name in ("roots", "feature", "left", "right")}
         real = {name: w.table(f"c{k}_{name}", d[name]) for name in ("threshold", "value")}
-        (a,), seen = n.args, self.name(n.args[0])
-        if d["single"][0] and self.program.nodes[a].size:
-            seen = w.array(f"o{k}", self.program.nodes[a].size)
-            with w.loop(self.program.nodes[a].size) as i:
-                w.put(f"{seen}[{i}]", self.language.call("single", self.item(a, i)))
+        (a,) = n.args
+        seen = w.array(f"o{k}", max(self.program.nodes[a].size, 1))
+        with w.loop(self.program.nodes[a].size) as i:
+            x = self.item(a, i)
+            w.put(f"{seen}[{i}]", self.language.call("single", x) if d["single"][0] else x)
         total, node = w.scalar("total"), w.scalar("node", "whole")
         w.put(total, self.language.number(0.0))
         with w.loop(len(d["roots"])) as i:
@@ -367,45 +418,7 @@ class _Lowered:
                 with w.otherwise():
                     w.put(node, f"{whole['right']}[{node}]")
             w.put(total, f"{total} + {real['value']}[{node}]")
-        w.put(f"{self.name(k)}[0]", total)
-
-
-_BLOCKS: Mapping[str, Callable[[_Lowered, int, Node], None]] = {
-    "join": _Lowered.join,
-    "pick": _Lowered.pick,
-    "affine": _Lowered.affine,
-    "sub": _Lowered.two,
-    "mul": _Lowered.two,
-    "power": _Lowered.power,
-    "median": _Lowered.median,
-    "first": _Lowered.first,
-    "lag": _Lowered.lag,
-    "delay": _Lowered.delay,
-    "rate": _Lowered.rate,
-    "clock": _Lowered.clock,
-    "curve": _Lowered.curve,
-    "tanh": _Lowered.tanh,
-    "kernel": _Lowered.kernel,
-    "trees": _Lowered.trees,
-}
-_TITLES: Mapping[str, str] = {
-    "join": "values joined",
-    "pick": "values picked",
-    "affine": "offset plus matrix times values",
-    "sub": "difference",
-    "mul": "product",
-    "power": "power of the absolute value",
-    "median": "median",
-    "first": "value in the first row",
-    "lag": "first-order lag",
-    "delay": "delay",
-    "rate": "slope per hour",
-    "clock": "s since the first row",
-    "curve": "piecewise linear curve",
-    "tanh": "tanh",
-    "kernel": "weighted sum of Gaussian kernels",
-    "trees": "weighted sum of regression trees",
-}
+        w.put(self.item(k, "0"), total)
 
 
 def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
@@ -415,12 +428,18 @@ def curve_pieces(n: Node) -> tuple[Array, Array, Array]:
     return knots[:-1], wide, np.divide(np.diff(values), wide, out=np.zeros_like(wide), where=wide > 0)
 
 
-def lower(w: Writer, axis: AxisModel) -> list[str]:
-    """Writes the blocks of all nodes; the outputs as expressions, one for each."""
-    lowered = _Lowered(w, axis.program)
-    for k in range(len(axis.program.nodes)):
+def lower(
+    w: Writer, program: Program, prefix: str = "", labels: Mapping[int, str] = MappingProxyType({})
+) -> list[list[str]]:
+    """Writes the blocks of all nodes, named with a prefix and by their labels; the elements of each output as
+    expressions."""
+    outer, w.prefix = w.prefix, w.prefix + prefix
+    lowered = _Lowered(w, program, labels)
+    for k in range(len(program.nodes)):
         lowered.block(k)
-    return [lowered.item(o, "0") for o in axis.program.outputs]
+    elements = [[lowered.item(o, str(i)) for i in range(program.nodes[o].size)] for o in program.outputs]
+    w.prefix = outer
+    return elements
 
 
 def number_lines(values: Array, number: Callable[[float], str]) -> list[str]:

@@ -208,13 +208,20 @@ def _trees(g: Graph, p: Program, n: Node, s: str, x: tuple[str, ...]) -> tuple[s
     return g.op("ReduceSum", g.op("Gather", g.real(d["value"]), node, axis=0), g.whole([0]), keepdims=1), ""
 
 
+def _two(op: str) -> Step:
+    return lambda g, p, n, s, x: (g.op(op, *x), "")
+
+
 _STEPS: Mapping[str, Step] = {
     "constant": lambda g, p, n, s, x: (g.real(n.data["value"]), ""),
     "join": _join,
     "pick": _pick,
     "affine": _affine,
-    "sub": lambda g, p, n, s, x: (g.op("Sub", *x), ""),
-    "mul": lambda g, p, n, s, x: (g.op("Mul", *x), ""),
+    **{op.lower(): _two(op) for op in ("Add", "Sub", "Mul", "Min", "Max")},
+    "less": lambda g, p, n, s, x: (g.op("Cast", g.op("Less", *x), to=TensorProto.DOUBLE), ""),
+    "equal": lambda g, p, n, s, x: (g.op("Cast", g.op("Equal", *x), to=TensorProto.DOUBLE), ""),
+    "select": lambda g, p, n, s, x: (g.op("Where", g.op("Less", g.real(0.5), x[0]), *x[1:]), ""),
+    "previous": lambda g, p, n, s, x: (g.op("Where", "started", s, g.real(n.data["initial"])), ""),
     "power": _power,
     "median": _median,
     "first": _first,
@@ -249,11 +256,13 @@ def _step(axis: AxisModel, order: tuple[str, str, str]) -> Any:
         size = n.state_size()
         own = g.op("Gather", "state", g.whole(np.arange(at, at + size)), axis=0) if size else none
         at += size
-        value, state = _STEPS[n.op](g, p, n, own, tuple(values[a] for a in n.args))
+        given = () if n.op == "previous" else n.args
+        value, state = _STEPS[n.op](g, p, n, own, tuple(values[a] for a in given))
         values.append(value)
-        states += [state] if size else []
+        states += [(state, n)] if size else []
     result = g.op("Concat", *(values[o] for o in p.outputs), axis=0)
-    new = g.op("Concat", *states, axis=0) if states else none
+    carries = [values[n.args[0]] if n.op == "previous" else state for state, n in states]
+    new = g.op("Concat", *carries, axis=0) if carries else none
     if channels:
         complete = g.op("Equal", g.count_of(g.op("IsNaN", held)), g.whole([0]))
         required = g.constant(np.array(p.required, bool))

@@ -1,93 +1,55 @@
-"""Export: machine and setting data in the style of SINUMERIK temperature compensation."""
+"""Export: machine and setting data of SINUMERIK temperature compensation, fed by the receiver."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
-from compensation.exports.base import AxisModel, Export
-from compensation.exports.straight_line import (
-    NOT_TESTED,
-    StraightLineExport,
-    commented,
-    formula_lines,
-    formulas,
-    plc_lines,
-    warnings,
-)
-
-CYCLE_S = 0.004  # interpolation cycle that the file assumes: MD10071 shows the control's own
-MOST_VELOCITY_MM_PER_MIN = 10_000.0  # axis velocity that the file assumes: MD32000 shows the axis' own
-_LEAST_FACTOR, _MOST_FACTOR = 1e-6, 0.1  # what MD32760 is kept within; the control accepts up to 0.1
-_MARGIN = 1.2  # MD32760 also caps tan β, which must not be cut in the trained region
+from compensation.exports.base import AxisModel, Export, Exporter, wrapped
 
 
-class SinumerikExport(StraightLineExport):
-    """MD32750, MD32760, SD43900, SD43910 and SD43920 of each axis, and pseudo code of the PLC that writes them.
+class SinumerikExport(Exporter):
+    """MD32750, SD43900, SD43910 and SD43920 of each axis, and what the PLC writes into them.
 
     Source: Siemens, SINUMERIK Function Manual Extended Functions, K3 Compensations (temperature compensation).
     """
 
     key: ClassVar[str] = "sinumerik"
-    summary: ClassVar[str] = "straight line in the style of SINUMERIK temperature compensation (MD32750, SD43900 ...)"
+    summary: ClassVar[str] = "data of SINUMERIK temperature compensation (MD32750, SD43900 ...) fed by the receiver"
     suffix: ClassVar[str] = "_sinumerik.txt"
 
     def files(self, export: Export) -> dict[str, str | bytes]:
-        """Raises WorkError where a program is no straight line after all."""
-        parts = [
-            commented(
-                [
-                    *export.heading(),
-                    "",
-                    NOT_TESTED,
-                    "dK(P) = K0 + tan beta * (P - P0): SD43900 is K0 in mm, SD43910 tan beta, SD43920 P0 in mm.",
-                    "SIGN = 1 where the control adds dK to the set point, as this file assumes; else -1.",
-                    f"Assumed: interpolation cycle {CYCLE_S:g} s (MD10071), axis velocity {MOST_VELOCITY_MM_PER_MIN:g} "
-                    "mm/min (MD32000). MD32760 is a share of that velocity.",
-                ],
-                ";",
-            )
+        head = [
+            *export.heading(),
+            "",
+            "This file has not been run on a control: compare every identifier with the manual of your control, and "
+            "the sign with a trial value of 10 um, before you use it.",
+            "dK(P) = K0 + tan beta * (P - P0): SD43900 is K0 in mm, SD43910 tan beta, SD43920 P0 in mm.",
+            "SIGN = 1 where the control adds dK to the set point, as this file assumes; else -1.",
+            "The PLC writes the outputs of the receiver (export receiver), which limits, holds and fades; never a "
+            "received or computed value itself.",
         ]
-        parts += [_axis(a) for a in export.axes]
+        parts = [_commented(head), *map(_axis, export.axes)]
         return {f"{export.stem}{self.suffix}": "\n\n".join(parts) + "\n"}
+
+
+def _commented(lines: list[str]) -> str:
+    return "\n".join(f"; {line}".rstrip() for line in wrapped(lines))
 
 
 def _axis(a: AxisModel) -> str:
     p, name = a.program, a.axis.upper()
-    factor, remarks = _factor(a)
-    most_um = factor * MOST_VELOCITY_MM_PER_MIN * 1000.0 / 60.0 * CYCLE_S
-    head = [f"Axis {name}", *formula_lines(a), *warnings(a, formulas(a)), *remarks]
     data = [
         (f"$MA_TEMP_COMP_TYPE[{name}] = {'3' if p.along else '1'}", "MD32750: bit 0 offset, bit 1 slope"),
-        (f"$MA_COMP_ADD_VELO_FACTOR[{name}] = {factor:.9f}", f"MD32760: at most {most_um:.4g} um per cycle"),
         (f"$SA_TEMP_COMP_ABS_VALUE[{name}] = 0.0", "SD43900: K0 in mm, from the PLC"),
     ]
-    writes = [f"write SD43900[{name}] := SIGN * offset_um / 1000.0        // mm"]
+    head, writes = [f"Axis {name}"], [f"SD43900[{name}] := SIGN * offset_um / 1000.0, in mm"]
     if p.along:
         data += [
             (f"$SA_TEMP_COMP_SLOPE[{name}] = 0.0", "SD43910: tan beta in mm/mm, from the PLC"),
             (f"$SA_TEMP_COMP_REF_POSITION[{name}] = {p.reference_mm:g}", "SD43920: P0 in mm"),
         ]
-        writes.append(f"write SD43910[{name}] := SIGN * slope_um_per_m / 1000000.0  // mm/mm")
-    lines = "\n".join(f"N{32000 + 10 * k} {text} ; {note}" for k, (text, note) in enumerate(data))
-    code = ["PLC, cyclically (pseudo code; cycle_s is its cycle):", *plc_lines(a, a.limits.rate_um_per_s, writes)]
-    return f"{commented(head, ';')}\n{lines}\n{commented(code, ';')}"
-
-
-def _factor(a: AxisModel) -> tuple[float, list[str]]:
-    """MD32760, and what is to be said of it: the rate limit, raised where it would cut tan β."""
-    factor = a.limits.rate_um_per_s * 60.0 / 1000.0 / MOST_VELOCITY_MM_PER_MIN
-    remarks = [
-        f"The rate limit of {a.limits.rate_um_per_s:g} um/s is {a.limits.rate_um_per_s * CYCLE_S:.4g} um per cycle, a "
-        f"factor of {factor:.3g}."
-    ]
-    needed = _MARGIN * a.max_slope_um_per_m * 1e-6 if a.program.along else 0.0
-    if max(needed, _LEAST_FACTOR) > factor:
-        remarks.append(
-            "MD32760 is larger, since it also caps tan beta and has few digits; the PLC keeps the rate limit."
-        )
-    chosen = max(factor, needed, _LEAST_FACTOR)
-    if chosen > _MOST_FACTOR:
-        remarks.append(
-            f"WARNING: axis {a.axis}: MD32760 would be {chosen:.3g}, above {_MOST_FACTOR:g}; it is cut there"
-        )
-    return min(chosen, _MOST_FACTOR), remarks
+        head.append(f"MD32760 caps tan beta as well: keep it above {a.max_slope_um_per_m * 1e-6:.3g}.")
+        writes.append(f"SD43910[{name}] := SIGN * slope_um_per_m / 1000000.0, in mm/mm")
+    lines = "\n".join(f"{text} ; {note}" for text, note in data)
+    code = ["From the receiver, in every cycle of the PLC:", *(f"  {text}" for text in writes)]
+    return f"{_commented(head)}\n{lines}\n{_commented(code)}"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import inf
 from typing import ClassVar
 
 import numpy as np
 
-from compensation.exports.base import AxisModel, Export, Exporter, ascii_text, identifiers
+from compensation.core import INPUTS, lower_core
+from compensation.exports.base import MOST, AxisModel, Export, Exporter, ascii_text, identifiers, stale_rows, wrapped
 from compensation.exports.lowering import Language, Shape, Writer, lower, number_lines
 
 MOST_NUMBERS = 2000  # constants of one block: 16 kB, which small controllers hold and compile
@@ -18,7 +19,9 @@ _TEXT = 120  # characters of a string
 class StructuredText(Language):
     """IEC 61131-3."""
 
-    functions: ClassVar[Mapping[str, str]] = {"abs": "ABS", "exp": "EXP", "min": "MIN", "max": "MAX", "or": "OR"}
+    functions: ClassVar[Mapping[str, str]] = {
+        "abs": "ABS", "exp": "EXP", "min": "MIN", "max": "MAX", "or": "OR", "less": "<", "equal": "=",
+    }  # fmt: skip
 
     def comment(self, text: str) -> str:
         return f"(* {ascii_text(text)} *)"
@@ -39,6 +42,9 @@ class StructuredText(Language):
 
     def number(self, value: float) -> str:
         return real(value) if value >= 0 else f"({real(value)})"
+
+    def choice(self, condition: str, yes: str, no: str) -> str:
+        return f"SEL({condition}, {no}, {yes})"
 
     def power(self, base: str, exponent: float) -> str:
         return f"EXPT({base}, {self.number(exponent)})"
@@ -79,7 +85,7 @@ class StructuredTextExport(Exporter):
             if total > MOST_NUMBERS:
                 most = a.program.nodes[max(sizes, key=lambda k: sizes[k])].op
                 return f"axis {a.axis} has {total} constants, most in {most}; a block holds {MOST_NUMBERS}"
-        return None
+        return stale_rows(export)
 
     def files(self, export: Export) -> dict[str, str | bytes]:
         names = identifiers(a.axis for a in export.axes)
@@ -90,27 +96,29 @@ class StructuredTextExport(Exporter):
 def _block(export: Export, a: AxisModel, name: str) -> str:
     p, w = a.program, Writer(StructuredText(), indent=0)
     names = identifiers(p.channels)
-    corrected = _corrected(a)
-    _reset(w, a)
+    with w.when("reset"):
+        w.put("since_s", real(p.step_s))
+        for variable in ("begun", "valid", *(f"seen[{k}]" for k in range(len(p.channels)))):
+            w.put(variable, "FALSE")
     w.put("version", _string(f"{export.model} {export.version}"))
     w.put("sha256", _string(export.digest))
     w.put("simulated", "TRUE" if export.simulated else "FALSE")
-    w.put("moved_s", "MAX(elapsed_s, 0.0)")
-    w.put("quiet_s", "quiet_s + moved_s")
-    w.put("due", f"since_s >= {real(p.step_s)}")
+    for event in ("usable", "faulty"):
+        w.put(event, "0.0")
+    w.put("due", f"fresh AND (since_s >= {real(p.step_s)})")
     with w.when("due"):
         w.put("since_s", f"MAX(MIN(since_s - {real(p.step_s)}, {real(p.step_s)}), 0.0)")
         _row(w, a, names)
     w.put("since_s", "since_s + moved_s")
-    _correction(w, a)
+    move(w, a)
 
+    w.memory.pop("v0", None)
     if names:
         w.memory |= {"v0": ("real", len(names)), "seen": ("logical", len(names))}
-    else:
-        w.memory.pop("v0", None)
     declared_in = [
-        "elapsed_s : LREAL; (* time since the last call, s *)",
-        "reset : BOOL; (* forgets all rows and the correction *)",
+        *MOVED,
+        "reset : BOOL; (* forgets all rows; what is sent goes on from where it is *)",
+        "fresh : BOOL := TRUE; (* FALSE while the inputs below are not renewed *)",
     ]
     for n, channel, unit in zip(names, p.channels, p.units, strict=True):
         declared_in += [
@@ -120,59 +128,97 @@ def _block(export: Export, a: AxisModel, name: str) -> str:
     declared_out = [
         "valid : BOOL; (* the last row has an error *)",
         *(f"{output} : LREAL; (* {unit} *)" for output, unit in a.output_units.items()),
-        *(f"{output} : LREAL; (* what the control adds *)" for output, _, _ in corrected),
+        *sent_outputs(a),
         f"version : STRING[{_TEXT}];",
         f"sha256 : STRING[{_TEXT}];",
         "simulated : BOOL;",
     ]
     variables = [
         f"since_s : LREAL := {real(p.step_s)}; (* since the last row *)",
-        "quiet_s : LREAL; (* since the last valid row *)",
-        "held_s : LREAL; (* since the fault began *)",
-        *(f"{n} : LREAL;" for n in ("moved_s", "reach", *(f"target_{output}" for output, _, _ in corrected))),
-        *(f"{n} : BOOL;" for n in ("due", "begun", "first_row", "complete", "lacking", "faulty")),
+        "trust : LREAL;",
+        *(f"{n} : BOOL;" for n in ("due", "begun", "complete", "lacking")),
+    ]
+    return function_block(name, w, declared_in, declared_out, variables, [
+        *export.heading([a]), "",
+        "Call this in every cycle with the time since the last call: it runs the model every "
+        f"{p.step_s:g} s and moves the outputs at most as far as the limits allow. The first row, at the start and "
+        "after a reset, is that at which every input has been seen.",
+    ])  # fmt: skip
+
+
+MOVED = (
+    "elapsed_s : LREAL; (* time since the last call, s *)",
+    "enable : BOOL := TRUE; (* FALSE: the outputs fade to 0 and stay there *)",
+)
+
+
+def sent_outputs(a: AxisModel) -> list[str]:
+    """Declarations of what the control adds."""
+    return [
+        "state : DINT; (* 0 off, 1 warm-up, 2 active, 3 hold, 4 fade-out *)",
+        *(f"{output} : LREAL; (* {unit}, what the control adds *)" for output, unit, _ in a.sent),
+    ]
+
+
+def move(w: Writer, a: AxisModel) -> None:
+    """Moves what is sent towards `wanted_um`, as `usable` and `faulty` of this call say."""
+    w.comment("what is sent, within the limits of size, rate and step; held, then faded to 0, without usable input")
+    count = len(a.sent)
+    w.put("first_row", "NOT core_begun")
+    w.put("core_begun", "TRUE")
+    w.put("stopped", "SEL(enable, 1.0, 0.0)")
+    wanted = [f"{w.array('wanted_um', count)}[{k}]" for k in range(count)]
+    events = {name: [name] * count for name in ("usable", "faulty", "stopped")}
+    state, now_um, *_ = lower_core(
+        w, {**events, "elapsed_s": ["moved_s"] * count, "wanted_um": wanted}, [a.limits] * count
+    )
+    w.memory["core_v0"] = ("real", len(INPUTS) * count)
+    for (output, _, um), value in zip(a.sent, now_um, strict=True):
+        w.put(output, value if um == 1.0 else f"{value} / {real(um)}")
+    w.put("state", f"LREAL_TO_DINT({state[0]})")
+
+
+def function_block(
+    name: str, w: Writer, given: Sequence[str], sent: Sequence[str], own: Sequence[str], heading: Sequence[str]
+) -> str:
+    """The block of what a writer holds, with declarations and a comment of its own."""
+    variables = [
+        *own,
+        *(f"{n} : LREAL;" for n in ("moved_s", "usable", "faulty", "stopped")),
+        *(f"{n} : BOOL;" for n in ("first_row", "core_begun")),
         *(f"{n} : {_KINDS[kind]};" for n, kind in w.scalars.items()),
         *(f"{n} : {_array(shape)};" for n, shape in w.memory.items()),
     ]
     constants = [line for n, values in w.tables.items() for line in _constant(n, values)]
-    parts = [("VAR_INPUT", declared_in), ("VAR_OUTPUT", declared_out), ("VAR", variables), ("VAR CONSTANT", constants)]
+    parts = [("VAR_INPUT", given), ("VAR_OUTPUT", sent), ("VAR", variables), ("VAR CONSTANT", constants)]
     declared = "\n".join(_section(title, lines) for title, lines in parts if lines)
-    heading = "\n".join(f"   {line}".rstrip() for line in export.heading([a]))
-    body = "\n".join(w.lines)
+    comment, body = "\n".join(f"   {line}".rstrip() for line in wrapped(heading)), "\n".join(w.lines)
+    moved = f"moved_s := SEL({within('elapsed_s', 0.0, inf)}, 0.0, elapsed_s);"
     return f"""(*
-{heading}
-
-   Call this in every cycle with the time since the last call: it runs the model every {p.step_s:g} s and moves the
-   outputs at most as far as the limits allow. The first row, at the start and after a reset, is that at which every
-   input has been seen.
+{comment}
 *)
 FUNCTION_BLOCK {name}
 {declared}
 
+{moved}
 {body}
 END_FUNCTION_BLOCK
 """
 
 
-def _reset(w: Writer, a: AxisModel) -> None:
-    with w.when("reset"):
-        w.put("since_s", real(a.program.step_s))
-        w.put("quiet_s", "0.0")
-        for variable in ("begun", "valid", "faulty", *(f"seen[{k}]" for k in range(len(a.program.channels)))):
-            w.put(variable, "FALSE")
-        for output, _, _ in _corrected(a):
-            w.put(output, "0.0")
-            w.put(f"target_{output}", "0.0")
+def within(x: str, low: float, high: float) -> str:
+    """A condition that NaN and infinity do not meet."""
+    low, high = max(low, -1e300), min(high, 1e300)
+    return f"({x} >= {real(low)}) AND ({x} <= {real(high)})"
 
 
 def _row(w: Writer, a: AxisModel, names: Sequence[str]) -> None:
-    """One row of the model, and the target of the correction."""
+    """One row of the model, and what it wants to be sent."""
     w.comment("one row of the model; an input that is not usable is missing")
     w.put("lacking", "FALSE")
     w.put("complete", "TRUE")
     for k, (n, required, usable) in enumerate(zip(names, a.program.required, a.usable(), strict=True)):
-        low, high = (real(min(max(end, -1e300), 1e300)) for end in usable)
-        with w.when(f"ok_{n} AND (in_{n} >= {low}) AND (in_{n} <= {high})"):
+        with w.when(f"ok_{n} AND {within(f'in_{n}', *usable)}"):
             w.put(f"v0[{k}]", f"in_{n}")
             w.put(f"seen[{k}]", "TRUE")
         if required:
@@ -180,37 +226,26 @@ def _row(w: Writer, a: AxisModel, names: Sequence[str]) -> None:
                 w.put("lacking", "TRUE")
         w.put("complete", f"complete AND seen[{k}]")
     w.put("valid", "complete AND NOT lacking")
+    w.put("trust", "1.0")
     with w.when("complete"):
         w.put("first_row", "NOT begun")
         w.put("begun", "TRUE")
-        for output, value in zip(a.output_units, lower(w, a), strict=True):
+        for output, (value,) in zip(a.output_units, lower(w, a.program), strict=True):
             w.put(output, value)
+        if a.trust is not None:
+            w.memory["trust_v0"] = ("real", len(a.trust.channels))
+            for k, channel in enumerate(a.trust.channels):
+                w.put(f"trust_v0[{k}]", f"v0[{a.program.channels.index(channel)}]")
+            ((trust,),) = lower(w, a.trust, "trust_")
+            w.put("trust", trust)
+    w.put("valid", " AND ".join(["valid", *(within(output, -MOST, MOST) for output in a.output_units)]))
     with w.when("valid"):
-        w.put("quiet_s", "0.0")
-        for (output, factor, (largest, _, _)), error in zip(_corrected(a), a.output_units, strict=True):
-            w.put(f"target_{output}", f"MIN(MAX({real(factor)} * {error}, {real(-largest)}), {real(largest)})")
-
-
-def _correction(w: Writer, a: AxisModel) -> None:
-    """Moves the outputs towards their targets; without valid rows they are held, then fade to 0."""
-    w.comment("correction: limited in size and rate; held, then faded to 0, without valid rows")
-    with w.when(f"quiet_s > {real(a.stale_s)}"):
-        w.put("valid", "FALSE")
-    with w.when("faulty"):
-        w.put("held_s", "held_s + moved_s")
+        w.put("usable", "1.0")
+        for k, ((_, unit, um), error) in enumerate(zip(a.sent, a.output_units, strict=True)):
+            scale = -um * (1000.0 if unit != "um" else 1.0)  # the model's outputs are um and um/mm
+            w.put(f"{w.array('wanted_um', len(a.sent))}[{k}]", f"({real(scale)}) * {error} * trust")
     with w.otherwise():
-        w.put("held_s", "0.0")
-    w.put("faulty", "NOT valid")
-    with w.when("faulty"):
-        with w.when(f"held_s > {real(a.limits.hold_s)}"):
-            for output, _, _ in _corrected(a):
-                w.put(f"target_{output}", "0.0")
-        with w.otherwise():
-            for output, _, _ in _corrected(a):
-                w.put(f"target_{output}", output)
-    for output, _, (_, rate, step) in _corrected(a):
-        w.put("reach", f"MIN({real(rate)} * MIN(moved_s, {real(a.stale_s)}), {real(step)})")
-        w.put(output, f"{output} + MIN(MAX(target_{output} - {output}, -reach), reach)")
+        w.put("faulty", "1.0")
 
 
 _KINDS: Mapping[str, str] = {"real": "LREAL", "whole": "DINT", "logical": "BOOL"}
@@ -235,14 +270,3 @@ def _section(title: str, lines: Sequence[str]) -> str:
 def _string(text: str) -> str:
     plain = ascii_text(text)[:_TEXT].replace("$", "$$").replace("'", "$'")
     return f"'{plain}'"
-
-
-def _corrected(a: AxisModel) -> list[tuple[str, float, tuple[float, float, float]]]:
-    """Outputs of the correction with their factor to the model's, and largest value, rate and change."""
-    step = a.step_um if isfinite(a.step_um) else 1e30
-    kept = (float(a.limits.max_offset_um), float(a.limits.rate_um_per_s), float(step))
-    out = [("offset_um", -1.0, kept)]
-    if a.program.along:
-        largest, rate, change = (value / a.lever_m for value in kept)
-        out.append(("slope_um_per_m", -1000.0, (largest, rate, change)))
-    return out

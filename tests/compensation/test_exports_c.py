@@ -14,9 +14,8 @@ from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, f
 
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel, Export
-from compensation.safety import Limits
 from models.program import replay
-from thermodrift.testing.exports import SomeLimits, export_of, offset_only, straight
+from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc to compile the C export")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
@@ -65,7 +64,7 @@ class Compiled:
 
 def test_every_family_in_one_machine(toy_batches: Batches, tmp_path: Path) -> None:
     programs = {key: fitted(key, toy_batches) for key in PROGRAMS}
-    export = export_of(*(AxisModel(key, p, {}, SomeLimits()) for key, (p, _) in programs.items()))
+    export = export_of(*(AxisModel(key, p, {}, LIMITS) for key, (p, _) in programs.items()))
     machine = Compiled(export, tmp_path)
     values = {c: rows[:, k] for p, rows in programs.values() for k, c in enumerate(p.channels)}
     got = []
@@ -106,9 +105,7 @@ def test_the_correction_is_limited_in_size_and_rate_and_reaches_the_negative_err
     assert np.abs(np.diff(sent)).max() <= 6.0 + 1e-9 and np.abs(np.diff(slopes)).max() <= 6.0 / 0.4 + 1e-9
     assert sent[1] == 6.0 and sent[9] == pytest.approx(-(1.5 + 12.0 - 40.0)) and slopes[13] == pytest.approx(-40.0)
     assert sent[-1] == pytest.approx(-36.5) and slopes[-1] == pytest.approx(-100.0)  # 40 µm at 0.4 m
-    stepped = Compiled(
-        export_of(replace(straight(), limits=Limits(rate_um_per_s=0.02, step_um=1.0))), tmp_path / "stepped"
-    )
+    stepped = Compiled(export_of(replace(straight(), limits=replace(LIMITS, step_um=1.0))), tmp_path / "stepped")
     assert [stepped.correction(np.array([20.0, 20.0]))[1][0] for _ in range(3)] == [1.0, 2.0, 3.0]
 
 

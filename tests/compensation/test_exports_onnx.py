@@ -12,7 +12,7 @@ from test_exports_programs import PROGRAMS, Batches, dynamic, every_operation, f
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel
 from models.program import Program, replay
-from thermodrift.testing.exports import SomeLimits, export_of
+from thermodrift.testing.exports import LIMITS, export_of
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
@@ -47,7 +47,7 @@ def check(axis: AxisModel, rows: np.ndarray, folder: Path) -> None:
 @pytest.mark.parametrize("key", PROGRAMS)
 def test_a_family_row_by_row_and_as_a_batch(key: str, toy_batches: Batches, tmp_path: Path) -> None:
     program, rows = fitted(key, toy_batches)
-    check(AxisModel("z", program, {}, SomeLimits()), rows, tmp_path)
+    check(AxisModel("z", program, {}, LIMITS), rows, tmp_path)
 
 
 def test_every_operation_with_holes(tmp_path: Path) -> None:

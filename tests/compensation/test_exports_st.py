@@ -18,11 +18,11 @@ from compensation.exports.base import AxisModel
 from compensation.exports.structured_text import StructuredTextExport, real
 from data.errors import InputError
 from models.program import replay
-from thermodrift.testing.exports import SomeLimits, export_of, offset_only, straight
+from thermodrift.testing.exports import LIMITS, export_of, offset_only, straight
 
 WORDS = {
     "IF", "THEN", "ELSE", "END_IF", "FOR", "TO", "DO", "END_FOR", "WHILE", "END_WHILE", "AND", "OR", "NOT", "TRUE",
-    "FALSE", "ABS", "EXP", "EXPT", "MIN", "MAX", "REAL_TO_LREAL", "LREAL_TO_REAL",
+    "FALSE", "ABS", "EXP", "EXPT", "MIN", "MAX", "SEL", "REAL_TO_LREAL", "LREAL_TO_REAL", "LREAL_TO_DINT",
 }  # fmt: skip
 DEFAULTS: dict[str, Callable[[], Any]] = {"LREAL": float, "DINT": int, "BOOL": bool, "STRING": str}
 
@@ -32,6 +32,10 @@ def expression(text: str) -> str:
     for word, python in {"AND": "and", "OR": "or", "NOT": "not", "TRUE": "True", "FALSE": "False"}.items():
         text = re.sub(rf"\b{word}\b", python, text)
     return text
+
+
+def sel(chosen: bool, no: float, yes: float) -> float:
+    return yes if chosen else no
 
 
 class Block:
@@ -58,8 +62,8 @@ class Block:
                 if array:
                     assert len(self.values[name]) == int(array) + 1
         self.code = compile(self._python(), "st", "exec")
-        single = {"REAL_TO_LREAL": float, "LREAL_TO_REAL": lambda x: float(np.float32(x))}
-        self.space = {"ABS": abs, "EXP": exp, "EXPT": pow, "MIN": min, "MAX": max, **single, **self.values}
+        single = {"REAL_TO_LREAL": float, "LREAL_TO_REAL": lambda x: float(np.float32(x)), "LREAL_TO_DINT": round}
+        self.space = {"ABS": abs, "EXP": exp, "EXPT": pow, "MIN": min, "MAX": max, "SEL": sel, **single, **self.values}
 
     def _python(self) -> str:
         out, depth = [], 0
@@ -116,7 +120,7 @@ def test_a_family_computes_what_its_program_does_or_is_too_large(
     key: str, toy_batches: Batches, tmp_path: Path
 ) -> None:
     program, rows = fitted(key, toy_batches)
-    axis = AxisModel("z", program, {}, SomeLimits())
+    axis = AxisModel("z", program, {}, LIMITS)
     if not fits(key, axis):
         with pytest.raises(InputError, match=r"^export st: axis z has \d+ constants, most in \w+; a block holds 2000"):
             EXPORTS["st"]().write(export_of(axis), tmp_path)
@@ -126,14 +130,14 @@ def test_a_family_computes_what_its_program_does_or_is_too_large(
 
 def test_every_operation_with_holes() -> None:
     rows = rows_with_holes(every_operation())
-    axis = AxisModel("z", every_operation(), {}, SomeLimits())
+    axis = AxisModel("z", every_operation(), {}, LIMITS)
     assert np.allclose(errors(axis, rows), replay(axis.program, rows), rtol=0.0, atol=1e-9, equal_nan=True)
 
 
 @pytest.mark.parametrize("key", [*PROGRAMS, "every", "straight"])
 def test_declarations_blocks_and_characters(key: str, toy_batches: Batches) -> None:
     axis = {"every": dynamic(), "straight": straight()}.get(key) or AxisModel(
-        "z", fitted(key, toy_batches)[0], {}, SomeLimits()
+        "z", fitted(key, toy_batches)[0], {}, LIMITS
     )
     (text,) = StructuredTextExport().files(export_of(axis)).values()
     assert isinstance(text, str) and text.isascii()
@@ -159,7 +163,9 @@ def test_the_correction_keeps_its_limits_holds_and_fades() -> None:
     back = block.call(elapsed_s=300.0, reset=False, ok_t1=True, **good)
     assert back["offset_um"] == pytest.approx(32.5) and back["valid"]
     assert not block.call(elapsed_s=300.0, reset=False, ok_t1=False, **good)["valid"]
-    assert block.call(elapsed_s=0.0, reset=True, ok_t1=True, **good)["offset_um"] == 0.0
+    assert block.call(elapsed_s=0.0, reset=True, ok_t1=True, **good)["offset_um"] == pytest.approx(32.5)
+    stopped = [block.call(elapsed_s=300.0, reset=False, enable=False, **good)["offset_um"] for _ in range(7)]
+    assert stopped[:2] == pytest.approx([26.5, 20.5]) and stopped[-1] == 0.0
 
 
 def test_short_cycles_run_the_model_at_its_step() -> None:

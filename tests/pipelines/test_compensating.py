@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from compensation.exports import EXPORTS
 from compensation.substitutes import Substitutes
 from data.errors import InputError
 from data.machine import load_machine
@@ -172,7 +173,7 @@ def test_a_rehearsal_shows_before_and_after(year: Path, model: Path, tmp_path: P
     assert isinstance(done.exception, InputError) and "SENSOR:HOW@START+DURATION" in str(done.exception)
 
 
-@pytest.mark.parametrize("kind", ["json", "c", "st", "onnx"])
+@pytest.mark.parametrize("kind", list(EXPORTS))
 def test_an_export_states_model_and_limits(model: Path, tmp_path: Path, kind: str) -> None:
     done = CliRunner().invoke(app, ["export", str(model), "--to", kind, "--out", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output
@@ -180,6 +181,17 @@ def test_an_export_states_model_and_limits(model: Path, tmp_path: Path, kind: st
     assert told["simulated"] and len(told["sha256"]) == 64
     content = b"".join(Path(p).read_bytes() for p in told["files"])
     assert b"SIMULATED" in content and told["sha256"].encode() in content
+
+
+@pytest.mark.parametrize(("given", "stale_s"), [([], 900.0), (["--stale-s", "700"], 700.0)])
+def test_the_stale_time_of_an_export_is_three_steps_or_as_given(
+    model: Path, tmp_path: Path, given: list[str], stale_s: float
+) -> None:
+    options = ["export", str(model), "--to", "json", "--out", str(tmp_path), "--period-s", "300", *given]
+    assert CliRunner().invoke(app, options).exit_code == 0
+    (path,) = tmp_path.glob("*.json")
+    (axis,) = json.loads(path.read_text())["axes"]
+    assert axis["limits"]["stale_s"] == stale_s and axis["trust"]["channels"]
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +259,7 @@ def test_a_rehearsal_runs_a_provisional_model_at_its_share(year: Path, provision
     assert 0.3 < left < 0.6
 
 
-@pytest.mark.parametrize("kind", ["json", "c", "st", "onnx"])
+@pytest.mark.parametrize("kind", list(EXPORTS))
 def test_an_export_of_a_provisional_model_has_its_share_and_says_so(
     model: Path, provisional: Path, tmp_path: Path, kind: str
 ) -> None:

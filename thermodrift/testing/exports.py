@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from compensation.exports.base import AxisModel, Export, Exporter
+from compensation.safety import Limits
 from data.batch import Channel
 from data.errors import InputError
 from models.program import Builder
@@ -19,12 +20,7 @@ from thermodrift.testing.contract import Suite, expect, expect_described
 DIGEST = "0123456789abcdef" * 4
 
 
-@dataclass(frozen=True)
-class SomeLimits:
-    max_offset_um: float = 40.0
-    rate_um_per_s: float = 0.02
-    hold_s: float = 900.0
-    stale_s: float = 30.0
+LIMITS = Limits(max_offset_um=40.0, rate_um_per_s=0.02, step_um=6.0, hold_s=900.0, stale_s=900.0, warm_up_s=0.0)
 
 
 def straight(region: Mapping[str, tuple[float, float]] | None = None) -> AxisModel:
@@ -36,7 +32,7 @@ def straight(region: Mapping[str, tuple[float, float]] | None = None) -> AxisMod
     error = b.affine(b.join(rise, b.pick(x, [1])), np.array([[3.0, -2.0]]), 1.5)
     program = b.program([error, b.affine(rise, np.array([[0.01]]))], False, "y", 100.0)
     trained = {"t0": (10.0, 30.0), "t1": (15.0, 25.0), "y": (0.0, 500.0)} if region is None else region
-    return AxisModel("y", program, trained, SomeLimits())
+    return AxisModel("y", program, trained, LIMITS)
 
 
 def offset_only() -> AxisModel:
@@ -50,7 +46,7 @@ def lagged() -> AxisModel:
     """2 × the rise of t0 behind a first-order lag of 20 min."""
     b = Builder({"t0": Channel("t0", "temperature", "degC")}, 300.0)
     late = b.lags(b.since_first(b.channels(["t0"])), [1200.0], 0.0)
-    return AxisModel("x", b.program([b.affine(late, np.array([[2.0]]))], False), {"t0": (10.0, 30.0)}, SomeLimits())
+    return AxisModel("x", b.program([b.affine(late, np.array([[2.0]]))], False), {"t0": (10.0, 30.0)}, LIMITS)
 
 
 def export_of(*axes: AxisModel, machine: str = "mill 1", simulated: bool = True) -> Export:
