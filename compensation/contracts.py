@@ -36,6 +36,8 @@ class Correction:
         state: axis → `off`, `warm-up`, `active`, `hold` or `fade-out`.
         reasons: axis → why it is not `active`, or acts with reduced authority, and what its model is, where that is
             no champion; empty where there is neither.
+        heartbeat: counts the corrections; one that stands still says that nobody computes them any more.
+        valid_until_s: Unix time after which a receiver should hold what it has, and then fade, s.
     """
 
     time_s: float
@@ -43,6 +45,8 @@ class Correction:
     slope_um_per_m: Mapping[str, float] = field(default_factory=dict)
     state: Mapping[str, str] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
+    heartbeat: int = 0
+    valid_until_s: float = 0.0
 
 
 class Source(Protocol):

@@ -55,7 +55,7 @@ class MqttExchange:
                 continue
             if abs(got["time_s"] - sample.time_s) < 1e-3:
                 self._heard = True
-                return Correction(got["time_s"], got["offset_um"], got["slope_um_per_m"], got["state"], got["reasons"])
+                return Correction(**got)
         raise WorkError(
             f"{self.address}: no correction within {_WAIT_S:g} s; start `thermodrift compensate --replay` with the "
             "same address"

@@ -9,6 +9,7 @@ so memory does not grow, and `as_plain` is all that a restart needs.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,6 +31,9 @@ from models.updating import Updater
 
 SCHEMA = "thermodrift.compensation/1"
 _ODD_READING_SD = 4.0  # of what the filter expects: beyond it a reading is a failed probing, not thermal error
+_MOST_BOUNDS = 5.0  # times what nine in ten runs stay below: no machine changes so much between two readings
+_INTERVALS = 20  # of samples, whose median is how often they arrive
+_LOST_SAMPLES = 5  # in a row are silence
 _LEAST_UM2 = 1e-12  # a variance of rounding alone
 _NEW_RUN_S = 4 * 3600.0  # of silence: the machine has cooled down unseen, so that the model starts again at 0
 _MM_PER_M = 1000.0
@@ -51,6 +55,7 @@ class AxisModel:
             slope moves the tool the most.
         share: of the correction that the measured trust in the model supports, above 0 up to 1.
         remark: on the model, in every record; empty: none.
+        readings_um: least and greatest plausible reading of a probe, µm.
     """
 
     axis: str
@@ -65,6 +70,7 @@ class AxisModel:
     lever_mm: float = 1000.0
     share: float = 1.0
     remark: str = ""
+    readings_um: tuple[float, float] = (-math.inf, math.inf)
 
     def __post_init__(self) -> None:
         """Raises InputError where the share is not above 0 up to 1."""
@@ -82,6 +88,12 @@ class AxisModel:
         if self.bound is None or not math.isfinite(factor := self.bound.factor(math.nan, distance)):
             return min(self.share, 1.0 / (1.0 + distance))
         return min(self.share, 1.0 / factor)
+
+    @property
+    def largest_surprise_um(self) -> float:
+        """How far a reading may be from what is expected, µm: beyond it the probing failed, however often it is so."""
+        bound_um = self.bound.bound_um if self.bound is not None else math.nan
+        return _MOST_BOUNDS * bound_um if math.isfinite(bound_um) else self.limits.max_offset_um
 
 
 @dataclass
@@ -143,6 +155,9 @@ class Compensator:
         self._arrived_s: dict[str, float] = {}  # time stamp at which each channel last had a value
         self._patience_s = max(a.limits.stale_s for a in axes)
         self.rejected = 0
+        self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)  # between samples, on the monotonic clock
+        self._last_clock_s: float | None = None
+        self._heartbeat = 0
 
     def _fresh(self, a: AxisModel, was: _Running | None = None) -> _Running:
         learned = a.updater.begin() if a.updater is not None else None
@@ -164,6 +179,9 @@ class Compensator:
             for axis, measured_um in sample.readings_um.items():
                 self._read(axis, measured_um)
             return self.silence(clock_s, sample.time_s)
+        if self._last_clock_s is not None and clock_s > self._last_clock_s:
+            self._intervals_s.append(clock_s - self._last_clock_s)
+        self._last_clock_s = clock_s
         fault, notes = self._advance(sample)
         for axis, measured_um in sample.readings_um.items():
             self._read(axis, measured_um)
@@ -174,19 +192,35 @@ class Compensator:
         return self._sent(
             sample.time_s,
             lambda a, was, k: safety.step(
-                was, a.limits, clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
+                was, self._limits(a), clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
             ),
             notes,
         )
 
     def silence(self, clock_s: float, time_s: float) -> Correction:
         """The correction while nothing arrives; `time_s` is stamped on it."""
-        return self._sent(time_s, lambda a, was, k: safety.silence(was, a.limits, clock_s))
+        return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits(a), clock_s))
+
+    def fault(self, clock_s: float, time_s: float, why: str) -> Correction:
+        """The correction where nothing else can be computed: every axis holds what it has, and fades after hold_s."""
+        return self._sent(time_s, lambda a, was, k: safety.step(was, self._limits(a), clock_s, time_s, 0.0, 1.0, why))
+
+    def _limits(self, a: AxisModel) -> Limits:
+        """The axis' limits; input is stale after a few of the stream's own intervals where that is sooner."""
+        if len(self._intervals_s) < _INTERVALS:
+            return a.limits
+        own_s = max(_LOST_SAMPLES * float(np.median(self._intervals_s)), Limits.stale_s)
+        return replace(a.limits, stale_s=own_s) if own_s < a.limits.stale_s else a.limits
 
     def stop(self) -> None:
         """The operator stops: every axis fades out."""
         for run in self._run.values():
             run.safety, run.slope_safety = safety.stop(run.safety), safety.stop(run.slope_safety)
+
+    def start(self) -> None:
+        """The operator ends a stop: every axis becomes active after warm-up."""
+        for run in self._run.values():
+            run.safety, run.slope_safety = safety.start(run.safety), safety.start(run.slope_safety)
 
     def _sent(
         self, time_s: float, step: Callable[[AxisModel, Axis, int], tuple[Axis, float, str]], notes: str | None = None
@@ -204,7 +238,9 @@ class Compensator:
             state[a.axis] = run.safety.state
             why = run.why if notes is not None else ""
             reasons[a.axis] = "; ".join(r for r in (reason, why, notes, a.remark) if r)
-        return Correction(time_s, offset, slope, state, reasons)
+        self._heartbeat += 1
+        until_s = time_s + min(self._limits(a).stale_s for a in self.axes)
+        return Correction(time_s, offset, slope, state, reasons, self._heartbeat, until_s)
 
     def _check_clock(self, time_s: float) -> None:
         """After a restart: a state from the future belongs to a clock that was set back, and no time since is known."""
@@ -244,7 +280,7 @@ class Compensator:
         if rows > 0:
             whole = {**self._held, **clean}
             shares = (np.arange(rows) + 1) / rows  # a longer gap is bridged by a straight line
-            between = [{c: self._held[c] + w * (v - self._held[c]) for c, v in whole.items()} for w in shares]
+            between = [{c: (h := self._held.get(c, v)) + w * (v - h) for c, v in whole.items()} for w in shares]
             self._held = whole
             self._rows(self._grid_s + rows * self.period_s, between)
         return None, notes
@@ -289,6 +325,11 @@ class Compensator:
         if a.updater is None or run.learned is None or not run.learned.started or not math.isfinite(run.free_um):
             self.log(f"{axis}: reading of {measured_um:g} µm not used: no filter, or no prediction yet")
             return
+        low, high = a.readings_um
+        if not low <= measured_um <= high:
+            self.rejected += 1
+            self.log(f"{axis}: reading of {measured_um:g} µm rejected: outside {low:g} to {high:g} µm; probe again")
+            return
         total_um = measured_um - run.safety.sent_um  # the machine's own error: what is left less what was added
         known, row = run.learned, (run.at_s, run.free_um, run.scaled)
         expected_um, sd_um, _ = a.updater.step(known, *row)
@@ -298,7 +339,7 @@ class Compensator:
             expected_um, sd_um, _ = a.updater.step(known, *row)
         off_um = total_um - expected_um
         if not abs(off_um) <= _ODD_READING_SD * sd_um:
-            again = abs(off_um - run.odd_um) <= _ODD_READING_SD * sd_um
+            again = abs(off_um - run.odd_um) <= _ODD_READING_SD * sd_um and abs(off_um) <= a.largest_surprise_um
             run.odd_um = off_um if math.isfinite(off_um) else math.nan
             if not again:
                 self.rejected += 1
@@ -332,6 +373,25 @@ class Compensator:
         return {"schema": SCHEMA, "machine": self.machine, "period_s": self.period_s, "grid_s": self._grid_s,
                 "held": self._held, "watch": watch, "axes": axes}  # fmt: skip
 
+    def sent(self) -> dict[str, Any]:
+        """What a restart needs to go on from what was sent, by axis."""
+        return {
+            n: {"safety": r.safety.as_plain(), "slope_safety": r.slope_safety.as_plain()} for n, r in self._run.items()
+        }
+
+    def restore_sent(self, plain: Mapping[str, Any]) -> None:
+        """Goes on from `sent` of another process, whatever is known of its models.
+
+        Raises:
+            InputError: a state that is unknown, or a number that is not finite.
+        """
+        known = {
+            n: (Axis.from_plain(plain[n]["safety"]), Axis.from_plain(plain[n]["slope_safety"]))
+            for n in self._run if n in plain
+        }  # fmt: skip
+        for name, (offset, slope) in known.items():
+            self._run[name].safety, self._run[name].slope_safety = offset, slope
+
     def restore(self, plain: Mapping[str, Any]) -> None:
         """Goes on from `as_plain` of another process: what was learned is kept, what is sent does not jump.
 
@@ -345,22 +405,24 @@ class Compensator:
                 f"state of a compensation: got {got}, expected {expected}; delete the file, the compensation then "
                 "starts afresh"
             )
-        self._grid_s, self._restored = plain["grid_s"], True
-        self._held = {c: float(v) for c, v in plain["held"].items()}
-        if self.guard is not None and plain["watch"] is not None:
-            self._watch = Watch.from_plain(plain["watch"])
+        runs = {}
         for name, one in plain["axes"].items():
             kept = one["learned"]
             learned = kept and Learned(
                 np.array(kept["mean"], float), np.array(kept["cov"], float), float(kept["time_s"]), kept["started"]
             )
-            self._run[name] = _Running(
+            runs[name] = _Running(
                 State.from_plain(one["model"]), State.from_plain(one["region"]), learned,
                 Axis.from_plain(one["safety"]), Axis.from_plain(one["slope_safety"]),
                 _or_nan(one["error_um"]), _or_nan(one["free_um"]),
                 np.array([_or_nan(v) for v in one["scaled"]]), _or_nan(one["slope_um_per_mm"]), float(one["trust"]),
                 at_s=float(one["at_s"]),
             )  # fmt: skip
+        held = {c: float(v) for c, v in plain["held"].items()}
+        watch = (
+            Watch.from_plain(plain["watch"]) if self.guard is not None and plain["watch"] is not None else self._watch
+        )
+        self._run, self._held, self._watch, self._grid_s, self._restored = runs, held, watch, plain["grid_s"], True
 
 
 def _inputs_of(a: AxisModel) -> tuple[list[int], Array]:

@@ -269,7 +269,6 @@ class Policy:
     idle_prior_share: float = analytic(1.0 - 1e-9, "of the prior sd", "a parameter that keeps it does nothing there")
     stands_alone_probability: float = convention(0.7, "probability", "with a tie below it nothing is decided")
     untied_probability: float = convention(0.9, "probability", "above it no alternative is tied")
-    tied_min_probability_share: float = convention(0.5, "of the explanation", "an alternative as probable is tied")
     plain_probability: float = convention(0.9, "probability", "above it a claim is stated plainly")
     likely_probability: float = convention(0.6, "probability", "above it a claim is most likely, below it perhaps")
     fallen_max_share: float = convention(0.98, "of the error before", "an error that keeps more has not fallen")

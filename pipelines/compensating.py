@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from compensation.contracts import Correction, Sink, Source
 from compensation.exchange import MqttExchange
 from compensation.exports import EXPORTS
 from compensation.exports.base import AxisModel as ExportedAxis
@@ -24,14 +21,12 @@ from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
 from compensation.safety import Limits
 from data.batch import Batch
-from data.errors import InputError, WorkError
-from data.files import write_atomic
+from data.errors import InputError
 from features.rises import feature_unit
 from pipelines.model_store import FILES, StoredModel, inner_folder, is_champion, load
 from pipelines.settings import home
 
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
-_SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
 _LOST_SAMPLES = 3  # in a row before the input is stale
 _LEVER_MM = 1000.0  # of an axis whose position channel has no range
 _ROOM = 1.25  # of the largest error of the training: a correction beyond is a failure of the model
@@ -45,6 +40,7 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     """
     channels = stored.machine.batch_channels()
     family = stored.family
+    error = channels[family.target]
     empty = Batch(stored.machine.machine, "no rows", pd.DataFrame({"time_s": []}), channels)
     program = family.program(channels, period_s)
     ends_mm = stored.machine.channels[program.along].range if program.along else None
@@ -52,7 +48,7 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     return AxisModel(
         family.target, program, family.inputs, tuple(feature_unit(empty, i) for i in family.inputs), stored.region,
         stored.region.program(channels, period_s), stored.bound, stored.updater, limits, lever_mm, stored.authority,
-        stored.remark,
+        stored.remark, (-math.inf if error.low is None else error.low, math.inf if error.high is None else error.high),
     )  # fmt: skip
 
 
@@ -142,84 +138,6 @@ class Given:
             rate_um_per_s=self.rate_um_per_s,
             stale_s=max(default.stale_s, _LOST_SAMPLES * (every_s or 0.0)) if self.stale_s is None else self.stale_s,
         )
-
-
-class StateFile:
-    """The state of a compensation on disk, replaced atomically."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def load(self) -> Mapping[str, Any] | None:
-        """What was saved; None where nothing was.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        try:
-            plain = json.loads(self.path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise InputError(f"state file {self.path}: cannot be read ({error}); delete it to start afresh") from None
-        return dict(plain)
-
-    def save(self, plain: Mapping[str, Any]) -> None:
-        """Replaces the file. Raises: WorkError, it cannot be written."""
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(self.path, json.dumps(plain))
-        except OSError as error:
-            raise WorkError(f"state file {self.path}: cannot be written ({error}); give another --state") from None
-
-
-def serve(
-    machine: Compensator,
-    source: Source,
-    sinks: Sequence[Sink],
-    state: StateFile | None = None,
-    log: Callable[[str], None] = print,
-    replay: bool = False,
-    seen: Callable[[Correction], None] = lambda c: None,
-) -> None:
-    """Answers samples until the source ends; then every axis keeps what it sent last in the state file.
-
-    A sink that fails is reported once and tried again with the next correction: the machine holds what it has.
-
-    Args:
-        replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests.
-        seen: called with every correction.
-    """
-    saved_s, failing, clock_s, begun = -_SAVED_EVERY_S, set[int](), 0.0, False
-    try:
-        if state is not None and (known := state.load()) is not None:
-            machine.restore(known)
-            log(f"goes on from {state.path}")
-        begun = True
-        for sample in source.samples():
-            if not replay:
-                clock_s = time.monotonic()
-            elif sample is not None:
-                clock_s = sample.time_s
-            correction = machine.take(sample, clock_s) if sample else machine.silence(clock_s, time.time())
-            for k, sink in enumerate(sinks):
-                try:
-                    sink.write(correction)
-                    failing.discard(k)
-                except WorkError as error:
-                    if k not in failing:
-                        log(str(error))
-                    failing.add(k)
-            seen(correction)
-            if state is not None and clock_s - saved_s > _SAVED_EVERY_S:
-                state.save(machine.as_plain())
-                saved_s = clock_s
-    finally:
-        if state is not None and begun:
-            state.save(machine.as_plain())
-        source.close()
-        for sink in sinks:
-            sink.close()
 
 
 def rehearse_models(

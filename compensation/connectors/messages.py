@@ -382,6 +382,8 @@ def correction_record(correction: Correction) -> dict[str, Any]:
         "slope_um_per_m": {axis: float(v) for axis, v in correction.slope_um_per_m.items()},
         "state": dict(correction.state),
         "reasons": dict(correction.reasons),
+        "heartbeat": correction.heartbeat,
+        "valid_until_s": float(correction.valid_until_s),
     }
 
 

@@ -32,7 +32,7 @@ from compensation.connectors.messages import (
 from compensation.contracts import Correction, Sample
 from data.errors import InputError, WorkError
 from data.machine import Machine
-from data.readers.csv import find_separator, normalise
+from data.readers.csv import find_decimal, find_separator, normalise
 from data.units import TIME_UNITS_S
 
 POLL_S = 0.2  # between two looks at a growing file
@@ -78,6 +78,7 @@ class _Columns:
         wanted = [c if isinstance(c, int) else normalise(c) for c in (clock.column, *TIME_KEYS)]
         self.width = None if header is None else len(header)
         self.separator = separator
+        self.decimal = machine.recording.decimal or "."
         self.time = next((folded.index(w) for w in wanted if w in folded), None)
         # unit and format of the machine file describe its own time column, not one under a standard name
         own = self.time is not None and folded[self.time] == wanted[0]
@@ -209,13 +210,13 @@ class LineParser:
         stamp = cells[time] if columns.date is None else f"{cells[columns.date].strip()} {cells[time].strip()}"
         time_s = unix_time_s(stamp, columns.pattern, columns.unit_s)
         given = {i: cells[i] for i in columns.targets}
-        commas = columns.separator != "," and not any("." in cell for cell in given.values())
+        if columns.separator != "," and find_decimal([list(given.values())]) == ",":
+            columns.decimal = ","  # of the whole table: a cell such as "n.a." has no say
         values: dict[str, float] = {}
         readings: dict[str, float] = {}
         for i, cell in given.items():
             target = columns.targets[i]
-            decimal = "," if commas else "."
-            take(target, target.channel, cell, self._names, self._cells, where, values, readings, decimal)
+            take(target, target.channel, cell, self._names, self._cells, where, values, readings, columns.decimal)
         return Sample(time_s, values, readings)
 
 

@@ -178,10 +178,10 @@ class Found:
 
     @property
     def tied(self) -> tuple[Other, ...]:
-        """Explanations that these runs cannot distinguish from it and that are at least half as probable."""
+        """Explanations that these runs cannot distinguish from it and that are nearly as probable."""
         if self.probability > POLICY.untied_probability:
             return ()
-        least = POLICY.tied_min_probability_share * self.probability
+        least = POLICY.alike_min_probability_share * self.probability
         return tuple(o for o in self.others if o.alike and o.probability >= least)
 
 

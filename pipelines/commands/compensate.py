@@ -30,17 +30,21 @@ def compensate(
     period_s: Period = 10.0,
     state: Annotated[Path | None, typer.Option(help="file that survives a restart; default: var/compensation")] = None,
     replay: Annotated[bool, typer.Option(help="time is that of the samples; a CSV file ends at its end")] = False,
+    fade_s: Annotated[
+        float | None, typer.Option(help="longest time that a stop may fade, s; default: as the rate needs")
+    ] = None,
     provisional: Provisional = False,
 ) -> None:
     """Answer the samples of a machine with corrections: limited in size and rate, safe when sensors or networks fail.
 
     A correction is the negative of the expected error, relative to the first sample. Measured errors that arrive as
-    readings (what is left with the correction that was sent) update it. Ctrl-C ends it; the state file keeps what was
-    learned and sent.
+    readings (what is left with the correction that was sent) update it. Ctrl-C fades to 0 and ends, a second one ends
+    at once; the state file keeps what was learned and sent.
     """
     from compensation.connectors import open_sink, open_source
+    from compensation.serving import StateFile, serve
     from pipelines.commands.predict import load_model
-    from pipelines.compensating import Given, StateFile, check_standing, compensator, serve
+    from pipelines.compensating import Given, check_standing, compensator
     from pipelines.settings import configure_environment, home, load
 
     if not period_s > 0:
@@ -59,4 +63,4 @@ def compensate(
     )
     stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
     console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
-    serve(running, source, sinks, kept, console.note, replay)
+    serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s)

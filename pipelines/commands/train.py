@@ -27,7 +27,7 @@ def training_dict(outcome: TrainOutcome) -> dict[str, Any]:
     best = {}
     for t, r in outcome.results.items():
         cells = r.cells[r.cells["protocol"] == _shown_protocol(r.cells)].nsmallest(5, "S_mean_um")
-        names = {c: error_column(c, outcome.units[t]) for c in cells if c.endswith("_um")}
+        names = {c: error_column(c, outcome.units[t]) for c in map(str, cells) if c.endswith("_um")}
         best[t] = cells.rename(columns=names).to_dict(orient="records")
     return {
         "machine": outcome.machine,
