@@ -102,6 +102,13 @@ def test_comments_are_no_samples(machine: Machine, capsys: pytest.CaptureFixture
     assert sample == Sample(5.0, {"front": 20.0}, {}) and not capsys.readouterr().err
 
 
+def test_a_dead_sensor_does_not_change_the_decimal_mark(machine: Machine) -> None:
+    one, other = from_text("time_s;front;room\n1700000000;21,512;20,25\n1700000010;21,612;n.a.\n", machine)
+    assert one.values == {"front": 21.512, "room": 20.25} and other.values["front"] == 21.612
+    (first,) = from_text("time_s;front;room\n1700000010;21,612;n.a.\n", machine)
+    assert first.values["front"] == 21.612
+
+
 def test_semicolons_decimal_commas_and_a_byte_order_mark(machine: Machine) -> None:
     (sample,) = from_text("\ufefftime;FRONT;room\r\n1700000000,5;25,125;20\r\n", machine)
     assert sample == Sample(1700000000.5, {"front": 25.125, "room": 20.0})
@@ -276,6 +283,8 @@ def test_json_lines_to_standard_output(machine: Machine, capsys: pytest.CaptureF
         "slope_um_per_m": {"ey": 3.5},
         "state": {"z": "active", "ey": "hold"},
         "reasons": {"ey": "sensor front is silent, since 3 min"},
+        "heartbeat": 0,
+        "valid_until_s": 0.0,
     }
 
 

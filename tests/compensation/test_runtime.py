@@ -20,6 +20,7 @@ from data.batch import Batch
 from data.errors import InputError
 from features.design import Design
 from models import FAMILIES
+from models.conformal import RunBound
 from models.program import Builder, replay
 from models.trust import Region, watched
 from models.updating import Updater, out_of_fold
@@ -306,3 +307,25 @@ def test_a_slope_fades_with_its_offset_and_survives_a_restart() -> None:
     for k in range(1, 5):
         faded = again.silence(500.0 * k, 1e9)
     assert faded.offset_um["z"] == faded.slope_um_per_m["z"] == 0.0
+
+
+def test_a_reading_is_refused_outside_its_range_and_where_no_machine_changes_so_much() -> None:
+    *train, left = make_toy_batches(8, 60)
+    bound = RunBound(1.0, 2.0, (0.25, 0.25), 1.0, 0.05, 1.0, 0.9, 4)
+    model, lines = replace(model_of(train), bound=bound, readings_um=(-500.0, 500.0)), list[str]()
+    machine = Compensator("toy", [model], period_s=left.step_s, log=lines.append)
+    for k, s in enumerate(samples(left)):
+        given = {20: 1e6, 21: 1e6, 25: 1e308, 26: 1e308, 30: 90.0, 31: 90.0, 32: math.nan}
+        machine.take(replace(s, readings_um={"z": given[k]} if k in given else {}), s.time_s - 1e9)
+    assert machine.rejected == len(given) and not any("both count" in line for line in lines)
+    assert sum("outside -500 to 500" in line for line in lines) == 5
+
+
+def test_silence_is_noticed_after_a_few_of_the_streams_own_intervals() -> None:
+    *train, left = make_toy_batches(8, 60)
+    machine = Compensator("toy", [model_of(train, limits=replace(QUICK, stale_s=900.0))], period_s=left.step_s)
+    first, at_s = samples(left)[0], 1e9
+    for k in range(60):
+        machine.take(replace(first, time_s=at_s + k), float(k))
+    assert machine.silence(59.0 + 25.0, at_s).state["z"] == "active"
+    assert machine.silence(59.0 + 40.0, at_s).state["z"] == "hold"

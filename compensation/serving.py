@@ -1,0 +1,244 @@
+"""The loop that answers samples next to the control: whatever fails, it goes on, and nothing that is sent jumps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from compensation.contracts import Correction, Sample, Sink, Source
+from compensation.runtime import Compensator
+from data.errors import InputError, WorkError
+from data.files import write_atomic
+
+_SAVED_EVERY_S = 30.0  # what a power cut may lose of what was learned
+_FADE_STEP_S = 1.0  # between two corrections while a stop fades
+
+
+class StateFile:
+    """The state of a compensation on disk, replaced atomically, with a checksum.
+
+    What is sent is written ahead to a second, small file, so that a restart after a crash goes on from it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.ahead = path, path.with_suffix(".sent")
+
+    def load(self, log: Callable[[str], None] = print) -> dict[str, Any]:
+        """`state` and `sent`, as far as they can be read; a file that cannot is set aside with one line."""
+        return {
+            name: plain
+            for name, path in (("state", self.path), ("sent", self.ahead))
+            if (plain := self._read(path, log)) is not None
+        }
+
+    def _read(self, path: Path, log: Callable[[str], None]) -> Mapping[str, Any] | None:
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            if kept["sha256"] != _digest(kept["state"]):
+                raise ValueError("its checksum is another one")
+            return dict(kept["state"])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            self.set_aside(path, f"cannot be read ({error})", log)
+            return None
+
+    def set_aside(self, path: Path, why: str, log: Callable[[str], None]) -> None:
+        """Keeps a file that cannot be used under another name."""
+        aside = path.with_name(f"{path.name}.unusable")
+        try:
+            path.replace(aside)
+        except OSError as error:
+            log(f"state file {path}: {why}, and cannot be set aside ({error}); it is not used")
+        else:
+            log(f"state file {path}: {why}; set aside as {aside.name}")
+
+    def save(self, plain: Mapping[str, Any]) -> None:
+        """Replaces the state. Raises: WorkError, it cannot be written."""
+        self._write(self.path, plain)
+
+    def send(self, sent: Mapping[str, Any]) -> None:
+        """Writes ahead what is about to be sent (`Compensator.sent`). Raises: WorkError, it cannot be written."""
+        self._write(self.ahead, sent)
+
+    def _write(self, path: Path, plain: Mapping[str, Any]) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, json.dumps({"sha256": _digest(plain), "state": plain}))
+        except OSError as error:
+            raise WorkError(f"state file {path}: cannot be written ({error}); give another --state") from None
+
+
+def _digest(plain: Any) -> str:
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+class _Stop:
+    """Signals that ask for an end: after the first one what is sent fades, the second one ends at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+@contextmanager
+def _signals(stop: _Stop, caught: bool) -> Iterator[None]:
+    """`stop` receives SIGINT and SIGTERM, in the main thread alone."""
+    if not caught or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Line:
+    """One compensation with its sinks and its state file."""
+
+    def __init__(
+        self, machine: Compensator, sinks: Sequence[Sink], state: StateFile | None, log: Callable[[str], None],
+        seen: Callable[[Correction], None],
+    ) -> None:  # fmt: skip
+        self.machine, self.sinks, self.state, self.log, self.seen = machine, sinks, state, log, seen
+        self._failing: dict[str, str] = {}  # what has failed since it last worked, and how
+        self._saved_s = 0.0
+        self._sent: Mapping[str, Any] = {}
+
+    def restore(self) -> None:
+        """Goes on from the state file, as far as it can be used: what was sent last in any case."""
+        if self.state is None:
+            return
+        known = self.state.load(self.log)
+        if "state" in known:
+            try:
+                self.machine.restore(known["state"])
+                self.log(f"goes on from {self.state.path}")
+            except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+                self.state.set_aside(self.state.path, f"cannot be used ({error})", self.log)
+                known.setdefault("sent", _sent_in(known["state"]))
+        if "sent" in known:
+            try:
+                self.machine.restore_sent(known["sent"])
+            except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
+                self.state.set_aside(self.state.ahead, f"cannot be used ({error})", self.log)
+
+    def answer(self, sample: Sample | None, clock_s: float) -> Correction:
+        """The correction after a sample, or in silence; where the models fail, what was sent is held and then fades."""
+        time_s = sample.time_s if sample is not None else time.time()
+        try:
+            correction = self.machine.take(sample, clock_s) if sample else self.machine.silence(clock_s, time_s)
+            self._failing.pop("model", None)
+        except Exception as error:  # no sample ends the process
+            self._fails("model", f"sample not used, {type(error).__name__} ({error}): {sample}"[:500])
+            correction = self.machine.fault(clock_s, time_s, f"the model fails ({type(error).__name__})")
+        self._write_ahead()
+        for k, sink in enumerate(self.sinks):
+            try:
+                sink.write(correction)
+                self._failing.pop(str(k), None)
+            except Exception as error:  # the other sinks go on
+                self._fails(str(k), str(error))
+        self.seen(correction)
+        return correction
+
+    def _write_ahead(self) -> None:
+        if self.state is not None and (sent := self.machine.sent()) != self._sent:
+            self._sent = sent
+            self._kept(lambda state: state.send(sent))
+
+    def save(self, clock_s: float, least_s: float = 0.0) -> None:
+        """Saves the state, if so much time has passed since it was."""
+        if self.state is not None and clock_s - self._saved_s >= least_s:
+            self._saved_s = clock_s
+            self._kept(lambda state: state.save(self.machine.as_plain()))
+
+    def _kept(self, write: Callable[[StateFile], None]) -> None:
+        assert self.state is not None
+        try:
+            write(self.state)
+            self._failing.pop("state", None)
+        except Exception as error:  # a full disk does not end the compensation
+            self._fails("state", str(error))
+
+    def _fails(self, what: str, why: str) -> None:
+        """One line for an unbroken row of failures."""
+        if what not in self._failing:
+            self.log(why)
+        self._failing[what] = why
+
+
+def _sent_in(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: {k: one[k] for k in ("safety", "slope_safety")} for name, one in state.get("axes", {}).items()}
+
+
+def serve(
+    machine: Compensator,
+    source: Source,
+    sinks: Sequence[Sink],
+    state: StateFile | None = None,
+    log: Callable[[str], None] = print,
+    replay: bool = False,
+    seen: Callable[[Correction], None] = lambda c: None,
+    fade_s: float | None = None,
+) -> None:
+    """Answers samples until the source ends or a signal asks for the end; the state file keeps what was sent last.
+
+    A sink that fails is reported once and tried again with the next correction: the machine holds what it has. The
+    first SIGINT or SIGTERM lets what is sent fade to 0 within the limits before the sinks are closed.
+
+    Args:
+        replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests.
+        seen: called with every correction.
+        fade_s: longest time that a stop may fade, s; None: as long as the limits need.
+    """
+    line, stop, clock_s = _Line(machine, sinks, state, log, seen), _Stop(), 0.0
+    try:
+        with _signals(stop, not replay):
+            line.restore()
+            for sample in source.samples():
+                if stop.asked:
+                    break
+                if not replay:
+                    clock_s = time.monotonic()
+                elif sample is not None:
+                    clock_s = sample.time_s
+                line.answer(sample, clock_s)
+                line.save(clock_s, _SAVED_EVERY_S)
+            if stop.asked:
+                _fade(line, fade_s, log)
+    finally:
+        line.save(clock_s)
+        source.close()
+        for sink in sinks:
+            sink.close()
+
+
+def _fade(line: _Line, fade_s: float | None, log: Callable[[str], None]) -> None:
+    """Lets what is sent fade to 0; this is no stop by the operator, so that a restart begins with warm-up."""
+    log("asked to end: what is sent fades to 0 first; ask again to end at once")
+    until_s = None if fade_s is None else time.monotonic() + fade_s
+    line.machine.stop()
+    try:
+        while until_s is None or time.monotonic() < until_s:
+            correction = line.answer(None, time.monotonic())
+            if not any((*correction.offset_um.values(), *correction.slope_um_per_m.values())):
+                return
+            time.sleep(_FADE_STEP_S)
+    except KeyboardInterrupt:
+        log("asked again: ends with what was sent last")
+    finally:
+        line.machine.start()

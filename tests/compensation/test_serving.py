@@ -1,0 +1,174 @@
+"""The loop next to the control: no sample, state or signal ends it with a jump."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from compensation import serving
+from compensation.contracts import Correction, Sample
+from compensation.runtime import AxisModel, Compensator
+from compensation.safety import Limits
+from compensation.serving import StateFile, serve
+from tests.compensation.test_runtime import model_of, samples
+from tests.conftest import make_toy_batches
+
+LIMITS = Limits(rate_um_per_s=0.1, step_um=1.0, warm_up_s=0.0, stale_s=1000.0, hold_s=120.0)
+
+
+@pytest.fixture(scope="module")
+def toy() -> tuple[AxisModel, list[Sample]]:
+    *train, left = make_toy_batches(8, 60)
+    return model_of(train, limits=LIMITS), samples(left)
+
+
+def compensator(model: AxisModel) -> Compensator:
+    return Compensator("toy", [model], period_s=model.program.step_s)
+
+
+class Given:
+    """A source of given samples; a function among them is called."""
+
+    def __init__(self, *given: Sample | Callable[[], object] | None) -> None:
+        self.given = given
+
+    def samples(self) -> Iterator[Sample | None]:
+        for one in self.given:
+            if callable(one):
+                one()
+            else:
+                yield one
+
+    def close(self) -> None: ...
+
+
+class Kept:
+    """A sink that keeps corrections, and the state on disk at the time of each."""
+
+    def __init__(self, state: StateFile | None = None) -> None:
+        self.got: list[Correction] = []
+        self.state, self.ahead = state, list[float]()
+
+    def write(self, correction: Correction) -> None:
+        self.got.append(correction)
+        if self.state is not None:
+            ahead = json.loads(self.state.ahead.read_text())["state"]
+            self.ahead.append(ahead["z"]["safety"]["sent_um"])
+
+    def close(self) -> None: ...
+
+    @property
+    def sent_um(self) -> list[float]:
+        return [c.offset_um["z"] for c in self.got]
+
+
+def test_a_channel_that_comes_later_is_a_missing_value_at_first(toy: tuple[AxisModel, list[Sample]]) -> None:
+    model, rows = toy
+    first = replace(rows[0], values={c: v for c, v in rows[0].values.items() if c != "spindle_rpm"})
+    sink = Kept()
+    serve(compensator(model), Given(first, *rows[1:20]), [sink], replay=True)
+    assert len(sink.got) == 20 and sink.got[-1].state["z"] == "active"
+    assert [c.heartbeat for c in sink.got] == list(range(1, 21))
+    assert all(c.valid_until_s > c.time_s for c in sink.got)
+
+
+def test_what_fails_is_held_then_fades_and_says_which_sample(toy: tuple[AxisModel, list[Sample]]) -> None:
+    model, rows = toy
+    machine, sink, said = compensator(model), Kept(), list[str]()
+    take = machine.take
+
+    def failing(sample: Sample, clock_s: float) -> Correction:
+        if sample.time_s >= rows[30].time_s:
+            raise ZeroDivisionError("no model")
+        return take(sample, clock_s)
+
+    machine.take = failing  # type: ignore[method-assign]
+    serve(machine, Given(*rows), [sink], log=said.append, replay=True)
+    assert len(sink.got) == len(rows) and sink.sent_um[29] != 0.0
+    assert sink.got[30].state["z"] == "hold" and sink.sent_um[30] == sink.sent_um[29]
+    assert sink.got[-1].state["z"] == "off" and sink.sent_um[-1] == 0.0
+    assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 1.0 + 1e-9
+    assert len(said) == 1 and "ZeroDivisionError (no model): Sample(time_s=" in said[0]
+
+
+def test_what_is_sent_is_on_disk_before_it_is_sent(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
+    model, rows = toy
+    state = StateFile(tmp_path / "state.json")
+    sink = Kept(state)
+    serve(compensator(model), Given(*rows[:30]), [sink], state, replay=True, log=lambda line: None)
+    assert sink.ahead == sink.sent_um and sink.sent_um[-1] != 0.0
+
+
+@pytest.mark.parametrize("damage", ["{", '{"sha256": "0", "state": {}}', "[]", ""])
+def test_a_state_that_cannot_be_used_is_set_aside_and_what_was_sent_goes_on(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, damage: str
+) -> None:
+    model, rows = toy
+    state, said = StateFile(tmp_path / "state.json"), list[str]()
+    before, after = Kept(), Kept()
+    serve(compensator(model), Given(*rows[:30]), [before], state, replay=True, log=said.append)
+    state.path.write_text(damage)
+    serve(compensator(model), Given(*rows[30:]), [after], state, replay=True, log=said.append)
+    assert (tmp_path / "state.json.unusable").read_text() == damage
+    assert sum("set aside as state.json.unusable" in line for line in said) == 1
+    assert abs(after.sent_um[0] - 0.0) > 0 and abs(after.sent_um[0] - before.sent_um[-1]) <= 1.0 + 1e-9
+
+
+def test_a_state_of_other_axes_is_set_aside_too(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
+    model, rows = toy
+    state, said, sink = StateFile(tmp_path / "state.json"), list[str](), Kept()
+    safe = {"state": "active", "sent_um": 7.0, "stopped": False, "held_s": 0.0}
+    slope = {**safe, "state": "off", "sent_um": 0.0}
+    state.save({"schema": "another", "axes": {"z": {"safety": safe, "slope_safety": slope}}})
+    serve(compensator(model), Given(rows[0]), [sink], state, replay=True, log=said.append)
+    assert "cannot be used" in said[0] and abs(sink.sent_um[0] - 7.0) <= 1.0
+
+
+def test_a_stop_fades_before_it_ends_and_a_restart_begins_with_warm_up(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, rows = toy
+    fast = replace(model, limits=replace(LIMITS, rate_um_per_s=1e4, step_um=0.5))
+    monkeypatch.setattr(serving, "_FADE_STEP_S", 0.001)
+    state, sink, said = StateFile(tmp_path / "state.json"), Kept(), list[str]()
+    stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
+    serve(compensator(fast), Given(*rows[:40], stop, *rows[40:]), [sink], state, said.append)
+    assert max(map(abs, sink.sent_um)) > 1.0 and sink.sent_um[-1] == 0.0 and sink.got[-1].state["z"] == "off"
+    assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 0.5 + 1e-9
+    assert any("asked to end" in line for line in said)
+    again = compensator(fast)
+    again.restore(state.load()["state"])
+    assert not any(one["safety"]["stopped"] for one in again.sent().values())
+
+
+def test_a_second_signal_ends_at_once(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, rows = toy
+    slow = replace(model, limits=replace(LIMITS, rate_um_per_s=0.01, step_um=0.5, stale_s=30.0))
+    monkeypatch.setattr(serving.time, "sleep", lambda s: os.kill(os.getpid(), signal.SIGINT))
+    clock = iter(range(10**6))
+    monkeypatch.setattr(serving.time, "monotonic", lambda: (rows[1].time_s - rows[0].time_s) * next(clock))
+    sink, said = Kept(), list[str]()
+    stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
+    serve(compensator(slow), Given(*rows[:40], stop, *rows[40:]), [sink], None, said.append)
+    assert sink.sent_um[-1] != 0.0 and any("asked again" in line for line in said)
+
+
+def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
+    model, rows = toy
+    state, said, good = StateFile(tmp_path / "state.json"), list[str](), Kept()
+
+    class Broken(Kept):
+        def write(self, correction: Correction) -> None:
+            raise OSError("no route")
+
+    (tmp_path / "state.sent").mkdir()
+    serve(compensator(model), Given(*rows[:10]), [Broken(), good], state, replay=True, log=said.append)
+    assert len(good.got) == 10 and sum("no route" in line for line in said) == 1
