@@ -42,8 +42,15 @@ def activity(fitted: Fitted, c: Candidate) -> tuple[str, Windows]:
     if switched:
         on = {b.batch_id: np.all([b.values(n) != 0 for n in switched], axis=0) for b in fitted.batches}
         times = {b.batch_id: b.time_s for b in fitted.batches}
-        return " and ".join(f"{n} > 0" for n in switched), _windows(on, times)
+        return " and ".join(f"{n} {_sign(fitted, n)} 0" for n in switched), _windows(on, times)
     return _by_watts(fitted, c.name)
+
+
+def _sign(fitted: Fitted, driver: str) -> str:
+    """How the driver's values differ from 0 where it is on: a discharge current is negative."""
+    values = np.concatenate([b.values(driver) for b in fitted.batches])
+    above, below = bool((values > 0).any()), bool((values < 0).any())
+    return "≠" if above and below else "<" if below else ">"
 
 
 def _by_watts(fitted: Fitted, name: str) -> tuple[str, Windows]:

@@ -62,7 +62,7 @@ def equation_with_numbers(mechanism: type[Mechanism], values: Mapping[str, float
 
 
 _THINGS = {"sensor": "sensor|channel", "error": "channel", "link": "joint|link", "node": "body"}  # what words call it
-_MAX_NAMED = 3  # limits, and alternatives, that a sentence names
+_MAX_NAMED = 3  # limits, alternatives and parameters that a sentence names
 
 
 def finding_of(found: Found) -> Finding:
@@ -234,7 +234,7 @@ def _consistent(rms: Sequence[Rms], limits: Sequence[DetectionLimit], places: Se
 def _sentence(found: Found) -> str:
     """The claim where it is a sentence by itself: alternatives, and summaries such as "sensor that drifts"."""
     if found.kind is CandidateKind.WRONG_PARAMETER:
-        said = [_replaced(p, found.was.get(p), found.parameters[p]) for p in found.parameters]
+        said = _few([_replaced(p, found.was.get(p), found.parameters[p]) for p in found.parameters])
         several = len(said) > 1
         return f"the value{'s' * several} of {listed(said)} in the machine file {'are' if several else 'is'} wrong"
     if found.mechanism not in MECHANISMS or found.kind.is_unlisted:
@@ -285,7 +285,13 @@ def _size(found: Found) -> str:
         return f", {amount(found.size)}"
     named = len(found.main) > 1 or any(not unit_label(found.parameters[p].unit) for p in found.main)
     said = [f"{p.replace('_', ' ')} " * named + amount(found.parameters[p]) for p in found.main]
-    return f", {listed(said)}" if said else ""
+    return f", {listed(_few(said))}" if said else ""
+
+
+def _few(said: list[str]) -> list[str]:
+    """What a sentence names of several parameters; all stand in `findings.json`."""
+    more = len(said) - _MAX_NAMED
+    return said if more < 1 else [*said[:_MAX_NAMED], f"{more} more"]
 
 
 def _replaced(path: str, was: float | None, now: Estimate) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -44,6 +45,14 @@ def test_what_multiplies_a_heat_is_at_work_while_its_drivers_run() -> None:
     assert regime == "rpm > 0"
     turning = sum(float((b.values("rpm") != 0)[:-1].sum()) * b.step_s for b in now.batches)
     assert sum(end - start for _, start, end in windows) == turning
+
+
+def test_a_driver_that_is_negative_where_it_is_on_is_said_so() -> None:
+    now = four()
+    c = next(c for c in proposed(now) if c.mechanism == "viscosity_feedback")
+    reverse = tuple(replace(b, table=b.table.assign(rpm=-b.table["rpm"])) for b in now.batches)
+    assert activity(replace(now, batches=reverse), c)[0] == "rpm < 0"
+    assert activity(replace(now, batches=(*reverse, *now.batches)), c)[0] == "rpm ≠ 0"
 
 
 def test_what_nothing_switches_is_always_at_work() -> None:
