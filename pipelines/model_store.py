@@ -304,7 +304,7 @@ def predict_frame(model: StoredModel, table: pd.DataFrame) -> pd.DataFrame:
     for batch_id, rows in groups:
         batch = frame_to_batch(model, table.iloc[rows], batch_id)
         predicted[rows] = model.predict(batch)
-        outside[rows] = [bool(names) for names in model.outside(batch)]
+        outside[rows] = [bool(names) for names in model.outside(batch)] | np.isnan(predicted[rows])
     return pd.DataFrame({"predicted_um": predicted, "outside_region": outside}, index=table.index)
 
 

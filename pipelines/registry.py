@@ -23,6 +23,7 @@ from mlflow.models import ModelSignature
 from mlflow.protos.databricks_pb2 import RESOURCE_DOES_NOT_EXIST, ErrorCode
 from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
+from mlflow.types.schema import AnyType
 
 from data.batch import Batch
 from data.errors import InputError, closest, one_of
@@ -43,6 +44,8 @@ from pipelines.tracking import load_training, open_store, record_promotion, stor
 _MODEL_PACKAGES = ("mlflow", "numpy", "pandas", "scipy", "scikit-learn", "pydantic", "PyYAML")
 _SERVED_PACKAGES = ("mlflow", "numpy", "pandas", "onnxruntime")  # of a family that is an ONNX file
 Outcome = Literal["champion", "provisional", "challenger", "unchanged"]
+_NUMBER = AnyType()  # MLflow refuses whole numbers, as pandas reads them from a file, where a double is expected
+
 OUTCOME = "outcome"  # the last tag of a version; what lacks it was interrupted
 _INTERRUPTED = "its promotion was interrupted; `thermodrift promote` or the next training finishes it"
 
@@ -472,8 +475,8 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
         drivers = [d for d in stored.machine.names("driver") if d not in channels]
         signature = ModelSignature(
             inputs=Schema([
-                ColSpec("double", "time_s"), *(ColSpec("double", c) for c in channels),
-                *(ColSpec("double", d, required=False) for d in drivers), ColSpec("string", "batch_id", required=False),
+                *(ColSpec(_NUMBER, c) for c in ("time_s", *channels)),
+                *(ColSpec(_NUMBER, d, required=False) for d in drivers), ColSpec("string", "batch_id", required=False),
             ]),
             outputs=Schema([ColSpec("double", "predicted_um"), ColSpec("boolean", "outside_region")]),
         )  # fmt: skip

@@ -189,6 +189,11 @@ def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story,
     front, bed = (table[c] - table[c].iloc[0] for c in ("front", "bed"))
     assert np.allclose(got["predicted_um"], GAIN_UM_PER_K[0] * front + GAIN_UM_PER_K[1] * bed, atol=1e-6)
     assert not got["outside_region"].any()
+    whole = table[["time_s", "front", "bed"]].round().astype(int).assign(speed=3000)  # as pandas reads whole numbers
+    assert np.isfinite(loaded.predict(whole)["predicted_um"]).all()
+    null = table[["time_s", "front", "bed"]].assign(front=[*table["front"][:-1], np.nan])
+    last = loaded.predict(null).iloc[-1]
+    assert np.isnan(last["predicted_um"]) and last["outside_region"]
     assert loaded.metadata.signature.inputs.input_names() == ["time_s", "front", "bed", "speed", "batch_id"]
 
 
