@@ -194,6 +194,7 @@ def serve(
     replay: bool = False,
     seen: Callable[[Correction], None] = lambda c: None,
     fade_s: float | None = None,
+    confirm: bool = False,
 ) -> None:
     """Answers samples until the source ends or a signal asks for the end; the state file keeps what was sent last.
 
@@ -204,11 +205,14 @@ def serve(
         replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests.
         seen: called with every correction.
         fade_s: longest time that a stop may fade, s; None: as long as the limits need.
+        confirm: the operator confirms the sensors as they are, see `Compensator.confirm`.
     """
     line, stop, clock_s = _Line(machine, sinks, state, log, seen), _Stop(), 0.0
     try:
         with _signals(stop, not replay):
             line.restore()
+            if confirm:
+                machine.confirm()
             for sample in source.samples():
                 if stop.asked:
                     break

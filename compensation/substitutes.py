@@ -408,7 +408,7 @@ class Guard:
         for i in np.flatnonzero(steady & ~near & trusted & gone):
             status[i] = "stepping"
         first = present & np.isnan(watch.raw)  # nothing before it to judge its rate by
-        consistent = (steady | first) & ~stuck & (near | (~trusted & (gone | many)))
+        consistent = (steady | first) & ~stuck & (near | (~trusted & gone))
         agreed = np.where(consistent, watch.agreed + 1, 0)
         return np.asarray(agreed >= limits.back_samples), agreed.astype(float)
 

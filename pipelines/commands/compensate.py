@@ -33,6 +33,7 @@ def compensate(
     fade_s: Annotated[
         float | None, typer.Option(help="longest time that a stop may fade, s; default: as the rate needs")
     ] = None,
+    confirm: Annotated[bool, typer.Option(help="the sensors are right as they are now: a new run begins")] = False,
     provisional: Provisional = False,
 ) -> None:
     """Answer the samples of a machine with corrections: limited in size and rate, safe when sensors or networks fail.
@@ -63,4 +64,4 @@ def compensate(
     )
     stated = "SIMULATED model; " if any(m.simulated for m in stored) else ""
     console.note(f"{stated}compensating {machine.machine} from {given}: {labels}, at most {rate_um_per_s:g} µm/s")
-    serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s)
+    serve(running, source, sinks, kept, console.note, replay, fade_s=fade_s, confirm=confirm)

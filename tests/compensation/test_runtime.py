@@ -207,6 +207,24 @@ def test_a_lost_sensor_is_replaced_then_held_then_faded() -> None:
     assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s][-1] in ("off", "fade-out")
 
 
+@pytest.mark.parametrize(("changed", "confirmed"), [(lambda v: v + 15.0, "active"), (lambda v: 1.8 * v + 32.0, "off")])
+def test_when_all_channels_jump_the_axis_fades_and_stays_off_until_it_is_confirmed(changed, confirmed) -> None:
+    *train, left = make_toy_batches(8, 240)
+    limits = replace(QUICK, hold_s=600.0, stale_s=400.0, rate_um_per_s=0.05)
+    machine = Compensator("toy", [model_of(train, limits=limits)], Substitutes.learn(train, INPUTS), left.step_s)
+    given = samples(left)
+    for k in range(60, len(given)):
+        values = {c: v if c == "spindle_rpm" else changed(v) for c, v in given[k].values.items()}
+        given[k] = replace(given[k], values=values)
+    done = run(machine, given[:200])
+    assert done[59].state["z"] == "active" and {c.state["z"] for c in done[90:]} == {"off"}
+    assert done[-1].state["z"] == "off" and "replaced for more than" in done[-1].reasons["z"]
+    steps = np.abs(np.diff([c.offset_um["z"] for c in done]))
+    assert steps.max() <= 0.05 * left.step_s + 1e-9
+    machine.confirm()
+    assert run(machine, given[200:])[-1].state["z"] == confirmed  # in °F two are outside their range
+
+
 def test_channels_that_were_never_seen_are_named() -> None:
     *train, left = make_toy_batches(8, 20)
     machine = Compensator("toy", [model_of(train)], period_s=left.step_s)
