@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from compensation import serving
+from compensation import safety, serving
 from compensation.contracts import Correction, Sample
 from compensation.runtime import AxisModel, Compensator
-from compensation.safety import Limits
+from compensation.safety import Axis, Limits
 from compensation.serving import StateFile, serve
 from tests.compensation.test_runtime import model_of, samples
 from tests.conftest import make_toy_batches
@@ -172,3 +173,42 @@ def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, li
     (tmp_path / "state.sent").mkdir()
     serve(compensator(model), Given(*rows[:10]), [Broken(), good], state, replay=True, log=said.append)
     assert len(good.got) == 10 and sum("no route" in line for line in said) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_computer_and_broker_die_fifty_times_and_nothing_jumps_at_the_receiver(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, seed: int
+) -> None:
+    """The receiver is the state machine that exports lower; a heartbeat that stands still is silence."""
+    model, rows = toy
+    rng, limits = np.random.default_rng(seed), replace(LIMITS, hold_s=30.0, stale_s=10.0)
+    sender = replace(model, limits=replace(LIMITS, stale_s=600.0))
+    state = StateFile(tmp_path / f"{seed}.json")
+    machine: Compensator | None = None
+    receiver, beat, sent_um, deaths = Axis(), -1, [0.0], 0
+    broker_until_s = computer_until_s = -1.0
+    for clock_s in range(int(rows[-1].time_s - rows[0].time_s)):
+        if rng.random() < 1 / 200:
+            broker_until_s = clock_s + rng.integers(1, 200)
+            deaths += 1
+        if rng.random() < 1 / 200:  # dies between two corrections, or between what is written ahead and what is sent
+            machine, computer_until_s = None, clock_s + rng.integers(1, 200)
+            deaths += 1
+        answer = None
+        if clock_s >= computer_until_s and clock_s % 10 == 0:
+            line = serving._Line(machine or compensator(sender), [], state, lambda line: None, lambda c: None)
+            if machine is None:
+                line.restore()
+            machine = line.machine
+            k = int(clock_s // (rows[1].time_s - rows[0].time_s))
+            answer = line.answer(replace(rows[k], time_s=rows[0].time_s + clock_s), float(clock_s))
+            line.save(float(clock_s), 30.0)
+        arrives = answer is not None and clock_s >= broker_until_s and answer.heartbeat != beat
+        if answer is not None and arrives:
+            beat = answer.heartbeat
+            receiver, now_um, _ = safety.step(receiver, limits, clock_s, clock_s, answer.offset_um["z"])
+        else:
+            receiver, now_um, _ = safety.silence(receiver, limits, clock_s)
+        sent_um.append(now_um)
+    assert deaths >= 50 and max(map(abs, sent_um)) > 1.0
+    assert np.abs(np.diff(sent_um)).max() <= limits.rate_um_per_s * 1.0 + 1e-9
