@@ -70,6 +70,7 @@ class _Link:
         self.connected = threading.Event()
         self._on_connected = on_connected
         self.problem = "not connected yet"
+        self.refused = ""  # by the broker, before any connection: nothing will change by itself
         self.client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=True)
         self.client.reconnect_delay_set(1, 5)
         # no limit of its own: paho counts messages that `drop_out_messages` dropped as in flight for ever
@@ -104,8 +105,11 @@ class _Link:
         self, client: Client, userdata: Any, flags: ConnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
         if reason.is_failure:
-            self._lost(f"refused by the broker ({reason}); check {SECRETS}_USER and {SECRETS}_PASSWORD")
+            why = f"refused by the broker ({reason}); check {SECRETS}_USER and {SECRETS}_PASSWORD"
+            self.refused = why if self.problem == "not connected yet" else self.refused
+            self._lost(why)
             return
+        self.refused = ""
         client.drop_out_messages()  # corrections of before the loss are out of date
         if self.problem and self.problem != "not connected yet":
             warn(f"{self.where}: connected again")
@@ -223,9 +227,15 @@ class MqttSource:
         return Sample(time.time(), values, readings) if values or readings else None
 
     def samples(self) -> Iterator[Sample | None]:
-        """Samples as they arrive, None in silence; ends after `close`."""
+        """Samples as they arrive, None in silence; ends after `close`.
+
+        Raises:
+            InputError: the broker refuses the first connection.
+        """
         quiet_from_s = time.monotonic()
         while not self._inbox.closed:
+            if self._link.refused:
+                raise InputError(f"{self._link.where}: {self._link.refused}")
             for sample in (self._inbox.get(_POLL_S), self._collected()):
                 if sample is not None and not self._inbox.closed:
                     yield sample
@@ -249,11 +259,12 @@ class MqttSink:
     | `PREFIX/correction/AXIS/offset_um` | a number, µm | no |
     | `PREFIX/correction/AXIS/slope_um_per_m` | a number, µm/m; only axes with a slope | no |
     | `PREFIX/correction/AXIS/state` | `off`, `warm-up`, `active`, `hold` or `fade-out` | no |
+    | `PREFIX/heartbeat` | a counter of the corrections: while it stands still, a receiver holds | no |
     | `PREFIX/state` | the state with most authority among the axes; `off` also when the compensator is lost | yes |
 
     All with QoS 1. Plain numbers are not retained, as they carry no time. The broker itself publishes `off` on
-    `PREFIX/state` when it hears nothing from the sink for 7.5 s (last will), and `close` does the same; a control acts
-    on a correction only while that state is not `off`. The sink connects again by itself. It never queues: what cannot
+    `PREFIX/state` when it hears nothing from the sink for 7.5 s (last will), and `close` does the same; that is no order to
+    send 0, but says that nobody sends. The sink connects again by itself. It never queues: what cannot
     be delivered at once is dropped, since a late correction is a wrong one.
 
     Raises:
@@ -286,6 +297,7 @@ class MqttSink:
             messages.append((f"{root}/{_level(axis)}/slope_um_per_m", repr(float(slope)), False))
         for axis, state in correction.state.items():
             messages.append((f"{root}/{_level(axis)}/state", state, False))
+        messages.append((f"{link.prefix}/heartbeat", str(correction.heartbeat), False))
         messages.append((root, json.dumps(correction_record(correction), ensure_ascii=False), True))
         messages.append((self._state_topic, overall_state(correction), True))
         try:

@@ -232,7 +232,10 @@ def test_a_correction_arrives_as_json_and_as_plain_numbers(broker: Broker, contr
     sink.write(CORRECTION)
     eventually(lambda: control.got.get("state") == "active", "no state")
     record = {"time_s": 100.5, "offset_um": {"z": -12.25}, "slope_um_per_m": {"z": 3.5}, "state": {"z": "active"}}
-    assert json.loads(control.got["correction"]) == {**record, "reasons": {}}
+    assert json.loads(control.got["correction"]) == {
+        **record, "reasons": {}, "heartbeat": 0, "valid_until_s": 0.0,
+    }  # fmt: skip
+    assert control.got["heartbeat"] == "0"
     assert float(control.got["correction/z/offset_um"]) == -12.25
     assert float(control.got["correction/z/slope_um_per_m"]) == 3.5
     assert control.got["correction/z/state"] == "active"
@@ -349,6 +352,11 @@ def test_user_and_password_come_from_the_environment(
     with pytest.raises(WorkError, match=r"refused by the broker .*THERMODRIFT_MQTT_USER"):
         refused.write(CORRECTION)
     refused.close()
+    source = open_source(broker.address, machine)
+    with pytest.raises(InputError, match=r"refused by the broker .*THERMODRIFT_MQTT_USER"):  # it does not run for ever
+        for _ in source.samples():
+            pass
+    source.close()
     monkeypatch.setenv("THERMODRIFT_MQTT_PASSWORD", "secret")
     with pytest.raises(InputError, match="THERMODRIFT_MQTT_USER is not"):
         open_sink(broker.address, machine)
