@@ -43,6 +43,7 @@ class Policy:
 
     # Refined twins and their covariance
     refined_twins: int = cost(100, "draws", "directions of structure; half as many about the first calibration")
+    drawn_max_sd: float = convention(3.0, "sd of the prior", "a value farther out is none of this machine")
     drawn_value_log_sd: float = physical(0.2, "log", "effective values of lumps scatter as much")
     drawn_exponent_log_sd: float = physical(0.25, "log", "heat grows with speed by other powers than a law states")
     drawn_cells: tuple[int, int] = physical((3, 8), "cells", "of a body that is cut into a chain")

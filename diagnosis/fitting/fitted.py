@@ -120,7 +120,9 @@ def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float]
 
 
 def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[str, int, int], None]) -> list[Array]:
-    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes."""
+    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes; about values that a machine may have,
+    which those of a fit that lacks an effect need not be."""
+    at = replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd))
     drawn = misfits(
         at.machine, at.part, at.batches, at.problem, at.values, draws, rng, lambda n, of: tell("refined twins", n, of)
     )
