@@ -264,8 +264,8 @@ class MqttSink:
 
     All with QoS 1. Plain numbers are not retained, as they carry no time. The broker itself publishes `off` on
     `PREFIX/state` when it hears nothing from the sink for 7.5 s (last will), and `close` does the same; that is no
-    order to send 0, but says that nobody sends. The sink connects again by itself. It never queues: what cannot be delivered
-    at once is dropped, since a late correction is a wrong one.
+    order to send 0, but says that nobody sends. The sink connects again by itself. It never queues: what cannot be
+    delivered at once is dropped, since a late correction is a wrong one.
 
     Raises:
         InputError: an unusable address or certificate.
