@@ -66,8 +66,8 @@ def _account(d: Diagnosis, pictures: bool) -> Part | None:
     account = d.findings.account
     if not account:
         return None
-    table = account_table(account, d.simulated)
-    return Part("used", "Recordings used", "What of the recordings was used", f"{account['summary']}.".capitalize(),
+    table, said = account_table(account, d.simulated), str(account["summary"])
+    return Part("used", "Recordings used", "What of the recordings was used", f"{said[:1].upper()}{said[1:]}.",
                 folded=(table,) if table else ())  # fmt: skip
 
 

@@ -243,3 +243,14 @@ def test_the_runs_of_every_channel_are_in_a_table() -> None:
     assert [(c.title, c.unit) for c in table.columns] == [("run", ""), ("z", "µm"), ("bed", "K")]
     alone = diagnosis_tables.runs(rms[rms["batch"] == BATCHES[0]], ["z"], False, True)
     assert alone.rows[0].cells == (BATCHES[0], f"{first['after']:.1f}")
+
+
+def test_the_page_names_rows_and_values_that_are_not_used() -> None:
+    lost = {"batch_id": "b1", "channel": "T_C", "check": "held_values", "state": "masked", "rows": 12, "share": 0.125,
+            "start_s": 3600.0, "end_s": 7200.0}  # fmt: skip
+    account = {"summary": "rows: 96 read, 3 dropped; 12 values masked: T_C 12 (held_values)", "lost": [lost]}
+    page = diagnosis_page(changed(toy_diagnosis("explained"), account=account), pictures=False)
+    (part,) = [p for p in page.parts if p.anchor == "used"]
+    assert part.lead == "Rows: 96 read, 3 dropped; 12 values masked: T_C 12 (held_values)."
+    (row,) = part.folded[0].rows
+    assert list(row.cells) == ["b1", "T_C", "held values", "masked", "12", "12", "1.00 to 2.00"]
