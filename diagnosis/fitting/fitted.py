@@ -120,14 +120,30 @@ def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float]
 
 
 def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[str, int, int], None]) -> list[Array]:
-    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes; about values that a machine may have,
-    which those of a fit that lacks an effect need not be."""
-    at = replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd))
-    drawn = misfits(
-        at.machine, at.part, at.batches, at.problem, at.values, draws, rng, lambda n, of: tell("refined twins", n, of)
-    )
-    blocks = list(at.problem.linearise(at.x, at.nuisance))
-    return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
+    """Misfits of refined twins (n_b, draws) beyond what a recalibration takes.
+
+    A fit that lacks an effect can have values that no machine has, about which few twins can be simulated: they are
+    drawn about the nearest ones within `drawn_max_sd` then.
+    """
+
+    def about(at: Point) -> list[Array]:
+        drawn = misfits(
+            at.machine,
+            at.part,
+            at.batches,
+            at.problem,
+            at.values,
+            draws,
+            rng,
+            lambda n, of: tell("refined twins", n, of),
+        )
+        blocks = list(at.problem.linearise(at.x, at.nuisance))
+        return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
+
+    try:
+        return about(at)
+    except WorkError:
+        return about(replace(at, z=np.clip(at.z, -POLICY.drawn_max_sd, POLICY.drawn_max_sd)))
 
 
 def _likeliest(at: Point, structure: Structure, shares: Sequence[float], factor: Array) -> Covariance:

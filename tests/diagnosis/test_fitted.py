@@ -87,11 +87,12 @@ def test_a_better_part_leaves_less_noise() -> None:
     assert (after.rows == before.rows).all() and after.rows.sum() == sum(map(len, after.columns))
 
 
-def test_full_derivatives_end_no_lower_than_a_chord_and_where_they_are_again() -> None:
+def test_a_chord_ends_where_full_derivatives_do() -> None:
     rough = refitted(cold_floor(), with_floor(cold_floor().part))
     fine = relinearised(rough)
     assert fine.log_evidence > rough.log_evidence - 0.5
-    assert relinearised(fine).log_evidence == pytest.approx(fine.log_evidence, abs=0.5)
+    again = relinearised(fine)
+    assert np.abs(again.z - fine.z).max() < 0.1
 
 
 def test_left_out_batches_are_predicted_as_by_fits_without_them() -> None:
