@@ -157,6 +157,7 @@ class Compensator:
         self.rejected = 0
         self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)  # between samples, on the monotonic clock
         self._last_clock_s: float | None = None
+        self._limits = {a.axis: a.limits for a in axes}
         self._heartbeat = 0
 
     def _fresh(self, a: AxisModel, was: _Running | None = None) -> _Running:
@@ -187,6 +188,7 @@ class Compensator:
             return self.silence(clock_s, sample.time_s)
         if self._last_clock_s is not None and clock_s > self._last_clock_s:
             self._intervals_s.append(clock_s - self._last_clock_s)
+            self._limits = self._limits_now()
         self._last_clock_s = clock_s
         fault, notes = self._advance(sample)
         for axis, measured_um in sample.readings_um.items():
@@ -198,25 +200,27 @@ class Compensator:
         return self._sent(
             sample.time_s,
             lambda a, was, k: safety.step(
-                was, self._limits(a), clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
+                was, self._limits[a.axis], clock_s, sample.time_s, wanted[a.axis][k], self._run[a.axis].trust, fault
             ),
             notes,
         )
 
     def silence(self, clock_s: float, time_s: float) -> Correction:
         """The correction while nothing arrives; `time_s` is stamped on it."""
-        return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits(a), clock_s))
+        return self._sent(time_s, lambda a, was, k: safety.silence(was, self._limits[a.axis], clock_s))
 
     def fault(self, clock_s: float, time_s: float, why: str) -> Correction:
         """The correction where nothing else can be computed: every axis holds what it has, and fades after hold_s."""
-        return self._sent(time_s, lambda a, was, k: safety.step(was, self._limits(a), clock_s, time_s, 0.0, 1.0, why))
+        return self._sent(
+            time_s, lambda a, was, k: safety.step(was, self._limits[a.axis], clock_s, time_s, 0.0, 1.0, why)
+        )
 
-    def _limits(self, a: AxisModel) -> Limits:
-        """The axis' limits; input is stale after a few of the stream's own intervals where that is sooner."""
+    def _limits_now(self) -> dict[str, Limits]:
+        """The axes' limits; input is stale after a few of the stream's own intervals where that is sooner."""
         if len(self._intervals_s) < _INTERVALS:
-            return a.limits
+            return self._limits
         own_s = max(_LOST_SAMPLES * float(np.median(self._intervals_s)), Limits.stale_s)
-        return replace(a.limits, stale_s=own_s) if own_s < a.limits.stale_s else a.limits
+        return {a.axis: replace(a.limits, stale_s=own_s) if own_s < a.limits.stale_s else a.limits for a in self.axes}
 
     def stop(self) -> None:
         """The operator stops: every axis fades out."""
@@ -245,7 +249,7 @@ class Compensator:
             why = run.why if notes is not None else ""
             reasons[a.axis] = "; ".join(r for r in (reason, why, notes, a.remark) if r)
         self._heartbeat += 1
-        until_s = time_s + min(self._limits(a).stale_s for a in self.axes)
+        until_s = time_s + min(self._limits[a.axis].stale_s for a in self.axes)
         return Correction(time_s, offset, slope, state, reasons, self._heartbeat, until_s)
 
     def _check_clock(self, time_s: float) -> None:
@@ -360,7 +364,7 @@ class Compensator:
 
     def as_plain(self) -> dict[str, Any]:
         """Everything that a restart needs, numbers, strings and lists."""
-        axes = {}
+        axes, sent = {}, self.sent()
         for name, run in self._run.items():
             learned = run.learned and {
                 "mean": run.learned.mean.tolist(), "cov": run.learned.cov.tolist(), "time_s": run.learned.time_s,
@@ -368,7 +372,7 @@ class Compensator:
             }  # fmt: skip
             axes[name] = {
                 "model": run.model.as_plain(), "region": run.region.as_plain(), "learned": learned,
-                "safety": run.safety.as_plain(), "slope_safety": run.slope_safety.as_plain(),
+                **sent[name],
                 "error_um": _or_none(run.error_um),
                 "free_um": _or_none(run.free_um), "scaled": [_or_none(v) for v in run.scaled.tolist()],
                 "slope_um_per_mm": _or_none(run.slope_um_per_mm), "trust": run.trust, "at_s": run.at_s,

@@ -129,7 +129,7 @@ class _Line:
                 self.log(f"goes on from {self.state.path}")
             except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
                 self.state.set_aside(self.state.path, f"cannot be used ({error})", self.log)
-                known.setdefault("sent", _sent_in(known["state"]))
+                known.setdefault("sent", known["state"].get("axes", {}))  # it holds `Compensator.sent` among others
         if "sent" in known:
             try:
                 self.machine.restore_sent(known["sent"])
@@ -156,9 +156,9 @@ class _Line:
         return correction
 
     def _write_ahead(self) -> None:
-        if self.state is not None and (sent := self.machine.sent()) != self._sent:
+        sent = self.machine.sent() if self.state is not None else self._sent
+        if sent != self._sent and self._kept(lambda state: state.send(sent)):
             self._sent = sent
-            self._kept(lambda state: state.send(sent))
 
     def save(self, clock_s: float, least_s: float = 0.0) -> None:
         """Saves the state, if so much time has passed since it was."""
@@ -166,23 +166,22 @@ class _Line:
             self._saved_s = clock_s
             self._kept(lambda state: state.save(self.machine.as_plain()))
 
-    def _kept(self, write: Callable[[StateFile], None]) -> None:
+    def _kept(self, write: Callable[[StateFile], None]) -> bool:
+        """Whether it could be written."""
         assert self.state is not None
         try:
             write(self.state)
-            self._failing.pop("state", None)
         except Exception as error:  # a full disk does not end the compensation
             self._fails("state", str(error))
+            return False
+        self._failing.pop("state", None)
+        return True
 
     def _fails(self, what: str, why: str) -> None:
         """One line for an unbroken row of failures."""
         if what not in self._failing:
             self.log(why)
         self._failing[what] = why
-
-
-def _sent_in(state: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: {k: one[k] for k in ("safety", "slope_safety")} for name, one in state.get("axes", {}).items()}
 
 
 def serve(
@@ -233,7 +232,7 @@ def serve(
 
 def _fade(line: _Line, fade_s: float | None, log: Callable[[str], None]) -> None:
     """Lets what is sent fade to 0; this is no stop by the operator, so that a restart begins with warm-up."""
-    log("asked to end: what is sent fades to 0 first; ask again to end at once")
+    log("signal to end: what is sent fades to 0 first; a second one ends at once")
     until_s = None if fade_s is None else time.monotonic() + fade_s
     line.machine.stop()
     try:
@@ -243,6 +242,6 @@ def _fade(line: _Line, fade_s: float | None, log: Callable[[str], None]) -> None
                 return
             time.sleep(_FADE_STEP_S)
     except KeyboardInterrupt:
-        log("asked again: ends with what was sent last")
+        log("second signal: ends with what was sent last")
     finally:
         line.machine.start()

@@ -33,6 +33,11 @@ class Channel:
     high: float | None = None
     position: str = ""
 
+    @property
+    def plausible(self) -> tuple[float, float]:
+        """Least and greatest plausible value, ±inf where an end is not known."""
+        return (-np.inf if self.low is None else self.low), (np.inf if self.high is None else self.high)
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -40,7 +40,6 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     """
     channels = stored.machine.batch_channels()
     family = stored.family
-    error = channels[family.target]
     empty = Batch(stored.machine.machine, "no rows", pd.DataFrame({"time_s": []}), channels)
     program = family.program(channels, period_s)
     ends_mm = stored.machine.channels[program.along].range if program.along else None
@@ -48,7 +47,7 @@ def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisMode
     return AxisModel(
         family.target, program, family.inputs, tuple(feature_unit(empty, i) for i in family.inputs), stored.region,
         stored.region.program(channels, period_s), stored.bound, stored.updater, limits, lever_mm, stored.authority,
-        stored.remark, (-math.inf if error.low is None else error.low, math.inf if error.high is None else error.high),
+        stored.remark, channels[family.target].plausible,
     )  # fmt: skip
 
 
@@ -177,10 +176,6 @@ def rehearse_models(
         return rehearse(batches, axes, exchange, sample_s, failing, reads, done)
 
 
-def _or(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
-
-
 def write_export(
     models: Mapping[str, Path],
     to: str,
@@ -227,7 +222,7 @@ def export_of(models: Mapping[str, StoredModel], folders: Mapping[str, Path], li
         program = made.program if made.share == 1.0 else made.program.scaled(made.share)
         remark = made.remark + ("; its outputs are that share" if made.share < 1.0 else "")
         channels = stored.machine.batch_channels()
-        plausible = {c: (_or(channels[c].low, -math.inf), _or(channels[c].high, math.inf)) for c in program.channels}
+        plausible = {c: channels[c].plausible for c in program.channels}
         trust = trust_program(made, channels)
         axes.append(ExportedAxis(made.axis, program, trained, made.limits, remark, plausible, trust))
     first = next(iter(models.values()))

@@ -119,3 +119,8 @@ def listed(names: Sequence[str], most: int = 12, last: str = "and") -> str:
     """``a, b and c``; a long list is cut and counted."""
     shown = list(names) if len(names) <= most else [*names[:most], f"{len(names) - most} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} {last} {shown[-1]}" if shown else ""
+
+
+def sentence(text: str) -> str:
+    """The text with a capital at its head and a full stop; nothing for nothing."""
+    return f"{text[:1].upper()}{text[1:]}." if text else ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 from threadpoolctl import threadpool_limits
@@ -80,8 +80,9 @@ def decided(done: Round, vetoed: bool = True) -> Round:
     first = sorted(settled, key=lambda t: (not _resolves(t, strange), -t.standing))
     done = replace(done, tried=(*first, *(t for t in done.tried if t not in likely)))
     judged: list[Round] = []
+    may = odds_of(done.before, done.screen) if first else {}
     for t in first[: POLICY.claims_judged]:
-        judged.append(_judged(done, t, strange, vetoed))
+        judged.append(_judged(done, t, may, strange, vetoed))
         if judged[-1].accepted:
             return judged[-1]
     return judged[0] if judged else done
@@ -105,14 +106,15 @@ def _resolves(t: Tried, before: frozenset[str]) -> frozenset[str]:
     return before - {i.channel for i in impossible(t.fitted)} if before else frozenset()
 
 
-def _judged(done: Round, t: Tried, impossible_now: frozenset[str], vetoed: bool) -> Round:
+def _judged(done: Round, t: Tried, may: Collection[str], impossible_now: frozenset[str], vetoed: bool) -> Round:
     """The round with `t` as its claim: probable enough, and no channel predicted worse.
 
     What structure alone gains is asked of the machine with the claim: without it, what it explains is in every twin.
+    `may`: names of the candidates that may be claimed.
     """
     rest = [o for o in done.tried if o is not t]
     seen = screen(t.fitted, [s.candidate for s in done.screen.scored], done.screen)
-    done = replace(done, null=seen.null_gains(odds_of(done.before, done.screen)))
+    done = replace(done, null=seen.null_gains(may))
     own = features(t, done.threshold)
     resolved = _resolves(t, impossible_now)
     probable = POLICY.max_probability if resolved else trust(own)

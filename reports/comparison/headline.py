@@ -13,7 +13,7 @@ from models.promotion import Choice
 from models.result import GridResult, Training
 from reports.comparison.story import Verdict
 from reports.comparison.tables import group_order
-from reports.labels import NOTHING, cell_label, count, number, percent, plus_minus
+from reports.labels import NOTHING, cell_label, count, number, percent, plus_minus, sentence
 from reports.layout import Column, Row, Table
 
 _GROUPS = {"season": "leave-season-out", "speed": "leave-speed-out"}
@@ -53,7 +53,7 @@ def headline(name: str, training: Training, choice: Choice, verdict: Verdict, di
     return Headline(
         tuple(f for f in figures if not f[1].startswith(NOTHING)),
         _rests_on(result, choice, expected),
-        _sentence(expected.warning),
+        sentence(expected.warning),
         verdict.caution,
         _groups(name, result, choice, expected, digits),
     )
@@ -98,7 +98,7 @@ def _rests_on(result: GridResult, choice: Choice, expected: Outlook) -> str:
     model = model[:1].upper() + model[1:]
     s = result.scores
     if expected.protocol != "forward":
-        return f"{model}. {_sentence(expected.note)}"
+        return f"{model}. {sentence(expected.note)}"
     blocks = s.loc[s["protocol"] == "forward", "fold"].nunique()
     return f"{model}. Each of {count(blocks, 'block')} of later runs is predicted by a model of all runs before it."
 
@@ -149,7 +149,3 @@ def _means(scores: pd.DataFrame, protocol: str, label: pd.Series) -> pd.Series:
 def _no_model_um(result: GridResult, protocol: str) -> float:
     zero = _of_cell(result, "none", "zero", 0)
     return float(zero.loc[zero["protocol"] == protocol, "S_um"].mean())
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}." if text else ""

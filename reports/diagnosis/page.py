@@ -9,7 +9,6 @@ from pathlib import Path
 from data.units import unit_label
 from diagnosis.findings.schema import Finding
 from diagnosis.result import Diagnosis
-from reports.account import account_table
 from reports.diagnosis import figures as evidence
 from reports.diagnosis import tables
 from reports.diagnosis.figures import before_after, by_run, left_out_batches
@@ -17,7 +16,7 @@ from reports.diagnosis.first_screen import Continued, Unsealed, limits_sentence,
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, telling
 from reports.drawing import Picture, picture
-from reports.labels import number
+from reports.labels import number, sentence
 from reports.layout import Table
 from reports.rendering import write_page
 from twin.compile import compile_network, expanded
@@ -66,9 +65,9 @@ def _account(d: Diagnosis, pictures: bool) -> Part | None:
     account = d.findings.account
     if not account:
         return None
-    table, said = account_table(account, d.simulated), str(account["summary"])
-    return Part("used", "Recordings used", "What of the recordings was used", f"{said[:1].upper()}{said[1:]}.",
-                folded=(table,) if table else ())  # fmt: skip
+    table = tables.account_table(account, d.simulated)
+    title, lead = "What of the recordings was used", sentence(account["summary"])
+    return Part("used", "Recordings used", title, lead, folded=(table,) if table else ())
 
 
 def _where(d: Diagnosis, pictures: bool) -> Part | None:

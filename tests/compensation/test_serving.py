@@ -131,6 +131,17 @@ def test_a_state_of_other_axes_is_set_aside_too(toy: tuple[AxisModel, list[Sampl
     assert "cannot be used" in said[0] and abs(sink.sent_um[0] - 7.0) <= 1.0
 
 
+@pytest.mark.parametrize("axes", [{"z": {}}, {"z": None}, [], None, {"z": {"safety": {}, "slope_safety": {}}}])
+def test_a_state_that_lacks_what_was_sent_ends_nothing(
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, axes: object
+) -> None:
+    model, rows = toy
+    state, said, sink = StateFile(tmp_path / "state.json"), list[str](), Kept()
+    state.save({"schema": "another", "axes": axes})
+    serve(compensator(model), Given(*rows[:5]), [sink], state, replay=True, log=said.append)
+    assert len(sink.got) == 5 and "cannot be used" in said[0]
+
+
 def test_a_stop_fades_before_it_ends_and_a_restart_begins_with_warm_up(
     toy: tuple[AxisModel, list[Sample]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,7 +153,7 @@ def test_a_stop_fades_before_it_ends_and_a_restart_begins_with_warm_up(
     serve(compensator(fast), Given(*rows[:40], stop, *rows[40:]), [sink], state, said.append)
     assert max(map(abs, sink.sent_um)) > 1.0 and sink.sent_um[-1] == 0.0 and sink.got[-1].state["z"] == "off"
     assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 0.5 + 1e-9
-    assert any("asked to end" in line for line in said)
+    assert any("signal to end" in line for line in said)
     again = compensator(fast)
     again.restore(state.load()["state"])
     assert not any(one["safety"]["stopped"] for one in again.sent().values())
@@ -159,7 +170,7 @@ def test_a_second_signal_ends_at_once(
     sink, said = Kept(), list[str]()
     stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
     serve(compensator(slow), Given(*rows[:40], stop, *rows[40:]), [sink], None, said.append)
-    assert sink.sent_um[-1] != 0.0 and any("asked again" in line for line in said)
+    assert sink.sent_um[-1] != 0.0 and any("second signal" in line for line in said)
 
 
 def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
