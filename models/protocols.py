@@ -116,10 +116,11 @@ def placed(batches: Sequence[Batch], order: Literal["name"] | Sequence[str | int
     """
     if order is None:
         return list(batches)
-    ids = [str(i) for i in order]
     if order == "name":
         parts = {b.batch_id: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", b.batch_id)] for b in batches}
         ids = sorted(parts, key=lambda batch_id: parts[batch_id])
+    else:
+        ids = [str(i) for i in order]
     for b in batches:
         if ids.count(b.batch_id) != 1:
             what = "repeats" if b.batch_id in ids else "lacks"

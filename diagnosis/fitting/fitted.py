@@ -126,17 +126,11 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
     drawn about the nearest ones within `drawn_max_sd` then.
     """
 
+    def progress(n: int, of: int) -> None:
+        tell("refined twins", n, of)
+
     def about(at: Point) -> list[Array]:
-        drawn = misfits(
-            at.machine,
-            at.part,
-            at.batches,
-            at.problem,
-            at.values,
-            draws,
-            rng,
-            lambda n, of: tell("refined twins", n, of),
-        )
+        drawn = misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, rng, progress)
         blocks = list(at.problem.linearise(at.x, at.nuisance))
         return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
 
@@ -388,7 +382,7 @@ def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[flo
     raised = worsened(left_out_rows(before), left_out_rows(after))
     if not raised:
         return after, {}
-    weight, still = (plain(after).noise.factor / plain(before).noise.factor) ** 2, raised
+    weight = (plain(after).noise.factor / plain(before).noise.factor) ** 2
     for _ in range(POLICY.weight_rounds):
         fair = replace(after, weight=tuple(weight.tolist()))
         still = worsened(left_out_rows(before), left_out_rows(fair))
