@@ -197,32 +197,43 @@ def serve(
 ) -> None:
     """Answers samples until the source ends or a signal asks for the end; the state file keeps what was sent last.
 
-    A sink that fails is reported once and tried again with the next correction: the machine holds what it has. The
-    first SIGINT or SIGTERM lets what is sent fade to 0 within the limits before the sinks are closed.
+    A sink that fails is reported once and tried again with the next correction: the machine holds what it has. Where
+    the source ends or fails once it has given samples, and at the first SIGINT or SIGTERM, what is sent fades to 0
+    within the limits before the sinks are closed; the failure is raised then.
 
     Args:
-        replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests.
+        replay: time is that of the samples instead of the computer's, as for recordings and accelerated tests; the end
+            of a recording is no end of a machine, and nothing fades.
         seen: called with every correction.
         fade_s: longest time that a stop may fade, s; None: as long as the limits need.
         confirm: the operator confirms the sensors as they are, see `Compensator.confirm`.
     """
     line, stop, clock_s = _Line(machine, sinks, state, log, seen), _Stop(), 0.0
+    why, failed, begun = "signal to end", None, False
     try:
         with _signals(stop, not replay):
             line.restore()
             if confirm:
                 machine.confirm()
-            for sample in source.samples():
-                if stop.asked:
-                    break
-                if not replay:
-                    clock_s = time.monotonic()
-                elif sample is not None:
-                    clock_s = sample.time_s
-                line.answer(sample, clock_s)
-                line.save(clock_s, _SAVED_EVERY_S)
-            if stop.asked:
-                _fade(line, fade_s, log)
+            try:
+                for sample in source.samples():
+                    if stop.asked:
+                        break
+                    if not replay:
+                        clock_s = time.monotonic()
+                    elif sample is not None:
+                        clock_s = sample.time_s
+                    line.answer(sample, clock_s)
+                    line.save(clock_s, _SAVED_EVERY_S)
+                    begun = begun or sample is not None
+                else:
+                    why = "the input ends"
+            except Exception as error:
+                failed, why = error, f"the input fails ({error})"
+            if (begun or stop.asked) and not replay:
+                _fade(line, fade_s, f"{why}: what is sent fades to 0 first; a signal ends at once", stop, log)
+            if failed is not None:
+                raise failed
     finally:
         line.save(clock_s)
         source.close()
@@ -230,9 +241,10 @@ def serve(
             sink.close()
 
 
-def _fade(line: _Line, fade_s: float | None, log: Callable[[str], None]) -> None:
+def _fade(line: _Line, fade_s: float | None, why: str, stop: _Stop, log: Callable[[str], None]) -> None:
     """Lets what is sent fade to 0; this is no stop by the operator, so that a restart begins with warm-up."""
-    log("signal to end: what is sent fades to 0 first; a second one ends at once")
+    stop.asked = True  # the next signal ends at once
+    log(why)
     until_s = None if fade_s is None else time.monotonic() + fade_s
     line.machine.stop()
     try:
@@ -242,6 +254,6 @@ def _fade(line: _Line, fade_s: float | None, log: Callable[[str], None]) -> None
                 return
             time.sleep(_FADE_STEP_S)
     except KeyboardInterrupt:
-        log("second signal: ends with what was sent last")
+        log("signal: ends with what was sent last")
     finally:
         line.machine.start()

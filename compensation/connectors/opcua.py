@@ -39,6 +39,10 @@ _CONNECT_S = 10.0
 _FIRST_CONNECTION_S = 5.0  # that a new sink waits for its server, before the first write
 _LONGEST_DELAY_S = 5.0  # between two tries to connect
 _INTEGER_BITS = {"SByte": 7, "Byte": 8, "Int16": 15, "UInt16": 16, "Int32": 31, "UInt32": 32, "Int64": 63, "UInt64": 64}
+_NUMBER = ("Double", "Float")
+_TYPES = {  # of the nodes that are written, by the first word of their key; others are of type String
+    "offset": _NUMBER, "slope": _NUMBER, "valid_until_s": ("Double",), "heartbeat": tuple(_INTEGER_BITS)
+}  # fmt: skip
 
 # asyncua logs every lost connection with a traceback, which is reported here in one line
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
@@ -58,8 +62,19 @@ class Nodes(BaseModel):
     reasons: dict[str, str] = {}
     state: str | None = None
     heartbeat: str | None = None
+    valid_until_s: str | None = None
 
-    @field_validator("values", "readings", "offsets_um", "slopes_um_per_m", "states", "reasons", "state", "heartbeat")
+    @field_validator(
+        "values",
+        "readings",
+        "offsets_um",
+        "slopes_um_per_m",
+        "states",
+        "reasons",
+        "state",
+        "heartbeat",
+        "valid_until_s",
+    )
     @classmethod
     def _node_ids(cls, given: Any) -> Any:
         for node_id in given.values() if isinstance(given, dict) else [given] if given is not None else []:
@@ -294,6 +309,7 @@ class OpcUaSink:
           z: ns=2;s=Comp.Z.Reason
         state: ns=2;s=Comp.State   # String, the state with most authority among the axes
         heartbeat: ns=2;s=Comp.Beat  # any integer: counts the corrections, from 0 again after the largest
+        valid_until_s: ns=2;s=Comp.Until  # Double: Unix time after which the control holds what it has
 
     The sink writes all of them in one request, the heartbeat last; `close` writes the states `off`. OPC UA has no last
     will: a control takes the correction back when the heartbeat stands still. The sink connects again by itself. It
@@ -313,13 +329,11 @@ class OpcUaSink:
             **{f"slope {axis}": node for axis, node in nodes.slopes_um_per_m.items()},
             **{f"state {axis}": node for axis, node in nodes.states.items()},
             **{f"reason {axis}": node for axis, node in nodes.reasons.items()},
-            **({"state": nodes.state} if nodes.state else {}),
-            **({"heartbeat": nodes.heartbeat} if nodes.heartbeat else {}),
+            **{key: node for key in ("state", "valid_until_s", "heartbeat") if (node := getattr(nodes, key))},
         }
         self._client: Client | None = None
         self._node_ids: dict[str, ua.NodeId] = {}
         self._types: dict[str, ua.VariantType] = {}
-        self._beat = 0
         self._axes = Reports()
         self._link.start()
         self._link.settled.wait(_FIRST_CONNECTION_S)
@@ -339,8 +353,7 @@ class OpcUaSink:
                 kind = await client.get_node(node_id).read_data_type_as_variant_type()
             except ua.UaStatusCodeError as error:
                 raise ConnectionError(f"node {node_id.to_string()} of {key}: {error}; correct the node file") from None
-            expected: tuple[str, ...] = ("Double", "Float") if key.startswith(("offset", "slope")) else ("String",)
-            expected = tuple(_INTEGER_BITS) if key == "heartbeat" else expected
+            expected = _TYPES.get(key.partition(" ")[0], ("String",))
             if kind.name not in expected:
                 raise ConnectionError(
                     f"node {node_id.to_string()} of {key}: got the type {kind.name}, expected {' or '.join(expected)}; "
@@ -371,10 +384,10 @@ class OpcUaSink:
             **{f"state {axis}": v for axis, v in correction.state.items()},
             **{f"reason {axis}": v for axis, v in correction.reasons.items()},
             "state": overall_state(correction),
+            "valid_until_s": correction.valid_until_s,
         }
         if "heartbeat" in self._wanted:
-            given["heartbeat"] = self._beat
-            self._beat = (self._beat + 1) % 2 ** _INTEGER_BITS[self._types["heartbeat"].name]
+            given["heartbeat"] = correction.heartbeat % 2 ** _INTEGER_BITS[self._types["heartbeat"].name]
         self._send(given)
 
     def _send(self, given: Mapping[str, Any]) -> None:

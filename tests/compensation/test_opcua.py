@@ -9,6 +9,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ states: {{z: ns=2;s=StateZ}}
 reasons: {{z: ns=2;s=ReasonZ}}
 state: ns=2;s=State
 heartbeat: ns=2;s=Beat
+valid_until_s: ns=2;s=Until
 """
 CORRECTION = Correction(
     100.5, {"z": -12.25, "x": 0.5}, {"z": 3.5}, {"z": "active", "x": "hold"}, {"z": "provisional model"}
@@ -69,6 +71,7 @@ async def _serve(port: int, pipe: Any) -> None:
         "ReasonZ": ("", ua.VariantType.String),
         "State": ("", ua.VariantType.String),
         "Beat": (0, ua.VariantType.Byte),
+        "Until": (0.0, ua.VariantType.Double),
         "ReadOnly": (0.0, ua.VariantType.Double),
     }
     nodes = {}
@@ -190,9 +193,9 @@ def test_all_nodes_are_read_together(control: Control, machine: Machine, capsys:
 
 def test_a_correction_is_written_with_the_types_of_its_nodes(control: Control, machine: Machine) -> None:
     sink = open_sink(control.address, machine)
-    for beat in range(3):
-        sink.write(CORRECTION)
-        assert control.read("Beat") == beat
+    for beat in (0, 1, 255, 256, 257):
+        sink.write(replace(CORRECTION, heartbeat=beat, valid_until_s=1.7e9 + beat))
+        assert (control.read("Beat"), control.read("Until")) == (beat % 256, 1.7e9 + beat)
     assert (control.read("Offset"), control.read("OffsetX"), control.read("Slope")) == (-12.25, 0.5, 3.5)
     assert (control.read("StateZ"), control.read("State")) == ("active", "active")
     assert control.read("ReasonZ") == "provisional model"
@@ -201,15 +204,6 @@ def test_a_correction_is_written_with_the_types_of_its_nodes(control: Control, m
     assert (control.read("StateZ"), control.read("State")) == ("off", "off")
     with pytest.raises(WorkError, match="closed"):
         sink.write(CORRECTION)
-
-
-def test_the_heartbeat_begins_again_after_its_largest_value(control: Control, machine: Machine) -> None:
-    control.nodes.write_text("{offsets_um: {z: ns=2;s=Offset}, heartbeat: ns=2;s=Beat}")
-    sink = open_sink(control.address, machine)
-    for _ in range(257):
-        sink.write(CORRECTION)
-    assert control.read("Beat") == 0
-    sink.close()
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,18 +143,28 @@ def test_a_state_that_lacks_what_was_sent_ends_nothing(
     assert len(sink.got) == 5 and "cannot be used" in said[0]
 
 
+@pytest.mark.parametrize("ending", ["signal", "source ends", "source fails"])
 def test_a_stop_fades_before_it_ends_and_a_restart_begins_with_warm_up(
-    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    toy: tuple[AxisModel, list[Sample]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
 ) -> None:
     model, rows = toy
     fast = replace(model, limits=replace(LIMITS, rate_um_per_s=1e4, step_um=0.5))
     monkeypatch.setattr(serving, "_FADE_STEP_S", 0.001)
     state, sink, said = StateFile(tmp_path / "state.json"), Kept(), list[str]()
-    stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
-    serve(compensator(fast), Given(*rows[:40], stop, *rows[40:]), [sink], state, said.append)
+
+    def fail() -> None:
+        raise OSError("the cable is out")
+
+    end, why = {
+        "signal": ((lambda: os.kill(os.getpid(), signal.SIGTERM), *rows[40:]), "signal to end"),
+        "source ends": ((), "the input ends"),
+        "source fails": ((fail,), "the input fails (the cable is out)"),
+    }[ending]
+    with pytest.raises(OSError, match="cable") if ending == "source fails" else nullcontext():
+        serve(compensator(fast), Given(*rows[:40], *end), [sink], state, said.append)
     assert max(map(abs, sink.sent_um)) > 1.0 and sink.sent_um[-1] == 0.0 and sink.got[-1].state["z"] == "off"
     assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 0.5 + 1e-9
-    assert any("signal to end" in line for line in said)
+    assert any(why in line for line in said)
     again = compensator(fast)
     again.restore(state.load()["state"])
     assert not any(one["safety"]["stopped"] for one in again.sent().values())
@@ -170,7 +181,7 @@ def test_a_second_signal_ends_at_once(
     sink, said = Kept(), list[str]()
     stop = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
     serve(compensator(slow), Given(*rows[:40], stop, *rows[40:]), [sink], None, said.append)
-    assert sink.sent_um[-1] != 0.0 and any("second signal" in line for line in said)
+    assert sink.sent_um[-1] != 0.0 and any("signal: ends with" in line for line in said)
 
 
 def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, list[Sample]], tmp_path: Path) -> None:
