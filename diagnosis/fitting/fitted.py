@@ -85,13 +85,22 @@ def baseline(
     drawn = _structure(at, first, rng, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     tell("baseline", 2, 3)
-    at = _fitted(at, covariance, runs)
-    drawn = _structure(at, POLICY.refined_twins, rng, tell)
     tell("baseline", 3, 3)
+    return structured(_fitted(at, covariance, runs), runs, seed, tell)
+
+
+def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, int], None] = lambda *_: None) -> Fitted:
+    """The fit under the covariance of what refined twins about it show, with all effects that it holds.
+
+    Raises:
+        WorkError: no refined twin can be simulated.
+    """
+    problem, rng = at.problem, np.random.default_rng(seed)
+    drawn = _structure(at, POLICY.refined_twins, rng, tell)
     blocks = list(problem.linearise(at.x, at.nuisance))
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
-    return _learned(at, structure, runs, POLICY.alone_shares, np.ones(k))
+    return _learned(at, structure, runs, POLICY.alone_shares, np.ones(len(problem.channels)))
 
 
 def relearned(fitted: Fitted) -> Fitted:

@@ -93,13 +93,18 @@ def refits(
 
 
 def refit(now: Fitted, s: Scored) -> Fitted | None:
-    """A fit with one candidate more; None where it cannot be simulated."""
+    """A fit with one candidate more; None where it cannot be simulated.
+
+    All derivatives are taken anew where those of the fit before lead to less than the screen foretells: an effect moves
+    the values that stood in for it.
+    """
     if s.candidate.kind is CandidateKind.SENSOR_SWAP:  # the fit was bent towards the wrong labels
         right = refitted(now, s.candidate.applied(now.part), steps=0)
         return relinearised(replace(right, z=np.zeros(len(right.z))), POLICY.baseline_steps)
     for values, begin in starts(s, now):
         try:
-            return refitted(now, s.candidate.applied(now.part, values), begin)
+            fitted = refitted(now, s.candidate.applied(now.part, values), begin)
+            return fitted if fitted.log_evidence - now.log_evidence >= s.gain else relinearised(fitted)
         except (InputError, WorkError):
             continue
     return None

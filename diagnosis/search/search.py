@@ -11,7 +11,7 @@ from data.errors import InputError, WorkError
 from data.processes import Processes
 from diagnosis.candidates.free_forms import Form, candidate_of, free_forms
 from diagnosis.contracts import Candidate, Fitted, Tried, with_parts
-from diagnosis.fitting.fitted import left_out_rows, refitted, relearned, unharmed, worsened
+from diagnosis.fitting.fitted import left_out_rows, refitted, relearned, structured, unharmed, worsened
 from diagnosis.localisation.balance import impossible
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
@@ -50,8 +50,17 @@ def search(baseline: Fitted, workers: Processes | None = None, progress: Progres
         if not done.accepted or done.best is None:
             now = done.before
             break
-        now = done.best.fitted
+        now = _again(done.best.fitted)
     return _without_needless(Search(baseline, now, tuple(rounds)))
+
+
+def _again(fitted: Fitted) -> Fitted:
+    """The fit with an effect more, under the covariance of refined twins that have it too: a law of the list is as
+    coarse as a body, and what it leaves is no further effect."""
+    try:
+        return replace(structured(fitted, fitted.runs), weight=fitted.weight)
+    except WorkError:
+        return fitted  # no refined twin can be simulated there: under what those of before show
 
 
 def one_round(
