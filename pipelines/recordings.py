@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from data.batch import Batch, Channel
-from data.checks import check_machine
+from data.checks import check_machine, checked
 from data.errors import InputError, closest
 from data.ingest import IngestReport, id_prefix, ingest
 from data.lake import Lake
@@ -80,9 +80,26 @@ def _meaning(channel: Channel) -> str:
     return f"{channel.role} in {channel.unit}{along}"
 
 
-def read_files(machine: Machine, path: Path, need_error: bool = True) -> Iterator[Batch]:
+def checked_files(
+    machine: Machine, paths: Iterable[Path], need_error: bool = True, channels: Collection[str] | None = None
+) -> list[Batch]:
+    """The batches of `read_files`, with the findings of all checks, as if they came from the lake."""
+    batches = [checked(b, machine) for path in paths for b in read_files(machine, path, need_error, channels)]
+    return check_machine(batches, machine)
+
+
+def played_files(machine: Machine, paths: Iterable[Path]) -> list[Batch]:
+    """`checked_files` for a rehearsal: errors are masked, sensors as recorded, since a control gets their faults."""
+    errors = {None, *machine.names("error")}
+    every = checked_files(machine, paths)
+    return [b.with_findings(tuple(f for f in b.findings if f.channel in errors or not f.masks)) for b in every]
+
+
+def read_files(
+    machine: Machine, path: Path, need_error: bool = True, channels: Collection[str] | None = None
+) -> Iterator[Batch]:
     """The batches of a file, or of all files in a folder that `recording.files` names, with the ids that an ingest
-    gives them; without the findings of `check_batch`.
+    gives them; without the findings of the checks. `channels` are those that are needed, see `read_batches`.
 
     Raises:
         InputError: nothing there, or a file that cannot be used.
@@ -96,7 +113,7 @@ def read_files(machine: Machine, path: Path, need_error: bool = True) -> Iterato
                 f"{', '.join(machine.recording.files)}"
             )
     for file in files:
-        for batch in read_batches(file, machine, need_error):
+        for batch in read_batches(file, machine, need_error, channels):
             yield replace(batch, batch_id=id_prefix(file, path) + batch.batch_id)
 
 

@@ -62,12 +62,9 @@ def read(recordings: Paths, machine: AnyMachine, *, need_error: bool = True) -> 
     Raises:
         InputError: no recording there, or one that cannot be used.
     """
-    from data.checks import check_machine, checked
-    from pipelines.recordings import read_files
+    from pipelines.recordings import checked_files
 
-    known = _machine(machine)
-    batches = [b for path in _paths(recordings) for b in read_files(known, path, need_error)]
-    return check_machine([checked(b, known) for b in batches], known)
+    return checked_files(_machine(machine), _paths(recordings), need_error)
 
 
 def ingest(recordings: Paths, machine: AnyMachine, lake: Lake | None = None) -> IngestReport:
@@ -229,10 +226,11 @@ def predict(model: StoredModel | Path | str, recording: Batch | Path | str) -> p
         InputError: a model or file that cannot be used, or a missing input.
     """
     from pipelines.commands.predict import predict_batches
-    from pipelines.recordings import read_files
+    from pipelines.recordings import checked_files
 
     known = load_model(model) if isinstance(model, Path | str) else model
-    batches = [recording] if isinstance(recording, Batch) else read_files(known.machine, Path(recording), False)
+    path = [] if isinstance(recording, Batch) else [Path(recording)]
+    batches = [recording] if isinstance(recording, Batch) else checked_files(known.machine, path, False)
     table = predict_batches(known, batches)
     if table is None:
         raise InputError(f"recording {recording}: no batch in it that machine {known.machine.machine} can read")
@@ -267,11 +265,11 @@ def rehearse(
         InputError: models, recordings or failures that cannot be used.
     """
     from pipelines.compensating import Given, labelled, rehearse_models
-    from pipelines.recordings import read_files
+    from pipelines.recordings import played_files
 
     names = _uris(models)
     known = [load_model(name) for name in names]
-    batches = [b for path in _paths(recordings) for b in read_files(known[0].machine, path)]
+    batches = played_files(known[0].machine, _paths(recordings))
     given = Given(max_um, rate_um_per_s, sample_s)
     done = rehearse_models(known, batches, given, failures=failures, readings=readings, readings_h=readings_h)
     if out is not None:

@@ -68,7 +68,7 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
 
 
 def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame:
-    """Predicted error of every batch in a raw recording, read by the machine file that the model carries.
+    """Predicted error of every batch in a raw recording, read and checked by the machine file that the model carries.
 
     Returns:
         The table of `predict_batches`.
@@ -77,10 +77,10 @@ def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame
         InputError: unknown model, a file that cannot be read, a missing input; one line each.
     """
     from data.account import Account
-    from data.recording import read_batches
+    from pipelines.recordings import checked_files
 
     model = load_model(model_uri, settings)
-    batches = list(read_batches(Path(file), model.machine, need_error=False, channels=model.channels()))
+    batches = checked_files(model.machine, [Path(file)], need_error=False, channels=model.channels())
     table = predict_batches(model, batches)
     if table is None:
         raise InputError(f"recording {file}: no batch in it that machine {model.machine.machine} can read")

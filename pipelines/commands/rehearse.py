@@ -59,7 +59,7 @@ def rehearse(
     from data.account import Account
     from pipelines.commands.predict import load_model
     from pipelines.compensating import Given, labelled, rehearse_models
-    from pipelines.recordings import check_recordings, read_files
+    from pipelines.recordings import check_recordings, played_files
     from pipelines.settings import configure_environment, home, load
     from reports.rehearsal import write_rehearsal
 
@@ -71,7 +71,7 @@ def rehearse(
     stored = [load_model(m, settings) for m in named]
     machine = stored[0].machine
     check_recordings(recordings)
-    batches = [b for path in recordings for b in read_files(machine, path)]
+    batches = played_files(machine, recordings)
     given = Given(max_um, rate_um_per_s, sample_s)
     with console.progress(as_json) as (_, done):
         r = rehearse_models(

@@ -76,7 +76,7 @@ def write_thermal_tests(
 
 
 def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> Iterator[Batch]:
-    from pipelines.recordings import load_batches, read_files
+    from pipelines.recordings import checked_files, load_batches
 
     held = lake.batch_ids(machine.machine)
     if not recordings:
@@ -87,7 +87,7 @@ def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> 
         yield from load_batches(lake, machine)
     for name in recordings:
         if Path(name).exists():
-            yield from read_files(machine, Path(name))
+            yield from checked_files(machine, [Path(name)])
         elif name in held:
             yield lake.load(machine.machine, name)
         else:

@@ -183,6 +183,16 @@ def test_a_run_unlike_the_training_is_flagged_with_the_reason_and_expected_to_be
     assert "60 of 120 rows are outside the trained range (front@start, bed@start" in line
 
 
+def test_rows_of_a_broken_sensor_are_not_predicted_and_the_account_names_it(stored, tmp_path):
+    table = toy_batches("toy-folder", 1)[0].table.drop(columns="z")
+    table.loc[30:, "front"] += 15.0
+    table.to_csv(tmp_path / "loose.csv", index=False)
+    done = CliRunner().invoke(app, ["predict", str(tmp_path / "loose.csv"), "--model", str(stored)])
+    predicted = pd.read_csv(StringIO(done.stdout))["predicted_um"]
+    assert done.exit_code == 0 and predicted[:30].notna().all() and predicted[30:].isna().all()
+    assert "30 values masked: front 30 (jump_no_return)" in done.stderr
+
+
 def test_a_run_that_other_models_disagree_about_is_flagged(bounded):
     batches = toy_batches("toy-bound", 4)
     double = MLR().fit([replace(b, table=b.table.assign(z=2 * b.table["z"])) for b in batches], ("front", "bed"), "z")
