@@ -40,7 +40,16 @@ from diagnosis.findings.schema import (
 )
 from diagnosis.findings.statement import finding_of, verdict_statement
 from diagnosis.fitting.batches import enough_batches, usable_batches
-from diagnosis.fitting.fitted import LeftOutRows, baseline, check, left_out_rows, plain, rows_as_given, worsened
+from diagnosis.fitting.fitted import (
+    LeftOutRows,
+    baseline,
+    check,
+    left_out_rows,
+    on_all_rows,
+    plain,
+    rows_as_given,
+    worsened,
+)
 from diagnosis.localisation.balance import impossible
 from diagnosis.localisation.where_when import Located, locate
 from diagnosis.next_experiment.proposal import NOTHING, Proposal, revealing_run, settling_run
@@ -94,7 +103,7 @@ def diagnose(
         fitted = baseline(machine, part, batches, tell, len(recordings), seed)
         done = search(fitted, workers, tell)
         tell("left out", 0, 0)
-        first = _located(done.baseline, batches)
+        first = _located(done.baseline, done.baseline.batches)
     located: dict[str, pd.DataFrame] = {}
     if isinstance(first, str):
         remarks.append(f"no map of where and when: {first}")
@@ -102,7 +111,7 @@ def diagnose(
         located["map"] = first.map
         if (form := _unlisted_form(done)) is not None:
             located["flux"] = first.over_time("heat" if form.heat else "displacement", form.where.name)
-    diagnosis = _diagnosis(part, recordings, done, located, tuple(remarks))
+    diagnosis = _diagnosis(part, recordings, batches, done, located, tuple(remarks))
     seconds = round(time.perf_counter() - begun, 1)
     return replace(diagnosis, findings=diagnosis.findings.model_copy(update={"seconds": seconds}))
 
@@ -130,16 +139,19 @@ def _unlisted_form(done: Search) -> Form | None:
 
 def _diagnosis(
     part: TwinPart,
-    batches: tuple[str, ...],
+    names: tuple[str, ...],
+    batches: Sequence[Batch],
     done: Search,
     located: Mapping[str, pd.DataFrame],
     remarks: tuple[str, ...],
 ) -> Diagnosis:
-    """What was found, from the search for listed effects, the effect of no list, and the tables of its localisation."""
+    """What was found, from the search for listed effects, the effect of no list, and the tables of its localisation;
+    `names` of the recordings, `batches` what was fitted of them, with all rows."""
     machine, steps = done.baseline.machine, stages(done)
     final, named = done.final, done.accepted
     before, after = steps[0][1], steps[-1][1]
-    written = _intervals(plain(final))  # the file's twin simulates alone
+    full = on_all_rows(final, batches)
+    written = _intervals(plain(full))  # the file's twin simulates alone
     intervals = {i.name: i for i in written}
     rms_table = made.rms_table(before, after, final)
     rms = rms_of(rms_table, final)
@@ -150,7 +162,7 @@ def _diagnosis(
     if refused is not None and refused.best is not None:
         label = refused.best.candidate.label
         remarks += (f"{label} is not accepted: it gains score, but raises {made.rises(refused.raised, units)}",)
-    worse = {} if drafted else worsened(rows_as_given(done.baseline), after)
+    worse = {} if drafted else worsened(rows_as_given(on_all_rows(done.baseline, batches)), left_out_rows(full))
     if worse:
         remarks += (f"the machine file keeps its values and parts: the fitted ones raise {made.rises(worse, units)}",)
     run = settling_run(named)
@@ -198,13 +210,13 @@ def _diagnosis(
         "values": {i.name: i.value for i in written},
         "intervals": written,
         "added": changed_parts(part, part_after),
-        "notes": _notes(findings, len(batches)),
+        "notes": _notes(findings, len(names)),
     }
     return Diagnosis(
         machine=machine,
         findings=Findings(
             machine=machine.machine,
-            batches=batches,
+            batches=names,
             verdict=verdict,
             findings=findings,
             fit=_summary(rms, better, len(final.batches)),

@@ -35,6 +35,24 @@ def enough_batches(batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ..
     return out, remarks
 
 
+def coarse(batches: Sequence[Batch], spacing_s: float) -> list[Batch]:
+    """The batches with a row every `spacing_s`, or their own step where that is longer: what a machine does takes
+    minutes, however often it is recorded. Sensors and errors are as read there, drivers their mean until the next row,
+    so that heat is kept."""
+    return [_thinned(b, round(spacing_s / b.step_s)) if b.step_s else b for b in batches]
+
+
+def _thinned(batch: Batch, stride: int) -> Batch:
+    if stride < 2:
+        return batch
+    table = batch.table.iloc[::stride].reset_index(drop=True)
+    for name in batch.names("driver"):
+        if name in batch.table.columns:
+            masked = pd.Series(batch.masked(name))
+            table[name] = masked.groupby(np.arange(batch.n_rows) // stride).mean().to_numpy()
+    return replace(batch, table=table)
+
+
 def usable_batches(network: Network, batches: Sequence[Batch]) -> tuple[list[Batch], tuple[str, ...]]:
     """Those that the network can be driven with, and of the others why not: a hole in one run spoils no other.
 

@@ -15,6 +15,7 @@ from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
 from diagnosis.contracts import Fitted, Point, own_step
+from diagnosis.fitting.batches import coarse
 from diagnosis.fitting.carried import carried_start
 from diagnosis.fitting.covariance import (
     Covariance,
@@ -61,7 +62,8 @@ def baseline(
 ) -> Fitted:
     """The twin part fitted to all batches, under the covariance of what refined twins about that fit show.
 
-    Refined twins are drawn twice: about a first calibration, and about the fit under what those say.
+    All fits are to `coarse` rows, so that their cost does not depend on how often a machine is recorded. Refined twins
+    are drawn twice: about a first calibration, and about the fit under what those say.
 
     Args:
         runs: the number of runs, where batches are blocks of fewer.
@@ -73,7 +75,8 @@ def baseline(
     """
     check(machine, batches)
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
-    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, spacing_s(batches))
+    batches, every_s = coarse(batches, spacing_s(batches)), spacing_s(batches)
+    problem = CalibrationProblem.of(compile_network(machine, part=part), batches, every_s)
     tell("baseline", 1, 3)
     k = len(problem.channels)
     alike = Noise(np.full(k, POLICY.initial_noise_factor), np.full(k, POLICY.initial_rows_per_value))
@@ -101,6 +104,16 @@ def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, in
     known = beyond_recalibration(blocks, _spread(problem.unknowns), imperfections(at))
     structure = Structure(drawn, known, white_noise(problem))
     return _learned(at, structure, runs, POLICY.alone_shares, np.ones(len(problem.channels)))
+
+
+def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
+    """The fit, simulated alone, to the recordings as they are; itself where they have no rows between."""
+    if [b.n_rows for b in batches] == [b.n_rows for b in fitted.batches]:
+        return fitted
+    one = plain(fitted)
+    problem = CalibrationProblem.of(one.problem.network, batches, spacing_s(batches))
+    at = Point(one.machine, one.part, tuple(batches), problem, one.z, one.nuisance)
+    return replace(calibrated(at, one.noise, one.runs), weight=fitted.weight)
 
 
 def relearned(fitted: Fitted) -> Fitted:
