@@ -9,15 +9,20 @@ where C is the second moment of training rises with the variance of noise on its
 predicts since the last good value, so that it continues from there. Its stated standard deviation is that of batches
 that were left out of C.
 
+The levels of the channels, over all runs and seasons, have such a regression too: a sensor that drifts, was exchanged
+with another one or is off from the start contradicts it, and that of the largest standardised residual is the faulty
+one (generalised likelihood ratio for a fault of one channel of unknown size: Willsky & Jones 1976, IEEE Trans. Autom.
+Control 21, 108; parity relations on subsets: Frank 1990, Automatica 26, 459).
+
 Conditional Gaussian: Rasmussen & Williams (2006), eq. A.6; the noise acts as the penalty of ridge regression.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Literal, Self, get_args
+from itertools import combinations
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 
@@ -27,7 +32,7 @@ from data.batch import Batch
 from data.checks.base import THERMAL, robust_sigma
 from data.errors import InputError, one_of
 
-Status = Literal["ok", "lost", "implausible", "stepping", "frozen"]
+Status = Literal["ok", "lost", "implausible", "stepping", "frozen", "off"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 
 _LEAST_BATCHES = 2  # one is left out
@@ -39,6 +44,10 @@ _NOISE_SD = 6.0  # standard deviations of noise that one sample does not exceed
 _SECOND_DIFFERENCE = np.sqrt(6.0)  # sd of x[k-1] - 2 x[k] + x[k+1] per sd of independent x
 _HELD_MARGIN = 1.5  # on the longest constant stretch of training
 _LEAST_SD_K = 1e-3  # below the resolution of any temperature sensor of a machine
+_LEVEL_MARGIN = 2.0  # on the largest distance from the levels' regression in training runs that were left out
+_LEAST_PARITY = 3  # channels: two that disagree do not say which of them is wrong
+_MOST_OFF = 2  # channels at once, as two exchanged plugs; what more of them do has other causes
+_MOST_KNOWN = 2000  # regressions kept: all pairs of sixty channels
 _SAME_K = 1e-9  # equal but for rounding: a frozen value is repeated exactly
 _FARTHEST_K = 1e4  # no machine is hotter; bounds channels without a range
 
@@ -72,6 +81,19 @@ class GuardLimits:
         check_limits("limits of sensors", self)
 
 
+class Regression(NamedTuple):
+    """Weights (n, n), row i for channel i; what is usual of its distance, K, (n,), enlarged as far as the Gaussian
+    loses precision without the channels that are not good; and the Gaussian's standard deviation, K, (n,)."""
+
+    weights: Array
+    usual_K: Array
+    sd_K: Array
+
+    def worst(self, off_K: Array, far: Mask) -> int:
+        """The channel whose fault alone explains most of the distances: of the largest standardised one."""
+        return int(np.argmax(np.where(far, np.abs(off_K) / self.sd_K, 0.0)))
+
+
 @dataclass(frozen=True)
 class Substitutes:
     """What training knows of n temperature channels.
@@ -86,6 +108,8 @@ class Substitutes:
         resolution_K: smallest step shown, K, (n,); 0 where not known.
         step_s: step of the training grid, s.
         noise_K: standard deviation of the noise of a training row, K, (n,); None in models stored without it.
+        level, level_K2, level_limit_K: mean of the channels' values over all runs, in their unit, (n,), covariance, K²,
+            (n, n), and the largest usual distance of each from its regression on all others, K, (n,); None as above.
     """
 
     names: tuple[str, ...]
@@ -98,6 +122,9 @@ class Substitutes:
     resolution_K: Array
     step_s: float
     noise_K: Array | None = None
+    level: Array | None = None
+    level_K2: Array | None = None
+    level_limit_K: Array | None = None
 
     @classmethod
     def learn(cls, batches: Sequence[Batch], channels: Sequence[str]) -> Self:
@@ -141,6 +168,7 @@ class Substitutes:
             resolution_K,
             step_s,
             _noise_K([values for _, values in runs], resolution_K),
+            *_levels([values for _, values in runs], resolution_K),
         )
 
     def usual_K(self, dt_s: float) -> Array:
@@ -155,23 +183,14 @@ class Substitutes:
             widest = np.minimum(widest, self.rate_K_per_s * dt_s + noise_K)
         return np.asarray(widest + 2 * self.resolution_K)
 
-    def weights(self, good: Mask) -> tuple[Array, Array]:
-        """Regression of every channel on the good ones other than itself, for a mask (n,).
+    def changes(self, good: Mask) -> Regression:
+        """Of the rises of every channel on those of the good ones (n,) other than itself."""
+        return _regression(self.covariance_K2, self.sd_K, good)
 
-        Returns:
-            Weights (n, n), row i for channel i, and standard deviations, K, (n,): `sd_K` enlarged as far as the
-            Gaussian loses precision without the channels that are not good.
-        """
-        c, at, rest = self.covariance_K2, np.flatnonzero(good), np.flatnonzero(~good)
-        weights, variance_K2 = np.zeros_like(c), np.diag(c).copy()
-        if len(at):
-            precision = np.linalg.inv(c[np.ix_(at, at)])
-            own = np.diag(precision)
-            weights[np.ix_(at, at)] = np.eye(len(at)) - precision / own[:, None]
-            variance_K2[at] = 1.0 / own
-            weights[np.ix_(rest, at)] = c[np.ix_(rest, at)] @ precision
-            variance_K2[rest] -= np.einsum("ij,ij->i", weights[np.ix_(rest, at)], c[np.ix_(rest, at)])
-        return weights, self.sd_K * np.sqrt(np.maximum(variance_K2 / self._full_K2, 1.0))
+    def levels(self, good: Mask) -> Regression:
+        """The same of the levels."""
+        assert self.level_K2 is not None and self.level_limit_K is not None
+        return _regression(self.level_K2, self.level_limit_K, good)
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings and arrays."""
@@ -181,14 +200,25 @@ class Substitutes:
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`; lists in place of arrays are read too."""
-        fields = [k for k in cls.__dataclass_fields__ if k in plain or k != "noise_K"]
+        optional = ("noise_K", "level", "level_K2", "level_limit_K")
+        fields = [k for k in cls.__dataclass_fields__ if k in plain or k not in optional]
         arrays = {k: np.asarray(plain[k], float) for k in fields if k not in ("names", "step_s")}
         return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), **arrays)
 
-    @cached_property
-    def _full_K2(self) -> Array:
-        """Conditional variance of each channel given all others, (n,)."""
-        return np.asarray(1.0 / np.diag(np.linalg.inv(self.covariance_K2)))
+
+def _regression(c: Array, usual_K: Array, good: Mask) -> Regression:
+    """Of every channel on the good ones other than itself, by the covariance `c`."""
+    at, rest = np.flatnonzero(good), np.flatnonzero(~good)
+    weights, variance_K2 = np.zeros_like(c), np.diag(c).copy()
+    if len(at):
+        precision = np.linalg.inv(c[np.ix_(at, at)])
+        own = np.diag(precision)
+        weights[np.ix_(at, at)] = np.eye(len(at)) - precision / own[:, None]
+        variance_K2[at] = 1.0 / own
+        weights[np.ix_(rest, at)] = c[np.ix_(rest, at)] @ precision
+        variance_K2[rest] -= np.einsum("ij,ij->i", weights[np.ix_(rest, at)], c[np.ix_(rest, at)])
+    full_K2 = 1.0 / np.diag(np.linalg.inv(c))
+    return Regression(weights, usual_K * np.sqrt(np.maximum(variance_K2 / full_K2, 1.0)), np.sqrt(variance_K2))
 
 
 @dataclass(frozen=True)
@@ -252,7 +282,7 @@ class Checked:
 
     Attributes:
         values: what the model may use: every value of the sample, failed channels replaced, in the unit that arrived.
-        status: guarded channel → `ok`, `lost`, `implausible`, `stepping` or `frozen`.
+        status: guarded channel → one of `STATUSES`.
         sd_K: replaced channel → standard deviation of its substitute, K.
         fault: why the values cannot be used; None where they can.
         reason: which channels are replaced, why and how well; empty where none is.
@@ -274,6 +304,8 @@ class Guard:
       Where several are, the worst is judged first and the others without it.
     - `frozen`: exactly constant for longer than in training, and than its grid's step, while the regression predicts a
       clear change.
+    - `off`: farther from the regression of the levels than any training run was, as a sensor that drifts or was
+      exchanged with another one. It is replaced by that regression.
 
     A failed channel is taken again after `back_samples` samples that change at a usual rate and agree with its
     substitute. Where the substitute itself cannot be trusted any more, because its time is spent or more than half of
@@ -284,7 +316,7 @@ class Guard:
     def __init__(self, substitutes: Substitutes, limits: GuardLimits | None = None) -> None:
         self.substitutes = substitutes
         self.limits = limits or GuardLimits()
-        self._weights: tuple[bytes, tuple[Array, Array]] | None = None  # of the mask used last
+        self._known: dict[tuple[str, bytes], Regression] = {}  # by the mask of good channels
 
     def begin(self) -> Watch:
         """State before the first sample."""
@@ -322,7 +354,7 @@ class Guard:
             status[i] = "lost" if np.isnan(x[i]) else "implausible"
         usual_K = s.usual_K(dt_s)
         good = present & ~watch.bad & ~fresh
-        good, weights, sd_K = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
+        good, (weights, sd_K, _) = self._without_steps(good, np.where(good, x - before, 0.0), usual_K)
         for i in np.flatnonzero(present & ~watch.bad & ~fresh & ~good):
             status[i] = "stepping"
         predicted_K = weights @ np.where(good, x - before, 0.0)
@@ -334,15 +366,21 @@ class Guard:
         frozen &= np.abs(moved_K) > limits.frozen_sd * sd_K + s.resolution_K
         for i in np.flatnonzero(frozen):
             status[i] = "frozen"
-        good &= ~frozen
-        filled = np.clip(np.where(frozen, watch.same + moved_K, before + predicted_K), s.low, s.high)
-        filled = np.where(good | fresh, x, filled)
         for i in np.flatnonzero(fresh):
             status[i] = "ok"
+        was_off = np.array([a == "off" for a in status])
+        compared = (good & ~frozen) | fresh | (was_off & present)
+        agree, level, level_sd_K = self._without_off(compared, x)
+        for i in np.flatnonzero(compared & ~agree):
+            status[i] = "off"
+        off = np.array([a == "off" for a in status])
+        filled = np.where(off, level, np.where(frozen, watch.same + moved_K, before + predicted_K))
+        filled = np.where(agree & ~was_off, x, np.clip(filled, s.low, s.high))
 
         failed = np.array([a != "ok" for a in status])
         many = failed.mean() > limits.bad_share
-        back, agreed = self._recovered(watch, status, x, present, filled, usual_K, sd_K, bool(many))
+        near = np.where(off, agree, np.abs(x - filled) <= limits.back_sd * sd_K + s.resolution_K)
+        back, agreed = self._recovered(watch, status, x, present, near, usual_K, bool(many))
         for i in np.flatnonzero(back):
             status[i] = "ok"
         filled = np.where(back, x, filled)
@@ -361,26 +399,59 @@ class Guard:
             moved_K=moved_K,
             time_s=float(time_s) if np.isfinite(time_s) else watch.time_s,
         )
-        return after, self._checked(after, values, sd_K)
+        return after, self._checked(after, values, np.where(off, level_sd_K, sd_K))
 
-    def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Array, Array]:
-        """Good channels that do not step, with the weights and standard deviations of the regressions on them."""
+    def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Regression]:
+        """Good channels that do not step, with the regression on them."""
         good = good & (np.abs(change_K) <= usual_K)
         while True:
-            weights, sd_K = self._regression(good)
-            off_K = np.where(good, change_K - weights @ np.where(good, change_K, 0.0), 0.0)
-            steps = np.abs(off_K) > self.limits.step_sd * sd_K + self.substitutes.resolution_K
+            regression = self._regression(self.substitutes.changes, good)
+            off_K = np.where(good, change_K - regression.weights @ np.where(good, change_K, 0.0), 0.0)
+            steps = np.abs(off_K) > self.limits.step_sd * regression.usual_K + self.substitutes.resolution_K
             # One channel left has no regression: its change is judged by the rate alone.
             if not steps.any() or good.sum() < 2:
-                return good, weights, sd_K
+                return good, regression
             good = good.copy()
-            good[np.argmax(np.where(steps, np.abs(off_K) / sd_K, 0.0))] = False
+            good[regression.worst(off_K, steps)] = False
 
-    def _regression(self, good: Mask) -> tuple[Array, Array]:
-        key = good.tobytes()
-        if self._weights is None or self._weights[0] != key:
-            self._weights = (key, self.substitutes.weights(good))
-        return self._weights[1]
+    def _without_off(self, good: Mask, x: Array) -> tuple[Mask, Array, Array]:
+        """Good channels whose levels agree, and the levels (n,) that these predict, with standard deviations, K."""
+        s = self.substitutes
+        if s.level is None:
+            return good, np.full(len(x), np.nan), s.sd_K
+        agree, regression = self._agreeing(good, x)
+        return agree, s.level + regression.weights @ np.where(agree, x - s.level, 0.0), regression.sd_K
+
+    def _agreeing(self, good: Mask, x: Array) -> tuple[Mask, Regression]:
+        """Without the fewest channels so that the rest agrees; of as many, those without which it agrees best."""
+        s = self.substitutes
+        assert s.level is not None
+        rise_K = np.where(good, x - s.level, 0.0)
+
+        def judged(rest: Mask) -> tuple[float, bool, Regression]:
+            """Misfit of the rest, and whether it agrees."""
+            regression = self._regression(s.levels, rest)
+            left_K = np.where(rest, rise_K - regression.weights @ np.where(rest, rise_K, 0.0), 0.0)
+            misfit = float(np.sum(np.where(rest, rise_K * left_K / regression.sd_K**2, 0.0)))
+            return misfit, bool((np.abs(left_K) <= regression.usual_K + s.resolution_K).all()), regression
+
+        _, agrees, regression = judged(good)
+        rest = good
+        for size in range(1, _MOST_OFF + 1):
+            if agrees or good.sum() - size < _LEAST_PARITY - 1:
+                break
+            sets = (good & ~np.isin(np.arange(len(x)), out) for out in combinations(np.flatnonzero(good), size))
+            found = [(judged(rest), rest) for rest in sets]
+            (_, agrees, regression), rest = min(found, key=lambda f: f[0][0])
+        return rest, regression
+
+    def _regression(self, of: Callable[[Mask], Regression], good: Mask) -> Regression:
+        key = of.__name__, good.tobytes()
+        if key not in self._known:
+            if len(self._known) > _MOST_KNOWN:
+                self._known.clear()
+            self._known[key] = of(good)
+        return self._known[key]
 
     def _recovered(
         self,
@@ -388,19 +459,17 @@ class Guard:
         status: list[Status],
         x: Array,
         present: Mask,
-        filled: Array,
+        near: Mask,
         usual_K: Array,
-        sd_K: Array,
         many: bool,
     ) -> tuple[Mask, Array]:
         """Which failed channels are taken again (n,), and the number of consistent samples of each (n,).
 
         A channel that returns with another value than its trusted substitute is marked as stepping in `status`.
         """
-        s, limits = self.substitutes, self.limits
+        limits = self.limits
         present = watch.bad & present
         steady = present & (np.abs(x - watch.raw) <= usual_K)
-        near = np.abs(x - filled) <= limits.back_sd * sd_K + s.resolution_K
         spent = watch.used_s > limits.substitute_s
         gone = np.array([a in ("lost", "implausible") for a in status])
         stuck = np.array([a == "frozen" for a in status]) & (np.abs(x - watch.same) <= _SAME_K)
@@ -472,6 +541,29 @@ def _regularised(rises_K: Sequence[Array], resolution_K: Array) -> tuple[Array, 
             best = score, total + noise, left_out_K2
     assert best is not None
     return best[1], best[2]
+
+
+def _levels(runs: Sequence[Array], resolution_K: Array) -> tuple[Array, Array, Array]:
+    """Mean (n,), covariance with the noise that predicts left-out runs best, K², (n, n), and the largest usual distance
+    of a channel from its regression in a run that was left out, K, (n,). Every run counts the same."""
+    means, moments = np.array([v.mean(axis=0) for v in runs]), np.array([v.T @ v / len(v) for v in runs])
+
+    def of(rows: Sequence[int], noise_K2: Array) -> tuple[Array, Array]:
+        mean = means[rows].mean(axis=0)
+        return mean, moments[rows].mean(axis=0) - np.outer(mean, mean) + np.diag(noise_K2)
+
+    every = list(range(len(runs)))
+    scale_K2 = max(float(np.diag(of(every, 0.0 * resolution_K)[1]).mean()), _LEAST_SD_K**2)
+    best: tuple[float, Array, Array] | None = None
+    for share in _NOISE_SHARES:
+        noise_K2 = resolution_K**2 / 12 + share * scale_K2
+        rest = [of([j for j in every if j != k], noise_K2) for k in every]
+        left = [np.abs(_residual(c, v - mean)) for (mean, c), v in zip(rest, runs, strict=True)]
+        score = float(sum(np.log(np.maximum(np.mean(r**2, axis=0), _LEAST_SD_K**2)).sum() for r in left))
+        if best is None or score < best[0]:
+            best = score, noise_K2, np.max([r.max(axis=0) for r in left], axis=0)
+    assert best is not None
+    return *of(every, best[1]), _LEVEL_MARGIN * np.maximum(best[2], _LEAST_SD_K)
 
 
 def _noise_K(runs: Sequence[Array], resolution_K: Array) -> Array:

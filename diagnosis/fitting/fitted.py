@@ -311,7 +311,7 @@ def _descended(fitted: Fitted, model: Callable[[Array], list[Array]], steps: int
             return here
         fallen, z, cost, damping = cost - then, moved, then, damping / POLICY.damping_factor**2
         here = at(z, left)
-        if fallen < 2.0 * POLICY.fit_tolerance_nats:
+        if fallen < 2.0 * POLICY.telling_nats:
             return here
     return here
 

@@ -17,7 +17,7 @@ from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen
 from twin.mechanisms import MECHANISMS
 
-FEATURES = ("excess", "network")
+FEATURES = ("excess", "network", "later")
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class Round:
 
     `null` (T,) are the largest gains on refined twins with nothing missing, in nats; `features` of the claim by name;
     `raised` channels by which it was refused, with rms before and after; `resolved` channels that show what is
-    impossible without it; `forms` the terms (`free_forms.Form`) of candidates of no listed mechanism.
+    impossible without it; `forms` the terms (`free_forms.Form`) of candidates of no listed mechanism; `later` after an
+    effect that was accepted.
     """
 
     before: Fitted
@@ -39,6 +40,7 @@ class Round:
     raised: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     resolved: frozenset[str] = frozenset()
     forms: Mapping[str, Any] = field(default_factory=dict)
+    later: bool = False
 
     @property
     def best(self) -> Tried | None:
@@ -56,17 +58,19 @@ def null_quantile(null: Array) -> float:
     return float(np.mean(null) - scale * (np.euler_gamma + np.log(-np.log(POLICY.chance_quantile))))
 
 
-def features(t: Tried, threshold: float) -> dict[str, float]:
-    """Of a claim, by `FEATURES`, at the nats that structure gains in one of a hundred refined twins.
+def features(t: Tried, done: Round) -> dict[str, float]:
+    """Of a claim of a round, by `FEATURES`.
 
-    excess: logarithm of its gain over them, which means the same on every machine; network: 1 for what may only say
-    that a network is drawn too coarse, or follows no law.
+    excess: logarithm of its gain over what structure gains in one of a hundred refined twins, which means the same on
+    every machine; network: 1 for what may only say that a network is drawn too coarse, or follows no law; later: 1
+    after an effect that was accepted, which is never modelled to the last nat.
     """
     c = t.candidate
     coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
     return {
-        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / max(threshold, 1.0))),
+        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / max(done.threshold, 1.0))),
         "network": float(c.kind.is_unlisted or coarse),
+        "later": float(done.later),
     }
 
 

@@ -76,7 +76,7 @@ def one_round(
     tried = refits(now, seen, shortlist(now, seen, odds), odds, workers, tell)
     now, tried = _fair(now, tried)
     known = {n: f for n, (_, f) in forms.items()}
-    return decided(Round(now, seen, tuple(tried), null, 0.0, False, forms=known))
+    return decided(Round(now, seen, tuple(tried), null, 0.0, False, forms=known, later=before is not None))
 
 
 def decided(done: Round, vetoed: bool = True) -> Round:
@@ -124,7 +124,7 @@ def _judged(done: Round, t: Tried, may: Collection[str], impossible_now: frozens
     rest = [o for o in done.tried if o is not t]
     seen = screen(t.fitted, [s.candidate for s in done.screen.scored], done.screen)
     done = replace(done, null=seen.null_gains(may))
-    own = features(t, done.threshold)
+    own = features(t, done)
     resolved = _resolves(t, impossible_now)
     probable = POLICY.max_probability if resolved else trust(own)
     enough = probable >= POLICY.claim_min_probability
