@@ -171,9 +171,10 @@ class Compensator:
         self._run = {a.axis: self._fresh(a, self._run[a.axis]) for a in self.axes}
         self._grid_s = None
 
-    def confirm(self) -> None:
-        """The operator confirms the sensors as they are from here on: a new run begins, none counts as failed."""
-        self._watch = self.guard.begin() if self.guard is not None else None
+    def confirm(self, levels: bool = False) -> None:
+        """The operator confirms the sensors as they are from here on: a new run begins, none counts as failed. Their
+        levels are compared no more, unless `levels`."""
+        self._watch = self.guard.begin(levels) if self.guard is not None else None
         self._held, self._arrived_s = {}, {}
         self.begin_run()
 
@@ -257,7 +258,7 @@ class Compensator:
         self._restored = False
         if self._grid_s is not None and (behind_s := self._grid_s - time_s) > self._patience_s:
             self.log(f"the clock is {behind_s / 3600:.1f} h behind the saved state: a new run begins")
-            self.confirm()
+            self.confirm(levels=True)
 
     def _advance(self, sample: Sample) -> tuple[str | None, str]:
         """Takes the models to the time of the sample: why it cannot be used, and what was replaced in it."""

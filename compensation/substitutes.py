@@ -234,6 +234,7 @@ class Watch:
         same: value that the channel has kept, `same_s` how long, s, and `moved_K` what the regression predicts for
             that time, K.
         time_s: time stamp of the last sample, s; None before the first.
+        levels: whether levels are compared; not where the operator has said that they are right.
     """
 
     status: tuple[Status, ...]
@@ -245,6 +246,7 @@ class Watch:
     same_s: Array
     moved_K: Array
     time_s: float | None = None
+    levels: bool = True
 
     @property
     def bad(self) -> Mask:
@@ -255,9 +257,9 @@ class Watch:
         arrays = {
             name: [None if np.isnan(v) else v for v in getattr(self, name).tolist()]
             for name in self.__dataclass_fields__
-            if name not in ("status", "time_s")
+            if name not in ("status", "time_s", "levels")
         }
-        return {"status": list(self.status), "time_s": self.time_s, **arrays}
+        return {"status": list(self.status), "time_s": self.time_s, "levels": self.levels, **arrays}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
@@ -266,14 +268,15 @@ class Watch:
         arrays = {
             name: np.array([np.nan if v is None else float(v) for v in plain[name]])
             for name in cls.__dataclass_fields__
-            if name not in ("status", "time_s")
+            if name not in ("status", "time_s", "levels")
         }
         if lengths := {name: len(a) for name, a in arrays.items() if len(a) != len(status)}:
             raise InputError(
                 f"state of a guard: got {lengths}, expected {len(status)} values, one for every status; delete the "
                 "stored state, the guard then starts afresh"
             )
-        return cls(status, time_s=None if plain["time_s"] is None else float(plain["time_s"]), **arrays)
+        time_s = None if plain["time_s"] is None else float(plain["time_s"])
+        return cls(status, time_s=time_s, levels=bool(plain["levels"]), **arrays)
 
 
 @dataclass(frozen=True)
@@ -318,12 +321,12 @@ class Guard:
         self.limits = limits or GuardLimits()
         self._known: dict[tuple[str, bytes], Regression] = {}  # by the mask of good channels
 
-    def begin(self) -> Watch:
-        """State before the first sample."""
+    def begin(self, levels: bool = True) -> Watch:
+        """State before the first sample; see `Watch.levels`."""
         n = len(self.substitutes.names)
         unknown, zero = np.full(n, np.nan), np.zeros(n)
         status: tuple[Status, ...] = ("ok",)
-        return Watch(status * n, unknown, unknown, zero, zero, unknown, zero, zero)
+        return Watch(status * n, unknown, unknown, zero, zero, unknown, zero, zero, levels=levels)
 
     def step(self, watch: Watch, time_s: float, values: Mapping[str, float]) -> tuple[Watch, Checked]:
         """One sample: the state after it and the values to use.
@@ -344,7 +347,7 @@ class Guard:
             )
         dt_s = 0.0 if watch.time_s is None or not np.isfinite(time_s) else max(time_s - watch.time_s, 0.0)
         if dt_s > limits.substitute_s:
-            watch, dt_s = self.begin(), 0.0
+            watch, dt_s = self.begin(watch.levels), 0.0
         x = np.array([_number(values.get(name)) for name in s.names])
         status: list[Status] = list(watch.status)
         present = np.isfinite(x) & (x >= s.low) & (x <= s.high)
@@ -370,7 +373,7 @@ class Guard:
             status[i] = "ok"
         was_off = np.array([a == "off" for a in status])
         compared = (good & ~frozen) | fresh | (was_off & present)
-        agree, level, level_sd_K = self._without_off(compared, x)
+        agree, level, level_sd_K = self._without_off(compared, x, watch)
         for i in np.flatnonzero(compared & ~agree):
             status[i] = "off"
         off = np.array([a == "off" for a in status])
@@ -414,16 +417,19 @@ class Guard:
             good = good.copy()
             good[regression.worst(off_K, steps)] = False
 
-    def _without_off(self, good: Mask, x: Array) -> tuple[Mask, Array, Array]:
-        """Good channels whose levels agree, and the levels (n,) that these predict, with standard deviations, K."""
+    def _without_off(self, good: Mask, x: Array, watch: Watch) -> tuple[Mask, Array, Array]:
+        """Good channels whose levels agree, and the levels (n,) that these predict, with standard deviations, K; none
+        and the last ones where more than `_MOST_OFF` would have to be wrong."""
         s = self.substitutes
-        if s.level is None:
+        if s.level is None or not watch.levels or good.sum() < _LEAST_PARITY:
             return good, np.full(len(x), np.nan), s.sd_K
         agree, regression = self._agreeing(good, x)
+        if not agree.any():
+            return agree, np.where(np.isnan(watch.filled), x, watch.filled), regression.sd_K
         return agree, s.level + regression.weights @ np.where(agree, x - s.level, 0.0), regression.sd_K
 
     def _agreeing(self, good: Mask, x: Array) -> tuple[Mask, Regression]:
-        """Without the fewest channels so that the rest agrees; of as many, those without which it agrees best."""
+        """Without the fewest channels so that the rest agrees, and agrees best of as many; none where no rest does."""
         s = self.substitutes
         assert s.level is not None
         rise_K = np.where(good, x - s.level, 0.0)
@@ -443,7 +449,7 @@ class Guard:
             sets = (good & ~np.isin(np.arange(len(x)), out) for out in combinations(np.flatnonzero(good), size))
             found = [(judged(rest), rest) for rest in sets]
             (_, agrees, regression), rest = min(found, key=lambda f: f[0][0])
-        return rest, regression
+        return rest & agrees, regression
 
     def _regression(self, of: Callable[[Mask], Regression], good: Mask) -> Regression:
         key = of.__name__, good.tobytes()

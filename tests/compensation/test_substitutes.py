@@ -216,6 +216,19 @@ def test_exchanged_plugs_are_found_and_do_not_reach_the_model(guard: Guard, batc
     assert np.abs(errors_K(found, batch, a)).max() < 0.6 * raw
 
 
+def test_where_no_few_sensors_explain_the_levels_all_count_as_failed_until_they_are_confirmed(
+    guard: Guard, batches: list[Batch]
+) -> None:
+    """More are wrong than can be named: the output is held and fades."""
+    batch, off_K = batches[-1], dict(zip(NAMES, (9.0, -8.0, 7.0, -9.0, 8.0, -7.0), strict=True))
+    rows = [{n: float(batch.values(n)[i]) + off_K[n] for n in NAMES} for i in range(batch.n_rows)]
+    for levels in (True, False):
+        watch = guard.begin(levels)
+        for time_s, values in zip(batch.time_s.tolist(), rows, strict=True):
+            watch, checked = guard.step(watch, time_s, values)
+            assert ("6 of 6 temperature channels failed (t0 off" in str(checked.fault)) == levels
+
+
 def test_sound_runs_raise_no_alarm(batches: list[Batch]) -> None:
     for k in range(len(batches)):
         guard = Guard(Substitutes.learn([b for j, b in enumerate(batches) if j != k], NAMES), LIMITS)
