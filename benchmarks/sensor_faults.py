@@ -27,8 +27,8 @@ from pipelines.model_store import StoredModel
 from pipelines.recordings import checked_files
 from pipelines.settings import configure_environment, load
 
-FOLDS = 6
-COUNTS_UM = 10.0
+FOLDS = 6  # five sixths of the runs are as many as a training has
+COUNTS_UM = 10.0  # a smaller error of the prediction is within what a model leaves anyway
 
 
 def faults(batch: Batch, names: Sequence[str]) -> Iterator[tuple[str, set[str], dict[str, Array]]]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Any, Literal, NamedTuple, Self, get_args
 
@@ -185,12 +186,12 @@ class Substitutes:
 
     def changes(self, good: Mask) -> Regression:
         """Of the rises of every channel on those of the good ones (n,) other than itself."""
-        return _regression(self.covariance_K2, self.sd_K, good)
+        return _regression(self.covariance_K2, self.sd_K, self._full_K2, good)
 
     def levels(self, good: Mask) -> Regression:
         """The same of the levels."""
         assert self.level_K2 is not None and self.level_limit_K is not None
-        return _regression(self.level_K2, self.level_limit_K, good)
+        return _regression(self.level_K2, self.level_limit_K, self._full_level_K2, good)
 
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings and arrays."""
@@ -205,9 +206,24 @@ class Substitutes:
         arrays = {k: np.asarray(plain[k], float) for k in fields if k not in ("names", "step_s")}
         return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), **arrays)
 
+    @cached_property
+    def _full_K2(self) -> Array:
+        """Variance of each channel given all others, (n,)."""
+        return _conditional_K2(self.covariance_K2)
 
-def _regression(c: Array, usual_K: Array, good: Mask) -> Regression:
-    """Of every channel on the good ones other than itself, by the covariance `c`."""
+    @cached_property
+    def _full_level_K2(self) -> Array:
+        """The same of the levels."""
+        assert self.level_K2 is not None
+        return _conditional_K2(self.level_K2)
+
+
+def _conditional_K2(c: Array) -> Array:
+    return np.asarray(1.0 / np.diag(np.linalg.inv(c)))
+
+
+def _regression(c: Array, usual_K: Array, full_K2: Array, good: Mask) -> Regression:
+    """Of every channel on the good ones other than itself, by the covariance `c` of conditional variances `full_K2`."""
     at, rest = np.flatnonzero(good), np.flatnonzero(~good)
     weights, variance_K2 = np.zeros_like(c), np.diag(c).copy()
     if len(at):
@@ -217,7 +233,6 @@ def _regression(c: Array, usual_K: Array, good: Mask) -> Regression:
         variance_K2[at] = 1.0 / own
         weights[np.ix_(rest, at)] = c[np.ix_(rest, at)] @ precision
         variance_K2[rest] -= np.einsum("ij,ij->i", weights[np.ix_(rest, at)], c[np.ix_(rest, at)])
-    full_K2 = 1.0 / np.diag(np.linalg.inv(c))
     return Regression(weights, usual_K * np.sqrt(np.maximum(variance_K2 / full_K2, 1.0)), np.sqrt(variance_K2))
 
 

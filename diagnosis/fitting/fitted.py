@@ -75,7 +75,8 @@ def baseline(
     """
     check(machine, batches)
     tell, runs = progress or (lambda step, n, of: None), runs or len(batches)
-    batches, every_s = coarse(batches, spacing_s(batches)), spacing_s(batches)
+    every_s = spacing_s(batches)
+    batches = coarse(batches, every_s)
     problem = CalibrationProblem.of(compile_network(machine, part=part), batches, every_s)
     tell("baseline", 1, 3)
     k = len(problem.channels)
@@ -88,8 +89,9 @@ def baseline(
     drawn = _structure(at, first, rng, tell)
     covariance = rough(problem, [POLICY.rough_structure_factor / np.sqrt(first) * d for d in drawn])
     tell("baseline", 2, 3)
+    at = _fitted(at, covariance, runs)
     tell("baseline", 3, 3)
-    return structured(_fitted(at, covariance, runs), runs, seed, tell)
+    return structured(at, runs, seed, tell)
 
 
 def structured(at: Point, runs: int, seed: int = 0, tell: Callable[[str, int, int], None] = lambda *_: None) -> Fitted:

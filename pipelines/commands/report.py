@@ -76,7 +76,8 @@ def write_thermal_tests(
 
 
 def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> Iterator[Batch]:
-    from pipelines.recordings import checked_files, load_batches
+    from data.checks import checked
+    from pipelines.recordings import load_batches, read_files
 
     held = lake.batch_ids(machine.machine)
     if not recordings:
@@ -87,7 +88,7 @@ def _tested_batches(machine: Machine, recordings: Sequence[str], lake: Lake) -> 
         yield from load_batches(lake, machine)
     for name in recordings:
         if Path(name).exists():
-            yield from checked_files(machine, [Path(name)])
+            yield from (checked(b, machine) for b in read_files(machine, Path(name)))
         elif name in held:
             yield lake.load(machine.machine, name)
         else:

@@ -161,7 +161,7 @@ def test_what_cannot_be_told_apart_is_told_together() -> None:
     told = {(first.mechanism, first.where.name), *((a.mechanism, a.where.name) for a in first.alternatives)}
     assert told >= {("cabinet_heat", "head"), ("electrical_heat", "head")}
     assert 0.2 < first.probability < 0.7
-    run = done.findings.next_experiment  # no run tells two names of one law apart: there is a third to be told apart
+    run = done.findings.next_experiment  # no run separates two names of one law: a third one is among them
     assert run is None or len(run.separates) > 2
 
 
