@@ -12,7 +12,8 @@ after any of the three. An entry that is not marked was carried out if the alias
 the next entry, which states what the alias named then, or now if none follows. Otherwise it was interrupted, and
 look-ups skip it. No repair is necessary, and the next promotion works in each case.
 
-Entries are ordered by the number in their key, since the clocks of two machines may differ.
+Entries are ordered by the number in their key, since the clocks of two machines may differ. An entry is never earlier than
+those before it: where the clock was set back, it has their latest time, and what the clock showed.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ _TIME = "%Y-%m-%d %H:%M:%S"
 class Entry(BaseModel):
     """One change of a champion, as the log holds it.
 
-    `when` is UTC, taken before the alias moves. `who` is MLFLOW_TRACKING_USERNAME, else the user of the operating
+    `when` is UTC, taken before the alias moves; where the clock showed an
+    earlier time than the entries before have, it is the latest of theirs, and `clock` is what the clock showed. `who` is MLFLOW_TRACKING_USERNAME, else the user of the operating
     system. `from_version` is the version that the alias named before, None without a champion. `code_version` is that
     of the program which made the change, see `tracking.code_version`.
     """
@@ -56,6 +58,7 @@ class Entry(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     when: AwareDatetime
+    clock: AwareDatetime | None = None
     who: str
     host: str
     action: Action
@@ -95,7 +98,8 @@ class Log:
     """The entries of a registered model, oldest first, and for each whether it was carried out.
 
     `champion` and `provisional` are the versions that these aliases name now. `trouble` is the one line on an entry
-    that cannot be read, which leaves the champions unknown; empty where all can be read.
+    that cannot be read, which leaves the champions unknown; empty where all can be read. `unmarked` is the key of the
+    last entry where it was carried out and its process stopped before it could say so.
     """
 
     model: str
@@ -106,6 +110,21 @@ class Log:
     carried_out: tuple[bool, ...]
     trouble: str = ""
     provisional: int | None = None
+    unmarked: str = ""
+
+    @property
+    def stack(self) -> list[int]:
+        """Versions to go back to, the champion last. A promotion puts one on top, a roll-back takes away all above the
+        one that it goes to; what was rolled back returns by a promotion only."""
+        found: list[int] = []
+        for e in (e for e, done in zip(self.entries, self.carried_out, strict=True) if done):
+            if not found and e.from_version is not None:  # champion before the log began
+                found = [e.from_version]
+            if e.action == "promote":
+                found = [*(v for v in found if v != e.to_version), e.to_version]
+            else:
+                found = [*found[: found.index(e.to_version)], e.to_version] if e.to_version in found else [e.to_version]
+        return found
 
     @property
     def reigns(self) -> list[Reign]:
@@ -118,13 +137,20 @@ class Log:
             named = [e.from_version for e in self.entries[k + 1 : later[0] + 1 if later else None]]
             named += [] if later else [self.champion]
             other = [n for n in named if n != self.entries[k].to_version]
-            note = ""
+            notes = []
+            if clock := self.entries[k].clock:
+                notes.append(
+                    f"the clock showed {stamp(clock)}, earlier than the entry before it: since when is not certain; "
+                    "the time is the earliest that is possible"
+                )
             if other:
                 what = "no version" if other[0] is None else f"version {other[0]}"
-                note = f"later the alias named {what}: changed outside thermodrift or by two machines at the same time"
+                notes.append(
+                    f"later the alias named {what}: changed outside thermodrift or by two machines at the same time"
+                )
             # The least of the later times: with clocks that differ, a champion's end never lies after its successor's.
             until = min((self.entries[i].when for i in later), default=None)
-            reigns.append(Reign(self.entries[k], until, note))
+            reigns.append(Reign(self.entries[k], until, "; ".join(notes)))
         return reigns
 
     def champions(self, span: Span) -> list[Reign]:
@@ -164,13 +190,20 @@ def move_champion(
     """
     model = client.get_registered_model(name)
     number = 1 + max((int(m[1]) for key in model.tags if (m := _KEY.fullmatch(key))), default=0)
+    clock = now()
+    latest = max((e.when for e in read(model).entries), default=clock)
     entry = Entry(
-        when=now(), who=who(), host=platform.node(), action=action, model=name, from_version=_named(model, CHAMPION),
+        when=max(clock, latest), clock=clock if clock < latest else None, who=who(), host=platform.node(), action=action, model=name, from_version=_named(model, CHAMPION),
         to_version=int(version), why=why[:_MAX_WHY], forced=forced, training_id=training_id, code_version=code_version,
     )  # fmt: skip
     key = f"thermodrift.log.{number:06d}.{uuid.uuid4().hex[:12]}"
     client.set_registered_model_tag(name, key, entry.model_dump_json())
     client.set_registered_model_alias(name, CHAMPION, version)
+    finish(client, name, key)
+
+
+def finish(client: MlflowClient, name: str, key: str) -> None:
+    """Mark an entry as carried out."""
     client.set_registered_model_tag(name, key + _DONE, now().isoformat())
 
 
@@ -194,8 +227,9 @@ def read(model: RegisteredModel) -> Log:
     named = [*(e.from_version for e in entries[1:]), champion]
     carried = [k[2] + _DONE in model.tags or k[3].to_version == n for k, n in zip(keyed, named, strict=False)]
     tags = model.tags
+    unmarked = keyed[-1][2] if keyed and carried[-1] and keyed[-1][2] + _DONE not in tags else ""
     return Log(model.name, tags.get("machine", ""), tags.get("target", ""), champion, tuple(entries), tuple(carried),
-               trouble, _named(model, PROVISIONAL))  # fmt: skip
+               trouble, _named(model, PROVISIONAL), unmarked)  # fmt: skip
 
 
 @dataclass(frozen=True)

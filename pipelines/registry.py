@@ -279,31 +279,53 @@ def _tags(new: Newcomer) -> dict[str, str]:
     }  # fmt: skip
 
 
-def rollback(name: str, settings: Settings, reason: str = "") -> Promotion:
-    """Make the version that the present champion replaced the champion again.
+def rollback(name: str, settings: Settings, reason: str = "", of: int | None = None) -> Promotion:
+    """Make the version that was champion before the present one the champion again, by the log of champions.
+
+    A version that was rolled back is not returned to: only a promotion makes it champion again. A roll-back that was
+    interrupted is finished by the next one, which then goes no further.
 
     Args:
         reason: why; the log of champions keeps it.
+        of: the version to roll back; where it is not the champion (any more), nothing changes.
 
     Raises:
-        InputError: unknown model, no champion, or nothing that it replaced.
+        InputError: unknown model, no champion, or none before it.
+        WorkError: the store does not answer.
     """
     client = open_store(settings)
     with _locked(name, settings):
-        present = find_version(client, name, CHAMPION)
-        previous = present.tags.get("replaces")
-        if not previous:
-            raise InputError(f"model {name!r}: champion version {present.version} replaced none; nothing to go back to")
-        back = find_version(client, name, previous)
-        audit.move_champion(
-            client, name, back.version, action="rollback", why=reason or f"version {present.version} was rolled back",
-            training_id=back.tags.get("training_id", ""), code_version=code_version(),
-        )  # fmt: skip
-        client.set_model_version_tag(name, present.version, "rolled_back", "true")
-    summary = f"{name}: champion is version {back.version} again; version {present.version} was rolled back"
-    return Promotion("champion", name, int(back.version), int(back.version), back.tags.get("cell", ""),
-                     back.tags.get("caution", ""), summary, standing=back.tags.get("standing", CHAMPION),
-                     authority=float(back.tags.get("authority", "1")))  # fmt: skip
+        model, present = find_model(client, name), find_version(client, name, CHAMPION)
+        log, champion = audit.read(model), int(present.version)
+        if of is not None and of != champion:
+            return _back(present, f"{name}: champion is version {champion}, not {of}; nothing changed")
+        if log.unmarked and log.entries[-1].action == "rollback":
+            rejected = log.entries[-1].from_version
+            audit.finish(client, name, log.unmarked)
+            summary = f"{name}: champion is version {champion} again; the roll-back of version {rejected} is finished"
+        else:
+            below = log.stack[: log.stack.index(champion)] if champion in log.stack else log.stack
+            held = {int(v.version): v for v in model_versions(client, name)}
+            back = next((held[v] for v in reversed(below) if v in held), None)
+            if back is None:
+                raise InputError(
+                    f"model {name!r}: no version was champion before version {champion} and not rolled back; nothing "
+                    f"to go back to; `thermodrift promote` makes another one champion"
+                )
+            audit.move_champion(
+                client, name, back.version, action="rollback", why=reason or f"version {champion} was rolled back",
+                training_id=back.tags.get("training_id", ""), code_version=code_version(),
+            )  # fmt: skip
+            summary = f"{name}: champion is version {back.version} again; version {champion} was rolled back"
+            present, rejected = back, champion
+        client.set_model_version_tag(name, str(rejected), "rolled_back", "true")
+        return _back(present, summary)
+
+
+def _back(version: ModelVersion, summary: str) -> Promotion:
+    number, tags = int(version.version), version.tags
+    return Promotion("champion", version.name, number, number, tags.get("cell", ""), tags.get("caution", ""), summary,
+                     standing=tags.get("standing", CHAMPION), authority=float(tags.get("authority", "1")))  # fmt: skip
 
 
 def status(settings: Settings) -> pd.DataFrame:

@@ -61,14 +61,14 @@ def null_quantile(null: Array) -> float:
 def features(t: Tried, done: Round) -> dict[str, float]:
     """Of a claim of a round, by `FEATURES`.
 
-    excess: logarithm of its gain over what structure gains in one of a hundred refined twins, which means the same on
-    every machine; network: 1 for what may only say that a network is drawn too coarse, or follows no law; later: 1
+    excess: logarithm of its gain over what structure gains in one of a hundred refined twins and what wrong claims gain
+    on any machine; network: 1 for what may only say that a network is drawn too coarse, or follows no law; later: 1
     after an effect that was accepted, which is never modelled to the last nat.
     """
     c = t.candidate
     coarse = c.mechanism in MECHANISMS and MECHANISMS[c.mechanism].of_network
     return {
-        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / max(done.threshold, 1.0))),
+        "excess": float(np.log((1.0 + max(t.gain, 0.0)) / (max(done.threshold, 1.0) + POLICY.claim_scatter_nats))),
         "network": float(c.kind.is_unlisted or coarse),
         "later": float(done.later),
     }

@@ -28,11 +28,14 @@ def promote(
 def rollback(
     model: Annotated[str, typer.Argument(help="registered model, MACHINE-CHANNEL")],
     reason: Annotated[str, typer.Option("--reason", help="why; `thermodrift registry MODEL` shows it")] = "",
+    of: Annotated[
+        int | None, typer.Option("--of", help="the version to roll back; where it is not champion, nothing changes")
+    ] = None,
 ) -> None:
-    """Make the previous champion the champion again."""
+    """Make the champion before the present one the champion again; what was rolled back is not returned to."""
     from pipelines import settings
 
     settings.configure_environment()
     from pipelines import registry
 
-    console.line(registry.rollback(model, settings.load(), reason).summary)
+    console.line(registry.rollback(model, settings.load(), reason, of).summary)

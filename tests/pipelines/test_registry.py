@@ -165,7 +165,7 @@ def test_roll_back_goes_to_the_version_before_and_no_further(store):
     assert client.get_model_version("toy-back-z", "2").tags["rolled_back"] == "true"
     ends = registry.status(store).set_index(["name", "version"]).loc["toy-back-z", "was_champion_until"]
     assert ends[2] and not ends[1]
-    with pytest.raises(InputError, match="champion version 1 replaced none; nothing to go back to"):
+    with pytest.raises(InputError, match="no version was champion before version 1 and not rolled back"):
         registry.rollback("toy-back-z", store)
     with pytest.raises(InputError, match="unknown model 'toy-bakc-z'; did you mean 'toy-back-z'"):
         registry.rollback("toy-bakc-z", store)
@@ -283,3 +283,62 @@ def test_the_error_to_expect_leads_the_tags(story, store):
     assert 5.5 < float(tags["expected_S_bound90_um"]) < 11 and "optimistic" in tags["expected"]
     row = registry.status(store).set_index(["name", "version"]).loc["toy-story-z", 2]
     assert row["expected_S_um"] == pytest.approx(33 / 7)
+
+
+@pytest.fixture(scope="module")
+def stacked(store):
+    """Four champions, the last two by force."""
+    for worse, more, force in ((1.0, 0, False), (0.0, 1, False), (9.0, 2, True), (8.0, 3, True)):
+        train(store, "toy-stack", [4.0 + worse, 5.0 + worse] * 3 + [5.0] * more, force=force)
+    return MlflowClient(store.store_uri, registry_uri=store.store_uri)
+
+
+def test_roll_backs_walk_down_and_never_return_to_what_was_rolled_back(store, stacked):
+    name = "toy-stack-z"
+    assert aliases(store, name)["champion"] == 4
+    assert [registry.rollback(name, store).version for _ in range(2)] == [3, 2]
+    assert "champion is version 2, not 3; nothing changed" in registry.rollback(name, store, of=3).summary
+    assert registry.rollback(name, store, of=2).version == 1
+    with pytest.raises(InputError, match="no version was champion before version 1"):
+        registry.rollback(name, store)
+    train(store, "toy-stack", [12.0, 13.0] * 3 + [5.0] * 3, force=True)  # a promotion makes it champion again: as version 4 was: the same batches and cell
+    assert aliases(store, name)["champion"] == 4
+    assert registry.rollback(name, store).version == 1
+
+
+def test_an_interrupted_roll_back_is_finished_by_the_next_and_goes_no_further(store):
+    name = "toy-half-z"
+    for k in range(3):
+        train(store, "toy-half", [9.0 - k] * (6 + k), force=True)
+    with pytest.MonkeyPatch.context() as patch:
+
+        def killed(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr(audit, "finish", killed)
+        with pytest.raises(KeyboardInterrupt):
+            registry.rollback(name, store)
+    assert aliases(store, name)["champion"] == 2
+    again = registry.rollback(name, store)
+    assert (again.version, aliases(store, name)["champion"]) == (2, 2)
+    assert "the roll-back of version 3 is finished" in again.summary
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    assert client.get_model_version(name, "3").tags["rolled_back"] == "true"
+    assert registry.rollback(name, store).version == 1
+
+
+def test_a_clock_that_was_set_back_is_named_and_orders_nothing_anew(store):
+    def at(day: str) -> Any:
+        patch = pytest.MonkeyPatch()
+        patch.setattr(audit, "now", lambda: audit.datetime.fromisoformat(f"2026-{day}T09:00+00:00"))
+        return patch
+
+    for day, runs in (("04-10", 6), ("03-11", 7)):
+        patch = at(day)
+        train(store, "toy-clock", [9.0] * runs, force=True)
+        patch.undo()
+    log = audit.read(MlflowClient(store.store_uri, registry_uri=store.store_uri).get_registered_model("toy-clock-z"))
+    assert [r.version for r in log.champions(audit.span_of("2026-03-20"))] == []
+    last = log.champions(audit.span_of("2026-05-01"))
+    assert [r.version for r in last] == [2]
+    assert "the clock showed 2026-03-11" in last[0].note and "since when is not certain" in last[0].note
