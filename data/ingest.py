@@ -167,6 +167,7 @@ class _Run:
         self.machine, self.lake, self.report = machine, lake, report
         self._first: dict[str, tuple[Path, str]] = {}  # batch id -> file and digest
         self._staged: list[tuple[Staged, Ingested]] = []
+        self._refused: list[tuple[Path, str]] = []
         self._committed_at = time.monotonic()
 
     def wait_for(self, file: Path) -> None:
@@ -199,8 +200,7 @@ class _Run:
             self._first = {i: first for i, first in self._first.items() if first[0] != file}
             self.wait_for(file)
             return
-        for reason in refused:
-            self.lake.quarantine(file, self.machine.machine, reason)
+        self._refused += [(file, reason) for reason in refused]
         if time.monotonic() - self._committed_at > COMMIT_EVERY_S:
             self.commit()
 
@@ -234,6 +234,8 @@ class _Run:
         for (_, row), result in zip(self._staged, stored, strict=True):
             _note(row, result)
         self._staged.clear()
+        self.lake.quarantine_many(self._refused, self.machine.machine)
+        self._refused.clear()
         self._committed_at = time.monotonic()
 
 

@@ -45,6 +45,7 @@ from data.manifest import Entry, Staged, Stored, Version
 LOG = "reasons.jsonl"
 MANIFEST = "_manifest.json"
 MANIFESTS = "_manifest"
+COPY_MAX_BYTES = 64 << 20  # of a file in quarantine: a year of one machine at 1 min is smaller
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,15 @@ def log_text(entries: list[Quarantined]) -> str:
 
 
 def entry_for(path: Path, machine: str, reason: str, folder: Path, name: str) -> Quarantined:
-    """The log entry for `path`, with the hash of its bytes; writes nothing."""
+    """The log entry for `path`, with the hash of its bytes; writes nothing. A large file gets no copy."""
     sha256, copy = "", None
     try:
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        copy = folder / f"{sha256[:12]}-{name}"
+        if path.stat().st_size <= COPY_MAX_BYTES:
+            copy = folder / f"{sha256[:12]}-{name}"
+        else:
+            reason = f"{reason} (no copy kept: larger than {COPY_MAX_BYTES >> 20} MB)"
     except OSError as error:
         reason = f"{reason} (no copy kept: its bytes cannot be read, {error.strerror})"
     return Quarantined(machine, path.name, str(path), sha256, reason, _now(), copy)
@@ -130,8 +134,7 @@ class Lake:
         `digest` saves hashing the batch again.
         """
         digest = digest or content_digest(batch)
-        folder = f"_versions/machine={safe_name(batch.machine)}/{safe_name(batch.batch_id)}"
-        file = f"{folder}/{digest[:12]}-{remarks_digest(batch)[:8]}.parquet"
+        file = f"{listing.folder_of(batch.machine, batch.batch_id)}/{digest[:12]}-{remarks_digest(batch)[:8]}.parquet"
         noted = self._noted(file)
         sha256 = self._intact(file, digest, noted)
         healed = sha256 is None and (noted is not None or self._store.exists(file))
@@ -314,19 +317,31 @@ class Lake:
     def quarantine(self, path: Path, machine: str, reason: str) -> Path:
         """Keep an unusable file's bytes and the reason; the file itself stays where it is.
 
-        Returns the copy's path (the log's, where the file cannot be read), below the root where that is no folder of
-        this computer. The same bytes under the same name with the same reason are entered once.
+        Returns the copy's path (the log's, where there is no copy), below the root where that is no folder of this
+        computer. The same bytes under the same name with the same reason are entered once.
         """
+        return self.quarantine_many([(path, reason)], machine)[0]
+
+    def quarantine_many(self, refused: Sequence[tuple[Path, str]], machine: str) -> list[Path]:
+        """As `quarantine`, of files with reasons. Copy and log can be read by their owner alone."""
+        if not refused:
+            return []
         folder = _quarantine(machine)
+        at = self._store.path(folder)
         with self._writing():
-            name = safe_name(ascii_if_broken(path.name))
-            entry = entry_for(path, machine, reason, self._store.path(folder), name)
             entries = self.quarantined(machine)
-            if entry.copy is not None and not self._store.exists(copy := f"{folder}/{entry.copy.name}"):
-                self._store.write(copy, path)
-            if not any(replace(e, at=entry.at) == entry for e in entries):
-                self._store.write(f"{folder}/{LOG}", log_text([*entries, entry]).encode(), keep=False)
-        return entry.copy or self._store.path(f"{folder}/{LOG}")
+            known, held, kept = {replace(e, at="") for e in entries}, set(self._store.files(folder)), []
+            for path, reason in refused:
+                entry = entry_for(path, machine, reason, at, safe_name(ascii_if_broken(path.name)))
+                if entry.copy is not None and entry.copy.name not in held:
+                    self._store.write(f"{folder}/{entry.copy.name}", path, private=True)
+                    held.add(entry.copy.name)
+                if replace(entry, at="") not in known:
+                    known.add(replace(entry, at=""))
+                    entries.append(entry)
+                kept.append(entry.copy or at / LOG)
+            self._store.write(f"{folder}/{LOG}", log_text(entries).encode(), keep=False, private=True)
+        return kept
 
     def quarantined(self, machine: str) -> list[Quarantined]:
         """Quarantined files of a machine, oldest first."""
@@ -374,6 +389,8 @@ class Lake:
             raise WorkError(
                 f"lake {where}: got schema {manifest.get('schema')!r}, expected {schemas[0]!r}; use another lake folder"
             )
+        if "machines" in manifest and (strange := listing.stray(manifest)):
+            raise WorkError(f"lake {where}: {strange}; it was changed by another program; restore it from a backup")
         return manifest
 
     def _batches(self, machine: str, manifest: dict[str, Any] | None = None) -> dict[str, list[Entry]]:

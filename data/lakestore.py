@@ -59,8 +59,11 @@ class Store(Protocol):
     def files(self, folder: str) -> list[str]:
         """Names of the files in a folder, sorted; empty for none."""
 
-    def write(self, file: str, body: Any, keep: bool = True) -> None:
-        """Put bytes, or the copy of a file of this computer, there in one step; `keep`: nobody is to write it again."""
+    def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
+        """Put bytes, or the copy of a file of this computer, there in one step.
+
+        `keep`: nobody is to write it again; `private`: only its owner reads it, where there are such rights.
+        """
 
     def repeat(self, file: str, source: str) -> bool:
         """Make `file` hold what the file `source` holds, in one step; False where it does already."""
@@ -115,7 +118,7 @@ class Folder:
         path = self.root / folder
         return sorted(p.name for p in path.iterdir() if p.is_file()) if path.is_dir() else []
 
-    def write(self, file: str, body: Any, keep: bool = True) -> None:
+    def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
         target, temporary = self.root / file, self.root / _TMP / "next"
         target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(body, Path):
@@ -125,7 +128,9 @@ class Folder:
             temporary.write_bytes(body)
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())
-        if keep:
+        if private:
+            temporary.chmod(0o600)
+        elif keep:
             temporary.chmod(0o444)
         temporary.replace(target)
         _sync(target.parent)
@@ -237,7 +242,7 @@ class Remote:
             return []
         return sorted(str(f["name"]).rpartition("/")[2] for f in found if f["type"] == "file")
 
-    def write(self, file: str, body: Any, keep: bool = True) -> None:
+    def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
         self._check_held()
         at = self._at(file) if self._atomic else self._at(f"{_TMP}/{uuid4().hex}")
         if not self._atomic:

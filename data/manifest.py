@@ -15,6 +15,7 @@ from fnmatch import fnmatchcase
 from typing import Any, Literal
 
 from data.errors import InputError, closest
+from data.lakefile import safe_name
 
 SCHEMA = "thermodrift.lake/2"
 SCHEMA_OF_ALL = "thermodrift.lake/1"  # of an earlier program: one manifest of all machines
@@ -95,6 +96,26 @@ class Staged:
 def empty() -> dict[str, Any]:
     """The manifest of a lake without a batch."""
     return {"schema": SCHEMA, "pending": [], "machines": {}}
+
+
+def folder_of(machine: str, batch_id: str) -> str:
+    """Where the files of a batch's versions are, below the root."""
+    return f"_versions/machine={safe_name(machine)}/{safe_name(batch_id)}"
+
+
+def stray(manifest: Mapping[str, Any]) -> str:
+    """What a manifest names outside of the folder of its batch, as only another program writes it; empty for none."""
+    for machine, batches in manifest["machines"].items():
+        for batch_id, entries in batches.items():
+            folder = f"{folder_of(machine, batch_id)}/"
+            for e in entries:
+                for file in (e["file"], *e["earlier"]):
+                    name = file.removeprefix(folder)
+                    if name == file or "/" in name or "\\" in name:
+                        return f"batch {batch_id} of {machine}: got file {file!r}, expected one in {folder}"
+                if not isinstance(e["year"], int):
+                    return f"batch {batch_id} of {machine}: got year {e['year']!r}, expected a whole number"
+    return ""
 
 
 def version_of(entry: Entry) -> Version:

@@ -137,8 +137,9 @@ def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list
 
     A pattern of `recording.files` without a slash is that of a file's name, one with a slash that of its path in the
     directory; ``./*.csv`` takes no file of a subfolder. Case does not matter. Files that are read with the recordings
-    (the schedule, `recording.joined`) are neither. Hidden folders, lakes and links to folders are not entered; the
-    lake's folder of this machine, given as the directory, gives its files whatever the patterns.
+    (the schedule, `recording.joined`) are neither. Hidden folders and lakes are not entered, links to folders and to
+    files outside are not followed; the lake's folder of this machine, given as the directory, gives its files whatever
+    the patterns.
 
     Raises:
         InputError: no such directory.
@@ -150,6 +151,7 @@ def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list
     recordings: list[Path] = []
     ignored: list[tuple[Path, str]] = []
     unreadable: list[OSError] = []
+    inside = directory.resolve()
     for folder, subfolders, names in os.walk(directory, onerror=unreadable.append):
         for name in list(subfolders):
             if reason := _folder_ignored(Path(folder, name)):
@@ -157,7 +159,7 @@ def recording_files(directory: Path, machine: Machine) -> tuple[list[Path], list
                 ignored.append((Path(folder, name), reason))
         for path in (Path(folder, name) for name in names):
             relative = path.relative_to(directory).as_posix()
-            reason = _file_ignored(path)
+            reason = _file_ignored(path, inside)
             if not reason and any(_fits(relative, p) or _fits(path.name, p) for p in side):
                 continue
             own = path.suffix == ".parquet" and f"machine={machine.machine}" in path.parts
@@ -190,12 +192,14 @@ def _folder_ignored(folder: Path) -> str:
     return "a lake" if (folder / "_manifest.json").is_file() else ""
 
 
-def _file_ignored(path: Path) -> str:
+def _file_ignored(path: Path, inside: Path) -> str:
     """Why a file is no recording whatever the patterns; empty where it may be one."""
     if path.name.startswith(("~$", ".~")):
         return "lock file of an open document"
     if path.name.startswith("."):
         return "hidden"
+    if path.is_symlink() and not path.resolve().is_relative_to(inside):
+        return "link to a file outside of the folder; name that file itself to read it"
     return "" if path.is_file() else "not a file"
 
 
@@ -250,13 +254,25 @@ def _file_batches(path: Path, machine: Machine, need_error: bool, needed: Collec
                 name = sheet.name if len(tables) + len(errors) > 1 else ""
                 place = Place(path, name, batch_id)
                 source = _Source(machine, place, where, need_error, needed, layout.sweeps, layout.origin_s)
-                yield from _sheet_batches(sheet, layout, source, extra, errors)
+                batches = _sheet_batches(sheet, layout, source, extra, errors)
+                yield from _last_truncated(batches) if sheet.cut else batches
             except InputError as error:
                 errors.append(error)
             extra = {}
     if errors:
         more = f" (and {len(errors) - 1} more parts of the file cannot be used)" if len(errors) > 1 else ""
         raise InputError(f"{errors[0]}{more}")
+
+
+def _last_truncated(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """The batches, of which the last one says that its file ends within a row."""
+    last = next(batches, None)
+    for batch in batches:
+        assert last is not None
+        yield last
+        last = batch
+    if last is not None:
+        yield replace(last, repairs={**last.repairs, "truncated": 1})
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ after any of the three. An entry that is not marked was carried out if the alias
 the next entry, which states what the alias named then, or now if none follows. Otherwise it was interrupted, and
 look-ups skip it. No repair is necessary, and the next promotion works in each case.
 
-Entries are ordered by the number in their key, since the clocks of two machines may differ. An entry is never earlier than
-those before it: where the clock was set back, it has their latest time, and what the clock showed.
+Entries are ordered by the number in their key, since the clocks of two machines may differ. An entry is never earlier
+than those before it: where the clock was set back, it has their latest time, and what the clock showed.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ _TIME = "%Y-%m-%d %H:%M:%S"
 class Entry(BaseModel):
     """One change of a champion, as the log holds it.
 
-    `when` is UTC, taken before the alias moves; where the clock showed an
-    earlier time than the entries before have, it is the latest of theirs, and `clock` is what the clock showed. `who` is MLFLOW_TRACKING_USERNAME, else the user of the operating
-    system. `from_version` is the version that the alias named before, None without a champion. `code_version` is that
-    of the program which made the change, see `tracking.code_version`.
+    `when` is UTC, taken before the alias moves; where the clock showed an earlier time than the entries before have, it
+    is the latest of theirs, and `clock` is what the clock showed. `who` is MLFLOW_TRACKING_USERNAME, else the user of
+    the operating system. `from_version` is the version that the alias named before, None without a champion.
+    `code_version` is that of the program which made the change, see `tracking.code_version`.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -193,8 +193,9 @@ def move_champion(
     clock = now()
     latest = max((e.when for e in read(model).entries), default=clock)
     entry = Entry(
-        when=max(clock, latest), clock=clock if clock < latest else None, who=who(), host=platform.node(), action=action, model=name, from_version=_named(model, CHAMPION),
-        to_version=int(version), why=why[:_MAX_WHY], forced=forced, training_id=training_id, code_version=code_version,
+        when=max(clock, latest), clock=clock if clock < latest else None, who=who(), host=platform.node(),
+        action=action, model=name, from_version=_named(model, CHAMPION), to_version=int(version),
+        why=why[:_MAX_WHY], forced=forced, training_id=training_id, code_version=code_version,
     )  # fmt: skip
     key = f"thermodrift.log.{number:06d}.{uuid.uuid4().hex[:12]}"
     client.set_registered_model_tag(name, key, entry.model_dump_json())

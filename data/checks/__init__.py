@@ -39,6 +39,7 @@ CHECKS = Registry(
         "swapped": "data.checks.across_batches:Swapped",
         "unexplained": "data.checks.across_batches:Unexplained",
         "short": "data.checks.timeline:Short",
+        "truncated": "data.checks.timeline:Truncated",
         "copied": "data.checks.copies:Copied",
     },
 )

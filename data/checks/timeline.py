@@ -45,6 +45,23 @@ class Clock(Check):
         return found
 
 
+class Truncated(Check):
+    """Found while a file is read. Where it was cut, rows are missing: nobody knows how many."""
+
+    key = "truncated"
+    summary = "the file ends within a row"
+
+    def batch(self, batch: Batch, machine: Machine) -> list[Finding]:
+        if not batch.repairs.get("truncated"):
+            return []
+        end = float(batch.time_s[-1]) if batch.n_rows else 0.0
+        message = (
+            f"the file ends within a row, {clock(end)} after the start: it was cut, and what follows is missing; copy "
+            "the whole file and ingest it again, or withdraw the run (thermodrift lake withdraw)"
+        )
+        return [self.finding(None, message, end, masks=False)]
+
+
 _SHORT_BATCHES = 5
 _SHORT_SHARE = 1.0 / 3.0
 

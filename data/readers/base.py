@@ -48,6 +48,7 @@ class Sheet(ABC):
     summary: str = ""  # how the text is encoded: "semicolon, decimal comma, cp1252"
     units: Sequence[str] = ()  # by column, where the format states them apart from the rows
     origin_s: float = 0.0  # s since 1970 at which an elapsed clock shows 0; 0 where the file does not say
+    cut: bool = False  # the file ends within a row: what follows is missing
     step_s: float | None = None  # between two rows, where the format states it in place of a clock
 
     @abstractmethod

@@ -148,6 +148,7 @@ def _whole(lines: list[str]) -> list[str]:
 _TITLE_LINES = 50
 _HEAD_BYTES = 1 << 20
 _BLOCK_BYTES = 4 << 20
+_TAIL_BYTES = 1 << 16
 
 
 class CsvSheet(Sheet):
@@ -169,9 +170,19 @@ class CsvSheet(Sheet):
         self.separator = form.separator or find_separator(lines, hints, (*SEPARATORS, *_BLANKS))
         self.head = [split(line, self.separator) if line.strip() else [] for line in lines]
         self.decimal = form.decimal or find_decimal(self.head)
+        self.cut = self._ends_within_a_row()
         self._quoted = '"' in text and self.separator not in _BLANKS
         mark = "point" if self.decimal == "." else "comma"
         self.summary = f"{_NAMES.get(self.separator, self.separator)} separated, decimal {mark}, {self.encoding}"
+
+    def _ends_within_a_row(self) -> bool:
+        """Whether the last line has no end, and fewer cells than the line before it."""
+        with self.path.open("rb") as file:
+            file.seek(max(0, self.path.stat().st_size - _TAIL_BYTES))
+            lines = file.read().decode(self.encoding, "replace").split(self._newline)
+        if len(lines) < 3 or not lines[-1].strip():
+            return False
+        return len(split(lines[-1], self.separator)) < len(split(lines[-2], self.separator))
 
     def blocks(self, first_row: int, positions: Sequence[int], text: Collection[int] = ()) -> Iterator[Block]:
         widths = Counter(len(row) for row in self.head[first_row : first_row + 200] if row)

@@ -345,3 +345,23 @@ def test_the_lakes_own_files_can_be_ingested_again(tmp_path: Path) -> None:
     batch = lake.load("vmc", "2025/run")
     assert np.isnan(batch.values("T2")).all()
     np.testing.assert_array_equal(batch.values("T1"), lake.load("vmc", "2025/run", 1).values("T1"))
+
+
+def test_a_file_that_was_cut_within_a_row_is_named_and_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
+    folder, lake = tmp_path / "in", Lake(tmp_path / "lake")
+    folder.mkdir()
+    rows = [f"{60 * k},{20 + 0.1 * (k % 7):.1f},{k % 5:.1f}" for k in range(40)]
+    whole = "\n".join(["t,T1,z_um", *rows])
+    (folder / "run1.csv").write_text(whole[:-9])  # within the last time stamp
+    (folder / "run2.csv").write_text(whole)  # whole, without an end of its last line
+    secret = tmp_path / "secret.csv"
+    secret.write_text("root:x:0")
+    (folder / "run3.csv").symlink_to(secret)
+    report = ingest([folder], MACHINE, lake)
+    found = {r.batch_id: [f.message for f in r.found if f.check == "truncated"] for r in report.rows}
+    assert list(found) == ["run1", "run2"] and not found["run2"]
+    assert found["run1"][0].startswith("the file ends within a row, 38 min after the start: it was cut")
+    assert [r.status for r in report.rows] == ["new", "new"]
+    assert [(f.name, reason.partition(";")[0]) for f, reason in report.ignored] == [
+        ("run3.csv", "link to a file outside of the folder")
+    ]

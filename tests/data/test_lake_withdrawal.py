@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from data.batch import Batch, Channel
-from data.errors import InputError
+from data.errors import InputError, WorkError
 from data.lake import Lake
 from data.lakefile import measured_digest
 from tests.data.test_lake import make, same
@@ -218,3 +218,39 @@ def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> N
         assert plain(lake) == {"run2", "run3"} | ({"run1"} if states[-1] == "in use" else set())
         assert (root / "_versions/machine=vmc/run1").exists() == (states[-1] != "purged")
     assert list(dict.fromkeys(states)) == ["in use", "withdrawn", "purged"] and len(states) > 30
+
+
+@pytest.mark.parametrize(
+    ("file", "key"),
+    [("../victim/data.parquet", "file"), ("/tmp/victim.parquet", "file"), ("_versions/machine=vmc/run2/x.parquet", "file"),
+     ("_versions/machine=vmc/run1/../../../../victim/data.parquet", "earlier"), ("../../victim", "year")],
+)  # fmt: skip
+def test_a_manifest_that_names_other_files_is_refused_and_nothing_is_deleted(lake: Lake, file: str, key: str) -> None:
+    victim = lake.root.parent / "victim" / "data.parquet"
+    victim.parent.mkdir()
+    victim.write_text("not of this lake")
+    lake.withdraw("vmc", ["run1"], "private")
+    path = lake.root / "_manifest" / "machine=vmc.json"
+    manifest = json.loads(path.read_text())
+    entry = manifest["machines"]["vmc"]["run1"][-1]
+    entry[key] = [file] if key == "earlier" else file
+    entry["sha256"] = {file: "0" * 64}
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(WorkError, match=r"batch run1 of vmc: got (file|year) .*restore it from a backup"):
+        lake.purge("vmc", ["run1"])
+    assert victim.exists() and list((lake.root / "_versions/machine=vmc/run2").iterdir())
+
+
+def test_files_in_quarantine_are_for_their_owner_alone_and_large_ones_get_no_copy(
+    lake: Lake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, large = tmp_path / "small.csv", tmp_path / "large.csv"
+    small.write_text("secret")
+    large.write_text("secret" * 100)
+    monkeypatch.setattr("data.lake.COPY_MAX_BYTES", 500)
+    copies = lake.quarantine_many([(small, "bad"), (large, "bad"), (small, "bad")], "vmc")
+    assert [p.name for p in copies][1] == "reasons.jsonl" and copies[0] == copies[2]
+    assert {oct(p.stat().st_mode & 0o777) for p in copies} == {"0o600"}
+    found = lake.quarantined("vmc")
+    assert [(e.name, e.copy is None) for e in found] == [("small.csv", False), ("large.csv", True)]
+    assert "no copy kept: larger than" in found[1].reason

@@ -301,7 +301,9 @@ def test_roll_backs_walk_down_and_never_return_to_what_was_rolled_back(store, st
     assert registry.rollback(name, store, of=2).version == 1
     with pytest.raises(InputError, match="no version was champion before version 1"):
         registry.rollback(name, store)
-    train(store, "toy-stack", [12.0, 13.0] * 3 + [5.0] * 3, force=True)  # a promotion makes it champion again: as version 4 was: the same batches and cell
+    train(
+        store, "toy-stack", [12.0, 13.0] * 3 + [5.0] * 3, force=True
+    )  # a promotion makes it champion again: as version 4 was: the same batches and cell
     assert aliases(store, name)["champion"] == 4
     assert registry.rollback(name, store).version == 1
 
