@@ -55,8 +55,8 @@ class Served:
                 "promote a model of another family"
             )
         for name in SERVED:
-            noted = stored.get("sha256", {}).get(name)  # none in a model of an earlier program
-            if noted and hashlib.sha256((folder / name).read_bytes()).hexdigest() != noted:
+            noted = stored.get("sha256", {}).get(name)
+            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != noted:
                 raise RuntimeError(
                     f"model folder {folder}: {name} is not the file that was promoted; load the model from the "
                     "registry again, or promote it again"

@@ -398,6 +398,28 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     return versions[which]
 
 
+def version_folder(source: str, sha256: str, settings: Settings) -> Path:
+    """The local folder of a registered version's files, which are those that were registered.
+
+    Args:
+        sha256: the digest that the registry has of them, see `model_store.digest`; empty: of an earlier program.
+
+    Raises:
+        InputError: `model.json` is another one.
+    """
+    folder = Path(local_folder(source, settings))
+    try:
+        got = model_store.digest(folder) if sha256 else ""
+    except OSError:
+        return folder  # `model_store.load` says what is missing
+    if got != sha256:
+        raise InputError(
+            f"model folder {folder}: model.json is not the one that was registered (sha256 {got[:12]}…, the registry "
+            f"has {sha256[:12]}…); restore it from a backup, or promote the model again"
+        )
+    return folder
+
+
 def local_folder(uri: str, settings: Settings) -> str:
     """The local folder of a model's files; downloaded if the store is remote."""
     open_store(settings)
@@ -431,7 +453,7 @@ def _against(
 
 def _score_unseen(champion: ModelVersion, unseen: Sequence[Batch], target: str, settings: Settings) -> pd.DataFrame:
     """S of the champion's own predictions on batches it was not trained on: batch_id, digest, S_um."""
-    model = model_store.load(Path(local_folder(champion.source, settings)))
+    model = model_store.load(version_folder(champion.source, champion.tags.get("sha256", ""), settings))
     rows = []
     for b in unseen:
         try:
@@ -493,6 +515,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
             folder, new.family, new.machine_yaml, new.batches, new.region, info, bound, result.curves, result.stack
         )
         served = write_served(stored, folder, stored.info["step_s"])
+        tags |= {"sha256": model_store.digest(folder)}
         channels = stored.channels()
         drivers = [d for d in stored.machine.names("driver") if d not in channels]
         signature = ModelSignature(

@@ -332,8 +332,9 @@ class _Year:
         if (target, version) not in self._models:
             client = tracking.open_store(self.settings)
             name = self.settings.model(self.machine.machine, target)
-            source = registry.find_version(client, name, str(version)).source
-            self._models[target, version] = model_store.load(Path(registry.local_folder(source, self.settings)))
+            found = registry.find_version(client, name, str(version))
+            folder = registry.version_folder(found.source, found.tags.get("sha256", ""), self.settings)
+            self._models[target, version] = model_store.load(folder)
         return self._models[target, version]
 
     @cached_property

@@ -156,7 +156,8 @@ def _gathered(
     for c in champions:
         try:
             if c.version is not None:
-                models[c.target] = model_store.load(Path(registry.local_folder(c.source, settings)))
+                folder = registry.version_folder(c.source, c.tags.get("sha256", ""), settings)
+                models[c.target] = model_store.load(folder)
         except (InputError, WorkError) as error:
             trouble[c.target] = str(error)
     batches: list[Batch] = []

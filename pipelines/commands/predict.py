@@ -48,7 +48,7 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
     from mlflow.exceptions import MlflowException
 
     from pipelines.model_store import registered
-    from pipelines.registry import find_version, local_folder
+    from pipelines.registry import find_version, local_folder, version_folder
     from pipelines.tracking import open_store, store_errors
 
     if model_uri.startswith("runs:/"):
@@ -64,7 +64,7 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
     with store_errors(settings):
         client = open_store(settings)
         version = find_version(client, *named)
-    return Path(local_folder(version.source, settings))
+    return version_folder(version.source, version.tags.get("sha256", ""), settings)
 
 
 def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame:

@@ -222,7 +222,8 @@ def test_a_kill_at_any_step_of_withdraw_and_purge_is_healed(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("file", "key"),
-    [("../victim/data.parquet", "file"), ("/tmp/victim.parquet", "file"), ("_versions/machine=vmc/run2/x.parquet", "file"),
+    [("../victim/data.parquet", "file"), ("/tmp/victim.parquet", "file"),
+     ("_versions/machine=vmc/run2/x.parquet", "file"),
      ("_versions/machine=vmc/run1/../../../../victim/data.parquet", "earlier"), ("../../victim", "year")],
 )  # fmt: skip
 def test_a_manifest_that_names_other_files_is_refused_and_nothing_is_deleted(lake: Lake, file: str, key: str) -> None:

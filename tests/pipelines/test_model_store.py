@@ -54,7 +54,8 @@ def test_a_changed_file_is_refused(stored: Path, name: str, how: str) -> None:
         model_store.load(stored)
     said = str(caught.value)
     assert said.startswith(f"model folder {stored}: not a stored model as it was promoted ({name} has sha256 ")
-    assert said.endswith("); load the model from the registry again, or promote it again") and "expected " in said
+    assert said.endswith("); load the model from the registry again, or promote it again")
+    assert "model.json names " in said
     assert len(said.splitlines()) == 1
 
 
@@ -76,13 +77,16 @@ def test_a_model_without_what_serves_it_is_read_and_one_without_its_arrays_is_no
         model_store.load(stored)
 
 
-def test_a_model_of_an_earlier_program_has_no_hashes(stored: Path) -> None:
+@pytest.mark.parametrize("name", [None, "arrays.npz", "machine.yml", "model.onnx"])
+def test_a_hash_cannot_be_left_out(stored: Path, name: str | None) -> None:
     document = json.loads((stored / "model.json").read_text(encoding="utf-8"))
-    del document["sha256"]
+    del (document if name is None else document["sha256"])[name or "sha256"]
     (stored / "model.json").write_text(json.dumps(document), encoding="utf-8")
-    changed(stored / "machine.yml", "longer")
-    changed(stored / "model.onnx", "longer")
-    assert model_store.load(stored).family.inputs == ("front", "bed")
+    with pytest.raises(InputError, match=f"{name or 'arrays.npz'} has sha256 .*, model.json names none"):
+        model_store.load(stored)
+    if name in (None, "model.onnx"):
+        with pytest.raises(RuntimeError, match="is not the file that was promoted"):
+            Served(stored)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +94,7 @@ def test_a_model_of_an_earlier_program_has_no_hashes(stored: Path) -> None:
     [
         ("{", '{"a":' * 20_000, "not a stored model"),
         ('"schema"', '"skema"', "got schema None, expected"),
-        ('"sha256": {', '"sha256": [1], "other": {', "not a stored model (sha256 is no mapping)"),
+        ('"sha256": {', '"sha256": [1], "other": {', "model.json names none"),
         ('"options"', '"optoins"', "model.json is damaged (KeyError: 'options')"),
         ('"a0"', '"a99"', "model.json is damaged (KeyError: 'a99')"),
     ],

@@ -197,6 +197,18 @@ def test_the_logged_model_has_no_pickle_and_predicts_through_plain_mlflow(story,
     assert loaded.metadata.signature.inputs.input_names() == ["time_s", "front", "bed", "speed", "batch_id"]
 
 
+def test_a_registered_model_that_was_changed_is_refused_whatever_it_says_of_itself(store):
+    train(store, "toy-changed", [5.0, 6.0] * 3)
+    load_model("models:/toy-changed-z@champion", store)
+    client = MlflowClient(store.store_uri, registry_uri=store.store_uri)
+    source = client.get_model_version("toy-changed-z", "1").source
+    file = Path(registry.local_folder(source, store)) / "artifacts" / "model.json"
+    file.write_text(file.read_text().replace('"n_batches": 6', '"n_batches": 9'))
+    with pytest.raises(InputError, match=r"model\.json is not the one that was registered \(sha256"):
+        load_model("models:/toy-changed-z@champion", store)
+    load_model(str(file.parent), store)  # a folder has no registry to be held against
+
+
 def test_a_choice_that_is_not_to_be_trusted_says_so(store):
     batches = toy_batches("toy-zero", 6)
     result = toy_result(batches, {"none|zero|0": [5.0] * 6, "none|mlr|2": [9.0] * 6})
