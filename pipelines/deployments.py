@@ -48,10 +48,15 @@ TROUBLE = (httpx.HTTPError, PrefectHTTPStatusError, RuntimeError, OSError)
 
 
 class Deployments:
-    """The source of jobs of `scheduling.Scheduler` where there is a Prefect server; a context."""
+    """The source of jobs of `scheduling.Scheduler` where there is a Prefect server; a context.
 
-    def __init__(self, fleet: Fleet, schema: Mapping[str, Any], folders: Folders, say: Say) -> None:
-        self.url = str(PREFECT_API_URL.value())
+    `again`: machines whose turn is to be repeated.
+    """
+
+    def __init__(
+        self, fleet: Fleet, schema: Mapping[str, Any], folders: Folders, say: Say, again: Iterable[str] = ()
+    ) -> None:
+        self.url, self._again = str(PREFECT_API_URL.value()), set(again)
         self._fleet, self._schema, self._folders, self._say = fleet, schema, folders, say
         self._ids: dict[UUID, FleetMachine] = {}
         self._due: dict[str, Job] = {}
@@ -81,7 +86,7 @@ class Deployments:
             except TROUBLE as error:
                 self._failed(now, error)
                 self._poll_at_s = time.monotonic() + LOST_POLL_S
-        return list(self._due.values())
+        return sorted(self._due.values(), key=lambda job: job.since)
 
     def begin(self, job: Job, now: datetime) -> bool:
         """Pending is what one process alone can propose: another that serves the same deployments gets no second."""
@@ -110,18 +115,20 @@ class Deployments:
     def _poll(self, now: datetime) -> None:
         if not self._ids:
             self._register()
-        for m in self._fleet.machines:
-            if m.name in self._folders.settled(now):
-                deployment = next(i for i, own in self._ids.items() if own.name == m.name)
+        for deployment, m in self._ids.items():
+            if m.name in self._folders.settled(now) or m.name in self._again:
                 self._client.create_flow_run_from_deployment(deployment, name=f"retrain {m.name}")
                 self._folders.taken(m.name)
+                self._again.discard(m.name)
         runs = self._scheduled(now)
-        self._due = {}
+        before, self._due = self._due, {}
         for deployment, machine in self._ids.items():
             own = [r for r in runs if r.deployment_id == deployment]
             self._skip(own[:-1])
             if own:
-                self._due[machine.name] = Job(machine, str(own[-1].id))
+                waits = [r.next_scheduled_start_time or now for r in own]
+                waits += [before[machine.name].since] if machine.name in before else []  # for a run that is skipped now
+                self._due[machine.name] = Job(machine, min(waits), str(own[-1].id))
         if time.monotonic() >= self._upcoming_at_s:
             self._upcoming()
             self._upcoming_at_s = time.monotonic() + UPCOMING_S

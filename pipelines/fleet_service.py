@@ -22,7 +22,7 @@ from pipelines import fleet_state
 from pipelines.caller import Say
 from pipelines.fleet import Fleet
 from pipelines.folders import Folders
-from pipelines.scheduling import Clock, Scheduler, started_apart
+from pipelines.scheduling import TRIES, Clock, Scheduler, started_apart
 
 
 def local_timezone() -> str:
@@ -84,15 +84,16 @@ def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -
     with alone(home, fleet):
         fleet, schema = checked(fleet, say)
         folders = Folders(fleet, say)
+        again = [name for name, (_, tries) in fleet_state.unfinished(home, fleet).items() if tries < TRIES]
         with folders.watching():
             if _has_server(home):
                 from pipelines.deployments import Deployments
 
-                with Deployments(fleet, schema, folders, say) as source:
+                with Deployments(fleet, schema, folders, say, again) as source:
                     say(_first_line(fleet, f"as scheduled by {source.url}"))
                     Scheduler(fleet, source, home, say).serve(rounds)
             else:
-                clock = Clock(fleet, fleet_state.last_turns(home, fleet), folders, datetime.now(UTC))
+                clock = Clock(fleet, fleet_state.last_turns(home, fleet), folders, datetime.now(UTC), again)
                 dates = {n: d for n, d in clock.next().items() if d is not None}
                 first = min(dates, key=lambda n: dates[n], default="")
                 say(_first_line(fleet, f"next at {dates[first]:%Y-%m-%d %H:%M %Z}" if first else "when files arrive"))

@@ -1,6 +1,7 @@
 """What is kept about a fleet below the home folder, as small JSON files that are read without heavy imports.
 
-fleet/KEY.schedule.json   a fleet: its file, next dates, last turns; KEY.lock is held while a process serves it
+fleet/KEY.schedule.json   a fleet: its file, next dates, last turns, which of them did not end; KEY.lock is held while a
+                          process serves it
 fleet/MACHINE.run.json    a machine's last run and its last failure
 fleet/MACHINE.state.json  its champions, their drift and the state of its sensors, see `pipelines.watching`
 fleet/MACHINE.alerts.json the alerts that were last reported
@@ -55,14 +56,32 @@ def write_schedule(home: Path, fleet: Fleet, upcoming: Mapping[str, datetime | N
 
 
 def note_turn(home: Path, fleet: Fleet, machine: str, now: datetime) -> None:
-    """A machine has its turn: dates up to now are done."""
-    kept = _schedule(home, fleet.key).get("turns", {})
-    _update(home, fleet, {"turns": {**kept, machine: now.isoformat()}})
+    """A machine has its turn: dates up to now are done. Until `end_turn` the turn is unfinished."""
+    kept = _schedule(home, fleet.key)
+    open_turns = kept.get("unfinished", {})
+    _update(home, fleet, {
+        "turns": {**kept.get("turns", {}), machine: now.isoformat()},
+        "unfinished": {**open_turns, machine: open_turns.get(machine, 0) + 1},
+    })  # fmt: skip
+
+
+def end_turn(home: Path, fleet: Fleet, machine: str) -> None:
+    """A machine's turn is over, however it ended."""
+    kept = _schedule(home, fleet.key).get("unfinished", {})
+    if machine in kept:
+        _update(home, fleet, {"unfinished": {m: tries for m, tries in kept.items() if m != machine}})
 
 
 def last_turns(home: Path, fleet: Fleet) -> dict[str, datetime]:
     """When each machine last had its turn."""
     return {m: datetime.fromisoformat(when) for m, when in _schedule(home, fleet.key).get("turns", {}).items()}
+
+
+def unfinished(home: Path, fleet: Fleet) -> dict[str, tuple[datetime, int]]:
+    """Machines whose last turn began and did not end: when, and how often in succession."""
+    turns, kept = last_turns(home, fleet), _schedule(home, fleet.key).get("unfinished", {})
+    own = {m.name for m in fleet.machines}
+    return {m: (turns[m], int(tries)) for m, tries in kept.items() if m in own and m in turns}
 
 
 def note_run(home: Path, machine: str, began: datetime, ok: bool, summary: str) -> None:

@@ -21,10 +21,14 @@ class Folders:
 
     def __init__(self, fleet: Fleet, say: Say) -> None:
         self._say = say
-        self._of = {Path(r): m for m in fleet.machines if m.when.watch for r in m.recordings}
+        self._of: dict[Path, list[str]] = {}  # two machines may record into one folder
+        for m in (m for m in fleet.machines if m.when.watch):
+            for r in m.recordings:
+                self._of.setdefault(Path(r), []).append(m.name)
         self._quiet = {m.name: timedelta(minutes=m.when.quiet_min) for m in fleet.machines if m.when.watch}
         # What arrived while nobody watched is looked for at once.
-        self._changed = dict.fromkeys(self._quiet, datetime.fromtimestamp(0, UTC))
+        never = datetime.fromtimestamp(0, UTC)
+        self._changed = dict.fromkeys(self._quiet, (never, never))  # first and last change since the machine's run
         self._lock = threading.Lock()
         self._stop = threading.Event()
 
@@ -44,12 +48,12 @@ class Folders:
     def touch(self, name: str, when: datetime) -> None:
         """A machine's folders changed."""
         with self._lock:
-            self._changed[name] = when
+            self._changed[name] = (self._changed.get(name, (when, when))[0], when)
 
-    def settled(self, now: datetime) -> set[str]:
-        """Machines whose folders have changed, and not for their quiet time."""
+    def settled(self, now: datetime) -> dict[str, datetime]:
+        """Machines whose folders have changed, and not for their quiet time; since when they have new files."""
         with self._lock:
-            return {name for name, when in self._changed.items() if now - when >= self._quiet[name]}
+            return {name: first for name, (first, last) in self._changed.items() if now - last >= self._quiet[name]}
 
     def taken(self, name: str) -> None:
         """A run of the machine begins: it takes what is there now."""
@@ -75,11 +79,15 @@ class Folders:
                              raise_interrupt=False):  # fmt: skip
             now = datetime.now(UTC)
             for _, path in changes:
-                for folder, machine in self._of.items():
+                for folder in self._of:
                     if folder == Path(path) or folder in Path(path).parents:
-                        self.touch(machine.name, now)
+                        self._touch_all(folder, now)
             if {p for p in self._of if p.exists()} != there:
                 for folder in set(self._of) - there:
                     if folder.exists():
-                        self.touch(self._of[folder].name, now)
+                        self._touch_all(folder, now)
                 return
+
+    def _touch_all(self, folder: Path, when: datetime) -> None:
+        for name in self._of[folder]:
+            self.touch(name, when)

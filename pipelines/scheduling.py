@@ -1,8 +1,9 @@
 """The process that waits for the machines of a fleet and has each retrained in a process of its own.
 
 It decides nothing about models and imports little: what comes due is a `Source` (dates and watched folders here, a
-Prefect server in `pipelines.deployments`), what a run does is in `pipelines.apart`. One run per machine at a time; a
-date that passes while a run goes on, or while this process does not run, is caught up once.
+Prefect server in `pipelines.deployments`), what a run does is in `pipelines.apart`. One run per machine at a time, the
+longest waiting first: too many machines for one computer are each retrained less often. A date that passes while a run
+goes on, or while this process does not run, is caught up once, and so is a run that ended with this process.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -27,6 +28,8 @@ from pipelines.fleet import Fleet, FleetMachine
 from pipelines.folders import Folders
 
 TICK_S = 1.0
+NEVER = datetime.min.replace(tzinfo=UTC)
+TRIES = 2  # of a turn that ended with this process: what ends twice may be what ends this process
 APART = (sys.executable, "-m", "pipelines.apart")
 END_S = 2.5  # for a run to end after SIGTERM; an operator waits 5 s for all of it
 
@@ -46,9 +49,10 @@ def started_apart(what: str, line: str, **streams: Any) -> subprocess.Popen[str]
 
 @dataclass(frozen=True)
 class Job:
-    """A machine whose turn has come; `flow_run_id` where a server scheduled it."""
+    """A machine whose turn has come, and since when it waits; `flow_run_id` where a server scheduled it."""
 
     machine: FleetMachine
+    since: datetime
     flow_run_id: str | None = None
 
 
@@ -56,7 +60,7 @@ class Source(Protocol):
     """What comes due, and when."""
 
     def due(self, now: datetime) -> list[Job]:
-        """Every job that could begin now, again and again until it begins."""
+        """Every job that could begin now, again and again until it begins, the longest waiting first."""
 
     def begin(self, job: Job, now: datetime) -> bool:
         """The job begins; False where it is no longer to be done."""
@@ -69,23 +73,37 @@ class Source(Protocol):
 
 
 class Clock:
-    """Dates that this process computes, and folders that it watches; `last` is when each machine last had its turn."""
+    """Dates that this process computes, and folders that it watches.
 
-    def __init__(self, fleet: Fleet, last: Mapping[str, datetime], folders: Folders, now: datetime) -> None:
-        self._fleet, self._folders = fleet, folders
-        self._next: dict[str, datetime | None] = {}
-        for m in fleet.machines:
-            since = last.get(m.name)
-            due = m.when.next(now if since is None else since, fleet.zone)
-            self._next[m.name] = due if due is None else max(due, now)
+    Args:
+        last: when each machine last had its turn.
+        again: machines whose turn is to be repeated.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        last: Mapping[str, datetime],
+        folders: Folders,
+        now: datetime,
+        again: Collection[str] = (),
+    ) -> None:
+        self._fleet, self._folders, self._last, self._began = fleet, folders, dict(last), now
+        self._next: dict[str, datetime | None] = {
+            m.name: last.get(m.name, now) if m.name in again else m.when.next(last.get(m.name, now), fleet.zone)
+            for m in fleet.machines
+        }
 
     def due(self, now: datetime) -> list[Job]:
-        changed = self._folders.settled(now)
-        passed = {name for name, due in self._next.items() if due is not None and due <= now}
-        return [Job(m) for m in self._fleet.machines if m.name in changed | passed]
+        since = {name: due for name, due in self._next.items() if due is not None and due <= now}
+        for name, changed in self._folders.settled(now).items():
+            since[name] = min(changed, since.get(name, changed))
+        jobs = [Job(m, since[m.name]) for m in self._fleet.machines if m.name in since]
+        return sorted(jobs, key=lambda j: (j.since, self._last.get(j.machine.name, NEVER)))
 
     def begin(self, job: Job, now: datetime) -> bool:
         self._next[job.machine.name] = job.machine.when.next(now, self._fleet.zone)
+        self._last[job.machine.name] = now
         self._folders.taken(job.machine.name)
         return True
 
@@ -93,7 +111,7 @@ class Clock:
         pass
 
     def next(self) -> Mapping[str, datetime | None]:
-        return self._next
+        return {name: due if due is None else max(due, self._began) for name, due in self._next.items()}
 
 
 @dataclass
@@ -150,6 +168,10 @@ class Scheduler:
 
     def serve(self, rounds: int | None = None, sleep: Callable[[float], None] = time.sleep) -> None:
         """Until interrupted, or until `rounds` runs have ended."""
+        for name, (began, tries) in fleet_state.unfinished(self.home, self.fleet).items():
+            if tries >= TRIES:
+                said = f"{tries} runs ended with the process that had begun them; the next one is at its next date"
+                self._report(name, began, False, said)
         with ending(self.stop):
             while rounds is None or self.ended < rounds:
                 self.step(datetime.now(UTC))
@@ -169,6 +191,7 @@ class Scheduler:
                 self.running[name] = self._begin(job, now)
             except OSError as error:  # no space, no memory for a process: the next date may fare better
                 self.source.ended(job, None)
+                self.ended += 1
                 self._report(name, now, False, str(error))
         if (upcoming := dict(self.source.next())) != self._told:
             with contextlib.suppress(OSError):  # tried again at the next change
@@ -205,12 +228,13 @@ class Scheduler:
         run.kill()
         outcome = run.outcome()
         self.source.ended(run.job, outcome["ok"])
+        self.ended += 1
         self._report(name, run.began, bool(outcome["ok"]), " ".join(str(outcome["summary"]).split()))
 
     def _report(self, name: str, began: datetime, ok: bool, summary: str) -> None:
-        self.ended += 1
         self.say(f"{datetime.now():%Y-%m-%d %H:%M} {name}: {'' if ok else 'not retrained: '}{summary}")
         try:
+            fleet_state.end_turn(self.home, self.fleet, name)
             fleet_state.note_run(self.home, name, began, ok, summary)
             alerts.after_run(self.home, self.fleet, name, self.say)
         except OSError as error:

@@ -30,12 +30,12 @@ def soon(condition: Callable[[], object]) -> bool:
 
 def changed(folders: Folders) -> set[str]:
     """Machines with a change, quiet or not."""
-    return folders.settled(datetime.now(UTC) + timedelta(hours=1))
+    return set(folders.settled(datetime.now(UTC) + timedelta(hours=1)))
 
 
 def test_what_arrived_while_nobody_watched_is_looked_for_at_once(tmp_path: Path) -> None:
     folders = Folders(fleet_of(mill=tmp_path), print)
-    assert folders.settled(datetime.now(UTC)) == {"mill"}
+    assert set(folders.settled(datetime.now(UTC))) == {"mill"}
     folders.taken("mill")
     assert not changed(folders)
 
@@ -53,7 +53,7 @@ def test_a_new_file_is_due_when_it_has_been_quiet(tmp_path: Path) -> None:
                 break
         now = datetime.now(UTC)
         assert changed(folders) == {"mill"} and not folders.settled(now)
-        assert folders.settled(now + timedelta(minutes=1)) == {"mill"}
+        assert set(folders.settled(now + timedelta(minutes=1))) == {"mill"}
 
 
 def soon_once(folders: Folders) -> bool:
@@ -77,3 +77,12 @@ def test_a_folder_that_comes_later_is_watched_then(tmp_path: Path, monkeypatch: 
             if soon_once(folders):
                 break
         assert changed(folders) == {"mill"}
+
+
+def test_two_machines_that_record_into_one_folder_both_hear_of_a_file(tmp_path: Path) -> None:
+    folders = Folders(fleet_of(mill=tmp_path, lathe=tmp_path), print)
+    assert changed(folders) == {"mill", "lathe"}
+    for name in ("mill", "lathe"):
+        folders.taken(name)
+    folders._touch_all(tmp_path, datetime.now(UTC))
+    assert changed(folders) == {"mill", "lathe"}

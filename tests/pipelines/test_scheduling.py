@@ -105,6 +105,63 @@ def test_a_machine_that_never_had_its_turn_waits_for_its_first_date() -> None:
     assert not Clock(fleet, {}, Folders(fleet, print), MONDAY + timedelta(minutes=1)).due(MONDAY + timedelta(minutes=1))
 
 
+class Simulated(Scheduler):
+    """Runs take `takes` of simulated time and no process; `turns` counts them."""
+
+    def __init__(self, fleet: Fleet, home: Path, now: datetime, takes: timedelta) -> None:
+        self.folders, self.now, self.takes = Folders(fleet, print), now, takes
+        super().__init__(fleet, Clock(fleet, {}, self.folders, now), home, print)
+        self.turns: list[str] = []
+
+    def step(self, now: datetime) -> None:
+        self.running = {n: began for n, began in self.running.items() if now - began < self.takes}  # type: ignore[misc,operator]
+        for job in self.source.due(now):
+            if job.machine.name not in self.running and len(self.running) < self.fleet.at_once:
+                assert self.source.begin(job, now)
+                self.running[job.machine.name] = now  # type: ignore[assignment]
+                self.turns.append(job.machine.name)
+
+
+def test_an_overloaded_computer_is_slower_for_every_machine(tmp_path: Path) -> None:
+    """Fifty machines every 6 h, 20 min each, one at a time: 72 of 200 turns a day are possible."""
+    fleet = fleet_of(*(f"m{k:02d}" for k in range(50)), when=When(every_h=6.0))
+    s = Simulated(fleet, tmp_path, MONDAY, timedelta(minutes=20))
+    for k in range(30 * 72):
+        s.step(MONDAY + k * timedelta(minutes=20))
+    counts = [s.turns.count(m.name) for m in fleet.machines]
+    assert sum(counts) == 30 * 72 - 18 and max(counts) - min(counts) <= 1
+
+
+def test_files_that_keep_arriving_take_no_other_machine_s_turn(tmp_path: Path) -> None:
+    fleet = fleet_of("a", "b", "c", "d", "e", when=When(watch=True, quiet_min=1.0))
+    s = Simulated(fleet, tmp_path, MONDAY, timedelta(minutes=20))
+    for k in range(12):
+        now = MONDAY + k * timedelta(minutes=20)
+        s.step(now)
+        s.folders.touch("a", now)
+        s.folders.touch("b", now)
+    assert s.turns[:5] == ["a", "b", "c", "d", "e"] and set(s.turns[5:]) == {"a", "b"}
+
+
+def test_a_run_that_ended_with_its_scheduler_is_caught_up_once(tmp_path: Path, said: list[str]) -> None:
+    """As after `kill -9`: the turn was noted, its end was not."""
+    fleet = fleet_of("mill", "lathe")
+    now = datetime.now(UTC)
+    fleet_state.note_turn(tmp_path, fleet, "mill", now)
+    assert fleet_state.unfinished(tmp_path, fleet) == {"mill": (now, 1)}
+    turns = fleet_state.last_turns(tmp_path, fleet)
+    clock = Clock(fleet, turns, Folders(fleet, print), now, ["mill"])
+    assert [j.machine.name for j in clock.due(now)] == ["mill"]
+    Scheduler(fleet, clock, tmp_path, said.append).serve(rounds=1)
+    assert said[0].endswith("mill: mill has run") and not fleet_state.unfinished(tmp_path, fleet)
+    for _ in range(2):
+        fleet_state.note_turn(tmp_path, fleet, "mill", now)
+    clock = Clock(fleet, turns, Folders(fleet, print), now)
+    Scheduler(fleet, clock, tmp_path, said.append).serve(rounds=0)
+    assert not clock.due(now) and not fleet_state.unfinished(tmp_path, fleet)
+    assert said[-1].startswith("alert mill: the last retraining failed: 2 runs ended with the process that had begun")
+
+
 def test_one_machine_s_failure_stays_with_it(tmp_path: Path, said: list[str]) -> None:
     fleet = fleet_of("bad", "killed", "good")
     served(fleet, tmp_path, said).serve(rounds=3)
@@ -129,11 +186,13 @@ def test_a_failure_stays_known_after_a_success(tmp_path: Path) -> None:
 
 
 def test_no_more_runs_at_once_than_allowed_and_one_per_machine(tmp_path: Path, said: list[str]) -> None:
-    scheduler = served(fleet_of("slow1", "slow2", "slow3", at_once=2), tmp_path, said)
+    scheduler = served(fleet_of("slow1", "slow2", "slow3", at_once=2, when=When(every_h=1.0)), tmp_path, said)
     try:
         scheduler.step(datetime.now(UTC))
-        scheduler.step(datetime.now(UTC) + WEEK)  # the next date of the running ones passes
+        scheduler.step(datetime.now(UTC) + timedelta(hours=2))  # the next date of the running ones passes
         assert list(scheduler.running) == ["slow1", "slow2"]
+        scheduler.step(datetime.now(UTC) + timedelta(hours=25))  # both are ended: the one that waits comes first
+        assert list(scheduler.running) == ["slow3", "slow1"]
     finally:
         scheduler.stop()
 
