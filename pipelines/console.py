@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -21,25 +22,31 @@ from pipelines.caller import Done, Say
 if TYPE_CHECKING:
     import pandas as pd
 
-out = Console(soft_wrap=True)
-err = Console(stderr=True, soft_wrap=True)
+out = Console(soft_wrap=True, emoji=False)
+err = Console(stderr=True, soft_wrap=True, emoji=False)
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # all but tab and newline
 PLAIN_EVERY_S = 30.0  # between two lines of progress in a log: a long night gives a thousand
 MIN_FINISHED = 2  # items from which on an estimate is shown: the first may have waited for imports
 
 
+def plain(text: object) -> str:
+    """Without markup, and with what would steer a terminal or turn the text around spelt out."""
+    return escape(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(text)))
+
+
 def line(text: object) -> None:
     """One line of result, without markup."""
-    out.print(escape(str(text)), highlight=False)
+    out.print(plain(text), highlight=False)
 
 
 def error(text: object) -> None:
     """The one line that a failed command ends with."""
-    err.print(f"thermodrift: {escape(str(text))}", highlight=False)
+    err.print(f"thermodrift: {plain(text)}", highlight=False)
 
 
 def note(text: object) -> None:
     """One line for the user's attention on standard error, without markup."""
-    err.print(escape(str(text)), highlight=False)
+    err.print(plain(text), highlight=False)
 
 
 class Pace:
@@ -88,17 +95,17 @@ def progress(quiet: bool) -> Iterator[tuple[Say, Done]]:
             nonlocal pace, printed_s
             pace, printed_s = Pace(time.monotonic()), time.monotonic()
             if not quiet:
-                err.print(escape(text), highlight=False)
-            bar.reset(current, description=escape(text), total=None, left="")
+                err.print(plain(text), highlight=False)
+            bar.reset(current, description=plain(text), total=None, left="")
 
         def done(step: str, n: int, of: int) -> None:
             nonlocal printed_s
             now_s = time.monotonic()
             left = pace.left(n, of, now_s)
-            bar.update(current, description=escape(step), completed=n, total=of, left=left)
+            bar.update(current, description=plain(step), completed=n, total=of, left=left)
             if not quiet and not err.is_terminal and of and now_s - printed_s > PLAIN_EVERY_S:
                 printed_s = now_s
-                err.print(escape(f"{step}: {n} of {of}" + f", {left}" * bool(left)), highlight=False)
+                err.print(plain(f"{step}: {n} of {of}" + f", {left}" * bool(left)), highlight=False)
 
         yield say, done
 

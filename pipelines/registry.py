@@ -421,9 +421,14 @@ def version_folder(source: str, sha256: str, settings: Settings) -> Path:
 
 
 def local_folder(uri: str, settings: Settings) -> str:
-    """The local folder of a model's files; downloaded if the store is remote."""
-    open_store(settings)
+    """The local folder of a model's files; downloaded if the store is remote.
+
+    A logged model is taken by its address: MLflow writes into the folder of one that it is to load by its name.
+    """
+    client = open_store(settings)
     with store_errors(settings):
+        if uri.startswith("models:/m-"):
+            uri = client.get_logged_model(uri.removeprefix("models:/")).artifact_location
         return str(mlflow.artifacts.download_artifacts(artifact_uri=uri, tracking_uri=settings.store_uri))
 
 

@@ -8,9 +8,12 @@ reads without any heavy import, as long as the files behind it are unchanged.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,7 +34,8 @@ if TYPE_CHECKING:
 SCHEMA = "thermodrift.status/2"
 KEPT_RUNS = 20  # of each channel, the newest
 _STATUS = "status.json"
-_VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE", "MLFLOW_TRACKING_URI")
+_VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE")  # and those that the settings file names
+_NAMED = re.compile(r"\{env:([^{}]+)\}")
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,10 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
         "schema": SCHEMA, "as_of": datetime.now(UTC).isoformat(timespec="seconds"), "home": str(settings.home),
         "made_from": before, **{k: records(t) for k, t in tables.items()}, "lake": held, "channels": channels,
     }  # fmt: skip
-    write_atomic(fleet_state.folder_of(settings.home) / _STATUS, json.dumps(status, ensure_ascii=False, default=str))
+    with suppress(OSError):  # a home that cannot be written is gathered anew each time
+        write_atomic(
+            fleet_state.folder_of(settings.home) / _STATUS, json.dumps(status, ensure_ascii=False, default=str)
+        )
     return status
 
 
@@ -141,7 +148,8 @@ def _machine(
         return found
     say(f"state of {machine}")
     found = _gathered(settings, lake, machine, champions, bool(current))
-    fleet_state.write(settings.home, machine, "state", {"made_from": mark, "channels": found})
+    with suppress(OSError):
+        fleet_state.write(settings.home, machine, "state", {"made_from": mark, "channels": found})
     return found
 
 
@@ -284,7 +292,7 @@ def _made_from(settings: Settings, lake: Lake) -> dict[str, Any] | None:
 
 def _stats(files: Iterable[Path]) -> dict[str, Any]:
     """Size and time of change of files, None where one is not there; the settings file of the working directory, and
-    the variables that decide where store and lake are."""
+    the variables that decide where store and lake are. MLFLOW_TRACKING_URI is none of them: MLflow itself sets it."""
     found: dict[str, list[int] | None] = {}
     for file in files:
         try:
@@ -293,5 +301,7 @@ def _stats(files: Iterable[Path]) -> dict[str, Any]:
         except OSError:
             found[str(file)] = None
     settings = Path("mlflow.yml").resolve()
-    own = [str(settings), settings.stat().st_size, settings.stat().st_mtime_ns] if settings.exists() else None
-    return {"files": found, "variables": [os.environ.get(v, "") for v in _VARIABLES], "settings": own}
+    own = settings.read_text(encoding="utf-8", errors="replace") if settings.exists() else ""
+    named = dict.fromkeys((*_VARIABLES, *_NAMED.findall(own)))
+    variables = {v: hashlib.sha256(os.environ.get(v, "").encode()).hexdigest() for v in named}  # some are secrets
+    return {"files": found, "variables": variables, "settings": own}

@@ -30,7 +30,7 @@ def print_ingest(report: IngestReport) -> None:
         console.line(f"  left out: {row.file} ({row.batch_id}): {row.reason}")
     reasons: dict[str, list[str]] = {}
     for file, reason in report.ignored:
-        reasons.setdefault(reason, []).append(file.name)
+        reasons.setdefault(reason, []).append(file.name.replace("\n", "\\n"))
     for reason, names in reasons.items():
         more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
         console.line(f"  ignored, {reason}: {', '.join(names[:SHOWN])}{more}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -155,6 +156,11 @@ def _between(values_um: pd.Series) -> str:
     return f"{' to '.join(ends)} µm" if ends else ""
 
 
+def as_cell(name: str) -> str:
+    """A name as a spreadsheet takes it for text: one that begins like a formula gets an apostrophe before it."""
+    return f"'{name}" if re.match(r"[=@+\-\t\r](?![\d.]*$)", name) else name
+
+
 def predict(
     file: Annotated[Path, typer.Argument(help="a raw recording of the model's machine")],
     model: Annotated[str, typer.Option("--model", help="models:/NAME@champion, models:/NAME/3, runs:/… or a folder")],
@@ -171,6 +177,7 @@ def predict(
     if to is not None and to.suffix == ".parquet":
         table.to_parquet(to, index=False)
     else:
-        table.to_csv(sys.stdout if to is None else to, index=False)
+        of_names = {"batch_id": table["batch_id"].map(as_cell)}
+        table.assign(**of_names).to_csv(sys.stdout if to is None else to, index=False)
     console.note(summary(table))
     console.note(table.attrs["account"]["summary"])

@@ -365,3 +365,14 @@ def test_a_file_that_was_cut_within_a_row_is_named_and_a_link_out_of_the_folder_
     assert [(f.name, reason.partition(";")[0]) for f, reason in report.ignored] == [
         ("run3.csv", "link to a file outside of the folder")
     ]
+
+
+def test_a_name_that_steers_a_terminal_is_not_taken(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in ("a\x1b[2J.csv", "b\nthermodrift: all is well.csv"):
+        (folder / name).write_text("t,T1,z_um\n0,20,0\n60,21,1\n")
+    report = ingest([folder], MACHINE, Lake(tmp_path / "lake"))
+    assert not report.rows and {reason for _, reason in report.ignored} == {"control characters in the name; rename it"}
+    with pytest.raises(InputError, match=r"a\\x1b\[2J\.csv': a name with control characters; rename it"):
+        ingest([folder / "a\x1b[2J.csv"], MACHINE, Lake(tmp_path / "lake"))

@@ -26,7 +26,7 @@ from models.promotion import choose
 from models.trust import Region
 from pipelines import model_store, registry
 from pipelines.cli import app
-from pipelines.commands.predict import load_model, predict_batches, predict_file, summary
+from pipelines.commands.predict import as_cell, load_model, predict_batches, predict_file, summary
 from tests.models.twin_year import recording, two_errors
 from tests.toys.tracked import log_training
 from tests.toys.training import GAIN_UM_PER_K, machine_yaml, toy_batches, toy_model, toy_result
@@ -368,3 +368,12 @@ def test_needed_channels_follow_from_the_features(stored):
     model.family.inputs = ("front@lag30min", "bed@ambient", "front")
     other = model_store.StoredModel(model.family, parse_machine(with_room, "test"), Region.of([], ()))
     assert other.channels() == ("front", "bed", "room")
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [("=HYPERLINK(1)", "'=HYPERLINK(1)"), ("@SUM(A1)", "'@SUM(A1)"), ("-run", "'-run"), ("-5.2", "-5.2"),
+     ("run=1", "run=1"), ("20250113_6000rpm", "20250113_6000rpm")],
+)  # fmt: skip
+def test_a_name_is_no_formula_of_a_spreadsheet(name: str, cell: str) -> None:
+    assert as_cell(name) == cell

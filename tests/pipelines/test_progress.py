@@ -83,3 +83,8 @@ def test_progress_follows_the_order_of_finishing() -> None:
     jobs = [("z", "slow"), ("z", "a"), ("z", "b")]
     assert DirectCaller(done).map("grid", work, jobs) == ["slow", "a", "b"]
     assert heard[2] == ("grid z slow", 3, 3) and {h[0] for h in heard[:2]} == {"grid z a", "grid z b"}
+
+
+def test_a_line_steers_no_terminal_and_says_what_it_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+    console.line("root:x:0 \x1b[2J\u202egnp.exe [bold]")
+    assert capsys.readouterr().out == "root:x:0 \\x1b[2J\\u202egnp.exe [bold]\n"

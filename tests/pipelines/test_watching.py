@@ -123,6 +123,9 @@ def test_only_what_changed_is_gathered_again(place: Place, monkeypatch: pytest.M
     warm = watching.warm()
     assert warm is not None and {s["channel"] for s in warm["channels"]} == {"x", "z"}
     said: list[str] = []
+    for uri in ("", str(place.settings.store_uri)):  # MLflow sets it in the process that opens the store
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        assert watching.warm() == warm
     watching.refresh(place.settings, said.append)
     assert not [line for line in said if line.startswith("state of")]
     unlike(1).to_csv(place.incoming / "20250920.csv", index=False)
@@ -179,3 +182,20 @@ def test_the_command_shows_it_and_fails_on_alert(
     assert NAME in page and "SIMULATED" in page and "older than a season" in page
     code, _, err = call("--html", str(tmp_path / "fleet.pdf"))
     assert code == 2 and "unsupported file extension" in err
+
+
+def test_a_home_that_cannot_be_written_is_read_all_the_same(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    (place.home / "fleet" / f"{NAME}.state.json").unlink(missing_ok=True)
+    monkeypatch.setattr(watching, "write_atomic", refused)
+    monkeypatch.setattr("pipelines.fleet_state.write_atomic", refused)
+    assert {s["channel"] for s in watching.refresh(place.settings)["channels"]} == {"x", "z"}
+
+
+def test_a_look_up_of_a_model_writes_nothing_into_its_folder(place: Place) -> None:
+    client = registry.open_store(place.settings)
+    version = registry.find_version(client, f"{NAME}-z", "champion")
+    folder = Path(registry.version_folder(version.source, version.tags["sha256"], place.settings))
+    assert (folder / "artifacts" / "model.json").exists() and not (folder / "registered_model_meta").exists()
