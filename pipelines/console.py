@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 out = Console(soft_wrap=True, emoji=False)
 err = Console(stderr=True, soft_wrap=True, emoji=False)
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # all but tab and newline
+MIN_WRAPPED = 12  # characters
 PLAIN_EVERY_S = 30.0  # between two lines of progress in a log: a long night gives a thousand
 MIN_FINISHED = 2  # items from which on an estimate is shown: the first may have waited for imports
 
@@ -127,12 +128,16 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def table(title: str, *columns: str, left: Collection[str] = (), wrap: Collection[str] = ()) -> Table:
-    """An empty table; columns are aligned right except those in `left`, and on one line except those in `wrap`."""
-    made = Table(title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
+    """An empty table; columns are aligned right except those in `left`, and on one line except those in `wrap`, which
+    keep a width in which words can be read."""
+    made = Table(
+        title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
     for name in columns:
         made.add_column(
             name, justify="left" if name in left else "right", no_wrap=name not in wrap,
-            overflow="fold" if name in wrap else "ellipsis",
+            overflow="fold" if name in wrap else "ellipsis", min_width=MIN_WRAPPED if name in wrap else None,
         )  # fmt: skip
     return made
 

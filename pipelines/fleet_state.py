@@ -112,7 +112,7 @@ def _schedule(home: Path, key: str) -> dict[str, Any]:
 
 
 def _update(home: Path, fleet: Fleet, changes: Mapping[str, Any]) -> None:
-    machines = {m.name: {"when": m.when.summary, "file": m.file} for m in fleet.machines}
+    machines = {m.name: {"when": m.when.summary, "file": m.file, "channels": list(m.channels)} for m in fleet.machines}
     content = {**_schedule(home, fleet.key), "source": fleet.source, "machines": machines,
                "alerts": fleet.alerts.model_dump(exclude={"webhook"}), **changes}  # fmt: skip
     write_atomic(folder_of(home) / f"{fleet.key}.schedule.json", json.dumps(content, ensure_ascii=False))

@@ -42,10 +42,14 @@ def fleet_view(home: Path, channels: Sequence[Mapping[str, Any]], now: datetime 
             if served or name not in plans:
                 due = kept.get("next", {}).get(name) if served else None
                 rules = AlertRules(**kept.get("alerts", {}))
-                plans[name] = {"when": machine["when"], "next": due, "served": served, "rules": rules}
+                plans[name] = {"when": machine["when"], "next": due, "served": served, "rules": rules,
+                               "channels": machine.get("channels", [])}  # fmt: skip
     states: dict[str, list[Mapping[str, Any]]] = {name: [] for name in plans}
     for state in channels:
-        states.setdefault(state["machine"], []).append(state)
+        wanted = plans.get(state["machine"], {}).get("channels")
+        modelled = state["version"] is not None or state["provisional"] is not None
+        if modelled or not wanted or state["channel"] in wanted:  # nobody is to learn what the fleet file leaves out
+            states.setdefault(state["machine"], []).append(state)
     rows, alerts = [], []
     for name, own in states.items():
         plan = plans.get(name, {"when": "", "next": None, "served": False, "rules": AlertRules()})

@@ -222,12 +222,12 @@ def _state(v: Version) -> str:
 
 
 def _print_rows(title: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Rows as a table; a column without a value is left out, digests and times (UTC) are cut."""
+    """Rows as a table; a column without a value is left out, digests are cut and of times the date (UTC) is shown."""
     columns = [c for c in rows[0] if any(r[c] is not None for r in rows)]
     numbers = [c for c in columns if all(isinstance(r[c], int | float | None) for r in rows)]
     table = console.table(title, *columns, left=set(columns) - set(numbers), wrap=("source", "reason"))
     for row in rows:
         shown = {c: "" if row[c] is None else str(row[c]) for c in columns}
-        shown |= {c: shown[c][:n] for c, n in (("digest", 12), ("stored_at", 16), ("withdrawn_at", 16)) if c in shown}
+        shown |= {c: shown[c][:n] for c, n in (("digest", 12), ("stored_at", 10), ("withdrawn_at", 10)) if c in shown}
         table.add_row(*shown.values())
     console.out.print(table)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from pipelines.settings import Settings
 
 _MODEL = re.compile(r"^(?:models:/)?(?P<name>[^/@]+)(?:[/@](?P<which>[^/@]+))?$")
+_START_SHOWN = 16  # to the minute
 _DIGEST_SHOWN = 12
 
 
@@ -336,12 +338,17 @@ def _print_lineage(found: Lineage) -> None:
         console.line("  never champion by the log")
     code = v["training_code_version"] or "a version not recorded"
     console.line(f"  training {v['training_id']}, {_local(_time(v['training_started']))} by {code}")
-    table = console.table("batches", *found.batches, left={"batch_id", "start", "digest", "source", "masked"},
+    batches = _rows(found.batches)
+    for b in batches:
+        b["source"] = "" if Path(b["source"] or "").stem == b["batch_id"] else b["source"]
+    columns = [c for c in found.batches if any(b[c] not in (None, "") for b in batches)]
+    table = console.table("batches", *columns, left={"batch_id", "start", "digest", "source", "masked"},
                           wrap=("source", "masked"))  # fmt: skip
-    for b in _rows(found.batches):
-        masked = ", ".join("all channels" if c == "*" else c for c in b["masked"].split("|"))
-        shown = {**b, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN], "masked": masked}
-        table.add_row(*("" if value is None else str(value) for value in shown.values()))
+    for b in batches:
+        masked = ", ".join("all channels" if c == "*" else c for c in (b["masked"] or "").split("|"))
+        shown = {**b, "masked": masked, "digest": str(b["digest"] or "")[:_DIGEST_SHOWN],
+                 "start": str(b["start"] or "")[:_START_SHOWN]}  # fmt: skip
+        table.add_row(*("" if shown[c] is None else str(shown[c]) for c in columns))
     console.out.print(table)
     console.line(f"findings: {len(found.findings)}; --json has all of them, and whole digests")
     print_findings(found.findings)

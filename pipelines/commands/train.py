@@ -96,9 +96,7 @@ def _print_leaderboard(title: str, cells: pd.DataFrame, unit: str) -> None:
     best = worst.sort_values().reset_index().drop_duplicates("family")
     heads = [_SHOWN_PROTOCOLS.get(p, p) for p in protocols]
     names = ("family", "selector")
-    table = console.table(
-        f"{title}, S mean ± std, {unit_label(unit) or 1}", *names, "n", *heads, left=names, wrap=names[1:]
-    )
+    table = console.table(f"{title}, S mean ± std, {unit_label(unit) or 1}", *names, "n", *heads, left=names)
     for row in best[(best["family"] == "zero") | best["family"].isin(best["family"].head(SHOWN))].to_dict("records"):
         own = rows[(rows[keys] == [row[k] for k in keys]).all(axis=1)].set_index("protocol")
         scores = [_score(own, p) for p in protocols]
@@ -110,7 +108,7 @@ def _score(own: pd.DataFrame, protocol: str) -> str:
     if protocol not in own.index:
         return "–"
     mean_um, std_um = (float(own[c][protocol]) for c in ("S_mean_um", "S_std_um"))
-    return " ± ".join(
+    return "±".join(  # without blanks: three protocols and the longest names fit into 80 columns
         f"{v:.2f}" if 0.05 < abs(v) < 9.995 else f"{v:.2g}" if v < 1 else f"{v:.1f}" for v in (mean_um, std_um)
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 
+import pandas as pd
 import pytest
 from rich.console import Console
 
@@ -88,3 +89,17 @@ def test_progress_follows_the_order_of_finishing() -> None:
 def test_a_line_steers_no_terminal_and_says_what_it_was_given(capsys: pytest.CaptureFixture[str]) -> None:
     console.line("root:x:0 \x1b[2J\u202egnp.exe [bold]")
     assert capsys.readouterr().out == "root:x:0 \\x1b[2J\\u202egnp.exe [bold]\n"
+
+
+def test_the_main_table_shows_whole_names_in_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipelines.commands.train import _print_leaderboard
+
+    out = io.StringIO()
+    monkeypatch.setattr(console, "out", Console(file=out, width=80, soft_wrap=True))
+    cell = {"selector": "sequential_forward", "family": "hist_gradient_boosting", "n_tsp": 10, "n_inputs": 10,
+            "S_mean_um": 24.74, "S_std_um": 14.81}  # fmt: skip
+    protocols = ("forward", "leave-season-out", "leave-batch-out")
+    _print_leaderboard("m z", pd.DataFrame([{**cell, "protocol": p} for p in protocols]), "um")
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80 and "hist_gradient_boosting" in lines[3] and "sequential_forward" in lines[3]
+    assert lines[3].count("24.7±14.8") == 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from features.rises import zeroed_error_um
 from models.crossing import Plan
 from models.metrics import residual_std_um
 from models.trust import farthest, watched
-from pipelines import model_store, registry, settings, training, watching
+from pipelines import fleet_state, model_store, registry, settings, training, watching
 from pipelines.caller import DirectCaller
+from pipelines.fleet import Fleet, FleetMachine
 from pipelines.fleet_view import fleet_view
 from pipelines.recordings import home_lake, load_batches
 from pipelines.training import TrainRequest
@@ -199,3 +201,12 @@ def test_a_look_up_of_a_model_writes_nothing_into_its_folder(place: Place) -> No
     version = registry.find_version(client, f"{NAME}-z", "champion")
     folder = Path(registry.version_folder(version.source, version.tags["sha256"], place.settings))
     assert (folder / "artifacts" / "model.json").exists() and not (folder / "registered_model_meta").exists()
+
+
+def test_a_channel_that_the_fleet_file_leaves_out_is_no_row(place: Place, tmp_path: Path) -> None:
+    channels = watching.refresh(place.settings)["channels"]
+    one = FleetMachine(NAME, str(place.machine), (str(place.incoming),), channels=("z",))
+    fleet_state.write_schedule(tmp_path, Fleet("/m/fleet.yml", (one,)), {})
+    assert [r["channel"] for r in fleet_view(tmp_path, channels).rows] == ["z"]
+    fleet_state.write_schedule(tmp_path, Fleet("/m/fleet.yml", (replace(one, channels=()),)), {})
+    assert {r["channel"] for r in fleet_view(tmp_path, channels).rows} == {"x", "z"}
