@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import atexit
 import logging
+import platform
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,8 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from prefect import flow, task
+from prefect import flow, get_run_logger, task
 from prefect import settings as prefect_settings
+from prefect.artifacts import create_link_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.server.api.server import SubprocessASGIServer
 from prefect.task_runners import ThreadPoolTaskRunner
@@ -134,13 +137,37 @@ def train_in_flow(
 
     @flow(name=f"thermodrift-train-{machine}", flow_run_name=run_name, task_runner=ThreadPoolTaskRunner(lanes),
           persist_result=False, validate_parameters=False)  # fmt: skip
-    def training() -> TrainOutcome:
-        return train(request, settings, PrefectCaller(done, machine), say, pools)
+    def training(
+        machine_file: str, recordings: list[str], channels: list[str], effort: str, families: list[str],
+        selectors: list[str], protocols: list[str], promote: bool,
+    ) -> TrainOutcome:  # what the UI shows; `request` has it all
+        log = get_run_logger()
+
+        def both(text: str) -> None:
+            log.info(text)
+            say(text)
+
+        outcome = train(request, settings, PrefectCaller(done, machine), both, pools)
+        for text in filter(None, (outcome.stopped, *(p.summary for p in outcome.promotions.values()))):
+            log.info(text)
+        if outcome.report is not None:
+            link_report(machine, outcome.report)
+        return outcome
 
     if server is not None:
         server.join()
-    quiet_prefect()
-    return training()
+    log_to_server()
+    return training(**_parameters(request))
+
+
+def _parameters(request: TrainRequest) -> dict[str, Any]:
+    """A request as the UI lists a run's parameters; empty lists mean all."""
+    plan = request.plan
+    return {
+        "machine_file": str(request.machine_file), "recordings": [str(r) for r in request.recordings],
+        "channels": list(request.targets), "effort": plan.effort, "families": list(plan.families),
+        "selectors": list(plan.selectors), "protocols": list(plan.protocols), "promote": request.promote,
+    }  # fmt: skip
 
 
 class PrefectEngine:
@@ -164,21 +191,47 @@ def diagnose(machine_file: str, recordings: list[str], out: str = "") -> str:
 
     An error is printed in one line, and the run counts as failed.
     """
-    quiet_prefect()
+    log_to_server()
+    log = get_run_logger()
     file = Path(machine_file)
     folder = Path(out) if out else dated_folder(file.stem)
     request = DiagnosisRequest(file, folder, tuple(Path(r) for r in recordings), overwrite=True)
     try:
         outcome = diagnose_file(request, load(), caller=PrefectCaller(machine=file.stem))
     except (InputError, WorkError) as error:
+        log.error("not diagnosed: %s", error)
         print(f"{datetime.now():%Y-%m-%d %H:%M} not diagnosed: {error}", flush=True)
         raise
     machine = outcome.diagnosis.findings.machine
+    log.info(outcome.summary)
     print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {outcome.summary}", flush=True)
     return outcome.summary
 
 
-def quiet_prefect() -> None:
-    """The command prints an error once, in one line; Prefect would log it with a traceback."""
+def link_report(machine: str, report: Path) -> None:
+    """The report as an artifact of the run; without it the run is as good."""
+    key = re.sub(r"[^a-z0-9]+", "-", f"report-{machine}".lower()).strip("-")
+    with suppress(Exception):
+        create_link_artifact(
+            link=report.as_uri(), link_text=f"report of {machine}", key=key,
+            description=f"Comparison report of {machine}: {report} on {platform.node()}",
+        )  # fmt: skip
+
+
+class _Plain(logging.Filter):
+    """An expected error has one line of its own; Prefect's with a traceback adds nothing."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        return not isinstance(error, InputError | WorkError)
+
+
+def log_to_server() -> None:
+    """Lines of a run go to the server and not to the console, where the run prints what it has to say."""
     for name in ("prefect.flow_runs", "prefect.task_runs"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+        logger = logging.getLogger(name)
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+        for handler in logger.handlers:
+            if not any(isinstance(f, _Plain) for f in handler.filters):
+                handler.addFilter(_Plain())

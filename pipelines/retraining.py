@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-import platform
-import re
 from collections.abc import Sequence
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 from prefect import flow, get_run_logger, runtime
-from prefect.artifacts import create_link_artifact
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine
 from models.crossing import Plan
 from pipelines.caller import LANES
-from pipelines.flows import PrefectCaller
+from pipelines.flows import PrefectCaller, link_report, log_to_server
 from pipelines.settings import load
 from pipelines.training import TrainOutcome, TrainRequest, train
 
@@ -46,7 +41,7 @@ def retrain(
     Its lines are logged to the run, and the report is an artifact of it. An error is printed in one line, and the run
     counts as failed.
     """
-    _log_to_server()
+    log_to_server()
     log = get_run_logger()
     request = request_for(machine_file, recordings, effort, channels or (), families or (), selectors or ())
     try:
@@ -61,7 +56,7 @@ def retrain(
     log.info(summary)
     print(f"{datetime.now():%Y-%m-%d %H:%M} {machine}: {summary}", flush=True)
     if outcome.report is not None:
-        _link(machine, outcome.report)
+        link_report(machine, outcome.report)
     return summary
 
 
@@ -94,32 +89,3 @@ def request_for(
 ) -> TrainRequest:
     plan = Plan(tuple(selectors), tuple(families), effort=effort)  # type: ignore[arg-type]
     return TrainRequest(Path(machine_file), tuple(Path(r) for r in recordings), tuple(channels), plan, only_if_new=True)
-
-
-def _link(machine: str, report: Path) -> None:
-    """The report as an artifact of the run; without it the run is as good."""
-    key = re.sub(r"[^a-z0-9]+", "-", f"report-{machine}".lower()).strip("-")
-    with suppress(Exception):
-        create_link_artifact(
-            link=report.as_uri(), link_text=f"report of {machine}", key=key,
-            description=f"Comparison report of {machine}: {report} on {platform.node()}",
-        )  # fmt: skip
-
-
-class _Plain(logging.Filter):
-    """An expected error has one line of its own; Prefect's with a traceback adds nothing."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        error = record.exc_info[1] if record.exc_info else None
-        return not isinstance(error, InputError | WorkError)
-
-
-def _log_to_server() -> None:
-    """Lines of a run go to the server and not to the console, where the run prints what it has to say."""
-    for name in ("prefect.flow_runs", "prefect.task_runs"):
-        logger = logging.getLogger(name)
-        logger.setLevel(logging.INFO)
-        logger.propagate = False
-        for handler in logger.handlers:
-            if not any(isinstance(f, _Plain) for f in handler.filters):
-                handler.addFilter(_Plain())

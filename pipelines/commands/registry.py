@@ -341,7 +341,7 @@ def _print_lineage(found: Lineage) -> None:
     batches = _rows(found.batches)
     for b in batches:
         b["source"] = "" if Path(b["source"] or "").stem == b["batch_id"] else b["source"]
-    columns = [c for c in found.batches if any(b[c] not in (None, "") for b in batches)]
+    columns = [c for c in map(str, found.batches) if any(b[c] not in (None, "") for b in batches)]
     table = console.table("batches", *columns, left={"batch_id", "start", "digest", "source", "masked"},
                           wrap=("source", "masked"))  # fmt: skip
     for b in batches:

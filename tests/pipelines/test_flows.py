@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -47,6 +48,29 @@ def test_same_numbers_with_prefect_and_without(flows: ModuleType, store: Any, ye
     assert {name for name, _, _ in grid} == {"grid z zero", "grid z pls", "grid z ridge"}
     assert [(n, of) for _, n, of in grid] == [(1, 3), (2, 3), (3, 3)]
     assert ("ingest", 1, 1) in steps and ("report", 1, 1) in steps
+
+
+def test_the_server_has_a_training_s_parameters_lines_and_report(flows: ModuleType, store: Any, year: Path) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName, LogFilter, LogFilterFlowRunId
+
+    request, lines = request_for(year, "flow-seen"), []
+    outcome = flows.train_in_flow(request, store, say=lines.append)
+    with get_client(sync_client=True) as client:
+        (run,) = client.read_flow_runs(
+            flow_run_filter=FlowRunFilter(name=FlowRunFilterName(any_=["train flow-seen z"]))
+        )
+        assert run.parameters["machine_file"] == str(request.machine_file) and run.parameters["channels"] == ["z"]
+        assert run.parameters["families"] == list(SMALL.families) and run.parameters["promote"] is True
+        of_run, logged = LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])), list[str]()
+        for _ in range(60):  # they are sent every two seconds
+            logged = [entry.message for entry in client.read_logs(of_run)]
+            if outcome.promotions["z"].summary in logged:
+                break
+            time.sleep(0.5)
+        assert outcome.promotions["z"].summary in logged and set(lines) <= set(logged) and "grid" in logged
+        links = [a.data for a in client.read_artifacts() if a.key == "report-flow-seen"]
+    assert len(links) == 1 and outcome.report is not None and outcome.report.as_uri() in str(links[0])
 
 
 @pytest.mark.slow
