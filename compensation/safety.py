@@ -33,6 +33,9 @@ STOPPED = "stopped by the operator"
 _CLOCK_DRIFT = 1e-3  # s per s that two healthy clocks may differ: a quartz stays below 1e-4
 
 
+ROOM = 1.25  # of the largest error of the training: a correction beyond is a failure of the model
+
+
 @dataclass(frozen=True)
 class Limits:
     """Limits of one axis.

@@ -213,6 +213,8 @@ class PromotionRule(BaseModel):
     ties_se: a simpler cell wins where it is behind by so many standard errors of the difference, or less.
     significance: one-sided level of the paired comparison with the champion and with no model.
     min_batches: fewer batches in common: the champion stays.
+    fault_budget_um: the most that a simulated fault of a sensor may cost in spite of the guard, µm; a newcomer above it
+        becomes neither champion nor provisional. None: it is stated alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -225,6 +227,7 @@ class PromotionRule(BaseModel):
     ties_se: Annotated[float, Field(ge=0)] = 1.0
     significance: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     min_batches: Annotated[int, Field(ge=2)] = 5
+    fault_budget_um: Annotated[float, Field(gt=0)] | None = None
 
     @field_validator("protocols")
     @classmethod

@@ -19,7 +19,7 @@ from compensation.exports.base import Export
 from compensation.exports.region import trust_program
 from compensation.rehearsal import Rehearsal, failure, readings_of, rehearse
 from compensation.runtime import AxisModel, Compensator
-from compensation.safety import Limits
+from compensation.safety import ROOM, Limits
 from data.batch import Batch
 from data.errors import InputError
 from features.rises import feature_unit
@@ -29,7 +29,6 @@ from pipelines.settings import home
 PERIOD_S = 10.0  # of the models: castings move in minutes, and a step costs a tenth of a millisecond
 _LOST_SAMPLES = 3  # in a row before the input is stale
 _LEVER_MM = 1000.0  # of an axis whose position channel has no range
-_ROOM = 1.25  # of the largest error of the training: a correction beyond is a failure of the model
 
 
 def axis_model(stored: StoredModel, limits: Limits, period_s: float) -> AxisModel:
@@ -130,7 +129,7 @@ class Given:
                 "`predict` gives this error in its own unit"
             )
         default, largest_um = Limits(), float(stored.info.get("largest_um", 0.0))
-        usual_um = _ROOM * largest_um if largest_um > 0 else default.max_offset_um
+        usual_um = ROOM * largest_um if largest_um > 0 else default.max_offset_um
         every_s = stored.machine.recording.step_s if self.sample_s is None else self.sample_s
         return Limits(
             max_offset_um=usual_um if self.max_um is None else self.max_um,

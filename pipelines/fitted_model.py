@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from compensation.faults import FaultCost, fault_cost
+from compensation.safety import ROOM
 from compensation.substitutes import Substitutes
 from data.batch import Batch
 from data.errors import InputError
@@ -116,6 +118,24 @@ def _at_the_machine(
         tracks = left_out_tracks(design, curves) if curves is not None else []
         updater = Updater.learn(tracks or out_of_fold(design, family.key, range(len(ordered))))
     with suppress(InputError):
-        channels = list(dict.fromkeys(i.partition("@")[0] for i in family.inputs))
-        substitutes = Substitutes.learn(ordered, channels)
+        substitutes = _substitutes(family, ordered)
     return updater, substitutes
+
+
+def _substitutes(family: Family, ordered: Sequence[Batch]) -> Substitutes:
+    return Substitutes.learn(ordered, list(dict.fromkeys(i.partition("@")[0] for i in family.inputs)))
+
+
+def faults_of(family: Family, batches: Sequence[Batch]) -> FaultCost | None:
+    """What failing sensors cost at the machine, from the run of the training with the largest error; None where the
+    family does not run at one, or its error moves no axis."""
+    largest = {b.batch_id: _largest_um(family, [b]) for b in batches}
+    most_um = max(largest.values(), default=0.0)
+    if not most_um or not family.has_program() or batches[0].channels[family.target].unit != "um":
+        return None
+    ordered = sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
+    run = max(ordered, key=lambda b: largest[b.batch_id])
+    try:
+        return fault_cost(family.predict, _substitutes(family, ordered), run, ROOM * most_um)
+    except InputError:  # too few runs for a guard
+        return None

@@ -138,8 +138,14 @@ def train_in_flow(
     @flow(name=f"thermodrift-train-{machine}", flow_run_name=run_name, task_runner=ThreadPoolTaskRunner(lanes),
           persist_result=False, validate_parameters=False)  # fmt: skip
     def training(
-        machine_file: str, recordings: list[str], channels: list[str], effort: str, families: list[str],
-        selectors: list[str], protocols: list[str], promote: bool,
+        machine_file: str,
+        recordings: list[str],
+        channels: list[str],
+        effort: str,
+        families: list[str],
+        selectors: list[str],
+        protocols: list[str],
+        promote: bool,
     ) -> TrainOutcome:  # what the UI shows; `request` has it all
         log = get_run_logger()
 

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -25,6 +26,7 @@ from mlflow.tracking import MlflowClient
 from mlflow.types import ColSpec, Schema
 from mlflow.types.schema import AnyType
 
+from compensation.faults import FaultCost
 from data.batch import Batch
 from data.errors import InputError, closest, one_of
 from features.rises import zeroed_error_um
@@ -75,6 +77,7 @@ class Promotion:
     outlook: Outlook | None = None
     standing: str = "champion"
     authority: float = 1.0
+    faults: str = ""  # what failing sensors cost, one sentence; empty where it is not known
 
     @property
     def trusted(self) -> bool:
@@ -111,6 +114,10 @@ class Newcomer:
     @property
     def outlook(self) -> Outlook:
         return outlook(self.result, self.choice)
+
+    @cached_property
+    def faults(self) -> FaultCost | None:
+        return fitted_model.faults_of(self.family, self.batches)
 
     @property
     def fingerprint(self) -> str:
@@ -217,14 +224,18 @@ def _register(
         why = f"better than no model, not shown beyond doubt; {choice.authority:g} of the correction is supported"
     elif not choice.trusted:
         why = "no trustworthy model"
+    budget_um, faults = settings.promotion.fault_budget_um, new.faults
+    dear = budget_um is not None and faults is not None and faults.worst_um > budget_um
+    if dear and faults is not None:
+        why += f"; a fault of a sensor costs {faults.worst_um:.3g} µm ({faults.worst}), more than fault_budget_um"
     why = f"by force; {why}" if force and (champion is not None or not choice.trusted) else why
     better = champion is None or (comparison is not None and comparison.better)
     outcome: Outcome = "challenger"
     if settled:
         outcome = one_of(settled, get_args(Outcome), OUTCOME)
-    elif force or (choice.standing == CHAMPION and better):
+    elif force or (choice.standing == CHAMPION and better and not dear):
         outcome = "champion"
-    elif champion is None and choice.standing == PROVISIONAL:
+    elif champion is None and choice.standing == PROVISIONAL and not dear:
         outcome = "provisional"
     replaces = outcome == CHAMPION
     reason = f"{why}, {choice.caution}" if choice.caution else why
@@ -250,6 +261,7 @@ def _register(
         choice.cell, choice.caution, f"{name} version {version} is {outcome}: {why}; {choice.summary}", comparison,
         None if champion is None else int(champion.version), obstacle, force, choice.nested_S_mean_um,
         choice.nested_S_std_um, new.outlook, choice.standing, choice.authority,
+        "" if faults is None else faults.summary,
     )  # fmt: skip
 
 
@@ -264,7 +276,7 @@ def _info(new: Newcomer) -> dict[str, Any]:
         "simulated": result.simulated, "score_um": choice.score_um, "choice": choice.summary,
         "trained_at": audit.now().isoformat(timespec="seconds"),
         "trusted": choice.trusted, "caution": choice.caution, "standing": choice.standing,
-        "authority": choice.authority,
+        "authority": choice.authority, "faults": {} if new.faults is None else new.faults.as_plain(),
     }  # fmt: skip
 
 
@@ -275,7 +287,16 @@ def _tags(new: Newcomer) -> dict[str, str]:
         "fingerprint": new.fingerprint, "machine": result.machine, "target": result.target,
         "selector": choice.selector, "family": choice.family, "n_tsp": str(choice.n_tsp),
         "inputs": "|".join(choice.inputs), "S_mean_um": _text(choice.S_mean_um), "S_std_um": _text(choice.S_std_um),
-        "code_version": code_version(),
+        "code_version": code_version(), **_fault_tags(new.faults),
+    }  # fmt: skip
+
+
+def _fault_tags(faults: FaultCost | None) -> dict[str, str]:
+    if faults is None:
+        return {}
+    return {
+        "faults": faults.summary, "worst_fault": faults.worst, "worst_fault_um": _text(round(faults.worst_um, 1)),
+        "sensor_um_per_K": json.dumps({n: round(v, 2) for n, v in faults.um_per_K.items()}),
     }  # fmt: skip
 
 
@@ -512,7 +533,7 @@ def _log_version(client: MlflowClient, name: str, new: Newcomer, tags: dict[str,
     from pipelines.serving import write_served  # loads onnx
 
     choice, result, info = new.choice, new.result, _info(new)
-    tags = {k: _text(v) for k, v in info.items() if k != "choice"} | _tags(new) | tags
+    tags = {k: _text(v) for k, v in info.items() if k not in ("choice", "faults")} | _tags(new) | tags
     bound = RunBound.of_cell(result.distances, result.scores, choice.selector, choice.family, choice.n_tsp)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)

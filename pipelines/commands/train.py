@@ -72,6 +72,8 @@ def print_training(outcome: TrainOutcome) -> None:
         promotion = outcome.promotions.get(target)
         said = promotion.summary if promotion else f"training {target} {training}"
         console.line(in_error_unit(said, outcome.units[target]))
+        if promotion and promotion.faults:
+            console.line(f"  {promotion.faults}")
     if outcome.postponed:
         console.line(f"postponed: {outcome.postponed}")
     console.line(f"report   {outcome.report}")

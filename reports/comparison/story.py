@@ -246,6 +246,8 @@ def verdict(channel: str, training: Training, choice: Choice) -> Verdict:
         )
     else:
         summary = f"Nothing was promoted. The rule would take {model}: {score}."
+    if p.get("faults"):
+        summary += f" At the machine {p['faults']}."
     why = str(p.get("caution", "")) if p else choice.caution
     why = re.sub(r"\b(zero|mean_curve)\b", lambda m: family_label(m[0]), why)
     short = why.partition(" (")[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mlflow.tracking import MlflowClient
 
+from compensation.faults import FaultCost
 from data.errors import InputError
 from models.promotion import Choice, choose, decide
 from models.protocols import PromotionRule
@@ -356,3 +357,19 @@ def test_a_clock_that_was_set_back_is_named_and_orders_nothing_anew(store):
     last = log.champions(audit.span_of("2026-05-01"))
     assert [r.version for r in last] == [2]
     assert "the clock showed 2026-03-11" in last[0].note and "since when is not certain" in last[0].note
+
+
+def test_a_model_that_a_failed_sensor_can_ruin_is_no_champion_where_a_budget_says_so(store, monkeypatch):
+    cost = FaultCost({"front": 9.0, "bed": 2.0}, 12, 3, "front: a drift of 1 K/h", 55.0)
+    monkeypatch.setattr(registry.fitted_model, "faults_of", lambda family, batches: cost)
+    within = replace(store, promotion=store.promotion.model_copy(update={"fault_budget_um": 60.0}))
+    above = replace(store, promotion=store.promotion.model_copy(update={"fault_budget_um": 50.0}))
+    refused = train(above, "toy-dear", [5.0, 6.0] * 3)
+    assert (refused.outcome, refused.champion_version) == ("challenger", None)
+    assert "a fault of a sensor costs 55 µm (front: a drift of 1 K/h), more than fault_budget_um" in refused.summary
+    taken = train(within, "toy-dear", [5.0, 6.0] * 3 + [5.0])
+    assert taken.outcome == "champion" and taken.faults == cost.summary
+    tags = MlflowClient(store.store_uri, registry_uri=store.store_uri).get_model_version("toy-dear-z", "2").tags
+    assert tags["worst_fault"] == "front: a drift of 1 K/h" and tags["worst_fault_um"] == "55.0"
+    assert tags["sensor_um_per_K"] == '{"front": 9.0, "bed": 2.0}'
+    assert load_model("models:/toy-dear-z@champion", store).info["faults"]["missed"] == 3

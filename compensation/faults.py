@@ -1,0 +1,141 @@
+"""What a sensor costs that fails at the machine: micrometres per kelvin, and simulated faults that the guard misses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from compensation.substitutes import Guard, Substitutes
+from data.arrays import Array
+from data.batch import Batch
+
+BEGINS = 4  # a fault begins after this part of a run
+COUNTS_SHARE = 0.1  # of the largest correction; a fault of less is within what a model leaves anyway
+Predict = Callable[[Batch], Array]  # error (n,) of a batch, µm
+
+
+def faults(batch: Batch, names: Sequence[str]) -> Iterator[tuple[str, set[str], dict[str, Array]]]:
+    """Kind, the sensors at fault, and the values (n,) of these, of every sensor in turn.
+
+    It freezes, steps by 5 K, drifts by 1 or 10 K/h, each from a quarter of the run on, and is exchanged with its
+    neighbour in the list during the whole run.
+    """
+    first = batch.n_rows // BEGINS
+    later = np.arange(batch.n_rows) >= first
+    hours = np.maximum(batch.time_s - batch.time_s[first], 0.0) / 3600.0
+    for name, other in zip(names, [*names[1:], names[0]], strict=True):
+        v = batch.masked(name)
+        yield "frozen", {name}, {name: np.where(later, v[first], v)}
+        yield "a step of 5 K", {name}, {name: v + 5.0 * later}
+        yield "a drift of 1 K/h", {name}, {name: v + hours}
+        yield "a drift of 10 K/h", {name}, {name: v + 10.0 * hours}
+        if other != name:
+            yield "exchanged", {name, other}, {name: batch.masked(other), other: v}
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A run as the guard saw it: by row the sensors that it does not trust, the batch with what it lets pass, and how
+    many rows pass until it gives up."""
+
+    untrusted: tuple[frozenset[str], ...]
+    passed: Batch
+    until: int
+
+    @property
+    def first(self) -> int | None:
+        """The first row with a sensor that is not trusted."""
+        return next((k for k, names in enumerate(self.untrusted) if names), None)
+
+
+def watched(guard: Guard, batch: Batch, names: Sequence[str]) -> Watched:
+    """Lead a run through the guard, row by row as at the machine."""
+    watch, found, passed, until = guard.begin(), [], [], batch.n_rows
+    columns = {n: batch.masked(n) for n in names}
+    for k, time_s in enumerate(batch.time_s):
+        watch, checked = guard.step(watch, float(time_s), {n: float(columns[n][k]) for n in names})
+        found.append(frozenset(n for n, s in checked.status.items() if s not in ("ok", "lost")))
+        passed.append([checked.values[n] for n in names])
+        if checked.fault is not None:
+            until = min(until, k)
+    table = dict(zip(names, np.array(passed).T, strict=True))
+    return Watched(tuple(found), with_values(batch, table), until)
+
+
+def with_values(batch: Batch, columns: Mapping[str, Array]) -> Batch:
+    """The batch with other values (n,) of some channels, none of them masked."""
+    return replace(batch, table=batch.table.assign(**columns), findings=())
+
+
+@dataclass(frozen=True)
+class FaultCost:
+    """What sensors cost that fail, from simulated faults of one recorded run.
+
+    Attributes:
+        um_per_K: by sensor the largest change of the prediction where it reads 1 K more from a quarter of the run on.
+        n: faults that change the prediction by more than `COUNTS_SHARE` of the largest correction.
+        missed: of them those that the guard does not find.
+        worst: the fault that is dearest in spite of the guard.
+        worst_um: the largest wrong correction that is sent during it, µm.
+    """
+
+    um_per_K: Mapping[str, float]
+    n: int
+    missed: int
+    worst: str
+    worst_um: float
+
+    @property
+    def summary(self) -> str:
+        """One sentence."""
+        dearest = max(self.um_per_K, key=lambda name: self.um_per_K[name])
+        said = f"a sensor that is wrong by 1 K costs up to {self.um_per_K[dearest]:.2g} µm ({dearest})"
+        if not self.n:
+            return f"{said}; no simulated fault of a sensor matters"
+        return f"{said}; the guard misses {self.missed} of {self.n} simulated faults, the dearest costs " \
+               f"{self.worst_um:.3g} µm ({self.worst})"  # fmt: skip
+
+    def as_plain(self) -> dict[str, Any]:
+        return {**self.__dict__, "um_per_K": dict(self.um_per_K), "summary": self.summary}
+
+
+def fault_cost(predict: Predict, substitutes: Substitutes, batch: Batch, most_um: float) -> FaultCost | None:
+    """Simulate every fault of every sensor of a model in a recorded run.
+
+    Args:
+        batch: a run of the training; the guard has learned from it too, so that it finds rather more than at the
+            machine.
+        most_um: the largest correction that is sent; predictions beyond it cost no more.
+
+    Returns:
+        None for a model without a sensor, or a run without a value of one.
+    """
+    names = [n for n in substitutes.names if batch.channels[n].unit == "degC" and np.isfinite(batch.masked(n)).all()]
+    if not names or batch.n_rows < BEGINS:
+        return None
+
+    def sent_um(b: Batch) -> Array:
+        return np.clip(predict(b), -most_um, most_um)
+
+    def wrong_um(b: Batch, until: int) -> float:
+        return float(np.nanmax(np.abs(sent_um(b) - right_um)[:until], initial=0.0))
+
+    right_um, later = sent_um(batch), np.arange(batch.n_rows) >= batch.n_rows // BEGINS
+    um_per_K = {
+        n: float(np.nanmax(np.abs(predict(with_values(batch, {n: batch.masked(n) + later})) - predict(batch))))
+        for n in names
+    }
+    guard, n, missed, worst, worst_um = Guard(substitutes), 0, 0, "", 0.0
+    for kind, at_fault, columns in faults(batch, names):
+        wrong = with_values(batch, columns)
+        if wrong_um(wrong, batch.n_rows) <= COUNTS_SHARE * most_um:
+            continue
+        seen = watched(guard, wrong, list(substitutes.names))
+        cost_um = wrong_um(seen.passed, seen.until)
+        n, missed = n + 1, missed + (seen.first is None)
+        if cost_um > worst_um:
+            worst, worst_um = f"{' and '.join(sorted(at_fault))}: {kind}", cost_um
+    return FaultCost(um_per_K, n, missed, worst, worst_um)

@@ -1,0 +1,73 @@
+"""What a failing sensor costs: hand-made models whose answer is known, with the guard of the toy machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from compensation.faults import BEGINS, fault_cost, faults, watched, with_values
+from compensation.substitutes import Guard, Substitutes
+from data.arrays import Array
+from data.batch import Batch
+
+NAMES = ("t0", "t1", "t2", "t3", "t4", "room")
+
+
+@pytest.fixture(scope="module")
+def batches(toy_batches: Callable[..., list[Batch]]) -> list[Batch]:
+    return toy_batches(k=8)
+
+
+@pytest.fixture(scope="module")
+def learned(batches: list[Batch]) -> Substitutes:
+    return Substitutes.learn(batches, (*NAMES, "spindle_rpm"))
+
+
+def of_one(batch: Batch) -> Array:
+    """10 µm/K of t0 against t1."""
+    return 10.0 * (batch.masked("t0") - batch.masked("t1"))
+
+
+def test_a_kelvin_costs_what_the_model_makes_of_it(learned: Substitutes, batches: list[Batch]) -> None:
+    cost = fault_cost(of_one, learned, batches[-1], 1e6)
+    assert cost is not None
+    assert cost.um_per_K == pytest.approx({"t0": 10.0, "t1": 10.0, **dict.fromkeys(NAMES[2:], 0.0)}, abs=1e-9)
+    assert "costs up to 10 µm (t0)" in cost.summary
+
+
+def test_faults_are_what_they_are_called(batches: list[Batch]) -> None:
+    batch = batches[-1]
+    made = {kind: columns["t0"] - batch.masked("t0") for kind, at, columns in faults(batch, NAMES) if "t0" in at}
+    first = batch.n_rows // BEGINS
+    hours = (batch.time_s - batch.time_s[first]) / 3600.0
+    assert all(not d[:first].any() for kind, d in made.items() if kind != "exchanged")
+    np.testing.assert_allclose(made["a step of 5 K"][first:], 5.0)
+    np.testing.assert_allclose(made["a drift of 10 K/h"][first:], 10.0 * hours[first:])
+    np.testing.assert_allclose((made["frozen"] + batch.masked("t0"))[first:], batch.masked("t0")[first])
+
+
+def test_the_dearest_fault_is_that_which_the_guard_leaves(learned: Substitutes, batches: list[Batch]) -> None:
+    """Held against the same faults led through the guard one by one."""
+    batch, most_um = batches[-1], 40.0
+    cost = fault_cost(of_one, learned, batch, most_um)
+    right = np.clip(of_one(batch), -most_um, most_um)
+    left = {}
+    for kind, at, columns in faults(batch, NAMES):
+        wrong = with_values(batch, columns)
+        if np.abs(np.clip(of_one(wrong), -most_um, most_um) - right).max() > 0.1 * most_um:
+            seen = watched(Guard(learned), wrong, learned.names)
+            sent = np.clip(of_one(seen.passed), -most_um, most_um)
+            left[f"{' and '.join(sorted(at))}: {kind}"] = (
+                np.abs(sent - right)[: seen.until].max(initial=0.0),
+                seen.first,
+            )
+    assert cost is not None and cost.n == len(left) > 5 and cost.missed == sum(f is None for _, f in left.values())
+    assert cost.worst_um == pytest.approx(max(um for um, _ in left.values())) and cost.worst_um <= 2 * most_um
+    assert left[cost.worst][0] == pytest.approx(cost.worst_um)
+
+
+def test_a_run_without_a_whole_sensor_says_nothing(learned: Substitutes, batches: list[Batch]) -> None:
+    lost = {n: np.full(batches[-1].n_rows, np.nan) for n in NAMES}
+    assert fault_cost(of_one, learned, with_values(batches[-1], lost), 40.0) is None
