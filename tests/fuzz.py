@@ -22,6 +22,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import openpyxl
 import pandas as pd
@@ -243,7 +244,7 @@ class Streams:
         for _ in range(dice.randrange(1, 5)):
             life = []
             for _ in range(dice.choice((1, 5, 20, 60))):
-                values = dict(next(rows).values)
+                values: dict[str, Any] = dict(next(rows).values)
                 for name in dice.sample(sorted(values), dice.choice((0, 0, 0, 1, 2))):
                     values[name] = dice.choice(odd)
                 if dice.random() < 0.1:
