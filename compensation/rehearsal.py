@@ -88,6 +88,7 @@ def rehearse(
     axes: Sequence[str],
     exchange: Callable[[Sample], Correction],
     sample_s: float = 10.0,
+    tick_s: float = 10.0,
     failures: Sequence[Failure] = (),
     readings: Readings | None = None,
     done: Callable[[int, int], None] = lambda n, of: None,
@@ -99,6 +100,9 @@ def rehearse(
 
     Args:
         exchange: sends a sample and returns the answer.
+        sample_s: time between two samples, s.
+        tick_s: time between two looks at what is sent, s; at a machine it moves on between samples that are further
+            apart.
         readings: when a probe reads the error of each recording; None: never.
         done: called with rows done and rows in all.
 
@@ -124,6 +128,11 @@ def rehearse(
         acting, due_s = dict.fromkeys(axes, 0.0), readings.first_s if readings else math.inf
         for k, t in enumerate(at_s):
             now_s = shown_s + float(t)
+            for part in range(1, math.ceil(sample_s / tick_s - 1e-9) if k else 1):
+                moved = exchange(Sample(clock_s + float(t) - sample_s + part * tick_s, {})).offset_um
+                if all(moved[a] == acting[a] for a in axes):
+                    break
+                acting = {a: moved[a] for a in axes}
             values = {c: float(v[k]) for c, v in columns.items() if np.isfinite(v[k])}
             for f in failures:
                 f.applied(values, now_s, frozen)

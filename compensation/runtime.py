@@ -160,6 +160,16 @@ class Compensator:
         self._limits = {a.axis: a.limits for a in axes}
         self._heartbeat = 0
 
+    @property
+    def tick_s(self) -> float:
+        """How often what is sent must be looked at so that it moves at its rate, s: a step may be no larger."""
+        return min(a.limits.step_um / a.limits.rate_um_per_s for a in self.axes)
+
+    @property
+    def behind_um(self) -> float:
+        """How far what is sent is from where its limits let it go, µm."""
+        return max(s.behind_um for run in self._run.values() for s in (run.safety, run.slope_safety))
+
     def _fresh(self, a: AxisModel, was: _Running | None = None) -> _Running:
         learned = a.updater.begin() if a.updater is not None else None
         sent = (was.safety, was.slope_safety) if was is not None else (Axis(), Axis())
@@ -248,7 +258,9 @@ class Compensator:
                 slope[a.axis] = part_um / a.lever_mm * _MM_PER_M
             state[a.axis] = run.safety.state
             why = run.why if notes is not None else ""
-            reasons[a.axis] = "; ".join(r for r in (reason, why, notes, a.remark) if r)
+            behind_um = run.safety.behind_um
+            limited = f"rate limited: {behind_um:.3g} um behind" if behind_um > self._limits[a.axis].step_um else ""
+            reasons[a.axis] = "; ".join(r for r in (reason, limited, why, notes, a.remark) if r)
         self._heartbeat += 1
         until_s = time_s + min(self._limits[a.axis].stale_s for a in self.axes)
         return Correction(time_s, offset, slope, state, reasons, self._heartbeat, until_s)

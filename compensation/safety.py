@@ -119,6 +119,12 @@ class Axis:
     clock_s: float | None = None
     samples: SampleClock = field(default_factory=SampleClock)
 
+    @property
+    def behind_um(self) -> float:
+        """How far what is sent is from where an active or fading axis moves to, µm: its limits hold it back."""
+        goal_um = {"active": self.target_um, "fade-out": 0.0}.get(self.state, self.sent_um)
+        return abs(goal_um - self.sent_um)
+
     def as_plain(self) -> dict[str, Any]:
         """Numbers and strings: what a restart needs."""
         return {"state": self.state, "sent_um": self.sent_um, "stopped": self.stopped, "held_s": self.held_s}

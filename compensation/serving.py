@@ -136,12 +136,16 @@ class _Line:
             except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
                 self.state.set_aside(self.state.ahead, f"cannot be used ({error})", self.log)
 
-    def answer(self, sample: Sample | None, clock_s: float) -> Correction:
-        """The correction after a sample, or in silence; where the models fail, what was sent is held and then fades."""
-        time_s = sample.time_s if sample is not None else time.time()
+    def answer(self, sample: Sample | None, clock_s: float, at_s: float | None = None) -> Correction:
+        """The correction after a sample, or in silence; where the models fail, what was sent is held and then fades.
+
+        `at_s`: Unix time of a silence, s; None: that of the computer.
+        """
+        time_s = sample.time_s if sample is not None else time.time() if at_s is None else at_s
         try:
             correction = self.machine.take(sample, clock_s) if sample else self.machine.silence(clock_s, time_s)
-            self._failing.pop("model", None)
+            if sample is not None:
+                self._failing.pop("model", None)
         except Exception as error:  # no sample ends the process
             self._fails("model", f"sample not used, {type(error).__name__} ({error}): {sample}"[:500])
             correction = self.machine.fault(clock_s, time_s, f"the model fails ({type(error).__name__})")
@@ -154,6 +158,13 @@ class _Line:
                 self._fails(str(k), str(error))
         self.seen(correction)
         return correction
+
+    def catch_up(self, from_s: float, to_s: float) -> None:
+        """In a replay, where nobody looks between two samples: what is sent moves on as at a machine."""
+        tick_s, at_s = self.machine.tick_s, from_s + self.machine.tick_s
+        while at_s < to_s and self.machine.behind_um > 0.0:
+            self.answer(None, at_s, at_s)
+            at_s += tick_s
 
     def _write_ahead(self) -> None:
         sent = self.machine.sent() if self.state is not None else self._sent
@@ -222,6 +233,8 @@ def serve(
                     if not replay:
                         clock_s = time.monotonic()
                     elif sample is not None:
+                        if begun:
+                            line.catch_up(clock_s, sample.time_s)
                         clock_s = sample.time_s
                     line.answer(sample, clock_s)
                     line.save(clock_s, _SAVED_EVERY_S)

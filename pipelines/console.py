@@ -128,8 +128,8 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def table(title: str, *columns: str, left: Collection[str] = (), wrap: Collection[str] = ()) -> Table:
-    """An empty table; columns are aligned right except those in `left`, and on one line except those in `wrap`, which
-    keep a width in which words can be read."""
+    """An empty table; columns are aligned right except those in `left`, and on one line except those in `wrap`;
+    of these the ones in `left` keep a width in which words can be read."""
     made = Table(
         title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False,
         padding=(0, 1, 0, 0),
@@ -137,7 +137,8 @@ def table(title: str, *columns: str, left: Collection[str] = (), wrap: Collectio
     for name in columns:
         made.add_column(
             name, justify="left" if name in left else "right", no_wrap=name not in wrap,
-            overflow="fold" if name in wrap else "ellipsis", min_width=MIN_WRAPPED if name in wrap else None,
+            overflow="fold" if name in wrap else "ellipsis",
+            min_width=MIN_WRAPPED if name in wrap and name in left else None,
         )  # fmt: skip
     return made
 

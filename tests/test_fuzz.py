@@ -29,7 +29,7 @@ def test_the_command_reports_a_failure_and_keeps_its_input(
         raise KeyError("a\nb")
 
     monkeypatch.setattr(fuzz.Messages, "run", broken)
-    arguments = ["messages", "--seconds", "0.05", "--seed", "7", "--keep", str(tmp_path)]
+    arguments = ["messages", "--seconds", "1", "--seed", "7", "--keep", str(tmp_path)]
     assert fuzz.main(arguments) == 1
     assert "seed 7, input in" in capsys.readouterr().out
     assert (tmp_path / "messages-7").exists() and len(list(tmp_path.iterdir())) == 1

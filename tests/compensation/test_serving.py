@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -69,14 +70,18 @@ class Kept:
     def sent_um(self) -> list[float]:
         return [c.offset_um["z"] for c in self.got]
 
+    def answers(self, given: Sequence[Sample]) -> list[Correction]:
+        """Those at the times of samples; between them what is sent moves on."""
+        return [c for c in self.got if c.time_s in {s.time_s for s in given}]
+
 
 def test_a_channel_that_comes_later_is_a_missing_value_at_first(toy: tuple[AxisModel, list[Sample]]) -> None:
     model, rows = toy
     first = replace(rows[0], values={c: v for c, v in rows[0].values.items() if c != "spindle_rpm"})
     sink = Kept()
     serve(compensator(model), Given(first, *rows[1:20]), [sink], replay=True)
-    assert len(sink.got) == 20 and sink.got[-1].state["z"] == "active"
-    assert [c.heartbeat for c in sink.got] == list(range(1, 21))
+    assert len(sink.answers(rows)) == 20 and sink.got[-1].state["z"] == "active"
+    assert [c.heartbeat for c in sink.got] == list(range(1, len(sink.got) + 1))
     assert all(c.valid_until_s > c.time_s for c in sink.got)
 
 
@@ -92,8 +97,10 @@ def test_what_fails_is_held_then_fades_and_says_which_sample(toy: tuple[AxisMode
 
     machine.take = failing  # type: ignore[method-assign]
     serve(machine, Given(*rows), [sink], log=said.append, replay=True)
-    assert len(sink.got) == len(rows) and sink.sent_um[29] != 0.0
-    assert sink.got[30].state["z"] == "hold" and sink.sent_um[30] == sink.sent_um[29]
+    answers = sink.answers(rows)
+    assert len(answers) == len(rows) and answers[29].offset_um["z"] != 0.0
+    held = sink.got.index(answers[30])
+    assert answers[30].state["z"] == "hold" and sink.sent_um[held] == sink.sent_um[held - 1]
     assert sink.got[-1].state["z"] == "off" and sink.sent_um[-1] == 0.0
     assert max(abs(b - a) for a, b in zip(sink.sent_um, sink.sent_um[1:], strict=False)) <= 1.0 + 1e-9
     assert len(said) == 1 and "ZeroDivisionError (no model): Sample(time_s=" in said[0]
@@ -140,7 +147,7 @@ def test_a_state_that_lacks_what_was_sent_ends_nothing(
     state, said, sink = StateFile(tmp_path / "state.json"), list[str](), Kept()
     state.save({"schema": "another", "axes": axes})
     serve(compensator(model), Given(*rows[:5]), [sink], state, replay=True, log=said.append)
-    assert len(sink.got) == 5 and "cannot be used" in said[0]
+    assert len(sink.answers(rows)) == 5 and "cannot be used" in said[0]
 
 
 @pytest.mark.parametrize("ending", ["signal", "source ends", "source fails"])
@@ -194,7 +201,7 @@ def test_a_full_disk_and_a_sink_that_breaks_end_nothing(toy: tuple[AxisModel, li
 
     (tmp_path / "state.sent").mkdir()
     serve(compensator(model), Given(*rows[:10]), [Broken(), good], state, replay=True, log=said.append)
-    assert len(good.got) == 10 and sum("no route" in line for line in said) == 1
+    assert len(good.answers(rows)) == 10 and sum("no route" in line for line in said) == 1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -234,3 +241,28 @@ def test_computer_and_broker_die_fifty_times_and_nothing_jumps_at_the_receiver(
         sent_um.append(now_um)
     assert deaths >= 50 and max(map(abs, sent_um)) > 1.0
     assert np.abs(np.diff(sent_um)).max() <= limits.rate_um_per_s * 1.0 + 1e-9
+
+
+def test_in_a_replay_what_is_sent_follows_as_at_a_machine_however_seldom_samples_come(
+    toy: tuple[AxisModel, list[Sample]],
+) -> None:
+    """Samples every 300 s: a live loop looks once a second and moves at 0.1 um/s, no more than 1 um at a time."""
+    model, given = replace(toy[0], limits=LIMITS, updater=None), toy[1]
+    sink = Kept()
+    serve(compensator(model), Given(*given), [sink], replay=True)
+    steps = np.diff(sink.sent_um)
+    assert np.abs(steps).max() <= LIMITS.step_um + 1e-9
+    at = {c.time_s: c.offset_um["z"] for c in sink.got}
+    free = compensator(replace(model, limits=replace(LIMITS, rate_um_per_s=1e3, step_um=1e6)))
+    wanted = {s.time_s: free.take(s, s.time_s).offset_um["z"] for s in given}
+    times = sorted(wanted)
+    reached = [abs(at[b] - wanted[a]) for a, b in itertools.pairwise(times) if abs(wanted[b] - wanted[a]) < 1]
+    assert max(abs(w) for w in wanted.values()) > 10.0 and np.max(reached) <= 2.0
+
+
+def test_an_axis_that_its_rate_holds_back_says_so(toy: tuple[AxisModel, list[Sample]]) -> None:
+    model = replace(toy[0], limits=replace(LIMITS, rate_um_per_s=0.002), updater=None)
+    sink = Kept()
+    serve(compensator(model), Given(*toy[1]), [sink], replay=True)
+    late = [c for c in sink.got if "rate limited: " in c.reasons["z"]]
+    assert late and all(c.state["z"] in ("active", "fade-out") and " um behind" in c.reasons["z"] for c in late)

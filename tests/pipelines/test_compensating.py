@@ -96,8 +96,9 @@ def test_a_recording_on_standard_input_is_answered_row_by_row(
     options = ["compensate", str(model), "--replay", "--period-s", "300", "--rate-um-per-s", "50", "--from", "-"]
     done = CliRunner().invoke(app, options, input=rows)
     assert done.exit_code == 0, done.output
-    answers = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-    assert len(answers) == batch.n_rows
+    sent = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    answers = [a for a in sent if a["time_s"] in {1e9 + t for t in batch.time_s}]  # between them it moves on
+    assert len(answers) == batch.n_rows < len(sent)
     assert {"time_s", "offset_um", "state"} <= answers[0].keys()
     assert answers[-1]["state"] == {"z": "active"}
     wanted = -stored.predict(batch)
@@ -119,7 +120,7 @@ def test_the_state_file_goes_on(year: Path, model: Path, tmp_path: Path) -> None
     assert "goes on from" in done.stderr
     sent = pd.read_csv(tmp_path / "sent.csv")
     column = next(c for c in sent if "offset" in c and "z" in c)
-    assert len(sent) == len(table) and np.abs(np.diff(sent[column])).max() <= 1.0 + 1e-9
+    assert set(table["time"]) <= set(sent["time_s"]) and np.abs(np.diff(sent[column])).max() <= 1.0 + 1e-9
     state.write_text("{")
     done = CliRunner().invoke(app, options)
     assert done.exit_code == 0 and "set aside as state.json.unusable" in done.stderr
