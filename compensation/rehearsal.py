@@ -24,6 +24,7 @@ STEP_K = 15.0  # of a sensor that steps: a loose plug
 _PAUSE_S = 10 * 3600.0  # between two recordings: a night
 _FADE_S = 3600.0  # of it, at most, until what was sent has faded
 _EPOCH_S = 1.7e9
+GAP_S = 3600.0  # that is shown in its place
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def rehearse(
             if not any(exchange(Sample(clock_s + k * sample_s, {})).offset_um.values()):
                 break
         clock_s += _PAUSE_S
-        shown_s += float(at_s[-1]) + 3600.0
+        shown_s += float(at_s[-1]) + GAP_S
     found = {what: {a: np.array(series[f"{what} {a}"]) for a in axes} for what in ("before", "after", "sent")}
     return Rehearsal(
         machine=batches[0].machine,

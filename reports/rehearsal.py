@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from compensation.rehearsal import Rehearsal
+from compensation.rehearsal import GAP_S, Rehearsal
 from reports.drawing import LINES, MUTED, WIDTH_IN, Picture, head, legend_row, panel, picture
 from reports.labels import GREEN, ORANGE
 from reports.layout import Column, Row, Table
@@ -67,13 +67,16 @@ def _table(r: Rehearsal) -> Table:
     columns = (
         Column("axis"), Column("band before", "µm", "number"), Column("band after", "µm", "number"),
         Column("rms before", "µm", "number"), Column("rms after", "µm", "number"), Column("active", "%", "number"),
-        Column("largest step sent", "µm", "number"),
+        Column("fastest change sent", "µm/s", "number"),
     )  # fmt: skip
     rows = []
     for a in r.before_um:
-        band, rms, sent = r.band_um(a), r.rms_um(a), np.abs(np.diff(r.sent_um[a])).max(initial=0.0)
+        apart_s = np.diff(r.time_s)
+        within = apart_s < GAP_S  # a night between two recordings is no change
+        rates = np.abs(np.diff(r.sent_um[a]))[within] / apart_s[within]
+        band, rms, fastest = r.band_um(a), r.rms_um(a), rates.max(initial=0.0)
         active = 100 * np.mean([s == "active" for s in r.state[a]])
-        cells = (*(f"{v:.2f}" for v in (*band, *rms)), f"{active:.0f}", f"{sent:.2f}")
+        cells = (*(f"{v:.2f}" for v in (*band, *rms)), f"{active:.0f}", f"{fastest:.2f}")
         rows.append(Row.of(a, *cells))
     note = "The band holds 95 % of the rows; rms is about 0, the error at each recording's start."
     return Table("Error without and with compensation", columns, tuple(rows), r.simulated, notes=(note,))

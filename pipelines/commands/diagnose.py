@@ -53,7 +53,7 @@ def continued_dict(outcome: DiagnosisOutcome) -> dict[str, Any]:
 def print_diagnosis(outcome: DiagnosisOutcome) -> None:
     """The verdict, the findings, left-out errors, the next run and the files."""
     from pipelines.diagnosing import FINDINGS, MACHINE, PLAN, REPORT
-    from reports.diagnosis.tables import experiment_sentence, headline
+    from reports.diagnosis.tables import experiment_sentence, headline, most_left
 
     contents = {
         REPORT: "the report, one page",
@@ -70,7 +70,8 @@ def print_diagnosis(outcome: DiagnosisOutcome) -> None:
     if outcome.ingested is not None and outcome.ingested.quarantined:
         bad = outcome.ingested.quarantined
         console.line(f"files in quarantine: {len(bad)}, not used; {bad[0].reason}")
-    console.out.print(headline(f.verdict, [x.probability for x in f.findings]), style="bold", highlight=False)
+    said = headline(f.verdict, [x.probability for x in f.findings], most_left(f.fit.left_out_rms))
+    console.out.print(said, style="bold", highlight=False)
     for line in sentences(d):
         console.line(line)
     for line in outcome.continued.sentences(f) if outcome.continued is not None else ():

@@ -91,4 +91,7 @@ def rehearse(
     for a in r.before_um:
         before, after = r.band_um(a)
         console.line(f"{a:<10} band of 95 % of the rows: {before:.2f} µm without, {after:.2f} µm with compensation")
+    for m in stored:
+        if said := m.info.get("faults", {}).get("summary"):
+            console.line(f"{m.family.target:<10} {said}")
     console.line(f"page       {page}")

@@ -295,7 +295,7 @@ def diagnosis_page(
         simulated=d.simulated,
         verdict=f.verdict,
         chip=tables.CHIPS[f.verdict],
-        headline=tables.headline(f.verdict, [x.probability for x in f.findings]),
+        headline=tables.headline(f.verdict, [x.probability for x in f.findings], tables.most_left(f.fit.left_out_rms)),
         lead="" if f.findings else shortened(lead),  # the findings say it themselves
         drafted=_DRAFTED if d.drafted else "",
         found=tuple(_found(k, x) for k, x in enumerate(f.findings, 1)),

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy.stats import chi2
 
 from data.units import unit_label
-from diagnosis.findings.schema import Finding, FoundParameter, NextExperiment
+from diagnosis.findings.schema import Finding, FoundParameter, LeftOutRms, NextExperiment
 from diagnosis.policy import POLICY
 from reports.labels import NOTHING, between, count, listed, number, percent, three_digits
 from reports.layout import Column, Row, Table
@@ -77,16 +77,30 @@ def probability_label(probability: float) -> str:
     return ("> 99 %" if percent > 99 else "< 1 %" if percent < 1 else f"{percent:.0f} %").replace(" ", NARROW)
 
 
-def headline(verdict: str, probabilities: Sequence[float]) -> str:
-    """The verdict as one line for the shop floor, as certain as its surest finding; the others may be fewer."""
+def most_left(rms: LeftOutRms) -> str:
+    """The channel whose left-out error is the most times its noise: "z at 12 times its noise"; empty where all are
+    noise, or no noise is known."""
+    times = {k: v / n for k, v in rms.after.items() if v is not None and (n := rms.noise_floor.get(k))}
+    key = max(times, key=lambda k: times[k], default="")
+    if not key or times[key] <= POLICY.noise_max_ratio:
+        return ""
+    return f"{key.rpartition('_')[0]} at {times[key]:.2g} times its noise"
+
+
+def headline(verdict: str, probabilities: Sequence[float], left: str = "") -> str:
+    """The verdict as one line for the shop floor, as certain as its surest finding; the others may be fewer.
+
+    `left`: what is left, as `most_left`.
+    """
+    remains = f"{left} is left" if left else ""
     n, most, least = len(probabilities), max(probabilities, default=1.0), min(probabilities, default=1.0)
     the = "Perhaps the" if most < POLICY.likely_probability else "Most likely the"
     the = "The" if most >= POLICY.plain_probability else the
     effects = "one effect" if n == 1 else f"{'up to ' if least < POLICY.plain_probability else ''}{_spelled(n)} effects"
     return {
-        "consistent": "Consistent: no missing effect is supported by these runs.",
+        "consistent": "Consistent: no missing effect is supported by these runs" + (f"; {remains}." if left else "."),
         "explained": f"{the} simulation left out {effects}; with {'it' if n == 1 else 'them'} noise alone is left.",
-        "partly_explained": f"{the} simulation left out {effects}; more than noise is left.",
+        "partly_explained": f"{the} simulation left out {effects}; {remains or 'more than noise is left'}.",
         "unlisted": "Something is missing that no listed mechanism explains.",
         "undecidable": "Something is missing, but these recordings do not show what.",
     }[verdict]

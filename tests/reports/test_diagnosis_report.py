@@ -17,11 +17,11 @@ from matplotlib.image import imread
 
 from data.errors import InputError
 from diagnosis.contracts import COLUMNS
-from diagnosis.findings.schema import Findings
+from diagnosis.findings.schema import Findings, LeftOutRms
 from diagnosis.result import Diagnosis
 from reports.diagnosis import tables as diagnosis_tables
 from reports.diagnosis.page import diagnosis_page, write_diagnosis_report
-from reports.diagnosis.tables import CHIPS, GLOSSARY, METHOD, headline, likelihood, probability_label
+from reports.diagnosis.tables import CHIPS, GLOSSARY, METHOD, headline, likelihood, most_left, probability_label
 from tests.snapshots import check_snapshot
 from tests.toys.diagnosis import BATCHES, toy_diagnosis
 
@@ -254,3 +254,15 @@ def test_the_page_names_rows_and_values_that_are_not_used() -> None:
     assert part.lead == "Rows: 96 read, 3 dropped; 12 values masked: T_C 12 (held_values)."
     (row,) = part.folded[0].rows
     assert list(row.cells) == ["b1", "T_C", "held values", "masked", "12", "12", "1.00 to 2.00"]
+
+
+def test_the_headline_says_what_is_left() -> None:
+    rms = LeftOutRms(
+        before={"z_um": 9.0}, after={"z_um": 6.0, "t_front_K": 0.11}, noise_floor={"z_um": 0.5, "t_front_K": 0.1}
+    )
+    assert most_left(rms) == "z at 12 times its noise"
+    said = headline("partly_explained", [0.95], most_left(rms))
+    assert said == "The simulation left out one effect; z at 12 times its noise is left."
+    assert headline("consistent", [], most_left(rms)).endswith("by these runs; z at 12 times its noise is left.")
+    noise = LeftOutRms(after={"z_um": 0.6, "x_um": None}, noise_floor={"z_um": 0.5, "y_um": None})
+    assert most_left(noise) == most_left(LeftOutRms()) == ""
