@@ -121,6 +121,7 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
     body = [row for row in sheet.head[first : first + _CLOCK_ROWS] if len(row) == width]
     filled = [[c for row in body if (c := row[i]) is not None and str(c).strip()] for i in range(width)]
     of_rows = [str(units[i] or "").strip() if i < len(units) else "" for i in range(width)]
+    titles = [row for row in sheet.head[:first] if _texts(row) == 1 or len(row) != width]
     stated = [_unit_of(cells[:200]) or of_rows[i] for i, cells in enumerate(filled)]
     clock = _clock(columns, filled, sheet.decimal, bool(header), stated, bool(sheet.origin_s))
     if clock.time is not None:
@@ -146,7 +147,7 @@ def look_at(sheet: Sheet, where: str, form: Form | None = None) -> Table:
     return Table(
         tuple(columns), tuple(stated), bool(header), first, clock, tuple(numeric), left,
         tuple(tuple(row[i] for row in body[:_SHOWN_ROWS]) for i in range(width)), sheet.summary, form,
-        any("simulat" in str(c).lower() for row in sheet.head[:first] if _texts(row) == 1 for c in row),
+        any("simulat" in str(c).lower() for row in titles for c in row),
         sheet.name, sheet.origin_s, sheet.step_s,
     )  # fmt: skip
 

@@ -257,6 +257,10 @@ def test_a_draft_proposes_how_to_cut_one_long_recording(tmp_path: Path, pause_s:
 def test_a_line_that_says_simulated_marks_the_machine(tmp_path: Path) -> None:
     path = saved(tmp_path, "a.csv", ["# simulated recording", HEAD, *rows("{t},{f},{b},{z}")])
     assert parse_machine(draft_machine_file([path]), "draft").simulated
+    path = saved(
+        tmp_path, "c.csv", ["# simulated recording, sample year, seed 0, shop, hall", HEAD, *rows("{t},{f},{b},{z}")]
+    )
+    assert parse_machine(draft_machine_file([path]), "draft").simulated
     path = saved(tmp_path, "b.csv", ["Time,T_simulated,z_um", *rows("{t},{f},{z}")])
     assert not parse_machine(draft_machine_file([path]), "draft").simulated
 
