@@ -69,6 +69,7 @@ def test_a_champion_older_than_a_season() -> None:
     undated = reasons(state_of(last_seen="", trained_at="2026-06-01T00:00:00+00:00"))["old_champion"]
     assert "trained on 2026-06-01, 178 days ago" in undated  # the runs have no dates: the training has
     assert not reasons(state_of(last_seen="", trained_at=""))
+    assert not reasons(state_of(last_seen="2025-06-01T08:00:00", simulated=True))  # its dates are made up
     assert not reasons(state_of(run_of(1, 99.0), version=None))
 
 
