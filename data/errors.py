@@ -16,6 +16,11 @@ class WorkError(Exception):
     """The input was fine but the work failed. Exit code 1."""
 
 
+def place_of(error: OSError, otherwise: object) -> object:
+    """The file that could not be written or read; of a copy its target, which is what a full disk is about."""
+    return error.filename2 or error.filename or otherwise
+
+
 def closest(got: str, allowed: Iterable[str]) -> str:
     """Suggestion for an unknown name with all allowed ones: ``did you mean 'ridge'? Allowed: bp, ridge``."""
     names = sorted(allowed)

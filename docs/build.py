@@ -277,7 +277,10 @@ def cli_page() -> str:
     root: Any = typer.main.get_command(app)
     commands = list(_commands("thermodrift", root))
     lines = ["# Command line", "", NOTE, "", root.help, ""]
-    lines += ["Exit codes: 0 done, 1 the work failed, 2 bad arguments or input, 3 an alert (`status --alert`), 130 and 143 stopped by a signal.", ""]
+    lines += [
+        "Exit codes: 0 done, 1 the work failed, 2 bad arguments or input, 3 an alert (`status --alert`), 130 and 143 "
+        "stopped by a signal.", "",
+    ]  # fmt: skip
     lines += ["| command | |", "|---|---|"]
     lines += [f"| [`{n}`](#{_anchor(n)}) | {_cell(_sentence(c.help))} |" for n, c in commands]
     for name, command in commands:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from data.errors import InputError, WorkError
+from data.errors import InputError, WorkError, place_of
 from pipelines import console, stopping
 from pipelines.commands.calibrate import calibrate
 from pipelines.commands.compensate import compensate
@@ -89,7 +89,7 @@ def main() -> None:
         sys.exit(130)
     except OSError as error:
         if error.errno in _DISK:
-            where = error.filename or home()
+            where = place_of(error, home())
             console.error(f"{where}: {error.strerror or error}; {_DISK[error.errno]}, then run the same command again")
             sys.exit(1)
         if error.errno != errno.ENAMETOOLONG:

@@ -33,7 +33,7 @@ from requests import RequestException
 from sqlalchemy.exc import SQLAlchemyError
 
 from data.batch import Batch
-from data.errors import InputError, WorkError
+from data.errors import InputError, WorkError, place_of
 from models import FAMILIES
 from models.outlook import outlook
 from models.promotion import Choice, choose, judged
@@ -121,7 +121,7 @@ def store_errors(settings: Settings) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:
             raise
-        where = error.filename or settings.artifacts_uri or settings.store_name
+        where = place_of(error, settings.artifacts_uri or settings.store_name)
         raise WorkError(f"{where}: cannot be written or read ({error.strerror or error})") from error
 
 

@@ -19,7 +19,7 @@ import pandas as pd
 from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine
-from data.errors import InputError, WorkError, check_suffix, closest
+from data.errors import InputError, WorkError, check_suffix, closest, place_of
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
 from models import promotion
@@ -324,9 +324,8 @@ def _kept(checkpoint: Checkpoint) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WorkError(
-            f"{error.filename or checkpoint.folder}: {error.strerror or error}; {checkpoint.summary()}"
-        ) from error
+        where = place_of(error, checkpoint.folder)
+        raise WorkError(f"{where}: {error.strerror or error}; {checkpoint.summary()}") from error
     except WorkError as error:
         raise WorkError(f"{error}; {checkpoint.summary()}") from error
 

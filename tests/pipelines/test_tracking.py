@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
 import platform
@@ -241,3 +242,9 @@ def test_artifacts_stay_in_the_folder_of_their_channel(store, tmp_path, target):
     client.log_artifact(run.info.run_id, str(tmp_path / "note.txt"))
     (note,) = store.home.rglob(f"{run.info.run_id}/**/note.txt")
     assert note.relative_to(store.home / "artifacts" / "toy-quoted").parts[0] == target
+
+
+def test_a_full_disk_is_that_of_the_home_and_not_the_source_of_the_copy(store, tmp_path):
+    full = OSError(errno.ENOSPC, "No space left on device", "/tmp/scratch/scores", None, f"{tmp_path}/scores")
+    with pytest.raises(WorkError, match=f"^{tmp_path}/scores: cannot be written or read"), tracking.store_errors(store):
+        raise full
