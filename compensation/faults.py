@@ -13,6 +13,7 @@ from data.arrays import Array
 from data.batch import Batch
 
 BEGINS = 4  # a fault begins after this part of a run
+LOOKS = 75  # of the guard in a run: every five minutes in one of six hours
 COUNTS_SHARE = 0.1  # of the largest correction; a fault of less is within what a model leaves anyway
 Predict = Callable[[Batch], Array]  # error (n,) of a batch, µm
 
@@ -51,17 +52,24 @@ class Watched:
         return next((k for k, names in enumerate(self.untrusted) if names), None)
 
 
-def watched(guard: Guard, batch: Batch, names: Sequence[str]) -> Watched:
-    """Lead a run through the guard, row by row as at the machine."""
-    watch, found, passed, until = guard.begin(), [], [], batch.n_rows
+def watched(guard: Guard, batch: Batch, names: Sequence[str], every: int = 1) -> Watched:
+    """Lead a run through the guard, as at the machine.
+
+    Args:
+        every: rows from one look of the guard to the next; what it changes in one holds for the rows between.
+    """
+    watch, found, changed, until = guard.begin(), list[frozenset[str]](), list[list[float]](), batch.n_rows
     columns = {n: batch.masked(n) for n in names}
-    for k, time_s in enumerate(batch.time_s):
-        watch, checked = guard.step(watch, float(time_s), {n: float(columns[n][k]) for n in names})
-        found.append(frozenset(n for n, s in checked.status.items() if s not in ("ok", "lost")))
-        passed.append([checked.values[n] for n in names])
+    for k in range(0, batch.n_rows, every):
+        given = {n: float(columns[n][k]) for n in names}
+        watch, checked = guard.step(watch, float(batch.time_s[k]), given)
+        untrusted = frozenset(n for n, s in checked.status.items() if s not in ("ok", "lost"))
+        held = min(every, batch.n_rows - k)
+        found += [untrusted] * held
+        changed += [[checked.values[n] - given[n] for n in names]] * held
         if checked.fault is not None:
             until = min(until, k)
-    table = dict(zip(names, np.array(passed).T, strict=True))
+    table = {n: columns[n] + change for n, change in zip(names, np.array(changed).T, strict=True)}
     return Watched(tuple(found), with_values(batch, table), until)
 
 
@@ -129,11 +137,12 @@ def fault_cost(predict: Predict, substitutes: Substitutes, batch: Batch, most_um
         for n in names
     }
     guard, n, missed, worst, worst_um = Guard(substitutes), 0, 0, "", 0.0
+    every = max(1, batch.n_rows // LOOKS)
     for kind, at_fault, columns in faults(batch, names):
         wrong = with_values(batch, columns)
         if wrong_um(wrong, batch.n_rows) <= COUNTS_SHARE * most_um:
             continue
-        seen = watched(guard, wrong, list(substitutes.names))
+        seen = watched(guard, wrong, list(substitutes.names), every)
         cost_um = wrong_um(seen.passed, seen.until)
         n, missed = n + 1, missed + (seen.first is None)
         if cost_um > worst_um:

@@ -71,3 +71,13 @@ def test_the_dearest_fault_is_that_which_the_guard_leaves(learned: Substitutes, 
 def test_a_run_without_a_whole_sensor_says_nothing(learned: Substitutes, batches: list[Batch]) -> None:
     lost = {n: np.full(batches[-1].n_rows, np.nan) for n in NAMES}
     assert fault_cost(of_one, learned, with_values(batches[-1], lost), 40.0) is None
+
+
+def test_fewer_looks_find_the_same_faults_a_little_later(learned: Substitutes, batches: list[Batch]) -> None:
+    batch = batches[-1]
+    stepped = with_values(batch, {"t2": batch.masked("t2") + 9.0 * (np.arange(batch.n_rows) >= 31)})
+    often, rarely = (watched(Guard(learned), stepped, learned.names, every) for every in (1, 3))
+    assert often.first == 31 and rarely.first == 33
+    assert rarely.untrusted[33] == rarely.untrusted[35] == {"t2"}
+    np.testing.assert_allclose(rarely.passed.values("t2")[:31], batch.masked("t2")[:31])
+    assert np.abs(rarely.passed.values("t2") - batch.masked("t2"))[33:].max() < 4.0
