@@ -30,6 +30,9 @@ class Headline:
     groups: Table | None
 
 
+_S = "S is the standard deviation of the error that is left in a run."
+
+
 def headline(name: str, training: Training, choice: Choice, verdict: Verdict, digits: int) -> Headline:
     """The first screen of one channel."""
     result, expected = training.result, outlook(training.result, choice)
@@ -98,9 +101,11 @@ def _rests_on(result: GridResult, choice: Choice, expected: Outlook) -> str:
     model = model[:1].upper() + model[1:]
     s = result.scores
     if expected.protocol != "forward":
-        return f"{model}. {sentence(expected.note)}"
+        return f"{model}. {sentence(expected.note)} {_S}"
     blocks = s.loc[s["protocol"] == "forward", "fold"].nunique()
-    return f"{model}. Each of {count(blocks, 'block')} of later runs is predicted by a model of all runs before it."
+    return (
+        f"{model}. Each of {count(blocks, 'block')} of later runs is predicted by a model of all runs before it. {_S}"
+    )
 
 
 def _groups(name: str, result: GridResult, choice: Choice, expected: Outlook, digits: int) -> Table | None:
