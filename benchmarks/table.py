@@ -57,7 +57,7 @@ class Row:
 
     def cells(self) -> tuple[str, ...]:
         """Text of the table's columns."""
-        ratio = f"{self.ratio:.3g}×" if math.isfinite(self.ratio) else ""
+        ratio = f"{float(f'{self.ratio:.3g}'):g}×" if math.isfinite(self.ratio) else ""
         target = [f"≥ {self.target_ratio:g}×"] if math.isfinite(self.target_ratio) else []
         target += [f"≤ {seconds(self.target_s)}"] if math.isfinite(self.target_s) else []
         target += [self.limit[0]] if self.limit else []
