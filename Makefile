@@ -52,11 +52,11 @@ lock: $(READY)  ## renew the lock files within the ranges of pyproject.toml
 	 $(FREEZE) | grep -vxFf requirements.lock) > .venv/new.lock && mv .venv/new.lock requirements-docs.lock
 
 # What is imported is compiled at its first use: compiling every module of every package takes a third of the set-up.
-$(READY): requirements.lock pyproject.toml
+$(READY): requirements.lock pyproject.toml exam/pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v == (3, 11) else f"thermodrift needs Python 3.11, got {v[0]}.{v[1]}; call make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . -e ./exam
 	@touch $@
 
 .venv/.docs-ready: requirements-docs.lock $(READY)

@@ -39,8 +39,8 @@ from models.result import CELL_KEYS
 from models.stack import best_cells
 from models.trust import Region, left_out_runs
 from pipelines.model_store import StoredModel
-from plants.plant import draw
 from plants.sample.sample_year import write_sample_year
+from thermodrift_exam.plants.plant import draw
 
 ROOT = Path(__file__).parent.parent
 CELLS = ("none|ridge", "correlation|ridge|4", "none|pls", "none|distributed_lag", "correlation|lag_dictionary|4")

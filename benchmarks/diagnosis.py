@@ -33,7 +33,7 @@ from diagnosis.localisation.where_when import locate
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
 from diagnosis.search.refits import odds_of, refit, shortlist
-from plants.plant import Case, draw
+from thermodrift_exam.plants.plant import Case, draw
 from twin.calibration.least_squares import State
 from twin.schema import twin_part
 

@@ -35,8 +35,8 @@ from features.design import Design
 from models import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import PROTOCOLS, Fold, folds_of
-from plants.plant import draw
 from plants.sample.sample_year import write_sample_year
+from thermodrift_exam.plants.plant import draw
 
 Runs = tuple[Machine, list[Batch]]
 STEP = "step"

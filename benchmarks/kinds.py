@@ -31,12 +31,12 @@ from diagnosis.diagnose import diagnose
 from diagnosis.fitting.batches import usable_batches
 from diagnosis.result import Diagnosis
 from diagnosis.search.claims import Round
-from evidence.proof.scoring.answer_key import AnswerKey, Spot
-from evidence.proof.scoring.matching import names_term
-from evidence.proof.scoring.true_model import TrueModel, true_model
-from evidence.proof.spec import KIND_PLANTS, Kind, PlantKind
-from evidence.proof.suite.build import answer_of
-from evidence.proof.suite.other_kinds import drawn_kind, executed_kind, kind_case
+from evidence.scoring.answer_key import AnswerKey, Spot
+from evidence.scoring.matching import names_term
+from thermodrift_exam.proof.scoring.true_model import TrueModel, true_model
+from thermodrift_exam.proof.spec import KIND_PLANTS, Kind, PlantKind
+from thermodrift_exam.proof.suite.build import answer_of
+from thermodrift_exam.proof.suite.other_kinds import drawn_kind, executed_kind, kind_case
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
@@ -113,7 +113,7 @@ def _proposed(
 
 
 def _visible(truth: TrueModel) -> dict[str, Any]:
-    """Whether the true effects, refitted, are visible (`evidence.proof.scoring.true_model`)."""
+    """Whether the true effects, refitted, are visible (`proof.scoring.true_model`)."""
     return {"visible": list(truth.visible), "true_gain": truth.gain_nats, "true_structure": truth.threshold_nats}
 
 

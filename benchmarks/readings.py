@@ -33,8 +33,8 @@ from models import FAMILIES
 from models.metrics import residual_std_um
 from models.protocols import forward
 from models.updating import COUNTS, SCHEDULES, Track, Updater, out_of_fold, scores
-from plants.plant import draw
 from plants.sample.sample_axis import write_sample_axis
+from thermodrift_exam.plants.plant import draw
 
 MACHINES = Path(__file__).parent.parent / "machines"
 LAGS = ("lag30min", "lag120min")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import sys
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
@@ -22,12 +23,10 @@ from pipelines.commands.ingest import ingest
 from pipelines.commands.lake import app as lake
 from pipelines.commands.predict import predict
 from pipelines.commands.promote import promote, rollback
-from pipelines.commands.prove import app as prove
 from pipelines.commands.registry import registry
 from pipelines.commands.rehearse import rehearse
 from pipelines.commands.replay import replay
 from pipelines.commands.report import report
-from pipelines.commands.reproduce import reproduce
 from pipelines.commands.schedule import schedule
 from pipelines.commands.simulate import simulate
 from pipelines.commands.status import status
@@ -44,7 +43,7 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (
     describe, ingest, train, report, promote, rollback, status, registry, predict, rehearse, compensate, export,
-    replay, schedule, simulate, calibrate, diagnose, demonstrate, reproduce,
+    replay, schedule, simulate, calibrate, diagnose, demonstrate,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)
@@ -61,8 +60,17 @@ def _options(
         raise typer.Exit
 
 
-app.add_typer(prove, name="prove")
 app.add_typer(lake, name="lake")
+for entry in entry_points(group="thermodrift.commands"):  # of other distributions that are installed
+    try:
+        found = entry.load()
+    except ImportError as error:
+        console.note(f"command {entry.name} of {entry.value}: cannot be loaded ({error}); install it again")
+        continue
+    if isinstance(found, typer.Typer):
+        app.add_typer(found, name=entry.name)
+    else:
+        app.command(entry.name)(found)
 
 
 _ROOM = "make room on the disk"

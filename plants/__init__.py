@@ -1,1 +1,1 @@
-"""Plants: simulated machines with independent numerics for testing a diagnosis; nothing here uses the twin."""
+"""Simulated machines of the sample year, with numerics of their own; nothing here uses the twin."""

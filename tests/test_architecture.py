@@ -28,8 +28,17 @@ ALLOWED: Mapping[str, set[str]] = {
         "data", "features", "models", "twin", "compensation", "diagnosis", "plants", "reports", "evidence", "pipelines",
     },
 }  # fmt: skip
+EXAM: Mapping[str, set[str]] = {  # a distribution of its own, which no room of the product may import
+    "thermodrift_exam.plants": {"data", "plants"},
+    "thermodrift_exam": {
+        "data", "features", "models", "twin", "diagnosis", "plants", "reports", "evidence", "pipelines",
+        "thermodrift_exam.plants",
+    },
+}  # fmt: skip
+EVERY = {**ALLOWED, **EXAM}
 ORCHESTRATION = {"prefect", "mlflow", "typer"}
-PLANTS_MAY_USE = {"data", "plants", "numpy", "scipy", "pandas", "yaml", "skfem"}
+PLANTS = {"plants", "thermodrift_exam.plants"}
+PLANTS_MAY_USE = {"data", *PLANTS, "numpy", "scipy", "pandas", "yaml", "skfem"}
 IMPORT_ALL = """
 import importlib, json, sys
 for name in json.load(sys.stdin):
@@ -40,14 +49,21 @@ print(json.dumps(sorted(sys.modules)))
 
 def _modules() -> dict[str, Path]:
     found = {}
-    for room in ALLOWED:
-        for path in (ROOT / room).rglob("*.py"):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for room in EVERY:
+        root = ROOT / "exam" if room.startswith("thermodrift_exam") else ROOT
+        for path in (root / room.partition(".")[0]).rglob("*.py"):
+            name = ".".join(path.relative_to(root).with_suffix("").parts)
             found[name.removesuffix(".__init__")] = path
     return found
 
 
 MODULES = _modules()
+
+
+def room_of(module: str) -> str:
+    """The longest name of a room that a module's begins with; else its first part."""
+    rooms = [r for r in EVERY if module == r or module.startswith(f"{r}.")]
+    return max(rooms, key=len, default=module.split(".")[0])
 
 
 def _imported(path: Path) -> Iterator[str]:
@@ -73,7 +89,7 @@ def test_a_file_imports_only_what_its_room_may() -> None:
         (name, other)
         for name, others in graph().items()
         for other in others
-        if (top := other.split(".")[0]) in ALLOWED and top != (room := name.split(".")[0]) and top not in ALLOWED[room]
+        if (top := room_of(other)) in EVERY and top != (room := room_of(name)) and top not in EVERY[room]
     ]
     assert not wrong
 
@@ -83,7 +99,7 @@ def test_only_pipelines_imports_what_orchestrates_and_tracks() -> None:
         (name, other)
         for name, others in graph().items()
         for other in others
-        if other.split(".")[0] in ORCHESTRATION and not name.startswith("pipelines")
+        if other.split(".")[0] in ORCHESTRATION and not name.startswith(("pipelines", "thermodrift_exam.commands"))
     ]
     assert not wrong
 
@@ -96,18 +112,18 @@ def test_no_cycle() -> None:
     assert not left, f"import cycles among {sorted(left)}"
 
 
-@pytest.mark.parametrize("module", sorted(m for m in MODULES if m.split(".")[0] == "plants"))
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if room_of(m) in PLANTS))
 def test_a_plant_names_nothing_of_the_twin(module: str) -> None:
     """A plant that shared code with what is examined on it would prove nothing; registries name modules in strings."""
-    foreign = {o.split(".")[0] for o in graph()[module]} - PLANTS_MAY_USE - set(sys.stdlib_module_names)
+    foreign = {room_of(o) for o in graph()[module]} - PLANTS_MAY_USE - set(sys.stdlib_module_names)
     assert not foreign
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
-    assert not {s for s in text if ":" in s and s.split(".")[0] in ALLOWED.keys() - {"plants"}}
+    assert not {s for s in text if ":" in s and room_of(s.partition(":")[0]) in EVERY.keys() - PLANTS}
 
 
 def test_a_fresh_interpreter_with_all_plants_has_nothing_of_the_twin() -> None:
-    every = sorted(m for m in MODULES if m.split(".")[0] == "plants")
+    every = sorted(m for m in MODULES if room_of(m) in PLANTS)
     done = subprocess.run(
         [sys.executable, "-c", IMPORT_ALL],
         input=json.dumps(every),
@@ -117,5 +133,6 @@ def test_a_fresh_interpreter_with_all_plants_has_nothing_of_the_twin() -> None:
         cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr
-    loaded = {m.split(".")[0] for m in json.loads(done.stdout)}
-    assert "plants" in loaded and not loaded & (ALLOWED.keys() - {"plants", "data"})
+    loaded = {room_of(m) for m in json.loads(done.stdout)}
+    assert loaded >= PLANTS and not loaded & (EVERY.keys() - {*PLANTS, "data", "thermodrift_exam"})
+    assert not [m for m in json.loads(done.stdout) if room_of(m) == "thermodrift_exam" and m != "thermodrift_exam"]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import data  # noqa: F401 - found before the walls stand, since the folder around it cannot be listed behind them
-from evidence.proof.sealing.isolation import Allowed, allowed, confine, own_source
+from evidence.sealing.isolation import Allowed, allowed, confine, own_source
 
 STATUS, DIAGNOSIS = "status.json", "diagnosis.json"
 OWN = ("__init__.py", "answering.py", "plain.py")
@@ -46,7 +46,7 @@ def main() -> None:
 
 def _answer(place: Path, task: dict[str, Any]) -> str:
     from evidence.demonstration.plain import plain_text
-    from evidence.proof.sealing.examinee import read_case
+    from evidence.sealing.examinee import read_case
 
     module, name = task["diagnose"].split(":")
     diagnose = getattr(import_module(module), name)

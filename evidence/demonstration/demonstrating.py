@@ -1,7 +1,7 @@
 """The demonstration: conceal an effect, seal it, diagnose it in an isolated process, open the seal, and score.
 
 The case's folder (machine file, recordings) is all that the answering process can read
-(`evidence.proof.sealing.isolation`). A salted SHA-256 commits to the concealed effect beforehand.
+(`evidence.sealing.isolation`). A salted SHA-256 commits to the concealed effect beforehand.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from diagnosis.findings.schema import Finding, as_json
 from diagnosis.result import Diagnosis
 from evidence.demonstration.answering import DIAGNOSIS
 from evidence.demonstration.plain import from_plain
-from evidence.proof.scoring.answer_key import SCHEMA, AnswerKey
-from evidence.proof.scoring.matching import matches, means
-from evidence.proof.sealing.folder import folder_digest, now, salted_digest
-from evidence.proof.sealing.isolation import allowed, own_source
-from evidence.proof.sealing.running import environment, last_line, lay_out, status_of
-from evidence.proof.sealing.seal import SALT_BYTES
+from evidence.scoring.answer_key import SCHEMA, AnswerKey
+from evidence.scoring.matching import matches, means
+from evidence.sealing.folder import folder_digest, now, salted_digest
+from evidence.sealing.isolation import allowed, own_source
+from evidence.sealing.running import environment, last_line, lay_out, status_of
+from evidence.sealing.seal import SALT_BYTES
 from plants.sample.concealed import Case, conceal, write_case
 from reports.diagnosis.first_screen import RIGHT, Outcome, Unsealed
 from reports.diagnosis.page import write_diagnosis_report

@@ -12,7 +12,7 @@ import pytest
 from data.batch import Batch, Finding
 from data.checks import check_batch, check_machine, checked
 from data.machine import parse_machine
-from plants.kinds import KINDS, draw_kind_case
+from thermodrift_exam.plants.kinds import KINDS, draw_kind_case
 
 BOARD = parse_machine(
     "machine: board\nrecording: {step_s: 5, max_gap_s: 30}\nchannels:\n"

@@ -14,8 +14,8 @@ import pytest
 from diagnosis.contracts import COLUMNS, Scored
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, limits, one_of_each, proposed, screen
-from plants.kinds import draw_kind_case
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
+from thermodrift_exam.plants.kinds import draw_kind_case
 from twin.mechanisms import MECHANISMS
 
 THRESHOLD = 25.0

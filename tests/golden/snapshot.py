@@ -30,15 +30,15 @@ from data.lake import Lake
 from data.machine import Machine, load_machine
 from diagnosis.diagnose import diagnose
 from diagnosis.findings.schema import as_json
-from evidence.proof.sealing.examinee import read_case
-from evidence.proof.spec import CaseSpec
-from evidence.proof.suite import build, small_suite, write_built
-from evidence.studies import STUDIES
-from evidence.studies.base import run_studies
+from evidence.sealing.examinee import read_case
 from models import FAMILIES
 from models.crossing import Plan
 from models.grid import run_grid
 from plants.sample.sample_year import write_sample_year
+from thermodrift_exam.proof.spec import CaseSpec
+from thermodrift_exam.proof.suite import build, small_suite, write_built
+from thermodrift_exam.studies import STUDIES
+from thermodrift_exam.studies.base import run_studies
 from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.run_plan import load_run_plan

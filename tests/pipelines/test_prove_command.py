@@ -10,11 +10,11 @@ import pytest
 
 from data.machine import load_machine
 from diagnosis.findings.schema import Findings, FitSummary, as_json
-from evidence.proof import judging as proof_judging
-from evidence.proof.scoring.true_model import TrueModel
-from evidence.proof.sealing import running
-from evidence.proof.sealing.running import Examinee
+from evidence.sealing import running
+from evidence.sealing.running import Examinee
 from tests.toys.command import Call, in_process
+from thermodrift_exam.proof import judging as proof_judging
+from thermodrift_exam.proof.scoring.true_model import TrueModel
 
 ASKED = ("--cases", 2, "--suite", "development", "--seed", 4, "--plants", "volumes", "--workers", 1)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from evidence.studies import STUDIES
-from evidence.studies.base import Figure, Ordering, Study
-from evidence.studies.report import FILES
 from tests.toys.command import Call, in_process
+from thermodrift_exam.studies import STUDIES
+from thermodrift_exam.studies.base import Figure, Ordering, Study
+from thermodrift_exam.studies.report import FILES
 
 
 class ToyStudy(Study):

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from data.arrays import Array
-from plants.drawing import draw_plant
-from plants.effects import EFFECTS
-from plants.plant import Case, draw
-from plants.runs import Now
-from plants.structure import Plant
+from thermodrift_exam.plants.drawing import draw_plant
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.plant import Case, draw
+from thermodrift_exam.plants.runs import Now
+from thermodrift_exam.plants.structure import Plant
 
 QUIET: dict[str, Any] = {
     "batches": 4, "hours": 4.0, "before_h": 5.0, "solver_s": 50.0,

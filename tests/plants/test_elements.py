@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from plants.convergence import slab_error_K
-from plants.elements.geometry import draw_castings
-from plants.elements.structure import Elements, integrate, total
-from plants.structure import AIR, exposures_W_per_K, links_W_per_K
 from tests.plants.plant_cases import SEED, Array
+from thermodrift_exam.plants.convergence import slab_error_K
+from thermodrift_exam.plants.elements.geometry import draw_castings
+from thermodrift_exam.plants.elements.structure import Elements, integrate, total
+from thermodrift_exam.plants.structure import AIR, exposures_W_per_K, links_W_per_K
 
 
 @cache

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plants.drawing import PLANTS, draw_plant
-from plants.effects import EFFECTS
-from plants.effects.heat import Draught
-from plants.elements.geometry import draw_castings
-from plants.plant import draw, posed
-from plants.runs import Now
-from plants.structure import FEATURES, Plant
 from tests.plants.plant_cases import NONE, SEED
+from thermodrift_exam.plants.drawing import PLANTS, draw_plant
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.effects.heat import Draught
+from thermodrift_exam.plants.elements.geometry import draw_castings
+from thermodrift_exam.plants.plant import draw, posed
+from thermodrift_exam.plants.runs import Now
+from thermodrift_exam.plants.structure import FEATURES, Plant
 
 pytestmark = pytest.mark.slow
 

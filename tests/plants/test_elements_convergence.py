@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plants.convergence import ELEMENTS_STEP_S, sensed_degC
-from plants.elements.geometry import draw_castings
 from tests.plants.plant_cases import Array
+from thermodrift_exam.plants.convergence import ELEMENTS_STEP_S, sensed_degC
+from thermodrift_exam.plants.elements.geometry import draw_castings
 
 pytestmark = pytest.mark.slow
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plants.elements.elasticity import Elasticity
-from plants.elements.geometry import draw_castings
-from plants.elements.layout import growths, odd, tool_weights_um_per_K
-from plants.elements.mesh import Box, Mesh
-from plants.elements.structure import Contact
-from plants.structure import FEATURES
 from tests.plants.plant_cases import SEED, Array
+from thermodrift_exam.plants.elements.elasticity import Elasticity
+from thermodrift_exam.plants.elements.geometry import draw_castings
+from thermodrift_exam.plants.elements.layout import growths, odd, tool_weights_um_per_K
+from thermodrift_exam.plants.elements.mesh import Box, Mesh
+from thermodrift_exam.plants.elements.structure import Contact
+from thermodrift_exam.plants.structure import FEATURES
 
 LENGTH_M, HIGH_M, WIDE_M = 0.6, 0.1, 0.12
 EXPANSION_PER_K = 10.8e-6
@@ -42,7 +42,7 @@ def test_a_bar_on_soft_feet_grows_by_expansion_times_length_and_rise() -> None:
 
 def test_a_free_bar_grows_exactly_and_a_gradient_bends_it_as_a_beam(monkeypatch: pytest.MonkeyPatch) -> None:
     """α L ΔT to 1e-6; and α ΔT L² / 2 h at the end of a bar held at the other (Timoshenko 1925)."""
-    monkeypatch.setattr("plants.elements.elasticity.FEET_N_PER_M3", (1e4, 1e4, 1e4))  # all but free
+    monkeypatch.setattr("thermodrift_exam.plants.elements.elasticity.FEET_N_PER_M3", (1e4, 1e4, 1e4))  # all but free
     mesh = _bar()
     near, far = np.array([0.0, WIDE_M / 2, HIGH_M / 2]), np.array([LENGTH_M, WIDE_M / 2, HIGH_M / 2])
     grown = _apart_um(mesh, np.full(mesh.size, 7.0), far, near)
@@ -58,7 +58,7 @@ def test_a_free_bar_grows_exactly_and_a_gradient_bends_it_as_a_beam(monkeypatch:
 
 
 def test_a_hollow_bar_grows_as_a_full_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plants.elements.elasticity.FEET_N_PER_M3", (1e4, 1e4, 1e4))
+    monkeypatch.setattr("thermodrift_exam.plants.elements.elasticity.FEET_N_PER_M3", (1e4, 1e4, 1e4))
     mesh = _bar(hollow="tube")
     assert mesh.box.fill > 1.5
     grown = _apart_um(mesh, np.full(mesh.size, 3.0), np.array([LENGTH_M, 0.0, 0.0]), np.zeros(3))

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plants.everyday import (
+from tests.plants.plant_cases import SEED, full_speed, plant
+from thermodrift_exam.plants.everyday import (
     EVERYDAY,
     SLICES,
     Films,
@@ -18,12 +19,11 @@ from plants.everyday import (
     radiation_factor,
     rising_factor,
 )
-from plants.options import Options, stream
-from plants.plant import draw
-from plants.runs import plan_runs
-from plants.simulation import simulated
-from plants.volumes.structure import Volumes
-from tests.plants.plant_cases import SEED, full_speed, plant
+from thermodrift_exam.plants.options import Options, stream
+from thermodrift_exam.plants.plant import draw
+from thermodrift_exam.plants.runs import plan_runs
+from thermodrift_exam.plants.simulation import simulated
+from thermodrift_exam.plants.volumes.structure import Volumes
 from twin.compile import compile_network
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from data.errors import InputError
 from diagnosis.next_experiment.menu import Run as MenuRun
-from plants.drawing import draw_plant
-from plants.effects import EFFECTS
-from plants.options import stream
-from plants.planned import RIPPLE_K, execute, read_plan
-from plants.runs import Block, Run, held
-from plants.simulation import shown, simulated
 from tests.plants.plant_cases import NONE, SEED
+from thermodrift_exam.plants.drawing import draw_plant
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.options import stream
+from thermodrift_exam.plants.planned import RIPPLE_K, execute, read_plan
+from thermodrift_exam.plants.runs import Block, Run, held
+from thermodrift_exam.plants.simulation import shown, simulated
 from twin.compile import compile_network
 from twin.run_plan import load_run_plan
 from twin.run_plan.plan import Stage

@@ -11,11 +11,11 @@ import pytest
 from data.batch import Batch, Channel
 from data.errors import InputError
 from data.machine import Machine
-from plants.grafted.base import Setting, magnitude
-from plants.grafted.faults import SensorBonding, SensorDrift, SensorLag, TimeSkew
-from plants.grafted.frame import Clockwork, Frame, Push, draw_frame, on_channels, response
-from plants.grafted.heats import CabinetHeat, FloorSink, HydraulicUnit, Sun
-from plants.real import windows
+from thermodrift_exam.plants.grafted.base import Setting, magnitude
+from thermodrift_exam.plants.grafted.faults import SensorBonding, SensorDrift, SensorLag, TimeSkew
+from thermodrift_exam.plants.grafted.frame import Clockwork, Frame, Push, draw_frame, on_channels, response
+from thermodrift_exam.plants.grafted.heats import CabinetHeat, FloorSink, HydraulicUnit, Sun
+from thermodrift_exam.plants.real import windows
 
 TWIN: dict[str, Any] = {
     "surroundings": {"room": {"channel": "room", "offset": "1 K"}},

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from data.errors import InputError
-from plants.kinds import KINDS, draw_kind_case, effects_of, execute, unlisted_of
-from plants.kinds.case import KindPosed, all_effects, made, posed, variants
-from plants.kinds.effects.base import lagged
-from plants.kinds.engine import Mesh, Solid, integrate
-from plants.kinds.simulation import noise_of, on_rows, rows_of, shown, simulated
-from plants.plant import Case
+from thermodrift_exam.plants.kinds import KINDS, draw_kind_case, effects_of, execute, unlisted_of
+from thermodrift_exam.plants.kinds.case import KindPosed, all_effects, made, posed, variants
+from thermodrift_exam.plants.kinds.effects.base import lagged
+from thermodrift_exam.plants.kinds.engine import Mesh, Solid, integrate
+from thermodrift_exam.plants.kinds.simulation import noise_of, on_rows, rows_of, shown, simulated
+from thermodrift_exam.plants.plant import Case
 from twin.calibration.estimate import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.schema import twin_part

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from plants.effects import EFFECTS
-from plants.options import stream
 from tests.plants.plant_cases import SEED, Array, driver, full_speed, moved, plant, with_and_without
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.options import stream
 
 
 def _used(key: str, name: str) -> NDArray[np.bool_]:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from plants.drawing import draw_plant
-from plants.effects import EFFECTS
-from plants.options import Options, stream
-from plants.runs import Block, held, plan_runs
-from plants.simulation import simulated
-from plants.structure import FEATURES, exposures_W_per_K, links_W_per_K
-from plants.volumes.layout import bending
-from plants.volumes.structure import Plate, Volumes, even, integrate
 from tests.plants.plant_cases import NONE, SEED, Array, plant
+from thermodrift_exam.plants.drawing import draw_plant
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.options import Options, stream
+from thermodrift_exam.plants.runs import Block, held, plan_runs
+from thermodrift_exam.plants.simulation import simulated
+from thermodrift_exam.plants.structure import FEATURES, exposures_W_per_K, links_W_per_K
+from thermodrift_exam.plants.volumes.layout import bending
+from thermodrift_exam.plants.volumes.structure import Plate, Volumes, even, integrate
 
 
 @pytest.mark.parametrize(

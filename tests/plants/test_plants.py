@@ -12,13 +12,13 @@ import pytest
 from data.errors import InputError
 from data.machine import load_machine
 from data.recording import read_batches, recording_files
-from plants.drawing import draw_plant
-from plants.effects import EFFECTS
-from plants.options import Options
-from plants.plant import draw, write_case
-from plants.runs import plan_runs
-from plants.simulation import power_W
 from tests.plants.plant_cases import NONE, SEED, brief, full_speed
+from thermodrift_exam.plants.drawing import draw_plant
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.options import Options
+from thermodrift_exam.plants.plant import draw, write_case
+from thermodrift_exam.plants.runs import plan_runs
+from thermodrift_exam.plants.simulation import power_W
 from twin.compile import compile_network
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View

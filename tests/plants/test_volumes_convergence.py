@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plants.convergence import COLUMNS, volumes_study
-from plants.drawing import draw_plant
-from plants.structure import exposures_W_per_K
-from plants.volumes.structure import Assembly, Plate
 from tests.plants.plant_cases import NONE
+from thermodrift_exam.plants.convergence import COLUMNS, volumes_study
+from thermodrift_exam.plants.drawing import draw_plant
+from thermodrift_exam.plants.structure import exposures_W_per_K
+from thermodrift_exam.plants.volumes.structure import Assembly, Plate
 
 
 @pytest.mark.parametrize("seed", [3, 5])

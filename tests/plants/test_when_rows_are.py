@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from data.batch import Batch
-from plants.plant import draw
 from tests.diagnosis.small_cases import SHIFT, four_bodies, runs
+from thermodrift_exam.plants.plant import draw
 from twin.simulation.inputs import intervals_at_rows
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pytest import approx
 
-from plants.effects import EFFECTS
-from plants.plant import Case, draw, stretches
 from tests.plants.plant_cases import QUIET, SEED, with_and_without
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.plant import Case, draw, stretches
 
 ROW_S = 300.0
 

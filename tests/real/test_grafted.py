@@ -11,12 +11,12 @@ import pytest
 
 from data.errors import InputError
 from diagnosis.candidates.library import candidates
-from evidence.proof.scoring.answer_key import AnswerKey
-from evidence.proof.spec import KINDS
-from plants.grafted import build, cases
-from plants.grafted.cases import CASES
-from plants.real import RealCase
+from evidence.scoring.answer_key import AnswerKey
 from tests.real.recorded import DATA
+from thermodrift_exam.plants.grafted import build, cases
+from thermodrift_exam.plants.grafted.cases import CASES
+from thermodrift_exam.plants.real import RealCase
+from thermodrift_exam.proof.spec import KINDS
 from twin.compile import compile_network
 from twin.schema import twin_part
 

@@ -14,11 +14,11 @@ from data.errors import InputError
 from data.machine import Machine, parse_machine
 from data.recording import read_batches
 from diagnosis.candidates.library import candidates
-from evidence.proof.scoring.answer_key import AnswerKey
-from evidence.proof.spec import KINDS
-from plants.real import recorded
-from plants.withheld import BOARD, CASES, CELL, build, cases
+from evidence.scoring.answer_key import AnswerKey
 from tests.real.recorded import DATA
+from thermodrift_exam.plants.real import recorded
+from thermodrift_exam.plants.withheld import BOARD, CASES, CELL, build, cases
+from thermodrift_exam.proof.spec import KINDS
 from twin.calibration import CalibrationOptions, calibrate
 from twin.compile import compile_network
 from twin.schema import twin_part

@@ -14,7 +14,7 @@ from data.machine import Machine, load_machine
 from evidence.demonstration import demonstrating
 from evidence.demonstration.demonstrating import Answerer, Demonstration, answered, demonstrate, judged
 from evidence.demonstration.plain import from_plain, plain_text
-from evidence.proof.sealing.folder import folder_digest
+from evidence.sealing.folder import folder_digest
 from plants.sample import concealed
 from reports.diagnosis.page import diagnosis_page, write_diagnosis_report
 from tests.evidence.demonstration.toy_answers import FLOOR, SUN, answer

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from diagnosis.findings.schema import Findings
-from evidence.proof.scoring.answer_key import Stored
-from evidence.proof.scoring.true_model import TrueModel
+from evidence.scoring.answer_key import Stored
+from thermodrift_exam.proof.scoring.true_model import TrueModel
 
 LENGTH_S = {"r1": 1000.0, "r2": 3000.0}
 BODY_OF = {"t_bed": "bed", "t_column": "column"}

@@ -8,11 +8,11 @@ import socket
 from pathlib import Path
 
 import pytest
+from tests.thermodrift_exam.proof.toy_suite import HERE, make, sealed, specs
 
 from data.errors import InputError, WorkError
-from evidence.proof.sealing.isolation import allowed, audit_hook, own_source
-from evidence.proof.sealing.running import RUN, Examinee, examine
-from tests.evidence.proof.toy_suite import HERE, make, sealed, specs
+from evidence.sealing.isolation import allowed, audit_hook, own_source
+from evidence.sealing.running import RUN, Examinee, examine
 
 CURIOUS = Examinee("toy_examinee:curious", None, import_from=(HERE,))
 
@@ -36,8 +36,9 @@ def test_every_way_out_is_shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         tries = [
             ("read", str(secret)), ("native read", str(secret)), ("list", str(tmp_path)), ("list", "/"),
             ("write", str(elsewhere)), ("shell", str(secret)), ("connect", str(server.getsockname()[1])),
-            ("read", "/proc/1/environ"), ("import", "plants.plant"), ("import", "evidence.proof.sealing.opening"),
-            ("environment", ""), ("read", "machine.yml"), ("list", "recordings"), ("write", "recordings/run_2.csv"),
+            ("read", "/proc/1/environ"), ("import", "thermodrift_exam.plants.plant"),
+            ("import", "thermodrift_exam.proof.sealing.opening"), ("environment", ""), ("read", "machine.yml"),
+            ("list", "recordings"), ("write", "recordings/run_2.csv"),
         ]  # fmt: skip
         files = examine(case_of(tmp_path / "case", tries), CURIOUS, "ab")
     run = json.loads(files[RUN])
@@ -86,8 +87,8 @@ def test_the_hook_alone_refuses_too(tmp_path: Path) -> None:
 def test_the_drawing_of_cases_is_no_part_of_what_is_seen() -> None:
     root, parts = own_source()
     seen = [p.relative_to(root).as_posix() for p in parts]
-    assert {"data", "diagnosis", "twin", "evidence/proof/baselines"} <= set(seen)
-    assert not any(s.startswith(("plants", "evidence/proof/suite", "evidence/proof/scoring", "tests")) for s in seen)
+    assert {"data", "diagnosis", "twin", "evidence/baselines"} <= set(seen)
+    assert not any(s.startswith(("plants", "exam", "evidence/scoring", "tests")) for s in seen)
 
 
 def test_a_proof_does_not_lie_where_it_is_seen() -> None:

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from sklearn.metrics import roc_auc_score
 
-from evidence.proof.sealing import leak
-from evidence.proof.sealing.leak import (
+from evidence.sealing import leak
+from thermodrift_exam.proof.sealing.leak import (
     COLUMNS,
     area_under_curve,
     effect_questions,
@@ -19,8 +19,8 @@ from evidence.proof.sealing.leak import (
     leak_table,
     predicted,
 )
-from evidence.proof.spec import CaseSpec
-from evidence.proof.suite import build, small_suite, write_built
+from thermodrift_exam.proof.spec import CaseSpec
+from thermodrift_exam.proof.suite import build, small_suite, write_built
 
 NAMES = [f"case_{k:04d}" for k in range(1, 45)]
 EFFECTS = ("floor_sink", "sun")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError
-from evidence.proof.sealing.folder import LATE, START, TWICE, Ledger, state_of
+from evidence.sealing.folder import LATE, START, TWICE, Ledger, state_of
 
 
 @pytest.fixture

@@ -12,22 +12,30 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import kstest
+from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
+from tests.thermodrift_exam.proof.test_scoring_parts import AnswerKey
+from tests.thermodrift_exam.proof.toy_proof import toy_proof
 
-from evidence.proof.judging import _add
-from evidence.proof.report.labels import plant_label, plant_origin
-from evidence.proof.report.markdown import proof_markdown
-from evidence.proof.scoring.goal_table import goal_table
-from evidence.proof.scoring.matching import means
-from evidence.proof.scoring.outcomes import outcomes
-from evidence.proof.spec import DEVELOPED_ON, KIND_PLANTS, KINDS, UNSEEN, CaseSpec, is_unseen
-from evidence.proof.suite import Built, build, suite, write_built
-from evidence.proof.suite.other_kinds import AMBIGUOUS, FAULTS, INVISIBLE_SIGMA, SIGMA, kind_case, kind_effects, sigma
-from evidence.proof.suite.suite import case, possible
-from plants.kinds import effects_of, unlisted_of
-from plants.plant import machine_text
-from tests.evidence.proof.answered import answer, finding, stored, term, truth
-from tests.evidence.proof.test_scoring_parts import AnswerKey
-from tests.evidence.proof.toy_proof import toy_proof
+from evidence.scoring.matching import means
+from thermodrift_exam.plants.kinds import effects_of, unlisted_of
+from thermodrift_exam.plants.plant import machine_text
+from thermodrift_exam.proof.judging import _add
+from thermodrift_exam.proof.report.labels import plant_label, plant_origin
+from thermodrift_exam.proof.report.markdown import proof_markdown
+from thermodrift_exam.proof.scoring.goal_table import goal_table
+from thermodrift_exam.proof.scoring.outcomes import outcomes
+from thermodrift_exam.proof.spec import DEVELOPED_ON, KIND_PLANTS, KINDS, UNSEEN, CaseSpec, is_unseen
+from thermodrift_exam.proof.suite import Built, build, suite, write_built
+from thermodrift_exam.proof.suite.other_kinds import (
+    AMBIGUOUS,
+    FAULTS,
+    INVISIBLE_SIGMA,
+    SIGMA,
+    kind_case,
+    kind_effects,
+    sigma,
+)
+from thermodrift_exam.proof.suite.suite import case, possible
 
 SEED = 2**140 + 9
 PLAN = """name: warm_up
@@ -129,7 +137,7 @@ def test_a_proposed_run_is_done_on_the_same_machine(tmp_path: Path) -> None:
 
 def test_unseen_kinds_have_a_column_of_goals_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("goals", "goal_table"):  # no interval is looked at
-        monkeypatch.setattr(f"evidence.proof.scoring.{module}.DRAWS", 50)
+        monkeypatch.setattr(f"thermodrift_exam.proof.scoring.{module}.DRAWS", 50)
     assert [p for p in KIND_PLANTS if is_unseen(p)] == [p for p in KIND_PLANTS if p not in DEVELOPED_ON]
     assert not any(map(is_unseen, ("elements", "volumes", "grafted", "withheld")))
     keys = {f"case_{k:04d}": answer(case=f"case_{k:04d}", plant=p) | {"kind": "nothing"}

@@ -7,9 +7,9 @@ from importlib import import_module
 import pandas as pd
 import pytest
 
-from evidence.proof import tables as proof_convergence
-from evidence.proof.report.tables import TABLES
-from evidence.proof.tables import STUDIES, convergence_of
+from thermodrift_exam.proof import tables as proof_convergence
+from thermodrift_exam.proof.report.tables import TABLES
+from thermodrift_exam.proof.tables import STUDIES, convergence_of
 
 
 @pytest.mark.parametrize("plant", STUDIES)

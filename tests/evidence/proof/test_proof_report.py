@@ -12,19 +12,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
+from tests.thermodrift_exam.proof.toy_proof import ROOT, toy_proof, without
 
 from data.errors import WorkError
-from evidence.proof.report import shortfall, tables
-from evidence.proof.report import tables as extracts
-from evidence.proof.report.labels import measured, origin
-from evidence.proof.report.page import headline, proof_page, write_proof_report
-from evidence.proof.report.tables import TABLES, ProofRun, goal_rows, shortfalls
-from evidence.proof.scoring.goal_table import GOAL_COLUMNS, RELIABILITY_COLUMNS
-from evidence.proof.scoring.outcomes import OUTCOMES, TERMS
-from evidence.proof.scoring.tables import CLAIMS, LITTLE, MISSED
-from evidence.proof.scoring.tables import COMPARED_COLUMNS as COMPARED
-from evidence.proof.sealing.leak import COLUMNS as LEAK
-from tests.evidence.proof.toy_proof import ROOT, toy_proof, without
+from thermodrift_exam.proof.report import shortfall, tables
+from thermodrift_exam.proof.report import tables as extracts
+from thermodrift_exam.proof.report.labels import measured, origin
+from thermodrift_exam.proof.report.page import headline, proof_page, write_proof_report
+from thermodrift_exam.proof.report.tables import TABLES, ProofRun, goal_rows, shortfalls
+from thermodrift_exam.proof.scoring.goal_table import GOAL_COLUMNS, RELIABILITY_COLUMNS
+from thermodrift_exam.proof.scoring.outcomes import OUTCOMES, TERMS
+from thermodrift_exam.proof.scoring.tables import CLAIMS, LITTLE, MISSED
+from thermodrift_exam.proof.scoring.tables import COMPARED_COLUMNS as COMPARED
+from thermodrift_exam.proof.sealing.leak import COLUMNS as LEAK
 
 ANCHORS = (
     "goals",

@@ -6,14 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tests.thermodrift_exam.proof.toy_proof import ROOT, toy_proof
 
 from data.errors import InputError
-from evidence.proof import proving
-from evidence.proof.report.markdown import BEGIN, END, proof_markdown, publish_proof
-from evidence.proof.report.tables import ProofRun
-from evidence.proof.scoring.tables import SILENT
-from tests.evidence.proof.toy_proof import ROOT, toy_proof
 from tests.toys.command import in_process
+from thermodrift_exam.proof import proving
+from thermodrift_exam.proof.report.markdown import BEGIN, END, proof_markdown, publish_proof
+from thermodrift_exam.proof.report.tables import ProofRun
+from thermodrift_exam.proof.scoring.tables import SILENT
 
 DOCS = Path(__file__).parents[3] / "docs" / "proof.md"
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from data.errors import InputError
-from evidence.proof import judging as proof_again
-from evidence.proof.judging import plain_json, truth_from_json
-from evidence.proof.proving import ProofRequest, drawn, specs_of
-from evidence.proof.scoring.true_model import TrueModel
-from evidence.proof.sealing.folder import Ledger
-from evidence.proof.sealing.running import Examinee
-from evidence.proof.spec import CaseSpec
-from evidence.proof.tables import ledger_table
+from evidence.sealing.folder import Ledger
+from evidence.sealing.running import Examinee
+from thermodrift_exam.proof import judging as proof_again
+from thermodrift_exam.proof.judging import plain_json, truth_from_json
+from thermodrift_exam.proof.proving import ProofRequest, drawn, specs_of
+from thermodrift_exam.proof.scoring.true_model import TrueModel
+from thermodrift_exam.proof.spec import CaseSpec
+from thermodrift_exam.proof.tables import ledger_table
 
 
 def test_real_cases_follow_the_simulated_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,7 +24,7 @@ def test_real_cases_follow_the_simulated_ones(tmp_path: Path, monkeypatch: pytes
         assert (seed, data, which) == (5, tmp_path, "development")
         return [CaseSpec(f"case_{first + k:04d}", "one", p, 1) for k, p in enumerate(plants)]  # type: ignore[arg-type]
 
-    monkeypatch.setattr("evidence.proof.suite.real_suite", real_suite)
+    monkeypatch.setattr("thermodrift_exam.proof.suite.real_suite", real_suite)
     asked = ProofRequest(tmp_path, 4, "development", ("volumes", "grafted", "withheld"), 5, tmp_path)
     suite = drawn(asked)
     assert (suite.seed, suite.secret) == ("5", False)

@@ -13,13 +13,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from evidence.proof.proving import ProofOutcome, make_case, open_proof, run_proof
-from evidence.proof.scoring.goals import GOALS
-from evidence.proof.sealing.folder import ProofFolder
-from evidence.proof.sealing.running import Examinee
-from evidence.proof.sealing.seal import Suite, seal
-from evidence.proof.spec import CaseSpec
-from evidence.proof.suite import small_suite
+from evidence.sealing.folder import ProofFolder
+from evidence.sealing.running import Examinee
+from evidence.sealing.seal import Suite, seal
+from thermodrift_exam.proof.proving import ProofOutcome, make_case, open_proof, run_proof
+from thermodrift_exam.proof.scoring.goals import GOALS
+from thermodrift_exam.proof.spec import CaseSpec
+from thermodrift_exam.proof.suite import small_suite
 
 WORKERS = 2
 pytestmark = pytest.mark.slow
@@ -49,7 +49,7 @@ def test_every_case_is_answered_apart_and_counts(proof: Proof) -> None:
 
 def test_the_same_specs_seal_the_same_cases(proof: Proof, tmp_path: Path) -> None:
     """Whoever has the key can draw any case again: here the first, its files compared by their digest."""
-    from evidence.proof.sealing.folder import folder_digest, salted_digest
+    from evidence.sealing.folder import folder_digest, salted_digest
 
     first = proof[2][0]
     opened = json.loads((proof[0] / "opened.json").read_text())["cases"][first.name]

@@ -13,9 +13,9 @@ import pytest
 from diagnosis.candidates.priors import start_values
 from diagnosis.screening.signatures import difference
 from diagnosis.search.search import Search, search
-from evidence.proof.baselines import replies
-from evidence.proof.baselines.base import correlations, plain_rows
-from evidence.proof.baselines.evaluate import ABLATIONS, BASELINES
+from evidence.baselines import replies
+from evidence.baselines.base import correlations, plain_rows
+from evidence.baselines.evaluate import ABLATIONS, BASELINES
 from tests.diagnosis.small_cases import cold_floor, consistent
 from twin.mechanisms import MECHANISMS
 

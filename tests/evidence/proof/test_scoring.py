@@ -6,12 +6,12 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from tests.thermodrift_exam.proof.answered import answer, finding, findings, other, stored, term, truth
 
 from data.errors import InputError
-from evidence.proof.scoring.answer_key import Stored
-from evidence.proof.scoring.outcomes import OUTCOMES, TERMS, outcomes
-from evidence.proof.scoring.true_model import TrueModel
-from tests.evidence.proof.answered import answer, finding, findings, other, stored, term, truth
+from evidence.scoring.answer_key import Stored
+from thermodrift_exam.proof.scoring.outcomes import OUTCOMES, TERMS, outcomes
+from thermodrift_exam.proof.scoring.true_model import TrueModel
 
 
 def scored(

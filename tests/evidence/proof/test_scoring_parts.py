@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from tests.thermodrift_exam.proof.answered import BODY_OF, LENGTH_S, answer, finding, findings, other, term
 
-from evidence.proof.scoring.answer_key import AnswerKey, Spot, TrueTerm
-from evidence.proof.scoring.matching import (
+from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
+from evidence.scoring.matching import (
     always,
     amplitude,
     exact,
@@ -18,8 +19,7 @@ from evidence.proof.scoring.matching import (
     reported_set,
     true_amplitude,
 )
-from evidence.proof.scoring.outcomes import closed, error_level
-from tests.evidence.proof.answered import BODY_OF, LENGTH_S, answer, finding, findings, other, term
+from thermodrift_exam.proof.scoring.outcomes import closed, error_level
 
 
 def key_term(**changes: Any) -> TrueTerm:

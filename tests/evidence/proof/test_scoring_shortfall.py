@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
 
-from evidence.proof.scoring.answer_key import Stored
-from evidence.proof.scoring.outcomes import outcomes
-from evidence.proof.scoring.tables import ALIKE, LITTLE, PREFERRED, SILENT, claims, missed
-from tests.evidence.proof.answered import answer, finding, stored, term, truth
+from evidence.scoring.answer_key import Stored
+from thermodrift_exam.proof.scoring.outcomes import outcomes
+from thermodrift_exam.proof.scoring.tables import ALIKE, LITTLE, PREFERRED, SILENT, claims, missed
 
 
 def reason(gain_nats: float, told: Stored, bar_nats: float = 40.0) -> str:

@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 from scipy.optimize import brentq
 from scipy.stats import binom
+from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
 
-from evidence.proof.scoring.goal_table import GOAL_COLUMNS, error_by_chance, goal_table, reliability
-from evidence.proof.scoring.goals import bootstrap, clopper_pearson
-from evidence.proof.scoring.outcomes import OUTCOMES, outcomes
-from evidence.proof.scoring.tables import by, confusion, worst
-from tests.evidence.proof.answered import answer, finding, stored, term, truth
 from tests.snapshots import check_snapshot
+from thermodrift_exam.proof.scoring.goal_table import GOAL_COLUMNS, error_by_chance, goal_table, reliability
+from thermodrift_exam.proof.scoring.goals import bootstrap, clopper_pearson
+from thermodrift_exam.proof.scoring.outcomes import OUTCOMES, outcomes
+from thermodrift_exam.proof.scoring.tables import by, confusion, worst
 
 HEATS_W = (100.0, 105.0, 110.0, 120.0, 150.0, 90.0, 100.0, 100.0)  # of 100; intervals 90 to 130
 
@@ -49,7 +49,7 @@ def row(goals: pd.DataFrame, measure: str, plant: str = "all") -> dict[str, Any]
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of resampling, for tests that look at no interval."""
     for module in ("goals", "goal_table"):
-        monkeypatch.setattr(f"evidence.proof.scoring.{module}.DRAWS", 50)
+        monkeypatch.setattr(f"thermodrift_exam.proof.scoring.{module}.DRAWS", 50)
 
 
 def test_every_goal_is_measured_over_all_and_by_plant(few_draws: None) -> None:

@@ -10,11 +10,13 @@ import pytest
 from scipy.stats import chi2_contingency, kstest
 
 from data.errors import InputError
-from evidence.proof.spec import KINDS, CaseSpec
-from evidence.proof.suite import small_suite, suite
-from evidence.proof.suite.setting import RANGES, setting
-from evidence.proof.suite.sizes import ALL_OR_NOTHING, SHARE, limit, most, size, table
-from evidence.proof.suite.suite import (
+from thermodrift_exam.plants.effects import EFFECTS
+from thermodrift_exam.plants.structure import FEATURES
+from thermodrift_exam.proof.spec import KINDS, CaseSpec
+from thermodrift_exam.proof.suite import small_suite, suite
+from thermodrift_exam.proof.suite.setting import RANGES, setting
+from thermodrift_exam.proof.suite.sizes import ALL_OR_NOTHING, SHARE, limit, most, size, table
+from thermodrift_exam.proof.suite.suite import (
     AMBIGUOUS,
     FAULTS,
     LACKING,
@@ -26,8 +28,6 @@ from evidence.proof.suite.suite import (
     counts,
     effects,
 )
-from plants.effects import EFFECTS
-from plants.structure import FEATURES
 
 SECRET = bytes(range(32))
 

@@ -16,12 +16,12 @@ import pytest
 from data.errors import InputError
 from data.machine import load_machine
 from data.recording import read_batches
-from evidence.proof.spec import CaseSpec
-from evidence.proof.suite import Built, batches_of, build, small_suite, without, write_built
-from evidence.proof.suite.build import HOTTEST_DEGC, WEAKER
-from evidence.proof.suite.setting import setting
-from evidence.proof.suite.suite import case
-from plants.plant import draw
+from thermodrift_exam.plants.plant import draw
+from thermodrift_exam.proof.spec import CaseSpec
+from thermodrift_exam.proof.suite import Built, batches_of, build, small_suite, without, write_built
+from thermodrift_exam.proof.suite.build import HOTTEST_DEGC, WEAKER
+from thermodrift_exam.proof.suite.setting import setting
+from thermodrift_exam.proof.suite.suite import case
 from twin.quantity import convert
 
 SEED = 2**140 + 5
@@ -191,7 +191,7 @@ def test_convection_that_the_plants_step_does_not_take_is_drawn_weaker() -> None
 
 
 def test_a_machine_that_is_too_hot_by_itself_is_drawn_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = sys.modules["evidence.proof.suite.build"]  # the package has a function of this name
+    own = sys.modules["thermodrift_exam.proof.suite.build"]  # the package has a function of this name
     monkeypatch.setattr(own, "_seized", lambda _: True)
     monkeypatch.setattr(own, "TIMES", 3)
     built = build(short(effects={"preload_feedback": 1.0}, hours=2.0))

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from data.arrays import Array
-from evidence.proof.suite.setting import setting
-from evidence.proof.suite.suite import ALWAYS, PAIRS, alternatives_of
-from plants.effects.base import Effect
-from plants.plant import Posed, posed, with_amounts
-from plants.runs import Now
-from plants.simulation import shown, simulated
-from plants.structure import Plant
+from thermodrift_exam.plants.effects.base import Effect
+from thermodrift_exam.plants.plant import Posed, posed, with_amounts
+from thermodrift_exam.plants.runs import Now
+from thermodrift_exam.plants.simulation import shown, simulated
+from thermodrift_exam.plants.structure import Plant
+from thermodrift_exam.proof.suite.setting import setting
+from thermodrift_exam.proof.suite.suite import ALWAYS, PAIRS, alternatives_of
 from twin.mechanisms import MECHANISMS
 from twin.mechanisms.base import View
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plants.drawing import HABITS
-from plants.options import Options
-from plants.runs import Run, earlier, held, plan_runs
+from thermodrift_exam.plants.drawing import HABITS
+from thermodrift_exam.plants.options import Options
+from thermodrift_exam.plants.runs import Run, earlier, held, plan_runs
 
 RATED_RPM = 8000.0
 ROWS_S = np.arange(0.0, 6 * 3600.0 + 1.0, 300.0)

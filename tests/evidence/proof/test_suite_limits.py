@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from data.arrays import Array
-from evidence.proof.suite.limits import MOST, Bench, renewed
 from tests.diagnosis.small_cases import consistent
+from thermodrift_exam.proof.suite.limits import MOST, Bench, renewed
 
 THRESHOLD = 10.0
 

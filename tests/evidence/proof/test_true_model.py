@@ -7,24 +7,24 @@ from functools import cache
 from typing import Any
 
 import pytest
+from tests.thermodrift_exam.proof.answered import answer, term
 
-import evidence.proof.scoring.true_model as module
+import thermodrift_exam.proof.scoring.true_model as module
 from data.errors import InputError
 from diagnosis.contracts import Scored
 from diagnosis.fitting.fitted import baseline, refitted
 from diagnosis.screening.screen import proposed, screen
-from evidence.proof.scoring.answer_key import AnswerKey
-from evidence.proof.scoring.true_model import (
+from evidence.scoring.answer_key import AnswerKey
+from tests.diagnosis.concealed import case, flux
+from tests.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
+from thermodrift_exam.plants.plant import draw
+from thermodrift_exam.proof.scoring.true_model import (
     VISIBLE_NATS,
     TrueModel,
     best_candidates,
     true_candidates,
     true_model,
 )
-from plants.plant import draw
-from tests.diagnosis.concealed import case, flux
-from tests.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
-from tests.evidence.proof.answered import answer, term
 from twin.schema import twin_part
 
 pytestmark = pytest.mark.slow

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from evidence.proof.report.tables import ProofRun
-from evidence.proof.scoring.tables import CLAIMS, missed
+from thermodrift_exam.proof.report.tables import ProofRun
+from thermodrift_exam.proof.scoring.tables import CLAIMS, missed
 
 EFFECTS = (
     "floor_sink", "cabinet_heat", "guide_friction", "sun", "radiation", "rotating_convection", "natural_convection",

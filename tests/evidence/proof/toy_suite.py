@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evidence.proof.sealing.folder import ProofFolder
-from evidence.proof.sealing.running import Examinee
-from evidence.proof.sealing.seal import Suite, seal
+from evidence.sealing.folder import ProofFolder
+from evidence.sealing.running import Examinee
+from evidence.sealing.seal import Suite, seal
 
 HERE = str(Path(__file__).parent)
 EXAMINEE = Examinee("toy_examinee:quick", "toy_examinee:rivals", import_from=(HERE,))

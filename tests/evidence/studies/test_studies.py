@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import beta
 
 from data.errors import InputError
-from evidence.studies import STUDIES
-from evidence.studies.base import Figure, Ordering, Study, StudyResult, run_studies
+from thermodrift_exam.studies import STUDIES
+from thermodrift_exam.studies.base import Figure, Ordering, Study, StudyResult, run_studies
 
 BRIEF = ("coupled_lathe", "grey_distributed_lag")  # the others take longer, and are made of the same pieces
 

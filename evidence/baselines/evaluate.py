@@ -1,0 +1,61 @@
+"""All baselines and ablations evaluated on one diagnosis, with the seconds that each took."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from data.errors import WorkError
+from data.registry import Registry
+from diagnosis.result import Diagnosis
+from diagnosis.search.search import Search
+from evidence.baselines.ablations import Stage
+
+BASELINES = Registry(
+    "baseline",
+    {
+        "raw_correlation": "evidence.baselines.regression:raw_correlation",
+        "sparse_regression": "evidence.baselines.regression:sparse_regression",
+        "in_sample_bic": "evidence.baselines.bic:in_sample_bic",
+    },
+)
+ABLATIONS = Registry(
+    "ablation",
+    {
+        "reference": "evidence.baselines.ablations:reference",
+        "no_projection": "evidence.baselines.ablations:no_projection",
+        "independent_noise": "evidence.baselines.ablations:independent_noise",
+        "no_veto": "evidence.baselines.ablations:no_veto",
+        "no_floor_check": "evidence.baselines.ablations:no_floor_check",
+    },
+)
+
+
+@threadpool_limits.wrap(limits=1)
+def replies(done: Diagnosis | Search) -> dict[str, Any]:
+    """The reply of each to the same recordings, as stored in `rivals.json`.
+
+    Baselines start from the first fit; ablations and the reference, the full rules, are of the first round. With a
+    diagnosis, the reference can say that something is unlisted.
+
+    Raises:
+        WorkError: a diagnosis that kept no search.
+    """
+    search = done.search if isinstance(done, Diagnosis) else done
+    if search is None or not search.rounds:
+        raise WorkError("baselines: the diagnosis kept no search; hand over one that `diagnose` has just made")
+    stage = Stage(search, done.findings if isinstance(done, Diagnosis) else None)
+    return {
+        "baselines": {key: _timed(BASELINES[key], search) for key in BASELINES},
+        "ablations": {key: _timed(ABLATIONS[key], stage) for key in ABLATIONS if key != "reference"},
+        "reference": _timed(ABLATIONS["reference"], stage),
+    }
+
+
+def _timed(method: Any, given: Any) -> dict[str, Any]:
+    begun = perf_counter()
+    reply = method(given)
+    out: dict[str, Any] = reply.as_json(perf_counter() - begun)
+    return out

@@ -1,0 +1,1 @@
+"""Plants: simulated machines with independent numerics for testing a diagnosis; nothing here uses the twin."""

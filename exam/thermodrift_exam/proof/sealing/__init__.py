@@ -1,0 +1,1 @@
+"""Opening a sealed proof, and what its names and sizes alone give away."""

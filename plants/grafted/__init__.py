@@ -1,5 +1,0 @@
-"""Real recordings on which the response of a known effect is superposed (plant C)."""
-
-from plants.grafted.cases import CASES, build, cases
-
-__all__ = ["CASES", "build", "cases"]
