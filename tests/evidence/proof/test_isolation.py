@@ -8,11 +8,11 @@ import socket
 from pathlib import Path
 
 import pytest
-from tests.thermodrift_exam.proof.toy_suite import HERE, make, sealed, specs
 
 from data.errors import InputError, WorkError
 from evidence.sealing.isolation import allowed, audit_hook, own_source
 from evidence.sealing.running import RUN, Examinee, examine
+from tests.evidence.proof.toy_suite import HERE, make, sealed, specs
 
 CURIOUS = Examinee("toy_examinee:curious", None, import_from=(HERE,))
 

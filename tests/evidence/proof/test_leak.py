@@ -10,7 +10,7 @@ import pytest
 import yaml
 from sklearn.metrics import roc_auc_score
 
-from evidence.sealing import leak
+from thermodrift_exam.proof.sealing import leak
 from thermodrift_exam.proof.sealing.leak import (
     COLUMNS,
     area_under_curve,

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import kstest
-from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
-from tests.thermodrift_exam.proof.test_scoring_parts import AnswerKey
-from tests.thermodrift_exam.proof.toy_proof import toy_proof
 
 from evidence.scoring.matching import means
+from tests.evidence.proof.answered import answer, finding, stored, term, truth
+from tests.evidence.proof.test_scoring_parts import AnswerKey
+from tests.evidence.proof.toy_proof import toy_proof
 from thermodrift_exam.plants.kinds import effects_of, unlisted_of
 from thermodrift_exam.plants.plant import machine_text
 from thermodrift_exam.proof.judging import _add

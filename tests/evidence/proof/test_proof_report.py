@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
-from tests.thermodrift_exam.proof.toy_proof import ROOT, toy_proof, without
 
 from data.errors import WorkError
+from tests.evidence.proof.toy_proof import ROOT, toy_proof, without
 from thermodrift_exam.proof.report import shortfall, tables
 from thermodrift_exam.proof.report import tables as extracts
 from thermodrift_exam.proof.report.labels import measured, origin

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.thermodrift_exam.proof.toy_proof import ROOT, toy_proof
 
 from data.errors import InputError
+from tests.evidence.proof.toy_proof import ROOT, toy_proof
 from tests.toys.command import in_process
 from thermodrift_exam.proof import proving
 from thermodrift_exam.proof.report.markdown import BEGIN, END, proof_markdown, publish_proof

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from tests.thermodrift_exam.proof.toy_proof import ROOT, toy_proof
 
 from data.errors import InputError
+from tests.evidence.proof.toy_proof import ROOT, toy_proof
 from thermodrift_exam.proof.report.markdown import BEGIN, END, RUNS_BEGIN, RUNS_END, publish_proof, record_of, with_runs
 from thermodrift_exam.proof.report.runs import FIGURES, GOAL_COLUMNS, RUN_COLUMNS, read_runs, runs_markdown
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from tests.thermodrift_exam.proof.answered import answer, finding, findings, other, stored, term, truth
 
 from data.errors import InputError
 from evidence.scoring.answer_key import Stored
+from tests.evidence.proof.answered import answer, finding, findings, other, stored, term, truth
 from thermodrift_exam.proof.scoring.outcomes import OUTCOMES, TERMS, outcomes
 from thermodrift_exam.proof.scoring.true_model import TrueModel
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
 
 from data.errors import InputError
+from tests.evidence.proof.answered import answer, finding, stored, term, truth
 from thermodrift_exam.proof.scoring.goal_table import goal_table
 from thermodrift_exam.proof.scoring.outcomes import outcomes
 from thermodrift_exam.proof.scoring.tables import ALARMS, COMPARED_COLUMNS, FIRST, RIGHT, as_findings, compared

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from tests.thermodrift_exam.proof.answered import BODY_OF, LENGTH_S, answer, finding, findings, other, term
 
 from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from evidence.scoring.matching import (
@@ -19,6 +18,7 @@ from evidence.scoring.matching import (
     reported_set,
     true_amplitude,
 )
+from tests.evidence.proof.answered import BODY_OF, LENGTH_S, answer, finding, findings, other, term
 from thermodrift_exam.proof.scoring.outcomes import closed, error_level
 
 

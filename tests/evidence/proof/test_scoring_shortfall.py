@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
-from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
 
 from evidence.scoring.answer_key import Stored
+from tests.evidence.proof.answered import answer, finding, stored, term, truth
 from thermodrift_exam.proof.scoring.outcomes import outcomes
 from thermodrift_exam.proof.scoring.tables import ALIKE, LITTLE, PREFERRED, SILENT, claims, missed
 

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 from scipy.optimize import brentq
 from scipy.stats import binom
-from tests.thermodrift_exam.proof.answered import answer, finding, stored, term, truth
 
+from tests.evidence.proof.answered import answer, finding, stored, term, truth
 from tests.snapshots import check_snapshot
 from thermodrift_exam.proof.scoring.goal_table import GOAL_COLUMNS, error_by_chance, goal_table, reliability
 from thermodrift_exam.proof.scoring.goals import bootstrap, clopper_pearson

@@ -9,13 +9,13 @@ from pathlib import Path
 from threading import Event
 
 import pytest
-from tests.thermodrift_exam.proof.toy_suite import EXAMINEE, make, sealed, specs
 
 from data.errors import InputError, WorkError
 from evidence.sealing import running
 from evidence.sealing.folder import ProofFolder
 from evidence.sealing.running import Examinee, RunOutcome, run
 from evidence.sealing.seal import Suite, seal
+from tests.evidence.proof.toy_suite import EXAMINEE, make, sealed, specs
 from thermodrift_exam.proof.sealing.opening import LOST, UNANSWERED, Opened, unseal
 
 Asked = list[str]

@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any
 
 import pytest
-from tests.thermodrift_exam.proof.answered import answer, term
 
 import thermodrift_exam.proof.scoring.true_model as module
 from data.errors import InputError
@@ -17,6 +16,7 @@ from diagnosis.screening.screen import proposed, screen
 from evidence.scoring.answer_key import AnswerKey
 from tests.diagnosis.concealed import case, flux
 from tests.diagnosis.small_cases import FLOOR, SHIFT, runs, two_bodies
+from tests.evidence.proof.answered import answer, term
 from thermodrift_exam.plants.plant import draw
 from thermodrift_exam.proof.scoring.true_model import (
     VISIBLE_NATS,
