@@ -18,6 +18,7 @@ from data.batch import Batch, Channel
 from data.checks import check_machine, checked
 from data.machine import ChannelPart, Machine, Recording, load_machine
 from data.recording import read_batches, recording_files
+from plants.sample.sample_machine import FILE
 from thermodrift_exam.plants.options import stream
 
 SCHEMA = "thermodrift.proof_answer/1"
@@ -109,7 +110,7 @@ def _place(place: Place) -> dict[str, str]:
     return dict(zip(("kind", "name"), place, strict=True))
 
 
-MACHINES = Path(__file__).parents[1] / "machines"
+MACHINES = FILE.parent
 CLOCK = "%Y%m%d_%H%M"
 
 
