@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from compensation.faults import faults, watched, with_values
+from compensation.faults import BEGINS, faults, watched, with_values
 from compensation.substitutes import Guard, Substitutes
 from data.batch import Batch
 from pipelines.commands.predict import load_model
@@ -49,7 +49,7 @@ def measured(models: Sequence[StoredModel], batches: Sequence[Batch]) -> tuple[p
                 for b, n in ((wrong, wrong.n_rows), (seen.passed, seen.until))
             )
             first = seen.first
-            begun = 0 if kind == "exchanged" else wrong.n_rows // 4
+            begun = 0 if kind == "exchanged" else wrong.n_rows // BEGINS
             rows.append({
                 "fault": kind, "without_um": raw_um, "with_um": left_um, "found": first is not None,
                 "right": first is not None and seen.untrusted[first] <= at_fault,

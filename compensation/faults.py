@@ -125,16 +125,14 @@ def fault_cost(predict: Predict, substitutes: Substitutes, batch: Batch, most_um
     if not names or batch.n_rows < BEGINS:
         return None
 
-    def sent_um(b: Batch) -> Array:
-        return np.clip(predict(b), -most_um, most_um)
+    right_um, later = predict(batch), np.arange(batch.n_rows) >= batch.n_rows // BEGINS
+    sent_um = np.clip(right_um, -most_um, most_um)
 
     def wrong_um(b: Batch, until: int) -> float:
-        return float(np.nanmax(np.abs(sent_um(b) - right_um)[:until], initial=0.0))
+        return float(np.nanmax(np.abs(np.clip(predict(b), -most_um, most_um) - sent_um)[:until], initial=0.0))
 
-    right_um, later = sent_um(batch), np.arange(batch.n_rows) >= batch.n_rows // BEGINS
     um_per_K = {
-        n: float(np.nanmax(np.abs(predict(with_values(batch, {n: batch.masked(n) + later})) - predict(batch))))
-        for n in names
+        n: float(np.nanmax(np.abs(predict(with_values(batch, {n: batch.masked(n) + later})) - right_um))) for n in names
     }
     guard, n, missed, worst, worst_um = Guard(substitutes), 0, 0, "", 0.0
     every = max(1, batch.n_rows // LOOKS)

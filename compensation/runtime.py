@@ -162,8 +162,8 @@ class Compensator:
 
     @property
     def tick_s(self) -> float:
-        """How often what is sent must be looked at so that it moves at its rate, s: a step may be no larger."""
-        return min(a.limits.step_um / a.limits.rate_um_per_s for a in self.axes)
+        """The least `Limits.tick_s` of the axes, s."""
+        return min(a.limits.tick_s for a in self.axes)
 
     @property
     def behind_um(self) -> float:

@@ -63,6 +63,11 @@ class Limits:
     stale_s: float = 30.0
     warm_up_s: float = 60.0
 
+    @property
+    def tick_s(self) -> float:
+        """How often what is sent must be looked at so that it moves at its rate, s: a step may be no larger."""
+        return self.step_um / self.rate_um_per_s
+
     def __post_init__(self) -> None:
         """Raises InputError where a limit is not finite, negative, or 0 where that makes no sense."""
         check_limits("safety limits", self, ("hold_s", "warm_up_s"))

@@ -7,7 +7,6 @@ same name do not meet; otherwise by the file's name alone. The same measured val
 from __future__ import annotations
 
 import time
-import unicodedata
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
@@ -24,7 +23,7 @@ from data.lake import Lake
 from data.lakefile import content_digest
 from data.machine import Machine
 from data.manifest import Staged, Stored
-from data.recording import read_batches, recording_files
+from data.recording import read_batches, recording_files, steers
 from data.units import check_canonical
 
 COMMIT_EVERY_S = 1.0
@@ -265,25 +264,18 @@ def _collect(paths: Sequence[Path], machine: Machine) -> tuple[dict[Path, str], 
         raise InputError(
             f"{', '.join(missing)}: no such file or directory; nothing was read, give existing recordings or folders"
         )
-    strange = next((p for p in map(Path, paths) if _steers(p.name)), None)
+    strange = next((p for p in map(Path, paths) if steers(p.name)), None)
     if strange is not None:
         raise InputError(f"{str(strange)!a}: a name with control characters; rename it")
     files: dict[Path, tuple[Path, str]] = {}
     ignored: dict[Path, tuple[Path, str]] = {}
     for path in map(Path, paths):
         wanted, others = recording_files(path, machine) if path.is_dir() else ([path], [])
-        others = [*others, *((f, "control characters in the name; rename it") for f in wanted if _steers(f.name))]
-        wanted = [f for f in wanted if not _steers(f.name)]
         for file in wanted:
             files.setdefault(file.resolve(), (file, id_prefix(file, path)))
         ignored |= {f.resolve(): (f, reason) for f, reason in others}
     ordered = sorted(files.values(), key=lambda f: (f[1].count("/"), len(f[0].stem)))
     return dict(ordered), [f for key, f in ignored.items() if key not in files]
-
-
-def _steers(name: str) -> bool:
-    """Whether a name holds what steers a terminal or forges a line of a log: it would name a batch everywhere."""
-    return any(unicodedata.category(c) == "Cc" for c in name)
 
 
 def id_prefix(file: Path, given: Path) -> str:

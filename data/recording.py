@@ -31,6 +31,7 @@ from __future__ import annotations
 import datetime as dt
 import fnmatch
 import os
+import unicodedata
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -192,12 +193,19 @@ def _folder_ignored(folder: Path) -> str:
     return "a lake" if (folder / "_manifest.json").is_file() else ""
 
 
+def steers(name: str) -> bool:
+    """Whether a name holds what steers a terminal or forges a line of a log: it would name a batch everywhere."""
+    return any(unicodedata.category(c) == "Cc" for c in name)
+
+
 def _file_ignored(path: Path, inside: Path) -> str:
     """Why a file is no recording whatever the patterns; empty where it may be one."""
     if path.name.startswith(("~$", ".~")):
         return "lock file of an open document"
     if path.name.startswith("."):
         return "hidden"
+    if steers(path.name):
+        return "control characters in the name; rename it"
     if path.is_symlink() and not path.resolve().is_relative_to(inside):
         return "link to a file outside of the folder; name that file itself to read it"
     return "" if path.is_file() else "not a file"

@@ -168,9 +168,9 @@ def rehearse_models(
     given_text = readings if readings_h is None else f"every {readings_h}h"
     reads = None if given_text is None else readings_of(given_text)
     axes = [m.family.target for m in models]
-    running = compensator(models, given, period_s, lambda line: None)
-    how = (sample_s, running.tick_s, failing, reads, done)
+    how = (sample_s, min(given.of(m).tick_s for m in models), failing, reads, done)
     if through is None:
+        running = compensator(models, given, period_s, lambda line: None)
         return rehearse(batches, axes, lambda s: running.take(s, s.time_s), *how)
     with closing(MqttExchange(through)) as exchange:
         return rehearse(batches, axes, exchange, *how)

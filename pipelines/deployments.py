@@ -115,8 +115,9 @@ class Deployments:
     def _poll(self, now: datetime) -> None:
         if not self._ids:
             self._register()
+        settled = self._folders.settled(now)
         for deployment, m in self._ids.items():
-            if m.name in self._folders.settled(now) or m.name in self._again:
+            if m.name in settled or m.name in self._again:
                 self._client.create_flow_run_from_deployment(deployment, name=f"retrain {m.name}")
                 self._folders.taken(m.name)
                 self._again.discard(m.name)

@@ -111,7 +111,7 @@ def _at_the_machine(
     updater, substitutes = None, None
     if not batches or not family.has_program():
         return None, None
-    ordered = sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
+    ordered = _ordered(batches)
     with suppress(InputError):
         machine = parse_machine(machine_yaml, "machine.yml")
         design = Design.build(ordered, family.inputs, family.target, machine)
@@ -120,6 +120,10 @@ def _at_the_machine(
     with suppress(InputError):
         substitutes = _substitutes(family, ordered)
     return updater, substitutes
+
+
+def _ordered(batches: Sequence[Batch]) -> list[Batch]:
+    return sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
 
 
 def _substitutes(family: Family, ordered: Sequence[Batch]) -> Substitutes:
@@ -133,7 +137,7 @@ def faults_of(family: Family, batches: Sequence[Batch]) -> FaultCost | None:
     most_um = max(largest.values(), default=0.0)
     if not most_um or not family.has_program() or batches[0].channels[family.target].unit != "um":
         return None
-    ordered = sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
+    ordered = _ordered(batches)
     run = max(ordered, key=lambda b: largest[b.batch_id])
     try:
         return fault_cost(family.predict, _substitutes(family, ordered), run, ROOM * most_um)

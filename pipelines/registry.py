@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version as installed
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import mlflow
 import pandas as pd
@@ -325,7 +325,8 @@ def rollback(name: str, settings: Settings, reason: str = "", of: int | None = N
             audit.finish(client, name, log.unmarked)
             summary = f"{name}: champion is version {champion} again; the roll-back of version {rejected} is finished"
         else:
-            below = log.stack[: log.stack.index(champion)] if champion in log.stack else log.stack
+            stack = log.stack
+            below = stack[: stack.index(champion)] if champion in stack else stack
             held = {int(v.version): v for v in model_versions(client, name)}
             back = next((held[v] for v in reversed(below) if v in held), None)
             if back is None:
@@ -419,16 +420,22 @@ def find_version(client: MlflowClient, name: str, which: str) -> ModelVersion:
     return versions[which]
 
 
-def version_folder(source: str, sha256: str, settings: Settings) -> Path:
-    """The local folder of a registered version's files, which are those that were registered.
+class Registered(Protocol):
+    """A version as the registry has it; its tag ``sha256`` is `model_store.digest`, absent in an earlier program's."""
 
-    Args:
-        sha256: the digest that the registry has of them, see `model_store.digest`; empty: of an earlier program.
+    @property
+    def source(self) -> str: ...
+    @property
+    def tags(self) -> Mapping[str, str]: ...
+
+
+def version_folder(version: Registered, settings: Settings) -> Path:
+    """The local folder of a registered version's files, which are those that were registered.
 
     Raises:
         InputError: `model.json` is another one.
     """
-    folder = Path(local_folder(source, settings))
+    folder, sha256 = Path(local_folder(version.source, settings)), version.tags.get("sha256", "")
     try:
         got = model_store.digest(folder) if sha256 else ""
     except OSError:
@@ -479,7 +486,7 @@ def _against(
 
 def _score_unseen(champion: ModelVersion, unseen: Sequence[Batch], target: str, settings: Settings) -> pd.DataFrame:
     """S of the champion's own predictions on batches it was not trained on: batch_id, digest, S_um."""
-    model = model_store.load(version_folder(champion.source, champion.tags.get("sha256", ""), settings))
+    model = model_store.load(version_folder(champion, settings))
     rows = []
     for b in unseen:
         try:

@@ -333,7 +333,7 @@ class _Year:
             client = tracking.open_store(self.settings)
             name = self.settings.model(self.machine.machine, target)
             found = registry.find_version(client, name, str(version))
-            folder = registry.version_folder(found.source, found.tags.get("sha256", ""), self.settings)
+            folder = registry.version_folder(found, self.settings)
             self._models[target, version] = model_store.load(folder)
         return self._models[target, version]
 

@@ -164,7 +164,7 @@ def _gathered(
     for c in champions:
         try:
             if c.version is not None:
-                folder = registry.version_folder(c.source, c.tags.get("sha256", ""), settings)
+                folder = registry.version_folder(c, settings)
                 models[c.target] = model_store.load(folder)
         except (InputError, WorkError) as error:
             trouble[c.target] = str(error)

@@ -65,7 +65,7 @@ def model_folder(model_uri: str, settings: Settings) -> Path:
     with store_errors(settings):
         client = open_store(settings)
         version = find_version(client, *named)
-    return version_folder(version.source, version.tags.get("sha256", ""), settings)
+    return version_folder(version, settings)
 
 
 def predict_file(model_uri: str, file: Path, settings: Settings) -> pd.DataFrame:
