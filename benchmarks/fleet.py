@@ -79,7 +79,8 @@ def recording(k: int, batch: int) -> pd.DataFrame:
 def trained(folder: Path, k: int, configured: Settings) -> dict[str, float]:
     """Seconds of every step for the k-th machine."""
     from pipelines.caller import DirectCaller
-    from pipelines.training import TrainRequest, train
+    from pipelines.request import TrainRequest
+    from pipelines.training import train
 
     file, recordings = write_machine(folder, k)
     begun_s = time.process_time()

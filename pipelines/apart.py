@@ -25,12 +25,11 @@ from pipelines.fleet import Fleet, FleetMachine
 
 def check(fleet: Fleet) -> dict[str, Any]:
     """What is wrong with a fleet's machine files: `problems`; folders that are not there now: `notes`; the names of the
-    machines, and the schema of the flow's parameters."""
-    from prefect.utilities.callables import parameter_schema
-
-    from pipelines.retraining import request_for, retrain
+    machines; the schema of a run's parameters, where a Prefect server needs it."""
+    from pipelines.fleet_service import has_server
+    from pipelines.home import home
+    from pipelines.request import check_request, request_for
     from pipelines.settings import load
-    from pipelines.training import check_request
 
     settings = load()
     problems, notes, names = list[str](), list[str](), list[str]()
@@ -46,15 +45,31 @@ def check(fleet: Fleet) -> dict[str, Any]:
         absent = [r for r in m.recordings if not Path(r).exists()]
         if absent:
             notes.append(f"{name}: {', '.join(absent)}: no such file or folder now; its runs fail until it is there")
-    return {"names": names, "problems": problems, "notes": notes, "schema": parameter_schema(retrain).model_dump()}
+    return {"names": names, "problems": problems, "notes": notes, "schema": _schema() if has_server(home()) else {}}
+
+
+def _schema() -> dict[str, Any]:
+    from prefect.utilities.callables import parameter_schema
+
+    from pipelines.retraining import retrain
+
+    return parameter_schema(retrain).model_dump()
 
 
 def run(machine: FleetMachine, flow_run_id: str | None) -> dict[str, Any]:
     """One retraining, as a run that a server scheduled or on a temporary server: `ok` and `summary`."""
-    from pipelines.retraining import finished
+    from pipelines.prefect_server import start_server
+
+    starting = start_server() if flow_run_id is None else None  # comes up while the rest is imported
+    from pipelines.retraining import finished, retrain
 
     try:
-        _run(machine, flow_run_id)
+        if flow_run_id is not None:
+            _run_scheduled(UUID(flow_run_id))
+        else:
+            if starting is not None:
+                starting.join()
+            retrain(**machine.parameters)
     except (InputError, WorkError) as error:
         return {"ok": False, "summary": str(error)}
     except Exception as error:
@@ -65,21 +80,14 @@ def run(machine: FleetMachine, flow_run_id: str | None) -> dict[str, Any]:
     return {"ok": True, "summary": finished[-1]}
 
 
-def _run(machine: FleetMachine, flow_run_id: str | None) -> None:
+def _run_scheduled(flow_run_id: UUID) -> None:
     from prefect.client.orchestration import get_client
     from prefect.flow_engine import run_flow
 
-    from pipelines.flows import start_server
     from pipelines.retraining import retrain
 
-    if flow_run_id is None:
-        server = start_server()
-        if server is not None:
-            server.join()
-        retrain(**machine.parameters)
-        return
     with get_client(sync_client=True) as client:
-        flow_run = client.read_flow_run(UUID(flow_run_id))
+        flow_run = client.read_flow_run(flow_run_id)
     run_flow(retrain, flow_run=flow_run, parameters=flow_run.parameters)
 
 

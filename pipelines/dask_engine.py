@@ -34,7 +34,8 @@ except ModuleNotFoundError as missing:
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from pipelines.training import TrainOutcome, TrainRequest
+    from pipelines.request import TrainRequest
+    from pipelines.training import TrainOutcome
 
 logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters reaches the user as an error
 R = TypeVar("R")
@@ -55,7 +56,7 @@ class DaskEngine:
     def __init__(self, address: str | None = None, workers: int = 0) -> None:
         if address is not None and "://" not in address:
             raise InputError(f"--address: got {address!r}, expected that of a Dask scheduler, such as tcp://host:8786")
-        from pipelines.flows import start_server
+        from pipelines.prefect_server import start_server
 
         self._address, self._workers, self._server = address, workers or LANES, start_server()
 

@@ -1,8 +1,9 @@
 """A fleet on a Prefect server: one deployment per machine, whose runs the server schedules and this process begins.
 
-Prefect's own `serve` ends, after tracebacks, where its server is away for some minutes, and works off every run that
-was scheduled meanwhile. Here a server that does not answer is one line, and its return another; of the runs that came
-due meanwhile the newest of each machine is done, the others are cancelled with the reason.
+Prefect's own `serve` ends where its server is away for some minutes. Its process worker (3.8) does not, but like
+`serve` it then works off every run that was scheduled meanwhile, one after another. Here a server that does not answer
+is one line, and its return another; of the runs that came due meanwhile the newest of each machine is done, the others
+are cancelled with the reason.
 """
 
 from __future__ import annotations

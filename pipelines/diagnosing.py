@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -30,7 +31,7 @@ from models import FAMILIES
 from models.promotion import judged, left_out
 from models.protocols import PromotionRule
 from models.result import GridResult
-from pipelines import tracking
+from pipelines import spool, tracking
 from pipelines.caller import RETRIES, Caller, DirectCaller, Done, Say
 from pipelines.inputs import INPUTS, Inputs
 from pipelines.recordings import Gathered, check_recordings, gather_batches
@@ -294,10 +295,16 @@ def _track(
     files: Mapping[str, Path],
 ) -> str:
     params = {"machine_file": request.machine_file.name, "seed": request.seed}
+    record = tracking.diagnosis_record(d, batches, params)
+
+    def fill(to: Path) -> None:
+        for path in files.values():
+            shutil.copy(path, to)
+
     try:
-        return tracking.log_diagnosis(d, batches, files, settings, params=params, say=say)
+        return spool.hand_over(settings, "run", record, fill, say=say).run_id
     except WorkError as error:
-        raise WorkError(f"{error}; the diagnosis is written to {request.out}, and not tracked") from None
+        raise WorkError(f"{error}; the diagnosis is written to {request.out}") from None
 
 
 def _check_same_machine(path: Path, machine: str) -> None:

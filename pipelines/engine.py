@@ -5,18 +5,21 @@ A new engine is a file with a class that has the methods of `Engine`, and a line
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from data.errors import InputError
 from data.registry import Registry
 from pipelines.caller import DirectCaller, Done, Say
+from pipelines.request import TrainRequest
 from pipelines.settings import Settings
-from pipelines.training import TrainOutcome, TrainRequest, train
+
+if TYPE_CHECKING:
+    from pipelines.training import TrainOutcome
 
 ENGINES = Registry(
     "engine",
     {
-        "prefect": "pipelines.flows:PrefectEngine",
+        "prefect": "pipelines.prefect_server:PrefectEngine",
         "direct": "pipelines.engine:DirectEngine",
         "dask": "pipelines.dask_engine:DaskEngine",
     },
@@ -46,6 +49,8 @@ class DirectEngine:
         self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
     ) -> TrainOutcome:
         """See `Engine`."""
+        from pipelines.training import train
+
         return train(request, settings, DirectCaller(done), say)
 
 

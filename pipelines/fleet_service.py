@@ -86,7 +86,7 @@ def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -
         folders = Folders(fleet, say)
         again = [name for name, (_, tries) in fleet_state.unfinished(home, fleet).items() if tries < TRIES]
         with folders.watching():
-            if _has_server(home):
+            if has_server(home):
                 from pipelines.deployments import Deployments
 
                 with Deployments(fleet, schema, folders, say, again) as source:
@@ -100,7 +100,7 @@ def serve_fleet(fleet: Fleet, home: Path, say: Say, rounds: int | None = None) -
                 Scheduler(fleet, clock, home, say).serve(rounds)
 
 
-def _has_server(home: Path) -> bool:
+def has_server(home: Path) -> bool:
     """Whether PREFECT_API_URL is set, in the environment or in a profile of Prefect's."""
     folder = Path(os.environ.setdefault("PREFECT_HOME", str(home / "prefect"))).expanduser()
     if os.environ.get("PREFECT_API_URL", "").strip():

@@ -2,42 +2,34 @@
 
 from __future__ import annotations
 
-import atexit
 import logging
 import platform
 import re
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from prefect import flow, get_run_logger, task
-from prefect import settings as prefect_settings
 from prefect.artifacts import create_link_artifact
 from prefect.cache_policies import NO_CACHE
-from prefect.server.api.server import SubprocessASGIServer
 from prefect.task_runners import ThreadPoolTaskRunner
 from threadpoolctl import threadpool_limits
 
-from data.endings import at_end, without_interrupt
 from data.errors import InputError, WorkError
 from data.machine import load_machine
 from models.grid import Pools, local_pools
 from pipelines.caller import LANES, Done, Say, counted, label
 from pipelines.diagnosing import DiagnosisRequest, dated_folder, diagnose_file
-from pipelines.engine import no_address
+from pipelines.request import TrainRequest
 from pipelines.settings import Settings, load
-from pipelines.training import TrainOutcome, TrainRequest, train
+from pipelines.training import TrainOutcome, train
 
 T = TypeVar("T")
 R = TypeVar("R")
 RETRY_DELAY_S = 2.0
-SERVER_START_S = 180  # its imports on a busy computer
-POPEN_S = 1.0  # for the operating system to start a process
 
 
 class PrefectCaller:
@@ -81,41 +73,6 @@ def _can_succeed(task: Any, run: Any, state: Any) -> bool:
     return True
 
 
-def start_server() -> threading.Thread | None:
-    """Start Prefect's temporary server in the background, so that it comes up while other work goes on.
-
-    None where PREFECT_API_URL names a running one. The flow finds the same server again. Prefect starts this server
-    by itself as well, but only when the flow begins, and has no public way to start it earlier or to stop it.
-    """
-    if prefect_settings.PREFECT_API_URL.value():
-        return None
-    thread = threading.Thread(target=_serve, daemon=True)
-    thread.start()
-    at_end(partial(_kill_server, thread))
-    return thread
-
-
-def _serve() -> None:
-    with without_interrupt(), suppress(RuntimeError):  # too late: the flow waits for it, or starts another
-        SubprocessASGIServer().start(timeout=SERVER_START_S)
-
-
-def _kill_server(starting: threading.Thread) -> None:
-    """Its own way to stop may take 5 s, and lets a client that misses it start another one.
-
-    Its store is SQLite, which a kill leaves in order.
-    """
-    server = SubprocessASGIServer()
-    server.running = True  # so that none is started from now on
-    atexit.unregister(server.stop)
-    end_s = time.monotonic() + POPEN_S
-    while server.server_process is None and starting.is_alive() and time.monotonic() < end_s:
-        time.sleep(0.01)
-    if server.server_process is not None:
-        server.server_process.kill()
-        server.server_process.wait()
-
-
 def train_in_flow(
     request: TrainRequest,
     settings: Settings,
@@ -128,7 +85,7 @@ def train_in_flow(
     """`pipelines.training.train` as a flow; same functions, same numbers.
 
     Args:
-        server: the start of a temporary server, see `start_server`.
+        server: the start of a temporary server, see `prefect_server.start_server`.
         pools: where the grid is computed.
         lanes: steps under way at a time.
     """
@@ -174,21 +131,6 @@ def _parameters(request: TrainRequest) -> dict[str, Any]:
         "channels": list(request.targets), "effort": plan.effort, "families": list(plan.families),
         "selectors": list(plan.selectors), "protocols": list(plan.protocols), "promote": request.promote,
     }  # fmt: skip
-
-
-class PrefectEngine:
-    """Trainings as Prefect flows, on the server that PREFECT_API_URL names, else on a temporary one."""
-
-    def __init__(self, address: str | None = None) -> None:
-        if address is not None:
-            raise no_address("prefect")
-        self._server = start_server()
-
-    def train(
-        self, request: TrainRequest, settings: Settings, say: Say = lambda text: None, done: Done | None = None
-    ) -> TrainOutcome:
-        """See `train_in_flow`."""
-        return train_in_flow(request, settings, say, done, self._server)
 
 
 @flow(name="thermodrift-diagnose", task_runner=ThreadPoolTaskRunner(max_workers=LANES), persist_result=False)

@@ -43,8 +43,9 @@ from pipelines import model_store, registry, tracking
 from pipelines.audit import CHAMPION
 from pipelines.caller import Caller, Done, Say
 from pipelines.recordings import check_recordings
+from pipelines.request import TrainRequest, check_request
 from pipelines.settings import DiagnoseRule, Settings
-from pipelines.training import TrainOutcome, TrainRequest, check_request, train
+from pipelines.training import TrainOutcome, train
 
 ARRIVALS, PROGRESS = "arrivals.json", "progress.json"
 _SCALE = 10.0  # of errors that are "scaled": micrometres that were exported as tenths
@@ -100,7 +101,7 @@ def check_replay(request: ReplayRequest, settings: Settings) -> tuple[Machine, t
     """The machine and the error channels.
 
     Raises:
-        InputError: see `pipelines.training.check_request`; or numbers that make no replay.
+        InputError: see `pipelines.request.check_request`; or numbers that make no replay.
     """
     check_recordings(request.recordings)
     for name, value, least in (("--start", request.start, 2), ("--every", request.every, 1)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -11,11 +10,11 @@ from prefect.task_runners import ThreadPoolTaskRunner
 
 from data.errors import InputError, WorkError
 from data.machine import load_machine
-from models.crossing import Plan
 from pipelines.caller import LANES
 from pipelines.flows import PrefectCaller, link_report, log_to_server
+from pipelines.request import request_for
 from pipelines.settings import load
-from pipelines.training import TrainOutcome, TrainRequest, train
+from pipelines.training import TrainOutcome, train
 
 finished: list[str] = []  # summaries of this process: known even where Prefect loses its server at the end of a run
 
@@ -77,15 +76,3 @@ def machine_name(file: str) -> str:
         return load_machine(Path(file)).machine
     except InputError:
         return Path(file).stem
-
-
-def request_for(
-    machine_file: str,
-    recordings: Sequence[str],
-    effort: str,
-    channels: Sequence[str],
-    families: Sequence[str],
-    selectors: Sequence[str],
-) -> TrainRequest:
-    plan = Plan(tuple(selectors), tuple(families), effort=effort)  # type: ignore[arg-type]
-    return TrainRequest(Path(machine_file), tuple(Path(r) for r in recordings), tuple(channels), plan, only_if_new=True)

@@ -1,17 +1,23 @@
-"""What a tracking server did not take: kept as plain files below the home, delivered later in order, and once.
+"""Results on their way to the tracking store: kept as plain files below the home, then delivered in order, and once.
 
-An item is a folder `NUMBER-KIND-MACHINE-TARGET` with `item.json` and `files/`: a training's run, its promotion, or a
-file for its artifacts. A folder is complete once it has its name. A delivery removes an item after the store has it; if
-it stops between, the next one finds the record's run by its id and writes none again. An item that the store or the
-lake refuses for good is moved to `refused/`, with the reason, so that it blocks nothing.
+Every result is kept first, whether or not the store answers: a training's or diagnosis' run, a promotion, a file for a
+run's artifacts. An outage, or the end of the process, is thereby a result that is not delivered yet: the next `train`,
+`status` or `schedule` does it.
+
+An item is a folder `NUMBER-KIND-MACHINE-TARGET` with `item.json` and `files/`. A folder is complete once it has its
+name. A delivery removes an item after the store has it; if it stops between, the next one finds the record's run by its
+id and writes none again. An item that the store or the lake refuses for good is moved to `refused/`, with the reason.
+One that cannot be delivered now, such as on a full disk, waits with those after it; those of other channels do not.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Generic, Literal, Protocol, TypeVar
 
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
@@ -25,9 +31,9 @@ from pipelines.settings import Settings
 from pipelines.store import StoreOutage
 from pipelines.tracking import attach, log_record, open_store, store_errors
 
-_ITEM, _FILES, _MACHINE, _REASON = "item.json", "files", "machine.yml", "reason.txt"
+MACHINE = "machine.yml"  # the machine file of a promotion
+_ITEM, _FILES, _REASON = "item.json", "files", "reason.txt"
 Kind = Literal["run", "promotion", "file"]
-Fill = Callable[[Path], object]  # writes the files of an item
 
 
 class Promoted(Protocol):
@@ -37,7 +43,8 @@ class Promoted(Protocol):
     def summary(self) -> str: ...
 
 
-Promote = Callable[[str, Path], Promoted]  # the id of a tracked training, and a machine file
+P = TypeVar("P", bound=Promoted)
+Promote = Callable[[str, Path], P]  # the id of a tracked training, and a machine file
 
 
 class _Item(BaseModel):
@@ -50,19 +57,35 @@ class _Item(BaseModel):
     record: Record | None = None
 
 
-def keep_run(settings: Settings, record: Record, files: Path) -> None:
-    """Keep a run with its files."""
-    _keep(settings, "run", record, lambda to: shutil.copytree(files, to, dirs_exist_ok=True), record)
+@dataclass(frozen=True)
+class Delivery(Generic[P]):
+    """What became of an item: `run_id` in the store, and what a promotion led to; or the `error`."""
+
+    line: str
+    run_id: str = ""
+    promoted: P | None = None
+    error: InputError | WorkError | None = None
 
 
-def keep_promotion(settings: Settings, record: Record, machine_yaml: str) -> None:
-    """Keep that a training is to be promoted; `machine_yaml` is the text of its machine file."""
-    _keep(settings, "promotion", record, lambda to: (to / _MACHINE).write_text(machine_yaml, encoding="utf-8"))
+def keep(settings: Settings, kind: Kind, record: Record, fill: Callable[[Path], object]) -> None:
+    """Keep a result, all or nothing; what waits already is not kept again.
 
-
-def keep_file(settings: Settings, record: Record, path: Path) -> None:
-    """Keep a file for the artifacts of a training."""
-    _keep(settings, "file", record, lambda to: shutil.copy(path, to))
+    Args:
+        fill: writes the item's files into a folder.
+    """
+    whole = record if kind == "run" else None
+    item = _Item(kind=kind, record_id=record.id, machine=record.machine, target=record.target, record=whole)
+    base = folder(settings)
+    base.mkdir(parents=True, exist_ok=True)
+    with FileLock(base / ".keeping.lock"):
+        held = waiting(settings)
+        if any((i.kind, i.record_id) == (kind, record.id) for i in map(_read, held)):
+            return
+        number = 1 + max((int(p.name.partition("-")[0]) for p in held), default=0)
+        with whole_folder(base / f"{number:06d}-{kind}-{_channel(item)}") as scratch:
+            (scratch / _FILES).mkdir()
+            fill(scratch / _FILES)
+            (scratch / _ITEM).write_text(item.model_dump_json(indent=1), encoding="utf-8")
 
 
 def waiting(settings: Settings) -> list[Path]:
@@ -75,42 +98,72 @@ def folder(settings: Settings) -> Path:
     return settings.home / "spool"
 
 
-def deliver(settings: Settings, promote: Promote, say: Say = lambda text: None) -> list[str]:
-    """Deliver what waits; returns a line for each item. Another process that delivers at the moment goes on alone.
+def deliver(settings: Settings, promote: Promote[P], say: Say = lambda text: None) -> list[Delivery[P]]:
+    """Deliver what waits, channel by channel. Another process that delivers a channel at the moment goes on alone.
 
     Raises:
         StoreOutage: the server does not answer; what is left waits on.
     """
-    if not waiting(settings):
-        return []
-    lines: list[str] = []
-    try:
-        with FileLock(folder(settings) / ".delivery.lock", timeout=0):
-            while items := waiting(settings):
-                say(f"delivers {len(items)} results that were kept while the tracking server did not answer")
-                lines += [_delivered(settings, path, promote) for path in items]
-    except Timeout:
-        pass
-    except StoreOutage as error:
-        raise StoreOutage(f"{error}; {len(waiting(settings))} results wait in {folder(settings)}") from None
-    return lines
+    items = waiting(settings)
+    if items:
+        say(f"delivers {len(items)} results that the tracking store does not have yet")
+    found: list[Delivery[P]] = []
+    for channel in dict.fromkeys(_channel(_read(path)) for path in items):
+        with suppress(Timeout), _alone(settings, channel, timeout_s=0.0):
+            found += _deliver_channel(settings, channel, promote, say)
+    return found
 
 
-def _keep(settings: Settings, kind: Kind, record: Record, fill: Fill, whole: Record | None = None) -> None:
-    """All or nothing. What waits already is not kept again."""
-    item = _Item(kind=kind, record_id=record.id, machine=record.machine, target=record.target, record=whole)
-    base = folder(settings)
-    base.mkdir(parents=True, exist_ok=True)
-    with FileLock(base / ".keeping.lock"):
-        held = waiting(settings)
-        if any((i.kind, i.record_id) == (kind, record.id) for i in map(_read, held)):
-            return
-        number = 1 + max((int(p.name.partition("-")[0]) for p in held), default=0)
-        name = f"{number:06d}-{kind}-{safe_name(record.machine)}-{safe_name(record.target)}"
-        with whole_folder(base / name) as scratch:
-            (scratch / _FILES).mkdir()
-            fill(scratch / _FILES)
-            (scratch / _ITEM).write_text(item.model_dump_json(indent=1), encoding="utf-8")
+def hand_over(
+    settings: Settings,
+    kind: Kind,
+    record: Record,
+    fill: Callable[[Path], object],
+    promote: Promote[P] | None = None,
+    say: Say = lambda text: None,
+) -> Delivery[P]:
+    """`keep` a result and deliver it, after what waits of its channel.
+
+    Raises:
+        StoreOutage: the server does not answer; the result waits.
+        WorkError: it cannot be kept, or not be delivered now; then it waits, too.
+        InputError: the store or the lake refuses it.
+    """
+    with _alone(settings, _channel(record)):
+        keep(settings, kind, record, fill)
+        done: Delivery[P] = _deliver_channel(settings, _channel(record), promote, say)[-1]
+    if done.error is not None:
+        raise done.error
+    return done
+
+
+@contextmanager
+def _alone(settings: Settings, channel: str, timeout_s: float = -1.0) -> Iterator[None]:
+    """One process at a time delivers the results of a channel."""
+    folder(settings).mkdir(parents=True, exist_ok=True)
+    with FileLock(folder(settings) / f".{channel}.lock", timeout=timeout_s):
+        yield
+
+
+def _deliver_channel(settings: Settings, channel: str, promote: Promote[P] | None, say: Say) -> list[Delivery[P]]:
+    found: list[Delivery[P]] = []
+    for path, item in [(p, _read(p)) for p in waiting(settings)]:
+        if _channel(item) != channel:
+            continue
+        try:
+            found.append(_delivered(settings, path, item, promote, say))
+        except StoreOutage as error:
+            raise StoreOutage(
+                f"{error}; {len(waiting(settings))} results wait in {folder(settings)}: the next `thermodrift train`, "
+                "`status` or `schedule` that reaches the store delivers them"
+            ) from None
+        if isinstance(found[-1].error, WorkError):
+            break
+    return found
+
+
+def _channel(of: Record | _Item) -> str:
+    return f"{safe_name(of.machine)}-{safe_name(of.target)}"
 
 
 def _read(path: Path) -> _Item:
@@ -120,36 +173,40 @@ def _read(path: Path) -> _Item:
         raise WorkError(f"{path / _ITEM}: cannot be read ({error}); move the folder away") from None
 
 
-def _delivered(settings: Settings, path: Path, promote: Promote) -> str:
-    item = _read(path)
+def _delivered(settings: Settings, path: Path, item: _Item, promote: Promote[P] | None, say: Say) -> Delivery[P]:
     label = f"{item.kind} of {item.machine} {item.target}"
     try:
-        line = f"delivered {label}: {_deliver(settings, item, path / _FILES, promote)}"
+        done = _deliver(settings, item, path / _FILES, promote, say)
     except StoreOutage:
         raise
-    except (InputError, WorkError) as error:
+    except WorkError as error:
+        return Delivery(f"not delivered: {label} ({error}); it waits in {path}", error=error)
+    except InputError as error:
         (path / _REASON).write_text(f"{error}\n", encoding="utf-8")
         refused = folder(settings) / "refused"
         refused.mkdir(exist_ok=True)
         path.rename(refused / f"{item.record_id}-{path.name}")
-        return f"not delivered: {label} ({error}); moved to {refused}"
-    done = path.with_name(f".done-{path.name}")
-    path.rename(done)
-    shutil.rmtree(done, ignore_errors=True)
-    return line
+        return Delivery(f"not delivered: {label} ({error}); moved to {refused}", error=error)
+    gone = path.with_name(f".done-{path.name}")
+    path.rename(gone)
+    shutil.rmtree(gone, ignore_errors=True)
+    said = done.promoted.summary if done.promoted is not None else done.line
+    return Delivery(f"delivered {label}: {said}", done.run_id, done.promoted)
 
 
-def _deliver(settings: Settings, item: _Item, files: Path, promote: Promote) -> str:
+def _deliver(settings: Settings, item: _Item, files: Path, promote: Promote[P] | None, say: Say) -> Delivery[P]:
     if item.record is not None:
-        return f"training {log_record(item.record, files, settings)}"
+        run_id = log_record(item.record, files, settings, say)
+        return Delivery(f"{item.record.kind} {run_id}", run_id)
     client = open_store(settings)
     with store_errors(settings):
-        training_id = find_record(client, settings, item.record_id, item.machine, item.target)
-    if training_id is None:
+        run = find_record(client, settings, item.record_id, item.machine, item.target)
+    if run is None:
         raise InputError(f"the store has no finished training of record {item.record_id}")
     if item.kind == "promotion":
-        return promote(training_id, files / _MACHINE).summary
-    names: Sequence[Path] = sorted(files.iterdir())
+        assert promote is not None  # the channel of a diagnosis has none
+        return Delivery("", run, promote(run, files / MACHINE))
+    names = sorted(files.iterdir())
     for name in names:
-        attach(training_id, name, settings)
-    return ", ".join(p.name for p in names)
+        attach(run, name, settings)
+    return Delivery(", ".join(p.name for p in names), run)

@@ -12,9 +12,7 @@ import logging
 import math
 import platform
 import re
-import shutil
 import sqlite3
-import tempfile
 import threading
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -379,36 +377,21 @@ _VERSIONS = ("thermodrift", "numpy", "scipy", "pandas", "mlflow")
 _MAX_CHARACTERS = 5000  # characters of a parameter or tag; the store takes 6000
 
 
-def log_diagnosis(
-    d: Diagnosis,
-    batches: Sequence[Batch],
-    files: Mapping[str, Path],
-    settings: Settings,
-    *,
-    params: Mapping[str, Any] | None = None,
-    say: Say = lambda text: None,
-) -> str:
-    """Track one diagnosis; returns the run's id.
+def diagnosis_record(d: Diagnosis, batches: Sequence[Batch], params: Mapping[str, Any] | None = None) -> Record:
+    """A diagnosis as a run, whose artifacts are the files that it wrote.
 
     Metrics: ``left_out_rms_before/z_um``, ``left_out_rms_after/z_um`` and ``noise_floor/z_um`` by channel, findings,
     probability (of the first one), batches, left_out_batches, left_out_batches_improved, seconds. Tags: verdict,
-    mechanism, where, simulated, drafted. The batches are dataset inputs, `files` (name -> path) artifacts.
-
-    Raises:
-        WorkError: the store does not answer.
+    mechanism, where, simulated, drafted. The batches are dataset inputs.
     """
     f, now = d.findings, now_ms()
     metrics = tuple((k, v, 0) for k, v in _diagnosis_metrics(d).items() if math.isfinite(v))
-    record = Record(
+    return Record(
         id=uuid.uuid4().hex, kind="diagnosis", machine=f.machine, target=DIAGNOSIS, simulated=d.simulated,
         name=f"{pd.Timestamp.now():%Y-%m-%d %H:%M} {f.verdict.replace('_', ' ')}", tags=_short(_diagnosis_tags(d)),
         params=_short({k: str(v) for k, v in {**_diagnosis_params(d), **(params or {})}.items()}), metrics=metrics,
         started_ms=now - int(1000 * (f.seconds or 0.0)), ended_ms=now, datasets=dataset_records(_batch_table(batches)),
     )  # fmt: skip
-    with tempfile.TemporaryDirectory() as scratch:
-        for path in files.values():
-            shutil.copy(path, scratch)
-        return log_record(record, Path(scratch), settings, say)
 
 
 def diagnoses(machine: str | None = None, settings: Settings | None = None) -> pd.DataFrame:

@@ -5,28 +5,28 @@ The steps are plain functions; a `pipelines.caller.Caller` decides how they run:
 from __future__ import annotations
 
 import json
-import tempfile
+import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from data.account import Account
 from data.batch import Batch
 from data.checks import check_machine
-from data.errors import InputError, WorkError, check_suffix, closest, place_of
+from data.errors import InputError, WorkError, place_of
 from data.ingest import IngestReport, ingest
 from data.machine import Machine, load_machine
 from models import promotion
 from models.crossing import Crossing, FamilyResult, Plan, prepare, refit, unfitted, with_target
 from models.grid import Pools, Workers, assemble, local_pools, workers_for
 from models.outlook import Outlook, outlook
-from models.protocols import PROTOCOLS
 from models.race import Job, Raced, drive
 from models.result import GridResult, Training
 from models.trust import Region, left_out_runs
@@ -34,73 +34,15 @@ from models.updating import updated_scores
 from pipelines import registry, spool, stopping, tracking
 from pipelines.caller import RETRIES, Caller, Say
 from pipelines.checkpoint import Checkpoint
-from pipelines.diagnosing import DiagnosisOutcome, diagnose_if_grown
 from pipelines.recordings import check_channels, home_lake, load_batches
+from pipelines.request import TrainRequest, check_request
 from pipelines.runs import Record, code_version, now_ms
 from pipelines.settings import Settings, home
 from pipelines.store import StoreOutage
 from reports.comparison import figure_pngs, write_report
 
-REPORT_SUFFIXES = (".html", ".md")
-
-
-@dataclass(frozen=True)
-class TrainRequest:
-    """What to train. `recordings` empty: what the lake holds. `targets` empty: every error channel."""
-
-    machine_file: Path
-    recordings: tuple[Path, ...] = ()
-    targets: tuple[str, ...] = ()
-    plan: Plan = field(default_factory=Plan)
-    report: Path | None = None
-    promote: bool = True
-    only_if_new: bool = False  # stop where the last training saw the same batches
-    workers: int = 0  # processes of the grid; 0: as many as make it faster
-
-
-def check_request(request: TrainRequest, settings: Settings) -> tuple[Machine, tuple[str, ...]]:
-    """The machine and the error channels to learn.
-
-    Raises:
-        InputError: a machine file that cannot be used, an unknown channel, recordings that do not exist, a report of
-            an unknown kind, a family that the machine cannot have, or a promotion rule that the chosen protocols do
-            not serve.
-    """
-    machine = load_machine(request.machine_file)
-    targets = error_channels(request.targets, machine)
-    missing = [str(p) for p in request.recordings if not p.exists()]
-    if missing:
-        raise InputError(f"recordings {', '.join(missing)}: no such file or folder; give existing ones")
-    if request.report is not None:
-        check_suffix("report", request.report, REPORT_SUFFIXES)
-    rule = settings.promotion
-    protocols = request.plan.protocols or tuple(PROTOCOLS)
-    if request.promote and not rule.offered(protocols):
-        raise InputError(
-            f"protocols: got {', '.join(protocols)}, but promotion judges by {', '.join(rule.protocols)}; "
-            "add one of them, or train without promotion (--no-promote)"
-        )
-    if request.plan.families:
-        request.plan.suited(machine, [machine.channel(t) for t in targets])
-    return machine, targets
-
-
-def error_channels(wanted: Sequence[str], machine: Machine) -> tuple[str, ...]:
-    """The error channels that are wanted, or all.
-
-    Raises:
-        InputError: a machine without one, or an unknown channel.
-    """
-    allowed = machine.names("error")
-    if not allowed:
-        raise InputError(
-            f"machine {machine.machine}: no channel has role: error, so there is nothing to learn; give the "
-            "displacement that role in the machine file"
-        )
-    for t in wanted:
-        if t not in allowed:
-            raise InputError(f"machine {machine.machine}: no error channel {t!r}; {closest(t, allowed)}")
-    return tuple(dict.fromkeys(wanted)) or allowed
+if TYPE_CHECKING:
+    from pipelines.diagnosing import DiagnosisOutcome
 
 
 @dataclass(repr=False)
@@ -139,8 +81,8 @@ def train(
 ) -> TrainOutcome:
     """Run the yearly job.
 
-    The tracking store is reached first, and gets what waits for it (see `pipelines.spool`). If it goes away later, the
-    results wait there, and nothing of them is lost. After any other failure the crossing is kept.
+    The tracking store is reached first, and gets what waits for it. Every result is kept before it is delivered (see
+    `pipelines.spool`), so that nothing is lost if the store goes away. After any other failure the crossing is kept.
 
     Args:
         caller: how the steps run.
@@ -153,8 +95,8 @@ def train(
     machine, targets = check_request(request, settings)
     started_ms = now_ms()
     tracking.open_store(settings, say)
-    for line in spool.deliver(settings, partial(promote_waiting, settings), say):
-        say(line)
+    for done in spool.deliver(settings, partial(promote_waiting, settings), say):
+        say(done.line)
     plan = request.plan.suited(machine)
     outcome = TrainOutcome(machine.machine, machine.simulated)
     outcome.units |= {t: machine.channels[t].unit for t in targets}
@@ -199,7 +141,7 @@ def train(
         token = checkpoint.token()
         for t in targets:
             outcome.records[t] = _record(outcome, plan, settings, t, f"{token}-{t}", started_ms)
-        caller.map("track", partial(_track, outcome, settings, say), targets, retries=RETRIES)
+        caller.map("track", partial(_track, outcome, settings), targets, retries=RETRIES)
         clock("track")
         if request.promote:
             say("promote")
@@ -214,8 +156,10 @@ def train(
     checkpoint.remove()
     stopping.note(None)
     if machine.twin is not None:
+        from pipelines import diagnosing  # most of a second of imports that other trainings do not need
+
         diagnose = partial(
-            diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
+            diagnosing.diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
         )
         outcome.diagnosis, outcome.diagnosis_summary = caller.map("diagnose", diagnose, [outcome.results])[0]
         clock("diagnose")
@@ -341,57 +285,59 @@ def _record(
     )  # fmt: skip
 
 
-def _track(outcome: TrainOutcome, settings: Settings, say: Say, target: str) -> None:
-    """In the store, or in the spool where it does not answer."""
-    result, record = outcome.results[target], outcome.records[target]
-    with tempfile.TemporaryDirectory() as scratch:
-        tracking.training_files(Path(scratch), result, figure_pngs(result))
-        try:
-            outcome.training_ids[target] = tracking.log_record(record, Path(scratch), settings, say)
-        except StoreOutage as error:
-            spool.keep_run(settings, record, Path(scratch))
-            _postpone(outcome, settings, error)
-
-
-def _postpone(outcome: TrainOutcome, settings: Settings, error: StoreOutage) -> None:
-    outcome.postponed = (
-        f"{error}; the results wait in {spool.folder(settings)}: the next `thermodrift train`, `status` or `schedule` "
-        "that reaches the store delivers and promotes them"
-    )
+def _track(outcome: TrainOutcome, settings: Settings, target: str) -> None:
+    result = outcome.results[target]
+    figures = figure_pngs(result)
+    _hand_over(outcome, settings, target, "run", lambda to: tracking.training_files(to, result, figures))
 
 
 def _promote(
     outcome: TrainOutcome, crossings: dict[str, Crossing], machine_file: Path, settings: Settings, target: str
 ) -> None:
-    """Where the training or the promotion does not reach the store, the promotion waits in the spool."""
-    choice, crossing = outcome.choices[target], crossings[target]
+    choice, crossing, result = outcome.choices[target], crossings[target], outcome.results[target]
     text = machine_file.read_text(encoding="utf-8")
-    if target not in outcome.training_ids:
-        spool.keep_promotion(settings, outcome.records[target], text)
-        return
-    family = refit(crossing, choice.selector, choice.family, choice.n_tsp, outcome.results[target].stack)
-    region, training_id = Region.of(crossing.batches, family.inputs), outcome.training_ids[target]
-    new = registry.Newcomer(outcome.results[target], choice, family, text, training_id, region, crossing.batches)
-    try:
-        outcome.promotions[target] = registry.promote(new, settings)
-    except StoreOutage as error:
-        spool.keep_promotion(settings, outcome.records[target], text)
-        _postpone(outcome, settings, error)
+
+    def promote(training_id: str, _: Path) -> registry.Promotion:
+        family = refit(crossing, choice.selector, choice.family, choice.n_tsp, result.stack)
+        region = Region.of(crossing.batches, family.inputs)
+        new = registry.Newcomer(result, choice, family, text, training_id, region, crossing.batches)
+        return registry.promote(new, settings)
+
+    def fill(to: Path) -> None:
+        (to / spool.MACHINE).write_text(text, encoding="utf-8")
+
+    _hand_over(outcome, settings, target, "promotion", fill, promote)
 
 
 def _report(outcome: TrainOutcome, settings: Settings, path: Path) -> Path:
     """Write the report, which every training keeps as an artifact."""
     written = write_report([_training(outcome, t) for t in outcome.results], path, settings.promotion)
-    for target, record in outcome.records.items():
-        try:
-            if target not in outcome.training_ids:
-                spool.keep_file(settings, record, written)
-            else:
-                tracking.attach(outcome.training_ids[target], written, settings)
-        except StoreOutage as error:
-            spool.keep_file(settings, record, written)
-            _postpone(outcome, settings, error)
+    for target in outcome.records:
+        _hand_over(outcome, settings, target, "file", lambda to: shutil.copy(written, to))
     return written
+
+
+def _hand_over(
+    outcome: TrainOutcome,
+    settings: Settings,
+    target: str,
+    kind: spool.Kind,
+    fill: Callable[[Path], object],
+    promote: spool.Promote[registry.Promotion] | None = None,
+) -> None:
+    """A result of a channel to the store; after an outage of it the result only waits, see `pipelines.spool`."""
+    record = outcome.records[target]
+    if outcome.postponed:
+        spool.keep(settings, kind, record, fill)
+        return
+    try:
+        done = spool.hand_over(settings, kind, record, fill, promote)
+    except StoreOutage as error:
+        outcome.postponed = str(error)
+        return
+    outcome.training_ids[target] = done.run_id
+    if done.promoted is not None:
+        outcome.promotions[target] = done.promoted
 
 
 def _training(outcome: TrainOutcome, target: str) -> Training:

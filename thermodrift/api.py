@@ -110,9 +110,10 @@ def train(
     from models.crossing import Plan
     from pipelines import settings, training
     from pipelines.caller import DirectCaller
+    from pipelines.request import TrainRequest
 
     settings.configure_environment()
-    request = training.TrainRequest(
+    request = TrainRequest(
         Path(machine_file), tuple(_paths(recordings)), tuple(channels), plan or Plan(), promote=promote,
         workers=processes,
     )  # fmt: skip
@@ -142,7 +143,7 @@ def cross(
     """
     from models.crossing import Plan
     from models.grid import run_grid
-    from pipelines.training import error_channels
+    from pipelines.request import error_channels
 
     known = _machine(machine)
     done = run_grid(

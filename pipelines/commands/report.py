@@ -26,7 +26,7 @@ def write_comparison(machine: str, training_ids: Sequence[str], to: Path | None,
         WorkError: the store does not answer.
     """
     from pipelines import settings, tracking
-    from pipelines.training import REPORT_SUFFIXES
+    from pipelines.request import REPORT_SUFFIXES
     from reports.comparison import write_report
 
     if to is not None:

@@ -159,7 +159,7 @@ def status(
 
 
 def _deliver() -> None:
-    """What waits for a tracking server that did not answer, see `pipelines.spool`."""
+    """What the tracking store does not have yet, see `pipelines.spool`."""
     if not any((home() / "spool").glob("[0-9]*")):
         return
     from pipelines import settings
@@ -169,8 +169,8 @@ def _deliver() -> None:
     from pipelines.training import promote_waiting
 
     configured = settings.load()
-    for line in spool.deliver(configured, partial(promote_waiting, configured), console.note):
-        console.note(line)
+    for done in spool.deliver(configured, partial(promote_waiting, configured), console.note):
+        console.note(done.line)
 
 
 def _gathered(quiet: bool) -> dict[str, Any]:

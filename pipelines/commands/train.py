@@ -141,7 +141,7 @@ def train(
     from models.crossing import FINALISTS, Plan
     from models.protocols import PROTOCOLS
     from pipelines.engine import ENGINES, open_engine
-    from pipelines.training import TrainRequest, check_request
+    from pipelines.request import TrainRequest, check_request
 
     one_of(engine, ENGINES, "--engine")
     if direct and engine not in ("prefect", "direct"):

@@ -78,9 +78,10 @@ def flows(store: object, store_home: Path) -> Iterator[ModuleType]:
         from prefect.server.api.server import SubprocessASGIServer
 
         from pipelines import flows as module
+        from pipelines.prefect_server import start_server
 
         patch.setattr(module, "RETRY_DELAY_S", 0.01)
-        server = module.start_server()
+        server = start_server()
         assert server is not None
         server.join()
         yield module

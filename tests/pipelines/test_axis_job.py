@@ -22,7 +22,7 @@ from models.result import GridResult
 from models.trust import Region
 from pipelines import model_store
 from pipelines.commands.predict import predict_file
-from pipelines.training import TrainRequest, check_request
+from pipelines.request import TrainRequest, check_request
 from plants.sample.sample_axis import write_sample_axis
 from reports.comparison import figure_pngs, write_report
 from reports.comparison.channel import left_out_panel

@@ -236,17 +236,21 @@ def test_findings_outlive_a_machine_file_that_cannot_be_written(diagnose: Diagno
     assert last.endswith(f"; the findings stand in {out}") and "left out one effect" in done.out
 
 
-def test_what_is_not_tracked_is_told(diagnose: Diagnosed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_tracked_is_told(
+    diagnose: Diagnosed, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object, **__: object) -> str:
         raise WorkError("tracking store sqlite:///x: database is locked")
 
-    monkeypatch.setattr("pipelines.tracking.log_diagnosis", broken)
-    done = diagnose("--no-report")
+    with monkeypatch.context() as patch:
+        patch.setattr("pipelines.spool.log_record", broken)
+        done = diagnose("--no-report")
     out = tmp_path / "out"
     assert (done.code, one_line(done)) == (
-        1, f"tracking store sqlite:///x: database is locked; the diagnosis is written to {out}, and not tracked"
+        1, f"tracking store sqlite:///x: database is locked; the diagnosis is written to {out}"
     )  # fmt: skip
     assert (out / "findings.json").exists()
+    assert "delivered run of " in call("status").err  # it waited
 
 
 def test_a_recording_that_cannot_be_used_is_told(call: Call, toy: Toy, given: Path, tmp_path: Path) -> None:

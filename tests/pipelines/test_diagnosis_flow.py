@@ -10,7 +10,7 @@ import pytest
 
 from data.errors import InputError, WorkError
 from diagnosis.findings.schema import read_findings
-from pipelines import diagnosing, training
+from pipelines import diagnosing
 from pipelines.tracking import diagnoses
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
 
@@ -64,7 +64,7 @@ def test_retraining_tells_of_the_diagnosis(
 ) -> None:
     from pipelines import retraining
 
-    monkeypatch.setattr(training, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
+    monkeypatch.setattr(diagnosing, "diagnose_if_grown", lambda *_, **__: (None, "z: left-out S has grown; diagnosed"))
     machine = write_machine(tmp_path / "m.yml", "flow-season")
     words = retraining.retrain(
         str(machine), [str(write_recordings(tmp_path / "in"))], channels=["z"], selectors=["none"], families=["zero"]

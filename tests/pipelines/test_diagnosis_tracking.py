@@ -12,8 +12,9 @@ from mlflow.tracking import MlflowClient
 from diagnosis.result import Diagnosis
 from pipelines import tracking
 from pipelines.settings import Settings
-from pipelines.tracking import diagnoses, log_diagnosis
+from pipelines.tracking import diagnoses
 from tests.toys.diagnosis import toy_diagnosis
+from tests.toys.tracked import log_diagnosis
 from tests.toys.training import toy_batches
 
 MACHINE = "sample_vmc"

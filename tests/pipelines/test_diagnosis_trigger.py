@@ -17,11 +17,11 @@ from data.machine import load_machine
 from models.crossing import Plan
 from models.protocols import PromotionRule
 from models.result import GridResult
-from pipelines import training
+from pipelines import diagnosing, training
 from pipelines.caller import DirectCaller
 from pipelines.diagnosing import diagnose_if_grown, greatest_growth, growth
+from pipelines.request import TrainRequest
 from pipelines.settings import DiagnoseRule, Settings
-from pipelines.training import TrainRequest
 from tests.toys.diagnoser import Toy, write_machine, write_recordings
 from tests.toys.tracked import log_training
 from tests.toys.training import toy_batches, toy_result
@@ -133,7 +133,7 @@ def test_training_ends_with_it(home: Path, store: Settings, tmp_path: Path, monk
         given.append((machine_file.stem, {t: r.target for t, r in now.items()}, ids))
         return None, "not diagnosed: this is a test"
 
-    monkeypatch.setattr(training, "diagnose_if_grown", asked)
+    monkeypatch.setattr(diagnosing, "diagnose_if_grown", asked)
     plan = Plan(("none",), ("zero",), ("leave-batch-out",))
     recordings = (write_recordings(tmp_path / "in"),)
     for name, twin in (("ends-twin", True), ("ends-bare", False)):

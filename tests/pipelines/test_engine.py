@@ -19,7 +19,8 @@ from models.grid import Workers
 from models.race import rounds
 from pipelines.caller import DirectCaller
 from pipelines.engine import ENGINES, DirectEngine, open_engine
-from pipelines.training import TrainOutcome, TrainRequest, train
+from pipelines.request import TrainRequest
+from pipelines.training import TrainOutcome, train
 from tests.conftest import make_toy_batches
 from tests.toys.command import in_process
 from tests.toys.postgres import free_port

@@ -15,7 +15,7 @@ from data.errors import InputError, WorkError
 from models.crossing import Plan
 from pipelines import training
 from pipelines.caller import RETRIES, DirectCaller
-from pipelines.training import TrainRequest
+from pipelines.request import TrainRequest
 from tests.toys.small_year import write_machine, write_year
 
 PLAN = Plan(("none", "correlation"), ("zero", "ridge", "pls"), ("leave-batch-out", "train-on-one"))

@@ -24,8 +24,9 @@ from models.crossing import Plan
 from models.promotion import choose
 from pipelines import checkpoint, local_store, model_store, registry, tracking
 from pipelines.caller import DirectCaller
+from pipelines.request import TrainRequest
 from pipelines.settings import NamesPart, Settings
-from pipelines.training import TrainRequest, train
+from pipelines.training import train
 from tests.toys.command import in_process
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training

@@ -21,7 +21,8 @@ from models.crossing import Plan
 from models.promotion import decide
 from pipelines import registry, runs, tracking
 from pipelines.caller import DirectCaller
-from pipelines.training import TrainRequest, train
+from pipelines.request import TrainRequest
+from pipelines.training import train
 from tests.toys.small_year import write_machine, write_year
 from tests.toys.tracked import log_training
 from tests.toys.training import machine_yaml, toy_batches, toy_model, toy_result

@@ -15,7 +15,8 @@ from data.lake import Lake
 from data.machine import load_machine
 from pipelines.caller import DirectCaller
 from pipelines.recordings import gather_batches, load_batches
-from pipelines.training import Plan, TrainRequest, promote_tracked, train
+from pipelines.request import TrainRequest
+from pipelines.training import Plan, promote_tracked, train
 from tests.toys.command import Call, in_process
 from tests.toys.small_year import write_machine, write_year
 

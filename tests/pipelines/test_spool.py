@@ -1,4 +1,4 @@
-"""A tracking server that does not answer: at the start one line, later the results wait and are delivered once."""
+"""Results on their way to the store: kept first, delivered once, whatever ends a process or a server."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ import mlflow
 import pytest
 from mlflow.tracking import MlflowClient
 
+from data.errors import WorkError
 from models.crossing import Plan
 from pipelines import registry, settings, spool, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.train import training_dict
 from pipelines.recordings import home_lake
+from pipelines.request import TrainRequest
 from pipelines.store import StoreOutage
-from pipelines.training import TrainRequest, promote_waiting, train
+from pipelines.training import promote_waiting, train
 from tests.toys.command import Call, in_process
 from tests.toys.mlflow_server import MlflowServer
 from tests.toys.postgres import free_port
@@ -65,10 +67,9 @@ def test_results_wait_and_are_delivered_once(
 ) -> None:
     monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
     with monkeypatch.context() as patch:
-        for name in ("log_record", "attach"):
-            patch.setattr(tracking, name, down)
+        patch.setattr(spool, "log_record", down)
         outcome = trained("small-spool", tmp_path, store)
-    assert outcome.postponed.startswith(f"{DOWN}; the results wait in {store_home / 'spool'}: the next `thermodrift ")
+    assert outcome.postponed.startswith(f"{DOWN}; 1 results wait in {store_home / 'spool'}: the next `thermodrift ")
     assert training_dict(outcome)["postponed"] == outcome.postponed
     assert not outcome.training_ids and not outcome.promotions and outcome.report.exists()
     names = [p.name for p in spool.waiting(store)]
@@ -79,7 +80,7 @@ def test_results_wait_and_are_delivered_once(
 
     done = call("status", "--json")
     assert done.code == 0 and [line.partition(":")[0] for line in done.err.splitlines()[:4]] == [
-        "delivers 3 results that were kept while the tracking server did not answer",
+        "delivers 3 results that the tracking store does not have yet",
         *(f"delivered {kind} of small-spool z" for kind in ("run", "promotion", "file")),
     ]
     (training,) = [t for t in json.loads(done.out)["trainings"] if t["machine"] == "small-spool"]
@@ -111,29 +112,85 @@ def test_a_promotion_that_does_not_reach_the_server_waits_and_one_that_is_refuse
         patch.setattr(registry, "promote", down)
         outcome = trained("small-later", tmp_path, store)
     assert list(outcome.training_ids) == ["z"] and not outcome.promotions and outcome.postponed.startswith(DOWN)
-    assert [p.name for p in spool.waiting(store)] == ["000001-promotion-small-later-z"]
-    with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 1 results wait in "):
+    assert [p.name[:16] for p in spool.waiting(store)] == ["000001-promotion", "000002-file-smal"]
+    with monkeypatch.context() as patch, pytest.raises(StoreOutage, match=r"refused\); 2 results wait in "):
         patch.setattr(spool, "open_store", down)
         spool.deliver(store, partial(promote_waiting, store))
-    assert len(spool.waiting(store)) == 1
+    assert len(spool.waiting(store)) == 2
     home_lake().forget_machine("small-later", "sold")
-    (line,) = spool.deliver(store, partial(promote_waiting, store))
+    promotion, report = spool.deliver(store, partial(promote_waiting, store))
+    line = promotion.line
     assert line.startswith("not delivered: promotion of small-later z (lake ") and "is withdrawn (sold)" in line
     (refused,) = (store_home / "spool" / "refused").iterdir()
     assert (refused / "reason.txt").read_text().strip() in line and not spool.waiting(store)
+    assert report.line.startswith("delivered file of small-later z: small-later-")
+
+
+def test_what_cannot_be_delivered_now_waits_with_what_follows_it_and_other_channels_do_not(
+    store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk: nothing is refused for good, and the order of a channel's results stays."""
+    own = replace(store, home=tmp_path)
+    for name in ("toy-a", "toy-b"):
+        record = tracking.training_record(
+            toy_result(toy_batches(name, 3), {"none|mlr|2": [1.0, 2.0, 1.5]}), store.promotion
+        )
+        spool.keep(own, "run", record, lambda to: None)
+        spool.keep(own, "file", record, lambda to: (to / "report.html").write_text("page"))
+    log = spool.log_record
+
+    def full(record: Any, *rest: Any) -> str:
+        if record.machine == "toy-a":
+            raise WorkError(f"{tmp_path}: cannot be written or read (No space left on device)")
+        return log(record, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(spool, "log_record", full)
+        lines = [d.line for d in spool.deliver(own, partial(promote_waiting, own))]
+    assert [line.partition("(")[0].partition(":")[0] for line in lines] == [
+        "not delivered", "delivered run of toy-b z", "delivered file of toy-b z"
+    ]  # fmt: skip
+    assert "No space left on device)); it waits in " in lines[0]
+    assert [p.name for p in spool.waiting(own)] == ["000001-run-toy-a-z", "000002-file-toy-a-z"]
+    assert len(spool.deliver(own, partial(promote_waiting, own))) == 2 and not spool.waiting(own)
+
+
+@pytest.mark.parametrize("lost", ["track", "promote", "report"])
+def test_a_training_that_is_killed_after_a_result_was_kept_loses_nothing(
+    lost: str, store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every result is kept before it is delivered: the next command delivers it."""
+    monkeypatch.setenv("THERMODRIFT_HOME", str(store_home))
+    name = f"small-killed-{lost}"
+    kind = {"track": "run", "promote": "promotion", "report": "file"}[lost]
+    deliver = spool._delivered
+
+    def killed(settings: Any, path: Path, item: Any, *rest: Any) -> Any:
+        if item.kind == kind:
+            raise KeyboardInterrupt
+        return deliver(settings, path, item, *rest)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(spool, "_delivered", killed)
+        trained(name, tmp_path, store)
+    assert [p.name.split("-")[1] for p in spool.waiting(store)] == [kind]
+    again = trained(name, tmp_path, store)
+    assert not spool.waiting(store) and not again.postponed
+    table = tracking.trainings(name, None, store)
+    assert table["training_id"].tolist() == [again.training_ids["z"]] and table["promotion"].tolist() == ["champion"]
+    versions = registry.status(store)
+    assert versions[versions["name"] == f"{name}-z"]["version"].tolist() == [1]
 
 
 def test_no_item_is_half_written(store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = toy_result(toy_batches("toy-torn", 3), {"none|mlr|2": [1.0, 2.0, 1.5]})
     record, own = tracking.training_record(result, store.promotion), replace(store, home=tmp_path)
-    files = tmp_path / "files"
-    files.mkdir()
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
         patch.setattr(Path, "write_text", _full)
-        spool.keep_run(own, record, files)
+        spool.keep(own, "run", record, lambda to: None)
     assert not [p for p in spool.folder(own).iterdir() if p.is_dir()]
-    spool.keep_run(own, record, files)
-    spool.keep_run(own, record, files)  # waits already
+    spool.keep(own, "run", record, lambda to: None)
+    spool.keep(own, "run", record, lambda to: None)  # waits already
     assert len(spool.waiting(own)) == 1
 
 
@@ -170,7 +227,9 @@ def test_a_real_server_that_goes_away(when: str, call: Call, tmp_path: Path, mon
             else:
                 caller = Interfering(when, server.kill)
             outcome = trained("small-gone", tmp_path, store, caller)
-        assert "does not answer (connection refused); the results wait in " in outcome.postponed
+        assert (
+            "does not answer (connection refused); " in outcome.postponed and " results wait in " in outcome.postponed
+        )
         assert len(outcome.training_ids) == (when == "promote") and not outcome.promotions
         assert call("status").code == 1
         server.start()

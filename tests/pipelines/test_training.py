@@ -20,7 +20,8 @@ from pipelines import registry, tracking
 from pipelines.caller import DirectCaller
 from pipelines.commands.predict import predict_file
 from pipelines.recordings import load_batches
-from pipelines.training import TrainOutcome, TrainRequest, promote_tracked, train
+from pipelines.request import TrainRequest
+from pipelines.training import TrainOutcome, promote_tracked, train
 from tests.toys.small_year import NOISE_UM, law_um, write_machine, write_year
 
 NAME = "small-train"

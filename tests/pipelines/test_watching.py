@@ -24,7 +24,7 @@ from pipelines.caller import DirectCaller
 from pipelines.fleet import Fleet, FleetMachine
 from pipelines.fleet_view import fleet_view
 from pipelines.recordings import home_lake, load_batches
-from pipelines.training import TrainRequest
+from pipelines.request import TrainRequest
 from tests.toys.small_year import recording, write_machine, write_year
 
 NAME = "watched"

@@ -1,11 +1,15 @@
-"""A training tracked in one call, without the steps around it."""
+"""A training or a diagnosis tracked in one call, without the steps around it."""
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from data.batch import Batch
+from diagnosis.result import Diagnosis
 from models.result import GridResult
 from pipelines import tracking
 from pipelines.settings import Settings
@@ -23,3 +27,17 @@ def log_training(
         tracking.training_files(Path(scratch), result, figures or {})
         record = tracking.training_record(result, settings.promotion, params)
         return tracking.log_record(record, Path(scratch), settings, say)
+
+
+def log_diagnosis(
+    d: Diagnosis,
+    batches: Sequence[Batch],
+    files: Mapping[str, Path],
+    settings: Settings,
+    params: Mapping[str, Any] | None = None,
+) -> str:
+    """The id of a diagnosis' run."""
+    with tempfile.TemporaryDirectory() as scratch:
+        for path in files.values():
+            shutil.copy(path, scratch)
+        return tracking.log_record(tracking.diagnosis_record(d, batches, params), Path(scratch), settings)
