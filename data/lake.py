@@ -1,5 +1,4 @@
-"""Parquet lake: versioned storage of batches, atomic and safe for concurrent writers, in a folder or any other place
-that `lakestore` reaches.
+"""Parquet lake: versioned storage of batches, atomic and safe for concurrent writers, in a folder or an object store.
 
     ROOT/machine=NAME/year=YYYY/BATCH.parquet      the current version, for any reader (hive partitions)
     ROOT/_versions/machine=NAME/BATCH/*.parquet    every version ever stored, read-only
@@ -13,12 +12,14 @@ Names with a leading underscore are skipped by the dataset discovery of pyarrow 
 A version is identified by its content (see `lakefile.content_digest`). New findings, repairs or channel descriptions
 for the same content *refresh* the version: number and digest stay, a new file holds the new remarks, and the earlier
 file is kept. Replacing a machine's manifest commits a write: `load` gives the old state before it and the new state
-after. A machine costs the same however many others there are.
+after. A machine costs the same however many others there are. Where two writers change a manifest at once, the second
+one makes its change again on what the first has written.
 The current file is replaced next. If the process is killed in between, plain readers see the old version until the
 machine's next write, which finds the batch under `pending`.
 
 The manifest has the hash of every file, and `load` verifies it: a file that was changed or cut after its ingest is
-refused, and the next ingest of its source *heals* it, which writes it anew.
+refused, and the next ingest of its source *heals* it, which writes it anew. With a key, every manifest carries an HMAC
+of its content, and one without the right HMAC is refused.
 
 A withdrawn batch keeps its versions but has no current file, and nothing loads it; `restore` brings it back, `purge`
 deletes its content. Withdrawn content is not stored again.
@@ -28,23 +29,28 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from data import manifest as listing
 from data.batch import Batch
 from data.errors import InputError, WorkError, closest
 from data.lakefile import content_digest, decode, encode, measured_digest, remarks_digest, safe_name, unreadable
-from data.lakestore import LOCK_WAIT_S, Folder, Locked, open_store
-from data.manifest import Entry, Staged, Stored, Version
+from data.lakestore import LOCK_WAIT_S, Folder, Locked, Stamp, open_store
+from data.manifest import Batches, Entry, Staged, Stored, Version
 
 LOG = "reasons.jsonl"
 MANIFEST = "_manifest.json"
 MANIFESTS = "_manifest"
+POLL_S = 0.1  # mean wait before a change is made again after another writer's
+R = TypeVar("R")
 COPY_MAX_BYTES = 64 << 20  # of a file in quarantine: a year of one machine at 1 min is smaller
 
 
@@ -91,15 +97,16 @@ class Lake:
     """Batches of all machines under one root, which the first write makes.
 
     Args:
-        root: a folder, or an address of fsspec such as ``s3://bucket/lake``.
+        root: a folder, or an address such as ``s3://bucket/lake``.
+        key: signs the manifests; empty: they carry plain hashes.
 
     Raises:
-        InputError: an address of a file system that is unknown or not installed.
+        InputError: an address that is unknown, or whose package is not installed.
     """
 
-    def __init__(self, root: Path | str) -> None:
-        self._store = open_store(root)
-        self._known: dict[str, tuple[Hashable, dict[str, str]]] = {}
+    def __init__(self, root: Path | str, key: str = "") -> None:
+        self._store, self._key = open_store(root), key
+        self._known: dict[str, tuple[Stamp, dict[str, str]]] = {}
 
     @property
     def name(self) -> str:
@@ -137,7 +144,7 @@ class Lake:
         file = f"{listing.folder_of(batch.machine, batch.batch_id)}/{digest[:12]}-{remarks_digest(batch)[:8]}.parquet"
         noted = self._noted(file)
         sha256 = self._intact(file, digest, noted)
-        healed = sha256 is None and (noted is not None or self._store.exists(file))
+        healed = sha256 is None and noted is not None
         if sha256 is None:
             body = encode(batch, digest)
             sha256 = hashlib.sha256(body).hexdigest()
@@ -154,28 +161,29 @@ class Lake:
 
         With `distinct`, the measured values of a batch are stored under one id only (see `manifest.enter`).
         """
-        if not staged:
-            return []
-        with self._changing(*{s.machine for s in staged}) as (manifest, touch):
-            copies = {m: self._copies(manifest, m) for m in {s.machine for s in staged}} if distinct else {}
-            stored = [listing.enter(manifest, s, _now(), copies.get(s.machine)) for s in staged]
-            entered = [s for s, done in zip(staged, stored, strict=True) if not done.left_out]
-            gone = [s.file for s in entered if not self._store.exists(s.file)]
-            if gone:
-                raise WorkError(f"lake {self.name}: {gone[0]} was deleted during the ingest; ingest again")
-            for s in entered:
-                touch(s.machine, s.batch_id)
-        self.discard([s for s, done in zip(staged, stored, strict=True) if done.left_out])
-        return stored
+        stored: dict[int, Stored] = {}
+        for machine in dict.fromkeys(s.machine for s in staged):
+            own = {k: s for k, s in enumerate(staged) if s.machine == machine}
+            stored |= self._change(machine, partial(self._enter, own, distinct))
+        self.discard([s for k, s in enumerate(staged) if stored[k].left_out])
+        return [stored[k] for k in range(len(staged))]
+
+    def _enter(self, own: dict[int, Staged], distinct: bool, batches: Batches) -> tuple[dict[int, Stored], set[str]]:
+        copies, at = listing.copies_of(batches) if distinct else None, _now()
+        stored = {k: listing.enter(batches, s, at, copies) for k, s in own.items()}
+        entered = [s for k, s in own.items() if not stored[k].left_out]
+        gone = [s.file for s in entered if not self._store.exists(s.file)]
+        if gone:
+            raise WorkError(f"lake {self.name}: {gone[0]} was deleted during the ingest; ingest again")
+        return stored, {s.batch_id for s in entered}
 
     def discard(self, staged: Sequence[Staged]) -> None:
-        """Delete the files of staged batches that no version uses."""
-        if not staged:
+        """Delete the files of staged batches that no version uses, where no other writer can just be using them."""
+        if not staged or not self._store.exclusive:
             return
         with self._writing():
             for s in staged:
-                batches = self._manifest(s.machine)["machines"].get(s.machine, {})
-                if s.file not in listing.files_kept(batches.get(s.batch_id, [])):
+                if s.file not in listing.files_kept(self._held(s.machine).get(s.batch_id, [])):
                     self._store.delete(s.file)
 
     def withdraw(self, machine: str, batch_ids: Sequence[str], reason: str) -> list[str]:
@@ -192,14 +200,14 @@ class Lake:
         """
         if not reason.strip():
             raise InputError("withdraw: the reason is empty; state why the batches are not to be used")
-        with self._changing(machine) as (manifest, touch):
-            batches = self._batches(machine, manifest)
+
+        def edit(batches: Batches) -> tuple[list[str], set[str]]:
             where = f"lake {self.name}: {machine} has no batch in use that fits"
             ids = listing.chosen(list(listing.active(batches)), batch_ids, where)
             listing.withdraw(batches, ids, reason.strip(), _now())
-            for batch_id in ids:
-                touch(machine, batch_id)
-        return ids
+            return ids, set(ids)
+
+        return self._change(machine, edit, known=True)
 
     def forget_machine(self, machine: str, reason: str) -> list[str]:
         """Withdraw every batch of a machine; see `withdraw`."""
@@ -214,14 +222,13 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-        with self._changing(machine) as (manifest, touch):
-            batches, ids = self._withdrawn(manifest, machine, batch_ids)
+
+        def edit(batches: Batches) -> tuple[list[str], set[str]]:
+            ids = self._withdrawn(batches, machine, batch_ids)
             listing.restore(batches, ids)
-            if not batches:
-                del manifest["machines"][machine]
-            for batch_id in ids:
-                touch(machine, batch_id)
-        return ids
+            return ids, set(ids)
+
+        return self._change(machine, edit, known=True)
 
     def purge(self, machine: str, batch_ids: Sequence[str], quarantined: bool = False) -> list[str]:
         """Delete the content of withdrawn batches for good; reason, source and digest stay, and keep them out.
@@ -235,12 +242,13 @@ class Lake:
             InputError: an unknown machine, or no withdrawn batch fits one of `batch_ids`.
             WorkError: see `put`.
         """
-        with self._changing(machine) as (manifest, touch):
-            self._copies(manifest, machine)  # states the digests of measured values, which outlive the content
-            batches, ids = self._withdrawn(manifest, machine, batch_ids)
+
+        def edit(batches: Batches) -> tuple[list[str], set[str]]:
+            ids = self._withdrawn(batches, machine, batch_ids)
             listing.purge(batches, ids, _now())
-            for batch_id in ids:
-                touch(machine, batch_id)
+            return ids, set(ids)
+
+        ids = self._change(machine, edit, known=True)
         if quarantined:
             with self._writing():
                 folder = _quarantine(machine)
@@ -296,11 +304,11 @@ class Lake:
     def machines(self, withdrawn: bool = False) -> list[str]:
         """Names of machines with at least one batch in use; with `withdrawn` also those with withdrawn ones alone."""
         machines = self._every_machine()
-        return sorted(m for m, batches in machines.items() if withdrawn or listing.active(batches))
+        return sorted(m for m, batches in machines.items() if batches if withdrawn or listing.active(batches))
 
     def batch_ids(self, machine: str) -> list[str]:
         """Ids of a machine's batches in use, sorted; empty for an unknown machine."""
-        return sorted(listing.active(self._manifest(machine)["machines"].get(machine, {})))
+        return sorted(listing.active(self._held(machine)))
 
     def contents(self, machine: str) -> dict[str, list[Version]]:
         """Every version of every batch of a machine by id, oldest first, withdrawn ones included.
@@ -326,80 +334,69 @@ class Lake:
         """As `quarantine`, of files with reasons. Copy and log can be read by their owner alone."""
         if not refused:
             return []
-        folder = _quarantine(machine)
+        folder, kept = _quarantine(machine), list[Path]()
         at = self._store.path(folder)
         with self._writing():
-            entries = self.quarantined(machine)
-            known, held, kept = {replace(e, at="") for e in entries}, set(self._store.files(folder)), []
+            held, found = set(self._store.files(folder)), list[Quarantined]()
             for path, reason in refused:
                 entry = entry_for(path, machine, reason, at, safe_name(ascii_if_broken(path.name)))
                 if entry.copy is not None and entry.copy.name not in held:
                     self._store.write(f"{folder}/{entry.copy.name}", path, private=True)
                     held.add(entry.copy.name)
-                if replace(entry, at="") not in known:
-                    known.add(replace(entry, at=""))
-                    entries.append(entry)
+                found.append(entry)
                 kept.append(entry.copy or at / LOG)
-            self._store.write(f"{folder}/{LOG}", log_text(entries).encode(), keep=False, private=True)
+            for again in self._attempts():
+                raw, stamp = self._store.read_stamped(f"{folder}/{LOG}")
+                entries = self._entries_of(raw, folder)
+                known = {replace(e, at="") for e in entries}
+                entries += [e for e in dict.fromkeys(found) if replace(e, at="") not in known]
+                if self._store.swap(f"{folder}/{LOG}", log_text(entries).encode(), stamp, private=True):
+                    break
+                again()
         return kept
 
     def quarantined(self, machine: str) -> list[Quarantined]:
         """Quarantined files of a machine, oldest first."""
         folder = _quarantine(machine)
-        try:
-            text = self._store.read(f"{folder}/{LOG}").decode()
-        except FileNotFoundError:
-            return []
-        at, rows = self._store.path(folder), [json.loads(line) for line in text.splitlines() if line]
+        return self._entries_of(self._store.read_stamped(f"{folder}/{LOG}")[0], folder)
+
+    def _entries_of(self, log: bytes | None, folder: str) -> list[Quarantined]:
+        at, rows = self._store.path(folder), [json.loads(line) for line in (log or b"").decode().splitlines() if line]
         return [Quarantined(**{**row, "copy": at / row["copy"] if row["copy"] else None}) for row in rows]
 
-    def _manifest(self, machine: str) -> dict[str, Any]:
-        """The manifest of a machine, without any batch where there is none."""
-        whole = self._manifest_of_all()
-        if whole is None:
-            return self._json(_manifest_file(machine), listing.SCHEMA) or listing.empty()
-        batches = whole["machines"].get(machine)
-        pending = [[m, batch_id] for m, batch_id in whole["pending"] if m == machine]
-        return {**listing.empty(), "pending": pending, "machines": {} if batches is None else {machine: batches}}
+    def _manifest(self, machine: str) -> tuple[dict[str, Any], Stamp]:
+        """The manifest of a machine, without any batch where there is none, and its state in the store."""
+        found, stamp = self._json(manifest_file(machine))
+        if found is None:
+            self._json(MANIFEST)  # a lake of an earlier version is none without this machine
+        return found or listing.empty(), stamp
 
-    def _every_machine(self) -> dict[str, dict[str, list[Entry]]]:
+    def _held(self, machine: str) -> Batches:
+        """The batches of a machine, withdrawn ones included."""
+        batches: Batches = self._manifest(machine)[0]["machines"].get(machine, {})
+        return batches
+
+    def _every_machine(self) -> dict[str, Batches]:
         """The batches of every machine; the only look-up whose cost grows with the machines."""
-        whole = self._manifest_of_all()
-        if whole is not None:
-            found: dict[str, dict[str, list[Entry]]] = whole["machines"]
-            return found
-        each = (self._json(f"{MANIFESTS}/{name}", listing.SCHEMA) for name in self._store.files(MANIFESTS))
+        self._json(MANIFEST)
+        each = (self._json(f"{MANIFESTS}/{name}")[0] for name in self._store.files(MANIFESTS))
         return {m: batches for manifest in each if manifest for m, batches in manifest["machines"].items()}
 
-    def _manifest_of_all(self) -> dict[str, Any] | None:
-        """That of an earlier program, until the next write; else None."""
-        head = self._json(MANIFEST, listing.SCHEMA, listing.SCHEMA_OF_ALL)
-        return head if head is not None and head["schema"] == listing.SCHEMA_OF_ALL else None
-
-    def _json(self, file: str, *schemas: str) -> dict[str, Any] | None:
+    def _json(self, file: str) -> tuple[dict[str, Any] | None, Stamp]:
         """A manifest, None where there is none."""
-        where = f"{self.name}/{file}"
+        where = f"lake {self.name}/{file}"
         try:
-            manifest: dict[str, Any] = json.loads(self._store.read(file))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError) as error:
-            raise WorkError(f"lake {where}: cannot be read ({error}); restore it from a backup") from None
-        if manifest.get("schema") not in schemas:
-            raise WorkError(
-                f"lake {where}: got schema {manifest.get('schema')!r}, expected {schemas[0]!r}; use another lake folder"
-            )
-        if "machines" in manifest and (strange := listing.stray(manifest)):
-            raise WorkError(f"lake {where}: {strange}; it was changed by another program; restore it from a backup")
-        return manifest
+            raw, stamp = self._store.read_stamped(file)
+        except OSError as error:
+            raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None
+        return None if raw is None else listing.unpack(raw, where, self._key if file != MANIFEST else ""), stamp
 
-    def _batches(self, machine: str, manifest: dict[str, Any] | None = None) -> dict[str, list[Entry]]:
-        machines = (manifest or self._manifest(machine))["machines"]
-        if machine not in machines:
-            others = self._every_machine()
+    def _batches(self, machine: str) -> Batches:
+        batches = self._held(machine)
+        if not batches:
+            others = self.machines(withdrawn=True)
             hint = closest(machine, others) if others else "it is empty"
             raise InputError(f"lake {self.name}: no batch of machine {machine!r}; {hint}. Run thermodrift ingest first")
-        batches: dict[str, list[Entry]] = machines[machine]
         return batches
 
     def _entries(self, machine: str, batch_id: str) -> list[Entry]:
@@ -419,19 +416,16 @@ class Lake:
             f"restore it from a backup or ingest its source {entry['source'] or '(unknown)'} again, "
             "which writes it anew where the content is the same"
         )
-        noted = entry.get("sha256", {}).get(entry["file"])
+        noted = entry["sha256"][entry["file"]]
         body = self._body(entry["file"]) if body is None else body
         if isinstance(body, OSError):
             raise unreadable(where, body, f"{name}: ", remedy)
-        if noted is not None and (got := hashlib.sha256(body).hexdigest()) != noted:
+        if (got := hashlib.sha256(body).hexdigest()) != noted:
             raise WorkError(
                 f"lake file {where}: {name} cannot be read (the file was changed or cut after its ingest: sha256 "
                 f"{got[:12]}…, expected {noted[:12]}…); {remedy}"
             )
-        batch = replace(decode(body, where, entry["version"]), source=entry["source"])
-        if noted is None and content_digest(batch) != entry["digest"]:  # a lake of an earlier program
-            raise WorkError(f"lake file {where}: {name} cannot be read (other content than was ingested); {remedy}")
-        return batch
+        return replace(decode(body, where, entry["version"]), source=entry["source"])
 
     def _body(self, file: str) -> bytes | OSError:
         try:
@@ -452,16 +446,12 @@ class Lake:
 
     def _noted(self, file: str) -> str | None:
         """The hash of a stored file as its machine's manifest has it; that is read where it has changed."""
-        if self._store.stamp(MANIFEST) is None:
-            return None
-        whole = self._manifest_of_all() is not None
-        manifest = MANIFEST if whole else f"{MANIFESTS}/{file.split('/')[1]}.json"
+        manifest = f"{MANIFESTS}/{file.split('/')[1]}.json"
         look = self._store.stamp(manifest)
         if look is None:
             return None
         if self._known.get(manifest, (None, {}))[0] != look:
-            listed = self._json(manifest, listing.SCHEMA, listing.SCHEMA_OF_ALL) or listing.empty()
-            machines = listed["machines"].values()
+            machines = (self._json(manifest)[0] or listing.empty())["machines"].values()
             found = listing.hashes(e for batches in machines for entries in batches.values() for e in entries)
             self._known[manifest] = look, found
         return self._known[manifest][1].get(file)
@@ -484,62 +474,51 @@ class Lake:
             return None
         return sha256 if sha256 == noted else None
 
-    def _withdrawn(
-        self, manifest: dict[str, Any], machine: str, batch_ids: Sequence[str]
-    ) -> tuple[dict[str, list[Entry]], list[str]]:
-        """A machine's batches, and the ids with withdrawn versions among those wanted."""
-        batches = self._batches(machine, manifest)
+    def _withdrawn(self, batches: Batches, machine: str, batch_ids: Sequence[str]) -> list[str]:
+        """The ids with withdrawn versions among those wanted."""
         gone = [i for i, entries in batches.items() if any("withdrawn" in e for e in entries)]
-        return batches, listing.chosen(gone, batch_ids, f"lake {self.name}: {machine} has no withdrawn batch that fits")
+        return listing.chosen(gone, batch_ids, f"lake {self.name}: {machine} has no withdrawn batch that fits")
 
-    def _copies(self, manifest: dict[str, Any], machine: str) -> listing.Copies:
-        """Versions by their measured values; a lake of an earlier program gets the digests."""
-        batches = manifest["machines"].get(machine, {})
-        for entry in (e for entries in batches.values() for e in entries if "measured" not in e):
-            try:
-                entry["measured"] = measured_digest(self._read(entry, machine))
-            except WorkError:
-                continue  # a damaged file has no values to compare; `load` reports it
-        return listing.copies_of(batches)
+    def _change(self, machine: str, edit: Callable[[Batches], tuple[R, set[str]]], known: bool = False) -> R:
+        """Change a machine's batches and commit that, then let the current files of the changed batches follow.
 
-    @contextmanager
-    def _changing(self, *machines: str) -> Iterator[tuple[dict[str, Any], Callable[[str, str], None]]]:
-        """Exclusive access to the manifest of these machines and a function that names the batches touched.
-
-        Changes are committed when the block ends, machine by machine, then the current files of these batches follow.
+        Args:
+            edit: changes the batches in place; returns its result and the ids that it changed. It is called again where
+                another writer was quicker.
+            known: raise InputError where the lake has nothing of the machine.
         """
         with self._writing():
-            self._split()
-            stored = {m: self._manifest(m) for m in machines}
-            manifest = listing.empty()
-            for own in stored.values():
-                manifest["machines"] |= own["machines"]
-                manifest["pending"] += own["pending"]
-            self._publish(manifest, manifest["pending"])
-            before, touched = json.dumps(manifest["machines"]), set[tuple[str, str]]()
-            yield manifest, lambda machine, batch_id: touched.add((machine, batch_id))
-            if json.dumps(manifest["machines"]) != before:
-                for m in machines:
-                    own = {k: v for k, v in manifest["machines"].items() if k == m}
-                    self._write_manifest(m, own, sorted(t for t in touched if t[0] == m))
-                head = json.dumps({"schema": listing.SCHEMA, "changed_at": datetime.now(UTC).isoformat()})
-                self._store.write(MANIFEST, head.encode(), keep=False)
-            self._publish(manifest, touched)
+            behind = set[str]()
+            for again in self._attempts():
+                manifest, stamp = self._manifest(machine)
+                if known and not manifest["machines"].get(machine):
+                    self._batches(machine)
+                batches: Batches = manifest["machines"].setdefault(machine, {})
+                self._publish(machine, batches, manifest["pending"])
+                behind |= set(manifest["pending"])  # once more below: another writer may have changed them meanwhile
+                before = json.dumps(batches)
+                result, touched = edit(batches)
+                if json.dumps(batches) == before:
+                    break
+                packed = listing.pack({**manifest, "pending": sorted(touched)}, self._key)
+                if self._store.swap(manifest_file(machine), packed, stamp):
+                    head = json.dumps({"schema": listing.SCHEMA, "changed_at": datetime.now(UTC).isoformat()})
+                    self._store.write(MANIFEST, head.encode(), keep=False)
+                    break
+                again()
+            while True:
+                self._publish(machine, batches, touched if self._store.exclusive else touched | behind)
+                now = batches if self._store.exclusive else self._held(machine)
+                if now == batches:
+                    return result
+                batches = now  # another writer's, whose current files these may have replaced
 
-    def _write_manifest(self, machine: str, own: dict[str, dict[str, list[Entry]]], pending: Sequence[Any]) -> None:
-        file, body = _manifest_file(machine), {"schema": listing.SCHEMA, "pending": pending, "machines": own}
-        if own:
-            self._store.write(file, json.dumps(body).encode(), keep=False)
-        else:
-            self._store.delete(file)
-
-    def _split(self) -> None:
-        """Give each machine the manifest of its own that an earlier program did not write."""
-        whole = self._manifest_of_all()
-        if whole is not None:
-            for m, batches in whole["machines"].items():
-                self._write_manifest(m, {m: batches}, [p for p in whole["pending"] if p[0] == m])
-            self._store.write(MANIFEST, json.dumps({"schema": listing.SCHEMA}).encode(), keep=False)
+    def _attempts(self) -> Iterator[Callable[[], None]]:
+        """Attempts at a change that another writer may be quicker with; each gives what waits before the next one."""
+        end_s = time.monotonic() + LOCK_WAIT_S
+        while time.monotonic() < end_s:
+            yield lambda: time.sleep(random.uniform(0.0, 2.0 * POLL_S))
+        raise Locked
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -554,11 +533,11 @@ class Lake:
         except OSError as error:
             raise WorkError(f"lake {self.name}: cannot be written ({error}); nothing stored was lost") from error
 
-    def _publish(self, manifest: dict[str, Any], batches: Iterable[Sequence[str]]) -> None:
+    def _publish(self, machine: str, batches: Batches, ids: Iterable[str]) -> None:
         """Replace the current files of these batches by those that the manifest names; delete purged files."""
         store, changed = self._store, list[str]()
-        for machine, batch_id in batches:
-            entries: list[Entry] = manifest["machines"].get(machine, {}).get(batch_id, [])
+        for batch_id in ids:
+            entries = batches.get(batch_id, [])
             purged = {f for e in entries for f in (*e["earlier"], e["file"])} - listing.files_kept(entries)
             for file in purged:
                 store.delete(file)
@@ -582,7 +561,8 @@ class Lake:
         store.settle(changed)
 
 
-def _manifest_file(machine: str) -> str:
+def manifest_file(machine: str) -> str:
+    """Where the manifest of a machine is, below the root."""
     return f"{MANIFESTS}/machine={safe_name(machine)}.json"
 
 

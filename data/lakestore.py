@@ -1,36 +1,35 @@
-"""Where a lake's files are: in a folder of this computer, or on any file system that fsspec reaches.
+"""Where a lake's files are: in a folder of this computer, or in an object store.
 
 Files have names relative to the root, with slashes. A write is complete or absent, whenever the process ends: in a
-folder by a rename, in an object store because a put is, elsewhere by a move.
+folder by a rename, in an object store because a put is. What several writers change, they change one after another: in
+a folder under a lock, in an object store by a put that succeeds only where the object is as it was read.
 """
 
 from __future__ import annotations
 
 import filecmp
-import json
 import os
 import re
 import shutil
-import socket
-import threading
-import time
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from datetime import timedelta
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
-from uuid import uuid4
 
 from filelock import FileLock, Timeout
 
 from data.errors import InputError
 
 LOCK_WAIT_S = 600.0  # for another writer
-RENEWED_S = 15.0  # between two signs of life of the holder of a remote lock
-DEAD_S = 120.0  # without one, the holder is taken to have ended
-POLL_S = 0.5  # between two looks at a remote lock
-PUT_IS_ATOMIC = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
-_PACKAGES = {"s3": "thermodrift[s3]", "s3a": "thermodrift[s3]"}
+ANSWER_S = 10.0  # for an object store to answer at all
+REQUEST_S = 300.0  # for one request to end: a large file over a slow line
+AT_ONCE = 16  # reads of an object store
+_INSTALL = "pip install 'thermodrift[s3]'"
 _TMP = "_tmp"
+Stamp = tuple[tuple[str, Any], ...] | None  # state of a file; None where there is none
 
 
 class Locked(Exception):
@@ -41,6 +40,7 @@ class Store(Protocol):
     """Files below one root. What cannot be done raises OSError."""
 
     name: str  # as messages have it, without secrets
+    exclusive: bool  # within `locked` nobody else writes
 
     def read(self, file: str) -> bytes:
         """The content; raises FileNotFoundError where there is none."""
@@ -48,12 +48,15 @@ class Store(Protocol):
     def read_many(self, files: Sequence[str]) -> Iterable[bytes | OSError]:
         """The contents, in the files' order, or why one cannot be read."""
 
+    def read_stamped(self, file: str) -> tuple[bytes | None, Stamp]:
+        """The content and the state that it is of, see `swap`; None where there is no such file."""
+
     def exists(self, file: str) -> bool: ...
 
     def size(self, file: str) -> int:
         """In bytes; 0 where there is no such file."""
 
-    def stamp(self, file: str) -> Hashable:
+    def stamp(self, file: str) -> Stamp:
         """Changes whenever the file does; None where there is none."""
 
     def files(self, folder: str) -> list[str]:
@@ -64,6 +67,9 @@ class Store(Protocol):
 
         `keep`: nobody is to write it again; `private`: only its owner reads it, where there are such rights.
         """
+
+    def swap(self, file: str, body: bytes, stamp: Stamp, private: bool = False) -> bool:
+        """Put bytes there unless the file is no longer as it was read, within `locked`; False where it is not."""
 
     def repeat(self, file: str, source: str) -> bool:
         """Make `file` hold what the file `source` holds, in one step; False where it does already."""
@@ -79,12 +85,14 @@ class Store(Protocol):
     def path(self, file: str) -> Path:
         """Where it is on this computer; below the root, where the root is elsewhere."""
 
-    def locked(self) -> Any:
-        """A context that one writer at a time is in; raises Locked."""
+    def locked(self) -> AbstractContextManager[None]:
+        """A context that one writer at a time is in, where the place is `exclusive`; raises Locked."""
 
 
 class Folder:
     """A folder of this computer, made by the first write."""
+
+    exclusive = True
 
     def __init__(self, root: Path) -> None:
         self.root, self.name = root, str(root)
@@ -100,6 +108,12 @@ class Folder:
             except OSError as error:
                 yield error
 
+    def read_stamped(self, file: str) -> tuple[bytes | None, Stamp]:
+        try:
+            return self.read(file), self.stamp(file)
+        except FileNotFoundError:
+            return None, None
+
     def exists(self, file: str) -> bool:
         return (self.root / file).exists()
 
@@ -107,12 +121,12 @@ class Folder:
         path = self.root / file
         return path.stat().st_size if path.exists() else 0
 
-    def stamp(self, file: str) -> Hashable:
+    def stamp(self, file: str) -> Stamp:
         try:
             seen = (self.root / file).stat()
         except OSError:
             return None
-        return seen.st_ino, seen.st_size, seen.st_mtime_ns
+        return ("inode", seen.st_ino), ("size", seen.st_size), ("mtime_ns", seen.st_mtime_ns)
 
     def files(self, folder: str) -> list[str]:
         path = self.root / folder
@@ -134,6 +148,10 @@ class Folder:
             temporary.chmod(0o444)
         temporary.replace(target)
         _sync(target.parent)
+
+    def swap(self, file: str, body: bytes, stamp: Stamp, private: bool = False) -> bool:
+        self.write(file, body, keep=False, private=private)
+        return True
 
     def repeat(self, file: str, source: str) -> bool:
         target, version = self.root / file, self.root / source
@@ -181,96 +199,86 @@ class Folder:
             raise Locked from None
 
 
-class Remote:
-    """A place on a file system of fsspec; addresses such as s3://bucket/lake, credentials as that system takes them.
+class Bucket:
+    """Objects below an address that obstore reaches (``s3://``, ``gs://``, ``az://``), with its variables and, for S3,
+    the credentials that boto3 finds. No lock: what two writers may change is put only where nobody else has."""
 
-    The lock is an object, `_lock`, that only one writer can create. Its holder renews it; one that is not renewed for
-    `DEAD_S`, by the waiter's own clock, is removed. A holder that was taken for dead notices before it writes.
-    """
+    exclusive = False
 
     def __init__(self, address: str) -> None:
-        self.name = re.sub(r"(://[^:/@]*):.*@", r"\1:***@", address)
-        protocol = address.partition("://")[0]
+        self.name = _masked(address)
         try:
-            import fsspec
-
-            # Without a cache of listings: what another computer wrote must be seen.
-            self._fs, self._root = fsspec.url_to_fs(address, use_listings_cache=False)
-        except ImportError as error:
-            install = f"run pip install {_PACKAGES[protocol]!r}" if protocol in _PACKAGES else str(error)
-            raise InputError(f"lake {self.name}: the file system {protocol} is not installed; {install}") from None
-        except ValueError as error:
+            self._objects = _opened(address)
+        except ImportError:
+            raise InputError(f"lake {self.name}: obstore is not installed; run {_INSTALL}") from None
+        except Exception as error:  # obstore's own, of no common class with a meaning
             raise InputError(
-                f"lake {self.name}: got {protocol}://, which is no file system that fsspec knows ({error}); expected a "
-                "folder or an address such as s3://bucket/lake"
+                f"lake {self.name}: no place that obstore knows ({_masked(_first_line(error))}); expected a folder or "
+                "an address such as s3://bucket/lake"
             ) from None
-        self._atomic = protocol in PUT_IS_ATOMIC
-        self._mine = b""
-        self._lost = threading.Event()
 
     def read(self, file: str) -> bytes:
-        body: bytes = self._do(self._fs.cat_file, self._at(file))
-        return body
+        return bytes(self._do("get", file).bytes())
 
     def read_many(self, files: Sequence[str]) -> list[bytes | OSError]:
         """All at once, since most of the time is waiting."""
-        paths = [self._at(f) for f in files]
-        found = self._do(self._fs.cat, paths, on_error="return") if paths else {}
-        bodies = [found.get(p, FileNotFoundError(p)) for p in paths]
-        return [b if isinstance(b, bytes | OSError) else OSError(str(b)) for b in bodies]
+
+        def read(file: str) -> bytes | OSError:
+            try:
+                return self.read(file)
+            except OSError as error:
+                return error
+
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            return list(pool.map(read, files))
+
+    def read_stamped(self, file: str) -> tuple[bytes | None, Stamp]:
+        try:
+            found = self._do("get", file)
+            return bytes(found.bytes()), _stamp(found.meta)
+        except FileNotFoundError:
+            return None, None
 
     def exists(self, file: str) -> bool:
-        return bool(self._do(self._fs.exists, self._at(file)))
+        return self.stamp(file) is not None
 
     def size(self, file: str) -> int:
-        try:
-            return int(self._do(self._fs.info, self._at(file))["size"] or 0)
-        except FileNotFoundError:
-            return 0
+        return int(self._head(file).get("size", 0))
 
-    def stamp(self, file: str) -> Hashable:
-        try:
-            stamp: str = self._do(self._fs.ukey, self._at(file))
-        except OSError:
-            return None
-        return stamp
+    def stamp(self, file: str) -> Stamp:
+        found = self._head(file)
+        return _stamp(found) if found else None
 
     def files(self, folder: str) -> list[str]:
-        try:
-            found = self._do(self._fs.ls, self._at(folder), detail=True)
-        except FileNotFoundError:
-            return []
-        return sorted(str(f["name"]).rpartition("/")[2] for f in found if f["type"] == "file")
+        found = self._do("list_with_delimiter", folder)["objects"]
+        return sorted(str(f["path"]).rpartition("/")[2] for f in found)
 
     def write(self, file: str, body: Any, keep: bool = True, private: bool = False) -> None:
-        self._check_held()
-        at = self._at(file) if self._atomic else self._at(f"{_TMP}/{uuid4().hex}")
-        if not self._atomic:
-            self._do(self._fs.makedirs, at.rpartition("/")[0], exist_ok=True)
-        if isinstance(body, Path):
-            self._do(self._fs.put_file, str(body), at)
-        else:
-            self._do(self._fs.pipe_file, at, bytes(body))
-        if not self._atomic:
-            self._do(self._fs.makedirs, self._at(file).rpartition("/")[0], exist_ok=True)
-            self._do(self._fs.mv, at, self._at(file))
+        self._do("put", file, body if isinstance(body, Path) else bytes(body))
+
+    def swap(self, file: str, body: bytes, stamp: Stamp, private: bool = False) -> bool:
+        import obstore.exceptions
+
+        mode = "create" if stamp is None else {k: v for k, v in stamp if v is not None}
+        try:
+            self._do("put", file, body, mode=mode)
+        except (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError, FileNotFoundError):
+            return False
+        return True
 
     def repeat(self, file: str, source: str) -> bool:
-        a, b = self._info(file), self._info(source)
-        same_tag = a.get("ETag") is not None and a.get("ETag") == b.get("ETag")
-        if a and a["size"] == b.get("size") and (same_tag or self.read(file) == self.read(source)):
+        there, wanted = self._head(file), self._head(source)
+        if there and (there["e_tag"], there["size"]) == (wanted.get("e_tag"), wanted.get("size")):
             return False
-        self.write(file, self.read(source))
+        self._do("copy", source, file)
         return True
 
     def move(self, file: str, target: str) -> None:
-        self.repeat(target, file)
-        self.delete(file)
+        self._do("rename", file, target)
 
     def delete(self, file: str) -> None:
-        self._check_held()
         with suppress(FileNotFoundError):
-            self._do(self._fs.rm_file, self._at(file))
+            self._do("delete", file)
 
     def settle(self, files: Iterable[str]) -> None:
         pass
@@ -278,97 +286,74 @@ class Remote:
     def path(self, file: str) -> Path:
         return Path(file)
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        token = {"host": socket.gethostname(), "process": os.getpid(), "id": uuid4().hex}
-        self._acquire(token)
-        self._lost.clear()
-        ended = threading.Event()
-        keeper = threading.Thread(target=self._renew, args=(token, ended), name="lake lock", daemon=True)
-        keeper.start()
+    def locked(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def _head(self, file: str) -> dict[str, Any]:
         try:
-            yield
-        finally:
-            ended.set()
-            keeper.join()
-            mine, self._mine = self._mine, b""
-            if self._lock_content() == mine:
-                self._do(self._fs.rm_file, self._at("_lock"))
-
-    def _acquire(self, token: dict[str, Any]) -> None:
-        start_s = seen_s = time.monotonic()
-        seen: bytes | None = None
-        while True:
-            body = json.dumps({**token, "renewed": 0}).encode()
-            try:
-                self._do(self._fs.pipe_file, self._at("_lock"), body, mode="create")
-                self._mine = body
-                return
-            except FileExistsError:
-                pass
-            now_s, there = time.monotonic(), self._lock_content()
-            if there != seen:
-                seen, seen_s = there, now_s
-            elif there is not None and now_s - seen_s > DEAD_S:
-                self._do(self._fs.rm_file, self._at("_lock"))
-            if now_s - start_s > LOCK_WAIT_S:
-                raise Locked
-            time.sleep(POLL_S)
-
-    def _renew(self, token: dict[str, Any], ended: threading.Event) -> None:
-        n = 0
-        while not ended.wait(RENEWED_S):
-            n += 1
-            body = json.dumps({**token, "renewed": n}).encode()
-            try:
-                if self._lock_content() != self._mine:
-                    self._lost.set()
-                    return
-                self._do(self._fs.pipe_file, self._at("_lock"), body)
-                self._mine = body
-            except OSError:
-                continue  # the next write finds out whether the lock is still there
-
-    def _check_held(self) -> None:
-        if self._lost.is_set() or not self._mine:
-            raise OSError("the lock of this lake was lost to another writer, since this one did not answer for long")
-
-    def _lock_content(self) -> bytes | None:
-        try:
-            return self.read("_lock")
-        except FileNotFoundError:
-            return None
-
-    def _info(self, file: str) -> dict[str, Any]:
-        try:
-            found: dict[str, Any] = self._do(self._fs.info, self._at(file))
+            found: dict[str, Any] = self._do("head", file)
             return found
         except FileNotFoundError:
             return {}
 
-    def _at(self, file: str) -> str:
-        return f"{self._root.rstrip('/')}/{file}"
+    def _do(self, call: str, *args: Any, **options: Any) -> Any:
+        """A call of obstore, whose errors become OSErrors in one line; that another was quicker stays as it is."""
+        import obstore
+        import obstore.exceptions
 
-    def _do(self, call: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """A call, whose errors of whatever library are OSErrors in one line."""
         try:
-            return call(*args, **options)
-        except OSError:
+            return getattr(obstore, call)(self._objects, *args, **options)
+        except (OSError, obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError):
             raise
         except Exception as error:
-            raise OSError(f"{type(error).__name__}: {' '.join(str(error).split())}") from None
+            raise OSError(_first_line(error)) from None
+
+
+@cache
+def _opened(address: str) -> Any:
+    """One store per address and process: its connections are used again."""
+    from obstore.store import from_url
+
+    scheme = address.partition("://")[0]
+    if scheme == "memory":
+        return from_url("memory:///")
+    options: dict[str, Any] = {
+        "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=ANSWER_S)},
+        "client_options": {"connect_timeout": timedelta(seconds=ANSWER_S), "timeout": timedelta(seconds=REQUEST_S)},
+    }
+    if os.environ.get("AWS_ENDPOINT_URL", "").startswith("http:"):
+        options["client_options"]["allow_http"] = True
+    if scheme in ("s3", "s3a") and not os.environ.get("AWS_ACCESS_KEY_ID"):
+        with suppress(ImportError, ValueError):  # without boto3's, those of the environment and the instance
+            from obstore.auth.boto3 import Boto3CredentialProvider
+
+            options["credential_provider"] = Boto3CredentialProvider()
+    return from_url(address, **options)
+
+
+def _masked(text: str) -> str:
+    """An address, or a text with one, without its password."""
+    return re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
+
+
+def _stamp(meta: Any) -> Stamp:
+    return tuple((k, meta.get(k)) for k in ("e_tag", "version"))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def open_store(root: Path | str) -> Store:
-    """The store of a lake's root: a folder, ``file://…`` or an address of fsspec.
+    """The store of a lake's root: a folder, ``file://…`` or an address of obstore.
 
     Raises:
-        InputError: a file system that is unknown or not installed.
+        InputError: an address that is unknown, or whose package is not installed.
     """
     text = str(root)
     if text.startswith("file://"):
         return Folder(Path(text.removeprefix("file://")))
-    return Remote(text) if "://" in text else Folder(Path(root))
+    return Bucket(text) if "://" in text else Folder(Path(root))
 
 
 def _sync(folder: Path) -> None:

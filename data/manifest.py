@@ -1,26 +1,29 @@
 """A machine's manifest as plain data: which versions of which batches exist, which are withdrawn, and changes to them.
 
-``{"schema", "pending": [[machine, batch], …], "machines": {machine: {batch: [version, …]}}}``, versions oldest first;
-the stored one has one machine, the one that a change works on has those that it concerns.
-A version's ``"sha256"`` has the hash of the bytes of each of its files; versions of an earlier program have none.
-A withdrawn version has ``"withdrawn": {"reason", "at", "purged_at"}``; `purged_at` is empty while its file is kept. A
-batch is withdrawn where its last version is. Functions change the manifest that they are given; nothing is written.
+``{"schema", "pending": [batch, …], "machines": {machine: {batch: [version, …]}}}`` of one machine, versions oldest
+first; with a key also ``"hmac"``. A version's ``"sha256"`` has the hash of the bytes of each of its files, and
+``"measured"`` that of its measured values. A withdrawn version has ``"withdrawn": {"reason", "at", "purged_at"}``;
+`purged_at` is empty while its file is kept. A batch is withdrawn where its last version is. Functions change the
+batches that they are given; nothing is written.
 """
 
 from __future__ import annotations
 
+import hmac
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
-from data.errors import InputError, closest
+from data.errors import InputError, WorkError, closest
 from data.lakefile import safe_name
 
-SCHEMA = "thermodrift.lake/2"
-SCHEMA_OF_ALL = "thermodrift.lake/1"  # of an earlier program: one manifest of all machines
+SCHEMA = "thermodrift.lake/3"
+EARLIER = ("thermodrift.lake/1", "thermodrift.lake/2")  # see `data.lake_migration`
 Status = Literal["new", "unchanged", "refreshed", "healed", "new_version", "duplicate", "withdrawn"]
 Entry = dict[str, Any]  # one version of a batch as it is stored
+Batches = dict[str, list[Entry]]  # of a machine
 Copies = dict[str, dict[str, Entry]]  # digest of measured values -> batch id -> version
 
 
@@ -98,6 +101,46 @@ def empty() -> dict[str, Any]:
     return {"schema": SCHEMA, "pending": [], "machines": {}}
 
 
+def pack(manifest: Mapping[str, Any], key: str) -> bytes:
+    """A manifest as it is stored, with an HMAC-SHA256 of its content where there is a key."""
+    own = {k: v for k, v in manifest.items() if k != "hmac"}
+    return json.dumps({**own, "hmac": _hmac(own, key)} if key else own).encode()
+
+
+def unpack(raw: bytes, where: str, key: str) -> dict[str, Any]:
+    """A stored manifest.
+
+    Raises:
+        WorkError: not readable, of an earlier version, naming strange files, or not signed with this key.
+    """
+    try:
+        manifest: dict[str, Any] = json.loads(raw)
+        schema = manifest.get("schema")
+    except (ValueError, AttributeError) as error:
+        raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None
+    if schema in EARLIER:
+        raise WorkError(f"{where}: the lake is of an earlier version ({schema}); run `thermodrift lake migrate`")
+    if schema != SCHEMA:
+        raise WorkError(f"{where}: got schema {schema!r}, expected {SCHEMA!r}; use another lake folder")
+    if key:
+        signed = manifest.pop("hmac", "")
+        if not signed:
+            raise WorkError(f"{where}: has no HMAC, and a key is set; run `thermodrift lake migrate` to sign the lake")
+        if not hmac.compare_digest(str(signed), _hmac(manifest, key)):
+            raise WorkError(
+                f"{where}: its HMAC does not fit its content; it was changed by another program or signed with another "
+                "key; restore it from a backup, or set the key that it was signed with"
+            )
+    if strange := stray(manifest):
+        raise WorkError(f"{where}: {strange}; it was changed by another program; restore it from a backup")
+    return manifest
+
+
+def _hmac(manifest: Mapping[str, Any], key: str) -> str:
+    content = json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()
+    return hmac.new(key.encode(), content, "sha256").hexdigest()
+
+
 def folder_of(machine: str, batch_id: str) -> str:
     """Where the files of a batch's versions are, below the root."""
     return f"_versions/machine={safe_name(machine)}/{safe_name(batch_id)}"
@@ -105,7 +148,7 @@ def folder_of(machine: str, batch_id: str) -> str:
 
 def stray(manifest: Mapping[str, Any]) -> str:
     """What a manifest names outside of the folder of its batch, as only another program writes it; empty for none."""
-    for machine, batches in manifest["machines"].items():
+    for machine, batches in manifest.get("machines", {}).items():
         for batch_id, entries in batches.items():
             folder = f"{folder_of(machine, batch_id)}/"
             for e in entries:
@@ -132,7 +175,7 @@ def withdrawal(entry: Entry) -> Withdrawal | None:
 
 def hashes(entries: Iterable[Entry]) -> dict[str, str]:
     """File -> SHA-256 (hex) of its bytes, as far as noted."""
-    return {file: sha256 for e in entries for file, sha256 in e.get("sha256", {}).items()}
+    return {file: sha256 for e in entries for file, sha256 in e["sha256"].items()}
 
 
 def active(batches: Mapping[str, list[Entry]]) -> dict[str, list[Entry]]:
@@ -150,23 +193,22 @@ def copies_of(batches: Mapping[str, list[Entry]]) -> Copies:
     found: Copies = {}
     for batch_id, entries in batches.items():
         for entry in entries:
-            if "measured" in entry and ("withdrawn" in entry or entry is entries[-1]):
+            if entry["measured"] and ("withdrawn" in entry or entry is entries[-1]):
                 found.setdefault(entry["measured"], {})[batch_id] = entry
     return found
 
 
-def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None = None) -> Stored:
-    """Write a staged batch into the manifest.
+def enter(batches: Batches, s: Staged, now: str, copies: Copies | None = None) -> Stored:
+    """Write a staged batch into those of its machine.
 
     Content equal to the current version makes no new one. Withdrawn content stays out, and with `copies` a batch
     whose measured values stand under another id as well; `copies` is updated.
     """
-    batches = manifest["machines"].get(s.machine, {})
     entries = batches.get(s.batch_id, [])
     last = entries[-1] if s.batch_id in active(batches) else None
     for entry in entries:  # content that came back has two versions with one file
         if s.file in (entry["file"], *entry["earlier"]):
-            entry.setdefault("sha256", {})[s.file] = s.sha256
+            entry["sha256"][s.file] = s.sha256
     if last is not None and last["digest"] == s.digest:
         return _same_again(last, s)
     same = dict((copies or {}).get(s.measured, {}))
@@ -189,10 +231,10 @@ def enter(manifest: dict[str, Any], s: Staged, now: str, copies: Copies | None =
         "current": True, "file": s.file, "earlier": [], "sha256": {s.file: s.sha256},
     }  # fmt: skip
     replaced = bool(entries)
-    manifest["machines"].setdefault(s.machine, {}).setdefault(s.batch_id, []).append(made)
+    batches.setdefault(s.batch_id, []).append(made)
     if copies is not None:
         if last is not None:
-            copies.get(last.get("measured", ""), {}).pop(s.batch_id, None)
+            copies.get(last["measured"], {}).pop(s.batch_id, None)
         copies.setdefault(s.measured, {})[s.batch_id] = made
     return Stored("new_version" if replaced else "new", made["version"], s.digest, s.machine, s.batch_id, replaces)
 
@@ -202,7 +244,7 @@ def _same_again(last: Entry, s: Staged) -> Stored:
     if last["file"] != s.file:
         last["earlier"] = [f for f in (*last["earlier"], last["file"]) if f != s.file]
         last["file"] = s.file
-        last.setdefault("sha256", {})[s.file] = s.sha256
+        last["sha256"][s.file] = s.sha256
     return Stored(status, last["version"], s.digest, s.machine, s.batch_id)
 
 

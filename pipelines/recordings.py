@@ -27,7 +27,8 @@ class Gathered:
 
 def home_lake() -> Lake:
     """The lake that `mlflow.yml` or THERMODRIFT_LAKE names, by default in `home()`."""
-    return Lake(load().lake)
+    settings = load()
+    return Lake(settings.lake, settings.lake_key)
 
 
 def check_recordings(recordings: Sequence[Path]) -> None:

@@ -70,20 +70,21 @@ class DiagnoseRule(_Part):
 
 class _File(_Part):
     lake: str = "{home}/lake"
+    lake_key: str = ""
     tracking: TrackingPart = TrackingPart()
     names: NamesPart = NamesPart()
     promotion: PromotionRule = PromotionRule()
     diagnose: DiagnoseRule = DiagnoseRule()
 
-    _address = field_validator("lake")(_only_home_and_environment)
+    _address = field_validator("lake", "lake_key")(_only_home_and_environment)
 
 
 @dataclass(frozen=True)
 class Settings:
     """`mlflow.yml` with the home folder and the environment filled in.
 
-    `store_uri` may hold a password; what people read gets `store_name`. `lake` is a folder, or the address of one on
-    another file system.
+    `store_uri` may hold a password; what people read gets `store_name`. `lake` is a folder, or an address;
+    `lake_key` signs its manifests.
     """
 
     home: Path
@@ -93,6 +94,7 @@ class Settings:
     promotion: PromotionRule
     diagnose: DiagnoseRule = field(default_factory=DiagnoseRule)
     lake: str = field(default="", repr=False)
+    lake_key: str = field(default="", repr=False)
 
     @property
     def store_name(self) -> str:
@@ -149,7 +151,8 @@ def load(path: Path | str | None = None) -> Settings:
         parsed.lake, base, f"settings file {where}: key 'lake'"
     )
     lake = lake if "://" in lake else str(base / Path(lake).expanduser())
-    return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose, lake)
+    key = _filled(parsed.lake_key, base, f"settings file {where}: key 'lake_key'")
+    return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose, lake, key)
 
 
 def masked(text: str) -> str:

@@ -149,6 +149,23 @@ def purge(
         console.line(f"{machine} {batch_id}: purged")
 
 
+@app.command()
+def migrate(as_json: Json = False) -> None:
+    """Bring a lake of an earlier version into the present form, and sign its manifests where `lake_key` is set."""
+    from data.lake_migration import migrate
+    from pipelines import settings
+
+    configured = settings.load()
+    done = migrate(configured.lake, configured.lake_key)
+    if as_json:
+        console.print_json({"machines": done.machines, "files_read": done.files, "damaged": done.damaged})
+        return
+    signed = ", signed" if configured.lake_key else ""
+    console.line(f"lake {configured.lake}: manifests written{signed}: {len(done.machines)}; files read: {done.files}")
+    for line in done.damaged:
+        console.note(f"damaged: {line}; ingest its source again")
+
+
 def _withdrawn_files(lake: Lake, versions: Sequence[Version]) -> list[str]:
     """Files of withdrawn versions that are still there."""
     return [f for v in versions if v.withdrawn and not v.withdrawn.purged_at for f in v.files if lake.size(f)]

@@ -149,17 +149,6 @@ def test_a_copy_is_left_out_where_batches_shall_be_distinct(lake: Lake) -> None:
     assert put(copy(make("run2", seed=2), "run9")) == ("withdrawn", "run2")
 
 
-def test_a_lake_of_an_earlier_program_knows_copies_too(lake: Lake) -> None:
-    manifest = json.loads((lake.root / "_manifest/machine=vmc.json").read_text())
-    for entries in (e for batches in manifest["machines"].values() for e in batches.values()):
-        for entry in entries:
-            del entry["measured"]
-    (lake.root / "_manifest/machine=vmc.json").write_text(json.dumps(manifest))
-    assert lake.batch_ids("vmc") == ["run1", "run2"]
-    (stored,) = lake.commit([lake.stage(copy(make("run2", seed=2), "run9"))], distinct=True)
-    assert (stored.status, stored.batch_id) == ("duplicate", "run2")
-
-
 def store_copies(root: Path, who: str) -> None:
     lake = Lake(root)
     for seed in range(20):

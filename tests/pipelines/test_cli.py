@@ -200,12 +200,13 @@ def test_work_that_fails_is_one_line_and_exit_code_1(
     year: Path, call: Call, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(store_home / "lake", tmp_path / "lake")
-    (tmp_path / "lake" / "_manifest.json").write_text("{ broken")
+    for manifest in (tmp_path / "lake" / "_manifest").iterdir():
+        manifest.write_text("{ broken")
     monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path))
     done = call("ingest", year / "in", "--machine", year / "small.yml", "--json")
     assert (done.code, done.out) == (1, "")
     (line,) = lines(done.err)
-    assert "_manifest.json: cannot be read" in line and "restore it from a backup" in line
+    assert ".json: cannot be read" in line and "restore it from a backup" in line
 
 
 def test_nothing_there_yet_is_no_error(call: Call, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

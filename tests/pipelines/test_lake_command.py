@@ -17,6 +17,7 @@ from pipelines.caller import DirectCaller
 from pipelines.recordings import gather_batches, load_batches
 from pipelines.request import TrainRequest
 from pipelines.training import Plan, promote_tracked, train
+from tests.conftest import make_toy_batches
 from tests.toys.command import Call, in_process
 from tests.toys.small_year import write_machine, write_year
 
@@ -139,3 +140,21 @@ def test_stored_batches_with_other_channels_are_one_line(
     assert words in told and "6 of 6 batches in the lake (20250114, 20250214, 20250314, …)" in told
     assert call("ingest", lake.root / f"machine={NAME}", "--machine", changed).code == 0
     assert len(load_batches(lake, load_machine(changed))) == 6
+
+
+def test_a_lake_of_an_earlier_version_is_migrated_and_signed(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("THE_KEY", "a key")
+    Lake(tmp_path / "home" / "lake").put_many(make_toy_batches(2, 20))
+    for file in (tmp_path / "home" / "lake").glob("_manifest*/*.json"):
+        file.write_text(file.read_text().replace("lake/3", "lake/2"))
+    assert call("lake", "list").err.endswith("of an earlier version (thermodrift.lake/2); run `thermodrift lake migrate`\n")
+    (tmp_path / "mlflow.yml").write_text('lake_key: "{env:THE_KEY}"\n')
+    done = call("lake", "migrate")
+    assert (done.code, done.err) == (0, "") and done.out.endswith("manifests written, signed: 1; files read: 0\n")
+    assert json.loads(call("lake", "list", "--json").out)[0]["batches"] == 2
+    monkeypatch.setenv("THE_KEY", "another key")
+    assert "set the key that it was signed with" in call("lake", "list").err
