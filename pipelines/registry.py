@@ -39,7 +39,14 @@ from models.result import GridResult
 from models.trust import Region
 from pipelines import audit, fitted_model, model_store, pyfunc_model, store
 from pipelines.audit import CHAMPION, PROVISIONAL
-from pipelines.runs import close_interrupted, code_version, model_versions, models_with_versions, registered_models
+from pipelines.runs import (
+    close_interrupted,
+    code_version,
+    model_versions,
+    registered_models,
+    standing_versions,
+    versions_by_model,
+)
 from pipelines.settings import Settings
 from pipelines.tracking import load_training, open_store, record_promotion, store_errors
 
@@ -350,11 +357,15 @@ def _back(version: ModelVersion, summary: str) -> Promotion:
                      standing=tags.get("standing", CHAMPION), authority=float(tags.get("authority", "1")))  # fmt: skip
 
 
-def status(settings: Settings) -> pd.DataFrame:
-    """Every version of every model: name, version, aliases, expected_S_um, expected_S_bound90_um and expected_by (the
-    protocol) of a run in the next season, leave_batch_out_S_mean_um, cell, score_um, n_batches, trained_at, simulated,
-    trusted, standing (champion, provisional or refused, by its training), reason, was_champion_until (UTC, by the log
-    of champions; empty for the champion), training_id; newest version first within a name."""
+def status(settings: Settings, history: bool = True) -> pd.DataFrame:
+    """Every version of every model, or without `history` those that an alias names and the newest one.
+
+    Returns:
+        name, version, aliases, expected_S_um, expected_S_bound90_um and expected_by (the protocol) of a run in the next
+        season, leave_batch_out_S_mean_um, cell, score_um, n_batches, trained_at, simulated, trusted, standing
+        (champion, provisional or refused, by its training), reason, was_champion_until (UTC, by the log of champions;
+        empty for the champion), training_id; newest version first within a name.
+    """
     client = open_store(settings)
     numbers = ["expected_S_um", "expected_S_bound90_um", "leave_batch_out_S_mean_um", "score_um"]
     columns = ["name", "version", "aliases", "machine", "target", *numbers[:2], "expected_by", *numbers[2:3], "cell",
@@ -362,7 +373,9 @@ def status(settings: Settings) -> pd.DataFrame:
                "was_champion_until", "training_id"]  # fmt: skip
     rows = []
     with store_errors(settings):
-        for model, versions in models_with_versions(client):
+        every = versions_by_model(client) if history else {}
+        for model in registered_models(client):
+            versions = every.get(model.name, []) if history else standing_versions(client, model)
             log = audit.read(model)
             ends = audit.latest_ends(log.reigns, log.champion)
             for v in versions:

@@ -306,7 +306,7 @@ class _Year:
         seconds: float,
     ) -> Retraining:  # fmt: skip
         """As the registry has it: an interrupted replay may come here after the promotion was made."""
-        past = tracking.trainings(self.machine.machine, target, self.settings)
+        past = tracking.trainings(self.machine.machine, target, self.settings, newest=1)
         training = tracking.load_training(str(past.iloc[0]["training_id"]), self.settings)
         n, why, version, kind = len(training.result.batches), outcome.stopped, None, "not trained"
         repeated = any(r.training_id == training.training_id for r in self.progress.retrainings)

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -34,6 +35,7 @@ from pipelines.settings import Settings
 
 PARENT = "mlflow.parentRunId"
 _DIGEST_LENGTH = 36  # the store's limit; the whole digest goes into a tag
+_PAGE = 1000  # runs that one answer of the store has
 _AT_ONCE = 900  # the store takes 1000 metrics, parameters and tags in one call
 _SAME_START_S = 30.0  # the clock may be set while a process runs; no number of a process returns that soon
 _PROGRAM = "thermodrift"
@@ -140,10 +142,11 @@ def close_interrupted(client: MlflowClient) -> int:
     return len(left)
 
 
-def finished_runs(client: MlflowClient, kind: str, **tags: str | None) -> list[Run]:
-    """Finished runs of a kind, newest first; with tags of an experiment (machine, target) those of such ones alone, so
-    that the cost does not grow with the number of machines."""
-    return list(_runs(client, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'", **tags))
+def finished_runs(client: MlflowClient, kind: str, newest: int | None = None, **tags: str | None) -> list[Run]:
+    """Finished runs of a kind, newest first: all, or the `newest` so many. With tags of an experiment (machine, target)
+    those of such ones alone. So the cost grows neither with the number of machines nor with their history."""
+    found = _runs(client, f"tags.kind = '{kind}' and attributes.status = 'FINISHED'", newest or _PAGE, **tags)
+    return list(islice(found, newest))
 
 
 def experiment_id(client: MlflowClient, settings: Settings, machine: str, target: str, simulated: bool) -> str:
@@ -311,16 +314,21 @@ def versions_by_model(client: MlflowClient) -> dict[str, list[ModelVersion]]:
     return found
 
 
-def models_with_versions(client: MlflowClient) -> list[tuple[RegisteredModel, list[ModelVersion]]]:
-    """Every registered model and its versions, the newest first; versions are read last: a champion is among them."""
-    models = list(registered_models(client))
-    versions = versions_by_model(client)
-    return [(model, versions[model.name]) for model in models]
+def standing_versions(client: MlflowClient, model: RegisteredModel) -> list[ModelVersion]:
+    """The versions that an alias names and the newest one, which may be neither; the cost does not grow with others."""
+    named = {int(number) for number in model.aliases.values()}
+    if "'" in model.name:  # a filter cannot write a quote
+        every = model_versions(client, model.name)
+        return [v for v in every if int(v.version) in named or v is every[0]]
+    newest = client.search_model_versions(f"name = '{model.name}'", 1, ["version_number DESC"])
+    others = named - {int(v.version) for v in newest}
+    return [*newest, *(client.get_model_version(model.name, str(n)) for n in sorted(others, reverse=True))]
 
 
-def _runs(client: MlflowClient, which: str, **tags: str | None) -> Iterator[Run]:
+def _runs(client: MlflowClient, which: str, at_once: int = _PAGE, **tags: str | None) -> Iterator[Run]:
     if ids := [e.experiment_id for e in experiments(client, **tags)]:
-        yield from _all(client.search_runs, ids, which, order_by=["attributes.start_time DESC"])
+        newest_first = ["attributes.start_time DESC"]
+        yield from _all(client.search_runs, ids, which, max_results=at_once, order_by=newest_first)
 
 
 def _all(search: Callable[..., Any], *args: Any, **more: Any) -> Iterator[Any]:

@@ -213,9 +213,17 @@ def training_files(folder: Path, result: GridResult, figures: Mapping[str, bytes
         (folder / "figures" / name).write_bytes(content)
 
 
-def trainings(machine: str | None = None, target: str | None = None, settings: Settings | None = None) -> pd.DataFrame:
-    """Finished trainings, newest first: training_id, machine, target, started, n_batches, best, score_um, simulated,
-    promotion (champion, provisional, challenger, unchanged or empty), model. Empty where there is none.
+def trainings(
+    machine: str | None = None,
+    target: str | None = None,
+    settings: Settings | None = None,
+    newest: int | None = None,
+) -> pd.DataFrame:
+    """Finished trainings, or the `newest` so many, newest first.
+
+    Returns:
+        training_id, machine, target, started, n_batches, best, score_um, simulated, promotion (champion, provisional,
+        challenger, unchanged or empty), model. Empty where there is none.
 
     Raises:
         WorkError: the store does not answer.
@@ -223,7 +231,7 @@ def trainings(machine: str | None = None, target: str | None = None, settings: S
     settings = settings or load()
     client = open_store(settings)
     with store_errors(settings):
-        runs = finished_runs(client, "training", machine=machine, target=target)
+        runs = finished_runs(client, "training", newest, machine=machine, target=target)
     columns = ["training_id", "machine", "target", "started", "n_batches", "best", "score_um", "simulated",
                "promotion", "model"]  # fmt: skip
     return pd.DataFrame([_training_row(r) for r in runs], columns=columns)

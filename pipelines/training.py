@@ -234,7 +234,7 @@ class _Clock:
 
 def _seen_before(machine: str, targets: Sequence[str], batches: Sequence[Batch], settings: Settings) -> bool:
     for target in targets:
-        past = tracking.trainings(machine, target, settings)
+        past = tracking.trainings(machine, target, settings, newest=1)
         if past.empty:
             return False
         last = tracking.load_training(str(past.iloc[0]["training_id"]), settings)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "thermodrift.status/2"
 KEPT_RUNS = 20  # of each channel, the newest
+KEPT_TRAININGS = 100  # the newest
 _STATUS = "status.json"
 _VARIABLES = ("THERMODRIFT_HOME", "THERMODRIFT_LAKE")  # and those that the settings file names
 _NAMED = re.compile(r"\{env:([^{}]+)\}")
@@ -79,7 +80,8 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
     """Gather what has changed, and keep it; the whole status.
 
     Returns:
-        `models`, `trainings`, `diagnoses`: rows of the tables of `thermodrift status`; `lake`: batches and quarantined
+        `models` (versions with an alias and the newest ones), `trainings` (the newest `KEPT_TRAININGS`), `diagnoses`:
+        rows of the tables of `thermodrift status`; `lake`: batches and quarantined
         files by machine; `channels`: the state of every machine and channel, see `_channel`; `as_of` (UTC).
 
     Raises:
@@ -93,8 +95,8 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
     tracking.open_store(settings, say)  # the first use takes seconds
     before = _made_from(settings, lake)
     tables = {
-        "models": registry.status(settings),
-        "trainings": tracking.trainings(settings=settings),
+        "models": registry.status(settings, history=False),
+        "trainings": tracking.trainings(settings=settings, newest=KEPT_TRAININGS),
         "diagnoses": tracking.diagnoses(settings=settings),
     }
     champions = _champions(settings)
@@ -116,18 +118,18 @@ def refresh(settings: Settings, say: Say = lambda text: None) -> dict[str, Any]:
 def _champions(settings: Settings) -> dict[str, list[Champion]]:
     """Champions by machine."""
     from pipelines import audit
-    from pipelines.runs import models_with_versions
+    from pipelines.runs import registered_models
     from pipelines.tracking import open_store, store_errors
 
     client, found = open_store(settings), dict[str, list[Champion]]()
     with store_errors(settings):
-        for model, versions in models_with_versions(client):
+        for model in registered_models(client):
             log = audit.read(model)
             if not log.machine or not log.target:
                 continue
             version, since, source, tags = log.champion, "", "", dict[str, str]()
             if version is not None:
-                v = next(v for v in versions if int(v.version) == version)
+                v = client.get_model_version(model.name, str(version))
                 source, tags = str(v.source), dict(v.tags)
                 reigns = [r for r in log.reigns if r.until is None]
                 since = reigns[-1].since.isoformat(timespec="seconds") if reigns else tags.get("trained_at", "")

@@ -151,7 +151,9 @@ def test_a_lake_of_an_earlier_version_is_migrated_and_signed(
     Lake(tmp_path / "home" / "lake").put_many(make_toy_batches(2, 20))
     for file in (tmp_path / "home" / "lake").glob("_manifest*/*.json"):
         file.write_text(file.read_text().replace("lake/3", "lake/2"))
-    assert call("lake", "list").err.endswith("of an earlier version (thermodrift.lake/2); run `thermodrift lake migrate`\n")
+    assert call("lake", "list").err.endswith(
+        "of an earlier version (thermodrift.lake/2); run `thermodrift lake migrate`\n"
+    )
     (tmp_path / "mlflow.yml").write_text('lake_key: "{env:THE_KEY}"\n')
     done = call("lake", "migrate")
     assert (done.code, done.err) == (0, "") and done.out.endswith("manifests written, signed: 1; files read: 0\n")

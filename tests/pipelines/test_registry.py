@@ -6,6 +6,7 @@ from typing import Any
 
 import mlflow
 import numpy as np
+import pandas as pd
 import pytest
 from mlflow.tracking import MlflowClient
 
@@ -101,6 +102,17 @@ def test_status_lists_every_version(story, store):
     assert table["aliases"].tolist() == ["challenger", "champion", ""]
     assert table["n_batches"].tolist() == [8, 7, 6]
     assert table["simulated"].all()
+
+
+def test_an_overview_reads_only_what_stands_and_the_newest_version(story, store, monkeypatch):
+    table = registry.status(store)
+    own = table[table["name"] == "toy-story-z"]
+    monkeypatch.setattr(registry, "versions_by_model", None)  # whose cost grows with the history
+    shown = registry.status(store, history=False)
+    shown = shown[shown["name"] == "toy-story-z"]
+    stands = (own["aliases"] != "") | (own["version"] == own["version"].max())
+    assert len(own) > stands.sum() == len(shown)
+    pd.testing.assert_frame_equal(shown.reset_index(drop=True), own[stands].reset_index(drop=True))
 
 
 def test_the_same_again_changes_nothing(store):
