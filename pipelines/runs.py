@@ -187,8 +187,9 @@ def _page(experiment: str, machine: str, target: str) -> dict[str, str]:
 
     By itself the list has no column of a metric. `viewStateShareKey` names a view that is kept with the experiment.
     """
+    metrics = ("score_um", "S_mean_um", "S_std_um", "max_um", "n_tsp", "nested_S_mean_um", "expected_S_um")
     columns = [
-        *(f"metrics.`{m}`" for m in ("S_mean_um", "S_std_um", "max_um", "n_tsp", "nested_S_mean_um", "expected_S_um")),
+        *(f"metrics.`{m}`" for m in metrics),
         *(f"params.`{p}`" for p in ("family", "selector")), "tags.`outcome`",
     ]  # fmt: skip
     view = {
