@@ -1,12 +1,15 @@
 """Does the diagnosis hold on machines of other kinds?
 
     python -m benchmarks.kinds --kinds lathe board --cases 12 --out var/kinds
+    python -m benchmarks.kinds --paired 808000 --table results/diagnosis_kinds.csv
 
 Draws cases of the proof for every kind (nothing missing, one effect, an effect of no list), diagnoses each, and prints
 by kind: effects named first (of those that are visible at all, and of all), cases of one effect that claim anything,
 false alarms, unlisted effects flagged, and seconds of CPU. Every case keeps the criteria of its rounds, and the rank
 and gain of the true candidate next to the winner's. Cases that are done are not done again; `--workers` side by side.
-The proof (`thermodrift prove --plants …`) asks the same under seal, with baselines.
+`--paired` takes of every kind five cases with one effect of at least three times its noise and three with none, by
+seeds from the number given; `--table` stores a row for each. The proof (`thermodrift prove --plants …`) asks the same
+under seal, with baselines.
 """
 
 from __future__ import annotations
@@ -20,8 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from threadpoolctl import threadpool_limits
 
+from benchmarks.results import write
 from data.batch import Batch
 from data.errors import InputError, WorkError
 from data.machine import Machine
@@ -40,23 +45,33 @@ from thermodrift_exam.proof.suite.other_kinds import drawn_kind, executed_kind, 
 from twin.compile import compile_network
 from twin.schema import TwinPart, twin_part
 
+LEAST_SIGMAS = 3.0  # of the effect of a paired case, by the noise of the channel that it moves most
+PAIRED: dict[Kind, int] = {"one": 5, "nothing": 3}  # cases of each kind
 SHARES: dict[Kind, float] = {"nothing": 0.4, "one": 0.45, "unlisted": 0.15}
 SHOWN = 10
 
 
-def examined(kind: PlantKind, seed: int, out: str, proposed: int = 0) -> dict[str, Any]:
-    """One case, from its file where it is done already; with so many proposed runs after the first answer."""
-    path = Path(out) / f"{kind}_{seed}.json"
+def examined(kind: PlantKind, seed: int, out: str, proposed: int = 0, paired: Kind | None = None) -> dict[str, Any]:
+    """One case, from its file where it is done already; with so many proposed runs after the first answer.
+
+    Args:
+        paired: what the case conceals; by default it is drawn.
+    """
+    path = Path(out) / f"{kind}_{seed}{f'_{paired}' if paired else ''}.json"
     if path.exists():
         return dict(json.loads(path.read_text()))
     drawn = 1000 * (1 + KIND_PLANTS.index(kind)) + seed  # of its own: equal seeds give kinds equal effects and sizes
-    what = np.random.default_rng(drawn).choice(list(SHARES), p=list(SHARES.values()))
-    spec = kind_case("case_0001", what, kind, drawn, "development")
-    case = drawn_kind(spec)
+    what = paired or np.random.default_rng(drawn).choice(list(SHARES), p=list(SHARES.values()))
+    while True:
+        spec = kind_case("case_0001", what, kind, drawn, "development")
+        case = drawn_kind(spec)
+        if paired is None or min((t["sigma"] for t in case.truth["terms"]), default=np.inf) >= LEAST_SIGMAS:
+            break
+        drawn += 1
     answer = answer_of(spec, case)
     key = AnswerKey.from_json(answer)
     begun = time.process_time()
-    row: dict[str, Any] = {"kind": kind, "seed": seed, "what": what, "terms": case.truth["terms"]}
+    row: dict[str, Any] = {"kind": kind, "seed": drawn if paired else seed, "what": what, "terms": case.truth["terms"]}
     try:
         with threadpool_limits(limits=1):
             part = twin_part(case.machine)
@@ -179,9 +194,36 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
+def pairs(kinds: Sequence[PlantKind], first: int, out: Path) -> list[tuple[PlantKind, int, str, int, Kind]]:
+    """The cases of `--paired`, in turn over the kinds."""
+    return [
+        (kind, first - 1000 + 100 * k, str(out), 0, what)
+        for k in range(max(PAIRED.values())) for what, n in PAIRED.items() if k < n for kind in kinds
+    ]  # fmt: skip
+
+
+def as_rows(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """What was concealed, whether it is visible, what was claimed, and whether that is right; a row a case."""
+    found = []
+    for r in rows:
+        one = r["what"] == "one"
+        seen, right = any(r.get("visible", ())), bool(r.get("right"))
+        found.append({
+            "kind": r["kind"], "seed": r["seed"],
+            "concealed": "+".join(t["effect"] for t in r["terms"]) or "nothing",
+            "sigmas": " ".join(f"{t.get('sigma', 0):.1f}" for t in r["terms"]),
+            "visible": ("yes" if seen else "no") if one else "",
+            "claimed": "; ".join(f["name"] for f in r.get("listed", ())),
+            "right": ("yes" if right else "no") if one else "", "cpu_s": round(r.get("cpu_s", 0.0)),
+        })  # fmt: skip
+    return pd.DataFrame(found).sort_values(["kind", "seed", "concealed"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--kinds", nargs="+", default=["lathe", "board"], choices=KIND_PLANTS)
+    parser.add_argument("--kinds", nargs="+", choices=KIND_PLANTS, help="default: lathe and board; all with --paired")
+    parser.add_argument("--paired", type=int, help="seed of the first pair")
+    parser.add_argument("--table", type=Path, help="where a row for each case goes, .csv")
     parser.add_argument("--cases", type=int, default=12, help="of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--workers", type=int, default=2)
@@ -189,8 +231,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("var/kinds"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    seeds = range(given.first, given.first + given.cases)
-    tasks = [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in given.kinds]
+    tasks: list[tuple[Any, ...]] = []
+    if given.paired is not None:
+        tasks += pairs(given.kinds or KIND_PLANTS, given.paired, given.out)
+    else:
+        seeds, kinds = range(given.first, given.first + given.cases), given.kinds or ["lathe", "board"]
+        tasks += [(kind, seed, str(given.out), given.proposed) for seed in seeds for kind in kinds]
     rows = []
     with Processes(given.workers) as pool:
         for k, row in pool.completed(examined, tasks):
@@ -198,6 +244,8 @@ def main() -> None:
             effect = "+".join(f"{t['effect']} {t.get('sigma', 0):.1f}" for t in row["terms"]) or row["what"]
             first = next(iter(row.get("listed", ())), {"name": row.get("trouble", "no claim")})
             print(f"{tasks[k][0]:<10} {effect:<28} {first['name'][:60]}  {row['cpu_s']:.0f} s", flush=True)
+    if given.table:
+        write(given.table, as_rows(rows), f"python -m benchmarks.kinds --paired {given.paired} --table {given.table}")
     print("\n".join([*table(rows), *(after_proposed(rows, given.proposed) if given.proposed else ())]))
 
 

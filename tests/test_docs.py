@@ -9,10 +9,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import pandas as pd
 import pytest
 from documented import Block, Session, blocks, commands, differs
-from scipy.stats import binomtest
 from toys.command import in_process
 
 ROOT = Path(__file__).parents[1]
@@ -208,22 +206,3 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path) -> Non
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     assert (tmp_path / "site" / "reference" / "mechanisms.html").exists()
-
-
-def test_the_readme_states_what_its_table_of_diagnoses_holds() -> None:
-    """Visible: the true model, fitted again, gains 30 nats; named: claimed with mechanism and place."""
-    rows = pd.read_csv(DOCS / "diagnosis_kinds.csv", keep_default_na=False)
-    single, nothing = rows[rows["concealed"] != "nothing"], rows[rows["concealed"] == "nothing"]
-    visible, claimed = single[single["visible"] == "yes"], single[single["claimed"] != ""]
-    named, wrong = int((visible["right"] == "yes").sum()), int((claimed["right"] == "no").sum())
-    interval = binomtest(named, len(visible)).proportion_ci(method="wilson")
-    n_false = int((nothing["claimed"] != "").sum())
-    most = 1.0 - 0.05 ** (1.0 / len(nothing))
-    assert n_false == 0
-    line = (
-        f"(simulated, {len(rows)} cases of one fresh seed, [all of them](docs/diagnosis_kinds.csv)): {named} of "
-        f"{len(visible)} visible single effects named with their place (95 % interval {100 * interval.low:.0f} to "
-        f"{100 * interval.high:.0f} %), {wrong} of {len(claimed)} claims wrong, no false alarm in {len(nothing)} "
-        f"(at most {100 * most:.0f} %)."
-    )
-    assert line in (ROOT / "README.md").read_text(encoding="utf-8")
