@@ -4,10 +4,11 @@
 
 The last twelve runs of a machine, in three blocks: before each block all that `train` does is repeated on the runs so
 far (race, choice, refit), and the chosen model predicts the block as it does at the machine: a guard replaces sensors
-that fail, and where it gives up nothing is sent. A provisional choice sends its share of the correction, a refused one
-nothing. Next to it are ridge on the temperatures that every run has, refitted at the same times, and no model. One row
-per error channel and run: S of each, µm, the 90 % bound that was stated, the family and its standing, and sensors that
-were not recorded. The lathe is real, FOLDER holds it; the year is simulated. Nothing is asserted.
+that fail for a while, and where it gives up, or a sensor never arrives, nothing is sent. A provisional choice sends its
+share of the correction, a refused one nothing. Next to it are ridge on all temperatures, refitted at the same times
+behind the same guard, and no model. One row per error channel and run: S of each, µm, the 90 % bound that was stated,
+the family and its standing, and sensors that never arrived. The lathe is real, FOLDER holds it; the year is simulated.
+Nothing is asserted.
 """
 
 from __future__ import annotations
@@ -41,6 +42,10 @@ from models.protocols import PromotionRule
 LAST, BLOCK = 12, 4  # runs that are predicted, and runs between two decisions
 
 
+def guard_of(model: Family, batches: Sequence[Batch]) -> Guard:
+    return Guard(Substitutes.learn(batches, list(dict.fromkeys(i.partition("@")[0] for i in model.inputs))))
+
+
 def corrected_um(model: Family, guard: Guard, batch: Batch) -> tuple[Array, list[str]]:
     """The correction of a run row by row (n,), µm, and the inputs that are nowhere recorded in it."""
     names = [n for n in guard.substitutes.names if n in batch.channels]
@@ -62,25 +67,25 @@ def corrected_um(model: Family, guard: Guard, batch: Batch) -> tuple[Array, list
 
 def rows(name: str, machine: Machine, batches: Sequence[Batch], effort: str) -> Iterator[dict[str, object]]:
     """A row per error channel and predicted run."""
-    thermal = batches[0].names("temperature", "ambient")
-    inputs = [n for n in thermal if all(np.isfinite(b.masked(n)).any() for b in batches)]
     for target in batches[0].names("error"):
         for first in range(len(batches) - LAST, len(batches), BLOCK):
             so_far, later = batches[:first], batches[first : first + BLOCK]
             _, result = run_grid(so_far, [target], Plan(effort=effort), machine)[target]  # type: ignore[arg-type]
             choice = decide(result, PromotionRule())
             model = unfitted(choice.family, result.stack).fit(so_far, choice.inputs, target, machine)
-            ridge = FAMILIES["ridge"]().fit(so_far, inputs, target, machine)
-            guard = Guard(Substitutes.learn(so_far, list(dict.fromkeys(i.partition("@")[0] for i in model.inputs))))
+            thermal = so_far[0].names("temperature", "ambient")
+            recorded = [n for n in thermal if all(np.isfinite(b.masked(n)).any() for b in so_far)]
+            ridge = FAMILIES["ridge"]().fit(so_far, recorded, target, machine)
+            guards = guard_of(model, so_far), guard_of(ridge, so_far)
             share = {"champion": 1.0, "provisional": choice.authority}.get(choice.standing, 0.0)
             for b in later:
                 error_um = zeroed_error_um(b, target)
-                sent_um, lacking = corrected_um(model, guard, b)
+                sent_um, lacking = corrected_um(model, guards[0], b)
                 yield {
                     "machine": name, "channel": target, "run": b.batch_id, "n_trained": first,
                     "S_um": residual_std_um(error_um - share * sent_um),
                     "bound90_S_um": outlook(result, choice).bound_um,
-                    "ridge_S_um": residual_std_um(error_um - ridge.predict(b)),
+                    "ridge_S_um": residual_std_um(error_um - corrected_um(ridge, guards[1], b)[0]),
                     "no_model_S_um": residual_std_um(error_um), "family": choice.family, "selector": choice.selector,
                     "n_tsp": choice.n_tsp, "standing": choice.standing, "not_recorded": " ".join(lacking),
                     "simulated": b.simulated,

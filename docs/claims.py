@@ -86,11 +86,11 @@ def decision(machine: str) -> str:
 
 
 def _without(rows: pd.DataFrame) -> str:
-    """Runs that lack a sensor of their model, which the guard then replaces."""
+    """Runs in which a sensor of their model never arrived."""
     if rows.empty:
         return ""
     sensors = sorted({name for names in rows["not_recorded"] for name in names.split()})
-    return f" In {rows['run'].nunique()} of the runs {', '.join(sensors)} failed and was replaced by the guard."
+    return f" In {rows['run'].nunique()} of the runs {', '.join(sensors)} never arrived, so nothing was sent."
 
 
 def kinds() -> str:
