@@ -14,10 +14,10 @@ from pipelines.runs import code_version
 
 def write(path: Path, table: pd.DataFrame, command: str) -> None:
     """Store a table, the command that made it, the version and commit of the program, and the day."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table.to_csv(path, index=False)
     made = {
         "schema": "thermodrift.result/1", "command": command, "version": version("thermodrift"),
         "code": code_version(), "date": date.today().isoformat(), "rows": len(table),
     }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table.to_csv(path, index=False)  # after `code_version`: a stored result is part of the code
     path.with_suffix(".json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")

@@ -486,6 +486,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default=",".join(CASES))
     parser.add_argument("--out", type=Path, default=ROOT / "var" / "chaos", help="work folder; kept between calls")
+    parser.add_argument("--table", type=Path, help="where a row for each command goes, such as results/kills.csv")
     parser.add_argument("--facts", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.facts:
@@ -494,10 +495,17 @@ def main() -> None:
     only = list(dict.fromkeys(k for k in given.only.split(",") if k))
     if unknown := set(only) - set(CASES):
         parser.error(f"--only: unknown {', '.join(sorted(unknown))}; expected {', '.join(CASES)}")
-    for row in summary(run(given.out, given.kills, given.seed, only)):
+    rows = summary(run(given.out, given.kills, given.seed, only))
+    for row in rows:
         print(f"{row['command']:<11} kills {row['kills']:>4}, broken after {row['kills_with_a_broken_invariant']:>3} "
               f"{row['broken'] or ''}, median moment {row['median_moment_s']:.1f} s "
               f"({100 * row['median_share']:.0f} % of an undisturbed run)")  # fmt: skip
+    if given.table:
+        import pandas as pd
+
+        from benchmarks.results import write
+
+        write(given.table, pd.DataFrame(rows).drop(columns="broken"), f"python -m tests.chaos --table {given.table}")
     sys.exit(0)
 
 

@@ -84,6 +84,6 @@ def test_a_failure_is_one_line_and_a_failed_run(
     shown = capfd.readouterr()
     assert shown.out.count("not retrained: the share does not answer") == 1
     assert "Traceback" not in shown.out + shown.err
-    runs, _, lines, _ = _in_prefect("retrain flow-share z")
+    runs, _, lines, _ = _in_prefect("retrain flow-share z", 2)
     assert [r.state.name for r in runs] == ["Failed"]
     assert "not retrained: the share does not answer" in lines and not any("Traceback" in text for text in lines)
