@@ -15,7 +15,7 @@ from thermodrift_exam.proof.report.markdown import BEGIN, END, proof_markdown, p
 from thermodrift_exam.proof.report.tables import ProofRun
 from thermodrift_exam.proof.scoring.tables import SILENT
 
-DOCS = Path(__file__).parents[3] / "docs" / "proof.md"
+DOCS = Path(__file__).parents[4] / "docs" / "proof.md"
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from tests.evidence.proof.toy_proof import ROOT, toy_proof
 from thermodrift_exam.proof.report.markdown import BEGIN, END, RUNS_BEGIN, RUNS_END, publish_proof, record_of, with_runs
 from thermodrift_exam.proof.report.runs import FIGURES, GOAL_COLUMNS, RUN_COLUMNS, read_runs, runs_markdown
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[4]
 RECORD = REPOSITORY / "exam" / "thermodrift_exam" / "proof" / "runs" / "runs.csv"
 PAGES = [REPOSITORY / "docs" / name for name in ("proof.md", "proof_real.md")]
 
