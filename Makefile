@@ -16,8 +16,9 @@ run: $(READY)  ## the main job on the built-in sample year, and a sealed demonst
 test: $(READY)  ## with bytecode, since many tests start processes
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
+EXAM ?= exam/tests
 test-exam: $(READY)  ## those of the examination, which no user at a machine runs
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile exam/tests
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(EXAM)
 
 lint: $(READY)
 	$(BIN)/ruff check .

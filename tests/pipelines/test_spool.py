@@ -155,7 +155,9 @@ def test_what_cannot_be_delivered_now_waits_with_what_follows_it_and_other_chann
     assert len(spool.deliver(own, partial(promote_waiting, own))) == 2 and not spool.waiting(own)
 
 
-@pytest.mark.parametrize("lost", ["track", "promote", "report"])
+@pytest.mark.parametrize(
+    "lost", ["promote", *(pytest.param(step, marks=pytest.mark.slow) for step in ("track", "report"))]
+)
 def test_a_training_that_is_killed_after_a_result_was_kept_loses_nothing(
     lost: str, store: Any, store_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
