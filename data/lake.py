@@ -388,7 +388,8 @@ class Lake:
         try:
             raw, stamp = self._store.read_stamped(file)
         except OSError as error:
-            raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None
+            remedy = "restore it from a backup" if self._store.exclusive else "check address, credentials and network"
+            raise WorkError(f"{where}: cannot be read ({error}); {remedy}") from None
         return None if raw is None else listing.unpack(raw, where, self._key if file != MANIFEST else ""), stamp
 
     def _batches(self, machine: str) -> Batches:
