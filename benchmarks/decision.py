@@ -25,7 +25,7 @@ from benchmarks.beyond import ROOT
 from benchmarks.forward import in_time, machines
 from benchmarks.results import write
 from compensation.faults import with_values
-from compensation.substitutes import Guard, Substitutes
+from compensation.substitutes import Guard
 from data.arrays import Array
 from data.batch import Batch
 from data.machine import Machine
@@ -38,12 +38,9 @@ from models.metrics import residual_std_um
 from models.outlook import outlook
 from models.promotion import decide
 from models.protocols import PromotionRule
+from pipelines.fitted_model import substitutes_of
 
 LAST, BLOCK = 12, 4  # runs that are predicted, and runs between two decisions
-
-
-def guard_of(model: Family, batches: Sequence[Batch]) -> Guard:
-    return Guard(Substitutes.learn(batches, list(dict.fromkeys(i.partition("@")[0] for i in model.inputs))))
 
 
 def corrected_um(model: Family, guard: Guard, batch: Batch) -> tuple[Array, list[str]]:
@@ -76,7 +73,8 @@ def rows(name: str, machine: Machine, batches: Sequence[Batch], effort: str) -> 
             thermal = so_far[0].names("temperature", "ambient")
             recorded = [n for n in thermal if all(np.isfinite(b.masked(n)).any() for b in so_far)]
             ridge = FAMILIES["ridge"]().fit(so_far, recorded, target, machine)
-            guards = guard_of(model, so_far), guard_of(ridge, so_far)
+            guards = [Guard(substitutes_of(m, so_far)) for m in (model, ridge)]
+            bound_um = outlook(result, choice).bound_um
             share = {"champion": 1.0, "provisional": choice.authority}.get(choice.standing, 0.0)
             for b in later:
                 error_um = zeroed_error_um(b, target)
@@ -84,7 +82,7 @@ def rows(name: str, machine: Machine, batches: Sequence[Batch], effort: str) -> 
                 yield {
                     "machine": name, "channel": target, "run": b.batch_id, "n_trained": first,
                     "S_um": residual_std_um(error_um - share * sent_um),
-                    "bound90_S_um": outlook(result, choice).bound_um,
+                    "bound90_S_um": bound_um,
                     "ridge_S_um": residual_std_um(error_um - corrected_um(ridge, guards[1], b)[0]),
                     "no_model_S_um": residual_std_um(error_um), "family": choice.family, "selector": choice.selector,
                     "n_tsp": choice.n_tsp, "standing": choice.standing, "not_recorded": " ".join(lacking),

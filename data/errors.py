@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -51,3 +52,9 @@ def check_suffix(what: str, path: Path, allowed: Sequence[str]) -> None:
         *first, last = allowed
         known = f"{', '.join(first)} or {last}" if first else last
         raise InputError(f"{what} {path}: unsupported file extension {path.suffix!r}; give {known}")
+
+
+def masked(text: str) -> str:
+    """An address, or a text with one, without its password."""
+    text = re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
+    return re.sub(r"(?i)([?&](?:password|passwd|secret|token|key)=)[^&\s]*", r"\1***", text)

@@ -304,7 +304,7 @@ class Lake:
     def machines(self, withdrawn: bool = False) -> list[str]:
         """Names of machines with at least one batch in use; with `withdrawn` also those with withdrawn ones alone."""
         machines = self._every_machine()
-        return sorted(m for m, batches in machines.items() if batches if withdrawn or listing.active(batches))
+        return sorted(m for m, batches in machines.items() if (batches if withdrawn else listing.active(batches)))
 
     def batch_ids(self, machine: str) -> list[str]:
         """Ids of a machine's batches in use, sorted; empty for an unknown machine."""

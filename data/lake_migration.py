@@ -36,7 +36,7 @@ def migrate(root: Path | str, key: str = "") -> Migrated:
 
     Raises:
         InputError: there is no lake.
-        WorkError: a manifest cannot be read, or the lake not be written.
+        WorkError: a manifest cannot be read or is signed with another key, or the lake cannot be written.
     """
     store = open_store(root)
     if store.stamp(MANIFEST) is None:
@@ -49,10 +49,10 @@ def migrate(root: Path | str, key: str = "") -> Migrated:
 
 
 def _migrated(store: Store, key: str) -> Migrated:
-    head = _read(store, MANIFEST)
+    head = _read(store, MANIFEST, key)
     own = {m: {"machines": {m: b}, "pending": head["pending"]} for m, b in head.get("machines", {}).items()}
     for name in store.files(MANIFESTS):
-        found = _read(store, f"{MANIFESTS}/{name}")
+        found = _read(store, f"{MANIFESTS}/{name}", key)
         own |= {machine: found for machine in found["machines"]}
     files, damaged = 0, list[str]()
     for machine, found in own.items():
@@ -87,15 +87,19 @@ def _complete(store: Store, entry: Entry, name: str, damaged: list[str]) -> int:
     return len(lacking)
 
 
-def _read(store: Store, file: str) -> dict[str, Any]:
+def _read(store: Store, file: str, key: str) -> dict[str, Any]:
+    """A manifest of any version; one that is signed must fit the key, so that no forged one is signed again."""
     where = f"lake {store.name}/{file}"
     try:
-        found: dict[str, Any] = json.loads(store.read(file))
+        raw = store.read(file)
+        found: dict[str, Any] = json.loads(raw)
         schema = found["schema"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise WorkError(f"{where}: cannot be read ({error}); restore it from a backup") from None
     if schema not in (*listing.EARLIER, listing.SCHEMA):
         raise WorkError(f"{where}: got schema {schema!r}, expected {listing.SCHEMA!r} or an earlier one")
+    if "hmac" in found:
+        return listing.unpack(raw, where, key)
     if strange := listing.stray(found):
         raise WorkError(f"{where}: {strange}; it was changed by another program; restore it from a backup")
     return found

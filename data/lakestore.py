@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import filecmp
 import os
-import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
-from data.errors import InputError
+from data.errors import InputError, masked
 
 LOCK_WAIT_S = 600.0  # for another writer
 ANSWER_S = 10.0  # for an object store to answer at all
@@ -206,14 +205,14 @@ class Bucket:
     exclusive = False
 
     def __init__(self, address: str) -> None:
-        self.name = _masked(address)
+        self.name = masked(address)
         try:
             self._objects = _opened(address)
         except ImportError:
             raise InputError(f"lake {self.name}: obstore is not installed; run {_INSTALL}") from None
         except Exception as error:  # obstore's own, of no common class with a meaning
             raise InputError(
-                f"lake {self.name}: no place that obstore knows ({_masked(_first_line(error))}); expected a folder or "
+                f"lake {self.name}: no place that obstore knows ({masked(_first_line(error))}); expected a folder or "
                 "an address such as s3://bucket/lake"
             ) from None
 
@@ -329,11 +328,6 @@ def _opened(address: str) -> Any:
 
             options["credential_provider"] = Boto3CredentialProvider()
     return from_url(address, **options)
-
-
-def _masked(text: str) -> str:
-    """An address, or a text with one, without its password."""
-    return re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
 
 
 def _stamp(meta: Any) -> Stamp:

@@ -125,7 +125,9 @@ def unpack(raw: bytes, where: str, key: str) -> dict[str, Any]:
     if key:
         signed = manifest.pop("hmac", "")
         if not signed:
-            raise WorkError(f"{where}: has no HMAC, and a key is set; run `thermodrift lake migrate` to sign the lake")
+            raise WorkError(
+                f"{where}: has no HMAC, and a key is set; run `thermodrift lake migrate` to sign a lake that never was"
+            )
         if not hmac.compare_digest(str(signed), _hmac(manifest, key)):
             raise WorkError(
                 f"{where}: its HMAC does not fit its content; it was changed by another program or signed with another "

@@ -118,7 +118,7 @@ def _at_the_machine(
         tracks = left_out_tracks(design, curves) if curves is not None else []
         updater = Updater.learn(tracks or out_of_fold(design, family.key, range(len(ordered))))
     with suppress(InputError):
-        substitutes = _substitutes(family, ordered)
+        substitutes = substitutes_of(family, ordered)
     return updater, substitutes
 
 
@@ -126,7 +126,8 @@ def _ordered(batches: Sequence[Batch]) -> list[Batch]:
     return sorted(batches, key=lambda b: (b.start is None, b.start, b.batch_id))
 
 
-def _substitutes(family: Family, ordered: Sequence[Batch]) -> Substitutes:
+def substitutes_of(family: Family, ordered: Sequence[Batch]) -> Substitutes:
+    """What replaces the sensors of a family while they fail, learned from batches in order of time."""
     return Substitutes.learn(ordered, list(dict.fromkeys(i.partition("@")[0] for i in family.inputs)))
 
 
@@ -140,6 +141,6 @@ def faults_of(family: Family, batches: Sequence[Batch]) -> FaultCost | None:
     ordered = _ordered(batches)
     run = max(ordered, key=lambda b: largest[b.batch_id])
     try:
-        return fault_cost(family.predict, _substitutes(family, ordered), run, ROOM * most_um)
+        return fault_cost(family.predict, substitutes_of(family, ordered), run, ROOM * most_um)
     except InputError:  # too few runs for a guard
         return None

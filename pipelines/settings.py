@@ -8,7 +8,6 @@ from the environment: ``{env:NAME}``. What is shown of an address is `masked`.
 from __future__ import annotations
 
 import os
-import re
 import string
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from data.errors import InputError, closest
+from data.errors import masked as masked
 from data.yaml_file import load_yaml
 from models.protocols import PromotionRule
 from pipelines import TELEMETRY_OFF
@@ -153,12 +153,6 @@ def load(path: Path | str | None = None) -> Settings:
     lake = lake if "://" in lake else str(base / Path(lake).expanduser())
     key = _filled(parsed.lake_key, base, f"settings file {where}: key 'lake_key'")
     return Settings(base, store, artifacts, parsed.names, parsed.promotion, parsed.diagnose, lake, key)
-
-
-def masked(text: str) -> str:
-    """An address, or a text with one, without its password."""
-    text = re.sub(r"(://[^:/@]*):.*@", r"\1:***@", text)
-    return re.sub(r"(?i)([?&](?:password|passwd|secret|token|key)=)[^&\s]*", r"\1***", text)
 
 
 class _Environment:

@@ -156,7 +156,7 @@ def train(
     checkpoint.remove()
     stopping.note(None)
     if machine.twin is not None:
-        from pipelines import diagnosing  # most of a second of imports that other trainings do not need
+        from pipelines import diagnosing  # its imports take seconds, and most trainings need none
 
         diagnose = partial(
             diagnosing.diagnose_if_grown, request.machine_file, ids=outcome.training_ids, settings=settings, say=say
