@@ -24,16 +24,23 @@ WIDTH_IN = 10.5
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on a page: what it shows, its data: address, whether all of it is simulated."""
+    """A figure on a page: what it shows, its data: address, whether all of it is simulated.
+
+    `look` is a class of the style sheet; `captioned` sets the label above it; `file` is its place next to a Markdown
+    page, which shows no other picture.
+    """
 
     label: str
     source: str
     simulated: bool
+    look: str = ""
+    captioned: bool = False
+    file: str = ""
 
 
-def picture(figure: Figure, label: str, simulated: bool, kind: str = "png") -> Picture:
+def picture(figure: Figure, label: str, simulated: bool, kind: str = "png", look: str = "") -> Picture:
     """The figure as svg or png within the page."""
-    return Picture(label, data_address(picture_bytes(figure, kind), kind), simulated)
+    return Picture(label, data_address(picture_bytes(figure, kind), kind), simulated, look)
 
 
 def data_address(content: bytes, kind: str) -> str:

@@ -3,70 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from reports.labels import count
+from reports.layout import Cell, Column, Gauge, Number, Numbers, Page, Row, Section, Table, Text
 from reports.rendering import write_page
 
 _SCALE = 1.5  # of the drift strip: its end, in 90 % bounds
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Newer runs against the promise, as positions 0..100: dots, the expected S, the 90 % bound."""
-
-    dots: tuple[float, ...]
-    expected: float
-    bound: float
-    beyond: bool
-    label: str
-
-
-@dataclass(frozen=True)
-class FleetCell:
-    """A value and a smaller line below it; `bad` where it is the reason of an alert."""
-
-    text: str
-    below: str = ""
-    bad: bool = False
-
-
-@dataclass(frozen=True)
-class FleetRow:
-    """A machine's channel."""
-
-    machine: str
-    channel: str
-    simulated: bool
-    state: str  # alert, none (no champion, at best provisional) or ok
-    state_label: str
-    champion: FleetCell
-    seen: FleetCell
-    expected: FleetCell
-    newer: FleetCell
-    drift: Drift | None
-    outside: FleetCell
-    sensors: FleetCell
-    next_run: FleetCell
-    failure: FleetCell
-
-
-@dataclass(frozen=True)
-class FleetPage:
-    """What the template shows."""
-
-    title: str
-    simulated: bool  # every row
-    summary: str
-    figures: tuple[tuple[str, str, str], ...]  # label, number, below
-    alerts: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]  # machine -> (channel, reason)
-    rows: tuple[FleetRow, ...]
-    unknown: tuple[str, ...]
-    fleets: tuple[str, ...]
 
 
 def write_fleet_page(
@@ -81,7 +26,7 @@ def write_fleet_page(
     Raises:
         InputError: another suffix than .html, or no place to write.
     """
-    write_page(path, "fleet", fleet_page(rows, alerts, fleets, now), (".html",))
+    write_page(path, fleet_page(rows, alerts, fleets, now), (".html",))
 
 
 def fleet_page(
@@ -89,34 +34,57 @@ def fleet_page(
     alerts: Sequence[tuple[str, str, str]],
     fleets: Sequence[Mapping[str, Any]],
     now: datetime,
-) -> FleetPage:
-    """The page's content, see `write_fleet_page`."""
+) -> Page:
+    """The page, see `write_fleet_page`."""
     machines = {r["machine"] for r in rows}
     alerted = {machine for machine, _, _ in alerts}
     without = sum(r["version"] is None for r in rows)
     failed = {r["machine"] for r in rows if r["last_run"] and not r["last_run"]["ok"]}
     figures = (
-        ("machines", str(len(machines)), f"{count(len(rows), 'channel')}"),
-        ("with an alert", str(len(alerted)), count(len(alerts), "alert")),
-        ("without a champion", str(without), "channels"),
-        ("last retraining failed", str(len(failed)), "machines"),
+        Number("machines", str(len(machines)), f"{count(len(rows), 'channel')}"),
+        Number("with an alert", str(len(alerted)), count(len(alerts), "alert")),
+        Number("without a champion", str(without), "channels"),
+        Number("last retraining failed", str(len(failed)), "machines"),
     )
     summary = (
         f"{count(len(alerts), 'alert')} on {len(alerted)} of {count(len(machines), 'machine')}."
         if alerts else f"No alert on {count(len(machines), 'machine')}."
     )  # fmt: skip
-    grouped = tuple((m, tuple((c, said) for _, c, said in own)) for m, own in groupby(alerts, key=lambda a: a[0]))
     unknown = tuple(f"{r['machine']} {r['channel']}: {r['unknown']}" for r in rows if r["unknown"])
     served = tuple(
-        f"{f['source']}: {count(f['machines'], 'machine')}, {'served now' if f['served'] else 'not served now'}"
+        f"{f['source']}: {count(f['machines'], 'machine')}, {'served now' if f['served'] else 'not served now'}."
         for f in fleets
     )
     simulated = bool(rows) and all(r["simulated"] for r in rows if r["n_seen"])
-    made = tuple(_row(r, now) for r in rows)
-    return FleetPage("Fleet", simulated, summary, figures, grouped, made, unknown, served)
+    sections = [Section("alerts", "Alerts", (_alerts(alerts),))] if alerts else []
+    table = Table("", _COLUMNS, tuple(_row(r, now, simulated) for r in rows), notes=(_NOTE,), look="stacked")
+    sections.append(Section("fleet", "Machines and channels, worst first", (table,), "Machines and channels"))
+    if unknown:
+        sections.append(Section("unknown", "Not known", tuple(Text(said, "note") for said in unknown)))
+    top = (Text(summary), Numbers(figures))
+    return Page("thermodrift status", f"Fleet: {summary}", top, tuple(sections), served, simulated, "Fleet")
 
 
-def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:
+_COLUMNS = (
+    Column("machine, channel"), Column("champion"), Column("knows runs up to"), Column("error to expect, S"),
+    Column("in newer runs, S"), Column("runs outside the trained region"), Column("failed sensors"),
+    Column("next run"), Column("last failure"),
+)  # fmt: skip
+_NOTE = (
+    "S is the standard deviation of what a compensation leaves of the error. The strip: green to the 90 % bound that "
+    "was promised at the training (black), the expected S as a short green line, a dot for each run that is newer than "
+    "the training. A run is outside where its inputs leave the region of the training runs by more than 5 % of its "
+    "width."
+)
+
+
+def _alerts(alerts: Sequence[tuple[str, str, str]]) -> Table:
+    columns = (Column("machine"), Column("channel"), Column("alert", kind="wide"))
+    return Table("", columns, tuple(Row.of(*a) for a in alerts))
+
+
+def _row(r: Mapping[str, Any], now: datetime, simulated: bool) -> Row:
+    """A machine's channel: alert, none (no champion, at best provisional) or ok."""
     has = r["version"] is not None
     state = "alert" if r["alerts"] else "ok" if has else "none"
     lacking = "none" if r["provisional"] is None else f"v{r['provisional']} provisional"
@@ -125,20 +93,20 @@ def _row(r: Mapping[str, Any], now: datetime) -> FleetRow:
     newer, bound = r["newer_S_mean_um"], r["bound90_S_um"]
     drifted = newer is not None and bound is not None and newer > bound
     seen = r["last_seen"] or ""
-    return FleetRow(
-        r["machine"], r["channel"], r["simulated"], state, label,
-        FleetCell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else FleetCell(lacking, r["reason"]),
-        FleetCell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
-                  "old_champion" in r["rules"]),
-        FleetCell(*_expected(r)),
-        FleetCell(f"{newer:.3g} µm" if newer is not None else "not measured" if has else "",
-                  count(len(r["newer_S_um"]), "run") if newer is not None else "", drifted),
-        _drift(r),
-        FleetCell(f"{r['outside_runs']} of {r['of_runs']}" if r["outside_runs"] is not None else
-                  "not known" if has else "", r["outside_why"], "inputs_outside" in r["rules"]),
-        FleetCell(", ".join(r["sensors"]) or ("none failed" if r["n_seen"] else ""), "", bool(r["sensors"])),
-        FleetCell(*_next(r, now)),
-        FleetCell(*_failure(r)),
+    return Row.of(
+        Cell(f"{r['machine']} {r['channel']}", chip=(label, state), simulated=r["simulated"] and not simulated),
+        Cell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else Cell(lacking, r["reason"]),
+        Cell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
+             "old_champion" in r["rules"]),
+        Cell(*_expected(r)),
+        Cell(f"{newer:.3g} µm" if newer is not None else "not measured" if has else "",
+             count(len(r["newer_S_um"]), "run") if newer is not None else "", drifted, gauge=_drift(r)),
+        Cell(f"{r['outside_runs']} of {r['of_runs']}" if r["outside_runs"] is not None else
+             "not known" if has else "", r["outside_why"], "inputs_outside" in r["rules"]),
+        Cell(", ".join(r["sensors"]) or ("none failed" if r["n_seen"] else ""), "", bool(r["sensors"])),
+        Cell(*_next(r, now)),
+        Cell(*_failure(r)),
+        look=state,
     )  # fmt: skip
 
 
@@ -165,17 +133,18 @@ def _failure(r: Mapping[str, Any]) -> tuple[str, str, bool]:
     return f"{when:%Y-%m-%d %H:%M}", r["last_failure"]["summary"], not r["last_run"]["ok"]
 
 
-def _drift(r: Mapping[str, Any]) -> Drift | None:
+def _drift(r: Mapping[str, Any]) -> Gauge | None:
+    """Newer runs against the promise."""
     expected, bound, S_um = r["expected_S_um"], r["bound90_S_um"], r["newer_S_um"]
     if not expected or not bound or not S_um:
         return None
-    end = _SCALE * bound
 
     def at(value_um: float) -> float:
-        return round(100 * min(value_um / end, 1.0), 1)
+        return round(100 * min(value_um / (_SCALE * bound), 1.0), 1)
 
     label = f"S of {count(len(S_um), 'newer run')}: {', '.join(f'{s:.3g}' for s in S_um)} µm; bound {bound:.3g} µm"
-    return Drift(tuple(at(s) for s in S_um), at(expected), at(bound), max(S_um) > end, label)
+    marks = (("expected", at(expected)), ("bound", at(bound)))
+    return Gauge((0.0, at(bound)), marks, tuple(at(s) for s in S_um), label, "drift")
 
 
 def _days(days: float | None) -> str:

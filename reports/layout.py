@@ -1,15 +1,19 @@
-"""What a page is made of: tables, strips of dots and figures, independent of HTML and Markdown."""
+"""What a page is made of: a list of blocks, independent of HTML and Markdown.
+
+A block is a dataclass; `templates/blocks.html.j2` and `templates/blocks.md.j2` draw it by the macro of its name. One
+without a macro does not appear there: Markdown has no figures.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
 
 from matplotlib.figure import Figure
-from matplotlib.text import Text
+from matplotlib.text import Text as FigureText
 
 from data.units import in_error_unit
 from reports.drawing import inline_svg
@@ -84,6 +88,32 @@ class Shade:
 
 
 @dataclass(frozen=True)
+class Gauge:
+    """A small picture of a value in its range, positions in 0..100: a band, marks across it, dots.
+
+    A mark is (look, position): ``expected``, ``bound`` or ``wanted``. Dots beyond the band are drawn in orange.
+    """
+
+    band: tuple[float, float]
+    marks: tuple[tuple[str, float], ...]
+    dots: tuple[float, ...]
+    label: str = ""
+    look: Literal["drift", "interval"] = "interval"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell with a smaller line below, a chip (text, look), a gauge; `alert` where it is the reason of an alert."""
+
+    text: str
+    below: str = ""
+    alert: bool = False
+    chip: tuple[str, str] = ("", "")
+    gauge: Gauge | None = None
+    simulated: bool = False
+
+
+@dataclass(frozen=True)
 class Column:
     """A column's head and how its cells stand."""
 
@@ -99,15 +129,16 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """A row's cells; `mark` says in a word why it stands out."""
+    """A row's cells; `mark` says in a word why it stands out, `look` is a class of the style sheet."""
 
-    cells: tuple[str | Strip | Shade, ...]
+    cells: tuple[str | Strip | Shade | Cell, ...]
     mark: str = ""
+    look: str = ""
 
     @classmethod
-    def of(cls, *cells: str | Strip | Shade, mark: str = "") -> Row:
+    def of(cls, *cells: str | Strip | Shade | Cell, mark: str = "", look: str = "") -> Row:
         """From the cells one by one."""
-        return cls(cells, mark)
+        return cls(cells, mark, look)
 
 
 @dataclass(frozen=True)
@@ -120,6 +151,11 @@ class Table:
     simulated: bool = False
     scale: Scale | None = None
     notes: tuple[str, ...] = ()
+    look: str = ""  # stacked: a card per row on a narrow screen
+
+    def folded(self, counted: bool = True) -> Details:
+        """The table behind its caption, with the number of its rows."""
+        return Details(f"{self.caption} ({len(self.rows)})" if counted else self.caption, (self,))
 
 
 @dataclass(frozen=True)
@@ -142,7 +178,7 @@ def with_unit(block: Any, unit: str) -> Any:
     if isinstance(block, str):
         return in_error_unit(block, unit)
     if isinstance(block, Figure):
-        for text in block.findobj(Text):
+        for text in block.findobj(FigureText):
             text.set_text(in_error_unit(text.get_text(), unit))
     elif isinstance(block, dict):
         return {k: with_unit(v, unit) for k, v in block.items()}
@@ -182,3 +218,157 @@ class Panel:
     simulated: bool = False
     keys: tuple[Key, ...] = ()
     notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; `strong` stands in bold before it, `link` is (label, anchor) behind it."""
+
+    text: str
+    look: str = ""  # classes of the style sheet: note, soft, caution, lead, law, ...
+    strong: str = ""
+    link: tuple[str, str] = ("", "")
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list; numbered where `ordered`."""
+
+    items: tuple[str, ...]
+    look: str = ""
+    ordered: bool = False
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Labels with their values; a value of several lines is a tuple of texts."""
+
+    entries: tuple[tuple[str, str | tuple[Text, ...]], ...]
+    look: str = "facts"  # facts, facts compact, facts quiet, pairs, glossary, three
+
+
+@dataclass(frozen=True)
+class Number:
+    """A large number with what it is; `before` is what it was."""
+
+    label: str
+    value: str
+    what: str = ""
+    before: str = ""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Large numbers in a row."""
+
+    entries: tuple[Number, ...]
+    look: Literal["headline", "figures"] = "headline"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading inside of a section, with a chip (text, look)."""
+
+    text: str
+    chip: tuple[str, str] = ("", "")
+    simulated: bool = False
+    level: Literal[2, 3] = 3
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim with its number, where and when it holds, and its probability in words and in percent."""
+
+    number: int
+    statement: str
+    where: tuple[tuple[str, str], ...]
+    probability: str
+    likelihood: str
+    percent: float
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Numbered claims."""
+
+    entries: tuple[Claim, ...]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Blocks in a box of its own look: pair, half, unsealed, changed, claim, static (for print and without scripts)."""
+
+    blocks: tuple[Any, ...]
+    look: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """Blocks that open on demand."""
+
+    summary: str
+    blocks: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page with an entry in its navigation, `short` or the title; `chip` is (text, look)."""
+
+    anchor: str
+    title: str
+    blocks: tuple[Any, ...]
+    short: str = ""
+    chip: tuple[str, str] = ("", "")
+    simulated: bool = False
+    look: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: `top` stands below its headline (the title where none is given), `above` before it.
+
+    `badge` is set next to the headline and behind the title; of simulated recordings it is SIMULATED.
+    """
+
+    eyebrow: str
+    title: str
+    top: tuple[Any, ...]
+    sections: tuple[Section, ...] = ()
+    footer: tuple[str, ...] = ()
+    simulated: bool = False
+    headline: str = ""
+    chip: tuple[str, str] = ("", "")
+    badge: str = ""
+    above: tuple[Any, ...] = ()
+
+    @property
+    def mark(self) -> str:
+        """The badge."""
+        return self.badge or ("SIMULATED" if self.simulated else "")
+
+    @property
+    def with_viewer(self) -> bool:
+        """Whether a block of the page is a viewer of runs."""
+        return any(type(b).__name__ == "Viewer" for b in every_block(self))
+
+
+def every_block(part: Any) -> Iterator[Any]:
+    """Every block of a page, a section or a block, the outer ones first."""
+    if isinstance(part, Page):
+        inner: tuple[Any, ...] = (*part.above, *part.top, *part.sections)
+    else:
+        yield part
+        inner = getattr(part, "blocks", ())
+    for block in inner:
+        yield from every_block(block)
+
+
+def given(*blocks: Any) -> tuple[Any, ...]:
+    """The blocks that there are: without None and without texts, lists and tables of nothing."""
+    return tuple(b for b in blocks if b is not None and not _empty(b))
+
+
+def _empty(block: Any) -> bool:
+    """A text, a list or a group whose first field, its content, is empty."""
+    of_content = isinstance(block, Text | Items | Pairs | Numbers | Claims | Group)
+    return of_content and not next(iter(vars(block).values()))

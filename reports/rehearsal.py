@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,24 +14,13 @@ from numpy.typing import NDArray
 from compensation.rehearsal import GAP_S, Rehearsal
 from reports.drawing import LINES, MUTED, WIDTH_IN, Picture, head, legend_row, panel, picture
 from reports.labels import GREEN, ORANGE
-from reports.layout import Column, Row, Table
+from reports.layout import Column, Page, Row, Section, Table, Text, given
 from reports.rendering import write_page
+from reports.viewer import Pane, Trace, viewer
 
 _MOST_POINTS = 1500  # of a line: more than there are pixels
 _TALL_IN, _GAP_IN = 2.1, 0.55
 _STATES = {"off": "#d9dee3", "warm-up": "#cfe3f2", "active": GREEN, "hold": "#e9b44c", "fade-out": ORANGE}
-
-
-@dataclass(frozen=True)
-class RehearsalPage:
-    """What the template shows."""
-
-    title: str
-    simulated: bool
-    summary: str
-    table: Table
-    events: Table
-    pictures: tuple[Picture, ...]
 
 
 def write_rehearsal(path: Path, r: Rehearsal, model: str, used: str) -> None:
@@ -41,26 +29,45 @@ def write_rehearsal(path: Path, r: Rehearsal, model: str, used: str) -> None:
     Raises:
         InputError: another suffix than .html, or no place to write.
     """
-    write_page(path, "rehearsal", rehearsal_page(r, model, used), (".html",))
+    write_page(path, rehearsal_page(r, model, used), (".html",))
 
 
-def rehearsal_page(r: Rehearsal, model: str, used: str) -> RehearsalPage:
-    """The page's content."""
+def rehearsal_page(r: Rehearsal, model: str, used: str) -> Page:
+    """The page."""
     axes = list(r.before_um)
     parts = []
     for a in axes:
         before, after = r.band_um(a)
         parts.append(f"{a}: {before:.1f} to {after:.1f} µm")
     failed = f", {len(r.failures)} failing sensor{'s' if len(r.failures) > 1 else ''}" if r.failures else ""
-    return RehearsalPage(
-        f"{r.machine}: rehearsal of the compensation",
-        r.simulated,
+    summary = (
         f"Width of the band that holds 95 % of the rows, without and with compensation: {'; '.join(parts)}. "
-        f"{model} answered {len(r.time_s)} samples of {len(r.starts_s)} recordings{failed}. Of the recordings: {used}.",
-        _table(r),
-        _events(r),
-        tuple(_picture(r, a) for a in axes),
+        f"{model} answered {len(r.time_s)} samples of {len(r.starts_s)} recordings{failed}. Of the recordings: {used}."
     )
+    every = viewer("Error and correction, run by run", [p for a in axes for p in _panes(r, a)], r.simulated)
+    blocks = given(*(_picture(r, a) for a in axes), _table(r), every, _events(r).folded())
+    footer = (
+        "The correction never acts on the temperatures, so the recorded error plus the correction is what a "
+        "compensated machine would have shown.",
+    )
+    title = f"{r.machine}: rehearsal of the compensation"
+    sections = (Section("rehearsal", "", blocks),)
+    return Page("thermodrift compensation", title, (Text(summary),), sections, footer, r.simulated)
+
+
+def _panes(r: Rehearsal, axis: str) -> list[Pane]:
+    """A pane per recording, its time from its start."""
+    starts = sorted(r.starts_s.items(), key=lambda item: item[1])
+    edges = np.searchsorted(r.time_s, [*(s - 1e-6 for _, s in starts), np.inf])
+    panes = []
+    for (name, start_s), (a, b) in zip(starts, pairwise(edges), strict=True):
+        traces = (
+            Trace("without compensation", r.before_um[axis][a:b], "before"),
+            Trace("with compensation", r.after_um[axis][a:b], "computed"),
+            Trace("sent", r.sent_um[axis][a:b], "sent", lower=True),
+        )
+        panes.append(Pane(name, axis, "um", (r.time_s[a:b] - start_s) / 3600, traces, residual=False))
+    return panes
 
 
 def _table(r: Rehearsal) -> Table:
@@ -121,7 +128,7 @@ def _picture(r: Rehearsal, axis: str) -> Picture:
         upper.annotate(f"{f.channel} {f.how}", (f.start_s / 3600, 1.0), xycoords=("data", "axes fraction"),
                        fontsize=7.5, color=ORANGE, va="bottom")  # fmt: skip
     _states(lower, r, axis)
-    return picture(fig, f"Error and correction of {axis} in the rehearsal", r.simulated)
+    return picture(fig, f"Error and correction of {axis} in the rehearsal", r.simulated, look="full")
 
 
 def _lines(ax: Axes, r: Rehearsal, lines: list[tuple[NDArray[np.float64], str, float]]) -> None:

@@ -1,7 +1,9 @@
-"""Jinja templates filled with pages, tables and figures: HTML and Markdown."""
+"""Pages as HTML and Markdown: one template of a page, one macro per kind of block."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 from collections.abc import Sequence
 from functools import cache
@@ -13,7 +15,7 @@ from markupsafe import Markup
 
 from data.errors import InputError, check_suffix
 from data.files import write_atomic
-from reports.layout import Shade, Strip
+from reports.layout import Page
 
 FORMATS = (".html", ".md")
 _TEMPLATES = Path(__file__).with_name("templates")
@@ -22,16 +24,17 @@ _HELD_TOGETHER = re.compile(r"(?<=\d) (?=(?:%|s|K|µm|points)(?!\w))|(?<=[≤≥
 _MARKDOWN = re.compile(r"[\\|*`\[\]<]|(?<!\w)_|_(?!\w)")  # an underscore inside a word is only itself
 
 
-def write_page(path: Path, template: str, page: object, formats: Sequence[str] = FORMATS) -> None:
-    """Write a page by its template; the suffix of `path`, one of `formats`, decides the format.
+def write_page(path: Path, page: Page, formats: Sequence[str] = FORMATS) -> None:
+    """Write a page; the suffix of `path`, one of `formats`, decides the format. It appears whole or not at all.
 
-    The folder is made; the file appears whole or not at all.
+    An HTML page is self-contained: it loads nothing, and runs no script but its own, named by their hashes in its
+    content security policy. The folder is made.
 
     Raises:
         InputError: another suffix, or a place that cannot be written.
     """
     check_suffix("report", path, formats)
-    text = rendered(f"{template}{path.suffix}", page)
+    text = rendered(page, path.suffix)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, text)
@@ -39,30 +42,49 @@ def write_page(path: Path, template: str, page: object, formats: Sequence[str] =
         raise InputError(f"report {path}: cannot be written ({error.strerror}); give another place") from None
 
 
-def rendered(name: str, page: object, **more: object) -> str:
-    """The text of a template (``twin.html``, ``twin.md``) filled with a page and the time in UTC."""
+def rendered(page: Page, suffix: str) -> str:
+    """The page as text in the format of the suffix, with the time in UTC."""
     written = f"{pd.Timestamp.now('UTC'):%Y-%m-%d %H:%M} UTC"
-    template = template_environment(name.endswith(".html")).get_template(f"{name}.j2")
-    return template.render(page=page, written=written, **more)
+    env = _environment(suffix == ".html")
+    scripts = [_resource("page.js")]
+    if page.with_viewer:
+        scripts = [_resource("uplot/uPlot.iife.min.js"), _resource("viewer.js"), *scripts]
+    hashes = [base64.b64encode(hashlib.sha256(s.encode("utf-8")).digest()).decode("ascii") for s in scripts]
+    return env.get_template(f"page{suffix}.j2").render(
+        page=page, written=written, style=Markup(_resource("style.css")),
+        scripts=[Markup(s) for s in scripts], hashes=hashes,
+        uplot_style=Markup(_resource("uplot/uPlot.min.css")), uplot_licence=Markup(_resource("uplot/LICENSE")),
+    )  # fmt: skip
 
 
 @cache
-def template_environment(html: bool) -> Environment:
+def _resource(name: str) -> str:
+    return (_TEMPLATES / name).read_text(encoding="utf-8")
+
+
+@cache
+def _environment(html: bool) -> Environment:
     env = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=html, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, keep_trailing_newline=True, finalize=None if html else _markdown,
     )  # fmt: skip
-    env.tests["strip"] = lambda cell: isinstance(cell, Strip)
-    env.tests["shade"] = lambda cell: isinstance(cell, Shade)
-    if html:
-        env.globals["style"] = Markup((_TEMPLATES / "style.css").read_text(encoding="utf-8"))
-        env.filters["unbroken"] = _unbroken
+    env.filters["kind"] = lambda value: type(value).__name__.lower()
+    env.filters["unbroken"] = _unbroken
+
+    def show(block: object, anchor: str) -> Markup:
+        macros = env.get_template(f"blocks.{'html' if html else 'md'}.j2").module
+        draw = getattr(macros, type(block).__name__.lower(), None)
+        return Markup("" if draw is None else draw(block, anchor))
+
+    env.globals["show"] = show
     return env
 
 
 def _markdown(value: object) -> object:
     """Names as they are: what Markdown would read as markup gets a backslash."""
-    return _MARKDOWN.sub(r"\\\g<0>", value).replace("\n", " ") if isinstance(value, str) else value
+    if isinstance(value, Markup) or not isinstance(value, str):
+        return value
+    return _MARKDOWN.sub(r"\\\g<0>", value).replace("\n", " ")
 
 
 def _unbroken(text: str) -> str:

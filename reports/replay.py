@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 from models.replay import Paired, Replay, Retraining, Run, Score
 from reports.drawing import LINES, MUTED, WIDTH_IN, panel
 from reports.labels import GREEN, NOTHING, count, number
-from reports.layout import Column, Key, Panel, Plot, Row, Table
+from reports.layout import Column, Key, Number, Numbers, Page, Panel, Plot, Row, Section, Table, Text
 from reports.rendering import write_page
 
 CHAMPION, FROZEN, NONE = LINES[0], LINES[1], "#8a949f"
@@ -22,44 +21,12 @@ _TALL_IN = 3.1
 _TICKS = 12  # dates below the picture
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A number of the first screen: label, value, and what it means."""
-
-    label: str
-    value: str
-    what: str
-
-
-@dataclass(frozen=True)
-class ChannelPart:
-    """One error channel."""
-
-    target: str
-    facts: tuple[Fact, ...]
-    picture: Panel
-    retrainings: Table
-    reasons: Table
-    runs: Table
-
-
-@dataclass(frozen=True)
-class ReplayPage:
-    """What the template shows."""
-
-    title: str
-    simulated: bool
-    summary: str
-    channels: tuple[ChannelPart, ...]
-    arrivals: Table
-
-
 def write_replay(path: Path, r: Replay) -> None:
     """Write the page. Raises: InputError, another suffix than .html, or no place to write."""
-    write_page(path, "replay", replay_page(r), (".html",))
+    write_page(path, replay_page(r), (".html",))
 
 
-def replay_page(r: Replay) -> ReplayPage:
+def replay_page(r: Replay) -> Page:
     """The page's content."""
     plan = "as recorded" if r.seed is None else f"disturbed by seed {r.seed}"
     runs = len({a.batch_id for a in r.arrivals})
@@ -70,29 +37,32 @@ def replay_page(r: Replay) -> ReplayPage:
         "by the champion in force when it arrived, before any model learned it. Of the recordings: "
         f"{r.account['summary']}."
     )
-    return ReplayPage(
-        f"{r.machine}: replay of a year", r.simulated, summary, tuple(_channel(r, t) for t in r.targets), _arrivals(r)
-    )
+    sections = [_channel(r, t, f"p{k}") for k, t in enumerate(r.targets, 1)]
+    disturbed = _arrivals(r)
+    if disturbed.rows or len(disturbed.notes) > 1:
+        sections.append(Section("arrivals", "", (disturbed.folded(),), "Arrivals"))
+    footer = ("The models are in the replay's own home and in no registry that a machine uses.",)
+    title = f"{r.machine}: replay of a year"
+    return Page("thermodrift replay", title, (Text(summary),), tuple(sections), footer, r.simulated)
 
 
-def _channel(r: Replay, target: str) -> ChannelPart:
-    return ChannelPart(
-        target, _facts(r.score(target)), _picture(r, target), _retrainings(r, target), _reasons(r, target),
-        _runs(r, target),
-    )  # fmt: skip
+def _channel(r: Replay, target: str, anchor: str) -> Section:
+    reasons, runs = _reasons(r, target), _runs(r, target)
+    blocks = (Numbers(_facts(r.score(target))), _picture(r, target), _retrainings(r, target))
+    return Section(anchor, target, (*blocks, reasons.folded(counted=False), runs.folded()), look="channel")
 
 
-def _facts(s: Score) -> tuple[Fact, ...]:
+def _facts(s: Score) -> tuple[Number, ...]:
     if not s.n:
-        return (Fact("runs with a champion", "0", "no trustworthy model was promoted"),)
+        return (Number("runs with a champion", "0", "no trustworthy model was promoted"),)
     share = f"{100 * s.covered / s.bounded:.0f} %" if s.bounded else NOTHING
     stated = f"{s.covered_stated} of {s.bounded_stated} below the bound that the champion states for any run"
     return (
-        Fact("champion of the day", f"{s.S_um:.2f} µm", f"mean S of {count(s.n, 'run')}"),
-        Fact("first champion, frozen", f"{s.frozen_S_um:.2f} µm",
-             f"{_paired(s.against_frozen)} µm paired; another champion on {count(s.retrained, 'run')}"),
-        Fact("no model", f"{s.none_S_um:.2f} µm", f"{_paired(s.against_none)} µm paired"),
-        Fact("below the run's 90 % bound", share, f"{s.covered} of {count(s.bounded, 'run')}; {stated}"),
+        Number("champion of the day", f"{s.S_um:.2f} µm", f"mean S of {count(s.n, 'run')}"),
+        Number("first champion, frozen", f"{s.frozen_S_um:.2f} µm",
+               f"{_paired(s.against_frozen)} µm paired; another champion on {count(s.retrained, 'run')}"),
+        Number("no model", f"{s.none_S_um:.2f} µm", f"{_paired(s.against_none)} µm paired"),
+        Number("below the run's 90 % bound", share, f"{s.covered} of {count(s.bounded, 'run')}; {stated}"),
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from models.result import GridResult, Training
 from reports.comparison import figures, tables
 from reports.comparison import story as records
 from reports.comparison.certainty import bound_panel, bound_table, certainty_table, diagnostics_table
-from reports.comparison.headline import Headline, headline
+from reports.comparison.headline import groups_table, headline
 from reports.comparison.race import race_table, why_panel
 from reports.comparison.readings import readings_panel, readings_table
 from reports.comparison.story import Verdict, comparison_rows, mark_of
@@ -38,41 +38,11 @@ from reports.labels import (
     family_label,
     family_style,
     listed,
+    number,
     selector_label,
 )
-from reports.layout import Key, Panel, Plot, Table
-
-
-@dataclass(frozen=True)
-class Channel:
-    """Everything the templates show of one error channel."""
-
-    anchor: str
-    name: str
-    simulated: bool
-    protocol: str
-    verdict: Verdict
-    headline: Headline
-    inputs: str
-    why: Panel | None
-    race: Table | None
-    boards: tuple[Table, ...]
-    certainty: Table | None
-    heat: Table | None
-    points: Panel | None
-    frequency: Table | None
-    weaknesses: Table | None
-    left_out: Panel | None
-    protocols: tuple[Table, ...]
-    batches: Table
-    rise: Panel | None
-    rises: Table | None
-    readings: Table | None
-    reading_curve: Panel | None
-    comparison: tuple[tuple[str, str], ...]
-    trainings: Table | None
-    changes: tuple[str, ...]
-    change: Panel | None
+from reports.layout import Details, Key, Pairs, Panel, Plot, Section, Table, Text, given
+from reports.viewer import Pane, Trace, Viewer, viewer
 
 
 def channel_part(
@@ -82,53 +52,91 @@ def channel_part(
     choices: Sequence[Choice],
     outcome: Verdict,
     rule: PromotionRule,
-) -> Channel:
+) -> Section:
     """A channel's part from its trainings, newest first, and their promoted cells."""
     result, choice = group[0].result, choices[0]
     protocol = protocols_of(result)[0]
     cells = scored(result, protocol)
     digits = decimals(choice.S_std_um, choice.n_batches)
-    mark = mark_of(group[0])
-    promoted = Promoted(choice, digits, mark)
-    boards = tuple(
-        tables.leaderboard(result, cells, key, promoted, f"{name}: best cell of every {key}, {protocol}")
-        for key in ("family", "selector")
+    promoted = Promoted(choice, digits, mark_of(group[0]))
+    shown = left_out_batches(result, choice)
+    left_out = left_out_panel(name, result, [b for b in shown if b.place], digits)
+    blocks = (
+        *headline(name, group[0], choice, outcome, digits),
+        Text(f"Points: {', '.join(choice.inputs)}.", "note") if choice.inputs else None,
+        left_out or Text("No left-out prediction of this model was kept.", "soft"),
+        runs_viewer(name, result, shown, digits),
+        groups_table(name, result, choice, digits),
+        why_panel(name, result, choice, rule, digits),
+        Details("Promotion, and what changed since the last training", _promotion(name, group, choices, outcome, rule)),
+        Details("The race, and leaderboards by protocol", _boards(name, result, promoted, digits)),
+        _folded(
+            "Selectors, families and number of points",
+            tables.heat_map(name, result, cells, digits),
+            _points(name, result, cells, choice),
+            tables.point_frequency(name, result, cells, protocol),
+            diagnostics_table(name, result),
+        ),
+        _folded(
+            "Certainty, and the error outside the trained region",
+            certainty_table(name, result, cells, choice, digits, promoted.mark),
+            bound_panel(name, result.distances, result.simulated),
+            bound_table(name, result.distances, digits, result.simulated),
+        ),
+        _folded("What a touch probe is worth", readings_table(name, result, digits), readings_panel(name, result)),
+        Details("Every batch", (tables.batches(result, choice, digits),)),
     )
-    others = []
-    for other in protocols_of(result)[1:]:
-        own = scored(result, other)
-        if len(own):
-            caption = f"{name}: best cell of every family, {other}"
-            others.append(tables.leaderboard(result, own, "family", promoted, caption))
+    chip = (outcome.chip, outcome.outcome)
+    return Section(anchor, name, given(*blocks), chip=chip, simulated=result.simulated, look="channel")
+
+
+def _folded(summary: str, *blocks: Any) -> Details | None:
+    """Details of what there is; None of nothing."""
+    inside = given(*blocks)
+    return Details(summary, inside) if inside else None
+
+
+def _promotion(
+    name: str, group: Sequence[Training], choices: Sequence[Choice], outcome: Verdict, rule: PromotionRule
+) -> tuple[Any, ...]:
     changes, change = _changes(name, group, choices, rule)
-    return Channel(
-        anchor=anchor,
-        name=name,
-        simulated=result.simulated,
-        protocol=protocol,
-        verdict=outcome,
-        headline=headline(name, group[0], choice, outcome, digits),
-        inputs=", ".join(choice.inputs),
-        why=why_panel(name, result, choice, rule, digits),
-        race=race_table(name, result, digits),
-        boards=boards,
-        certainty=certainty_table(name, result, cells, choice, digits, mark),
-        heat=tables.heat_map(name, result, cells, digits),
-        points=_points(name, result, cells, choice),
-        frequency=tables.point_frequency(name, result, cells, protocol),
-        weaknesses=diagnostics_table(name, result),
-        left_out=left_out_panel(name, result, left_out_batches(result, choice), digits),
-        protocols=tuple(others),
-        batches=tables.batches(result, choice, digits),
-        rise=bound_panel(name, result.distances, result.simulated),
-        rises=bound_table(name, result.distances, digits, result.simulated),
-        readings=readings_table(name, result, digits),
-        reading_curve=readings_panel(name, result),
-        comparison=tuple(comparison_rows(group[0].promotion)),
-        trainings=_trainings(group, choices) if len(group) > 1 else None,
-        changes=changes,
-        change=change,
+    compared = tuple(comparison_rows(group[0].promotion))
+    return given(
+        Text(outcome.summary),
+        Pairs(compared, "pairs") if compared else Text("No comparison with a champion belongs to this training."),
+        *map(Text, changes),
+        _trainings(group, choices) if len(group) > 1 else None,
+        change,
     )
+
+
+def _boards(name: str, result: GridResult, promoted: Promoted, digits: int) -> tuple[Any, ...]:
+    """The race, the best cell of every family and selector by the first protocol, and by family under the others."""
+    first, *others = protocols_of(result)
+    wanted = [(first, "family"), (first, "selector"), *((p, "family") for p in others)]
+    boards = []
+    for protocol, key in wanted:
+        cells = scored(result, protocol)
+        if len(cells):
+            caption = f"{name}: best cell of every {key}, {protocol}"
+            boards.append(tables.leaderboard(result, cells, key, promoted, caption))
+    apart = Text("Numbers of different protocols are not comparable.", "soft")
+    return given(race_table(name, result, digits), apart, *boards)
+
+
+def runs_viewer(name: str, result: GridResult, shown: Sequence[LeftOut], digits: int) -> Viewer | None:
+    """Every left-out run, recorded and predicted; None along an axis, where a run is no line over the time."""
+    panes = [
+        Pane(
+            b.batch_id, result.target, "um", b.time_h,
+            (Trace("recorded", b.recorded_um, "recorded"), Trace("predicted", b.predicted_um, "computed")),
+            f"S = {number(b.S_um, digits)} µm",
+        )
+        for b in shown
+        if b.position_mm is None
+    ]  # fmt: skip
+    how = f", {shown[0].protocol}" if shown else ""
+    return viewer(f"{name}: every left-out run{how}", panes, result.simulated)
 
 
 def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) -> Panel | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from models.outlook import Outlook, outlook
@@ -14,51 +15,42 @@ from models.result import GridResult, Training
 from reports.comparison.story import Verdict
 from reports.comparison.tables import group_order
 from reports.labels import NOTHING, cell_label, count, number, percent, plus_minus, sentence
-from reports.layout import Column, Row, Table
+from reports.layout import Column, Number, Numbers, Row, Table, Text, given
 
 _GROUPS = {"season": "leave-season-out", "speed": "leave-speed-out"}
-
-
-@dataclass(frozen=True)
-class Headline:
-    """Figures as (label, value, what it is), the sentence below them, and warnings; empty where there are none."""
-
-    figures: tuple[tuple[str, str, str], ...]
-    rests_on: str
-    warning: str
-    caution: str
-    groups: Table | None
 
 
 _S = "S is the standard deviation of the error that is left in a run."
 
 
-def headline(name: str, training: Training, choice: Choice, verdict: Verdict, digits: int) -> Headline:
-    """The first screen of one channel."""
+def headline(name: str, training: Training, choice: Choice, verdict: Verdict, digits: int) -> tuple[Any, ...]:
+    """The first screen of one channel as blocks: figures, what they rest on, warnings; without the groups' table."""
     result, expected = training.result, outlook(training.result, choice)
     forward = expected.protocol == "forward"
     none_um = _no_model_um(result, expected.protocol)
+    own = _of_cell(result, choice.selector, choice.family, choice.n_tsp)
+    S_um = own.loc[own["protocol"] == expected.protocol, "S_um"].to_numpy(float)
+    below = f"{int((S_um <= expected.bound_um).sum())} of {count(int(np.isfinite(S_um).sum()), 'left-out run')} below"
     figures = [
-        (
+        Number(
             "Expected next season" if forward else "Expected error, optimistic",
             f"{number(expected.S_um, digits)} µm",
             f"mean S of {count(expected.n_runs, 'later run' if forward else 'left-out run')}"
             + (", each by the model that the others chose" if expected.nested else ""),
         ),
-        ("9 of 10 runs stay below", f"{number(expected.bound_um, digits)} µm", "90 % bound, one run"),
-        (
+        Number("90 % bound of one run", f"{number(expected.bound_um, digits)} µm", f"{below} it"),
+        Number(
             "Leave-batch-out",
             f"{plus_minus(expected.leave_batch_out_um, expected.leave_batch_out_std_um, digits)} µm",
             "all other runs are known",
         ),
-        ("No model", f"{number(none_um, digits)} µm", f"S on the same {'later ' if forward else ''}runs"),
+        Number("No model", f"{number(none_um, digits)} µm", f"S on the same {'later ' if forward else ''}runs"),
     ]
-    return Headline(
-        tuple(f for f in figures if not f[1].startswith(NOTHING)),
-        _rests_on(result, choice, expected),
-        sentence(expected.warning),
-        verdict.caution,
-        _groups(name, result, choice, expected, digits),
+    return given(
+        Text(sentence(expected.warning), "caution"),
+        Numbers(tuple(f for f in figures if not f.value.startswith(NOTHING))),
+        Text(verdict.caution, "caution"),
+        Text(_rests_on(result, choice, expected)),
     )
 
 
@@ -108,8 +100,9 @@ def _rests_on(result: GridResult, choice: Choice, expected: Outlook) -> str:
     )
 
 
-def _groups(name: str, result: GridResult, choice: Choice, expected: Outlook, digits: int) -> Table | None:
+def groups_table(name: str, result: GridResult, choice: Choice, digits: int) -> Table | None:
     """Every season and speed: S of the model forward, with the group left out, and without a model; worst marked."""
+    expected = outlook(result, choice)
     own = _of_cell(result, choice.selector, choice.family, choice.n_tsp)
     nothing = _of_cell(result, "none", "zero", 0)
     rows: list[tuple[float, Row]] = []

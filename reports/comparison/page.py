@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,39 +16,19 @@ from models import FAMILIES
 from models.protocols import PromotionRule
 from models.result import GridResult, Training
 from reports.comparison import story as records
-from reports.comparison.channel import Channel, channel_part
+from reports.comparison.channel import channel_part
 from reports.comparison.headline import overview
 from reports.comparison.story import promoted_cell, verdict
 from reports.comparison.tables import group_order, protocols_of, scored
 from reports.labels import count, decimals, family_label, listed, number, selector_label
-from reports.layout import Table, with_unit
+from reports.layout import Page, Pairs, Section, Text, given, with_unit
 from reports.rendering import FORMATS, write_page
 
 _FEW_FINDINGS = 12
 
 
-@dataclass(frozen=True)
-class Page:
-    """Everything that the templates show."""
-
-    title: str
-    machines: str
-    simulated: bool
-    facts: tuple[tuple[str, str], ...]
-    overview: Table | None
-    channels: tuple[Channel, ...]
-    findings_summary: str
-    findings: tuple[Table, ...]  # a summary where there are many, then every finding
-    few_findings: bool
-    excluded: Table | None
-    rule: str
-    families: tuple[tuple[str, str], ...]
-    selectors: tuple[tuple[str, str], ...]
-    sources: tuple[tuple[str, str], ...]
-
-
 def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
-    """Collect the page. Trainings of one machine and channel are compared; the newest stands for the channel.
+    """The page. Trainings of one machine and channel are compared; the newest stands for the channel.
 
     Raises:
         InputError: no training, or one without a judged cell.
@@ -74,39 +54,47 @@ def page(trainings: Sequence[Training], rule: PromotionRule) -> Page:
     common = units[0] if len({*units}) == 1 else "its own unit"
     results = [t.result for t in newest]
     simulated = any(t.simulated or t.result.simulated for t in trainings)
-    found = records.findings_of(results)
+    machine = listed(machines)
     n_batches = sum(len(set().union(*(r.batches["batch_id"] for r in results if r.machine == m))) for m in machines)
-    left = records.excluded(list(zip(names, results, strict=True)), simulated)
-    every = (records.findings(found, simulated),) if len(found) else ()
-    many = (records.findings_by_channel(found, simulated),) if len(found) > _FEW_FINDINGS else ()
+    first = with_unit(overview(rows, simulated), common) if len(rows) > 1 else None
+    sources = [f"{_name(t, len(machines) > 1)}, {t.started:%Y-%m-%d %H:%M} UTC: {t.training_id}" for t in trainings]
     return Page(
-        title=f"Thermal error models of {listed(machines)}",
-        machines=listed(machines),
-        simulated=simulated,
-        facts=_facts(newest, n_batches),
-        overview=with_unit(overview(rows, simulated), common) if len(rows) > 1 else None,
-        channels=tuple(channels),
-        findings_summary=records.findings_summary(found, n_batches),
-        findings=many + every,
-        few_findings=not many,
-        excluded=left if left.rows else None,
-        rule=_rule_sentence(rule),
-        families=_members(FAMILIES, results, "family", family_label),
-        selectors=_members(SELECTORS, results, "selector", selector_label),
-        sources=tuple(
-            (f"{_name(t, len(machines) > 1)}, {t.started:%Y-%m-%d %H:%M} UTC", t.training_id) for t in trainings
-        ),
+        "thermodrift comparison report",
+        f"Thermal error models of {machine}",
+        given(Pairs(_facts(newest, n_batches), "facts compact"), first),
+        (*channels, _findings(list(zip(names, results, strict=True)), n_batches, simulated), _glossary(results, rule)),
+        (f"From tracked trainings: {'; '.join(sources)}.",),
+        simulated,
     )
 
 
-def _members(
-    registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]
-) -> tuple[tuple[str, str], ...]:
+def _findings(results: Sequence[tuple[str, GridResult]], n_batches: int, simulated: bool) -> Section:
+    found = records.findings_of([r for _, r in results])
+    left = records.excluded(results, simulated)
+    every = records.findings(found, simulated) if len(found) else None
+    if every is not None and len(found) > _FEW_FINDINGS:
+        shown: tuple[Any, ...] = (records.findings_by_channel(found, simulated), every.folded())
+    else:
+        shown = (every,)
+    none = Text("No channel was excluded and no family failed.")
+    blocks = given(Text(records.findings_summary(found, n_batches)), *shown, left if left.rows else none)
+    return Section("findings", "Data findings", blocks, simulated=simulated)
+
+
+def _glossary(results: Sequence[GridResult], rule: PromotionRule) -> Section:
+    members = (
+        ("families", _members(FAMILIES, results, "family", family_label)),
+        ("selectors", _members(SELECTORS, results, "selector", selector_label)),
+        ("champion, provisional, challenger", f"{_STANDINGS} {_rule_sentence(rule)}"),
+    )
+    return Section("glossary", "What the numbers mean", (Pairs((*GLOSSARY, *members), "glossary"),))
+
+
+def _members(registry: Registry, results: Sequence[GridResult], column: str, label: Callable[[str], str]) -> str:
     """Label and summary of every member that was tried, in the registry's order."""
     tried = set().union(*(r.cells[column] for r in results))
-    return tuple(
-        (label(key), registry[key].summary.removeprefix(f"{label(key)}: ")) for key in registry if key in tried
-    )
+    said = [f"{label(k)} ({registry[k].summary.removeprefix(f'{label(k)}: ')})" for k in registry if k in tried]
+    return f"{'; '.join(said)}."
 
 
 def _grouped(trainings: Sequence[Training]) -> list[list[Training]]:
@@ -161,5 +149,36 @@ def write_report(trainings: Sequence[Training], path: Path, rule: PromotionRule)
     """
     path = Path(path)
     check_suffix("report", path, FORMATS)
-    write_page(path, "report", page(trainings, rule))
+    write_page(path, page(trainings, rule))
     return path
+
+
+_STANDINGS = (
+    "The version that runs on the machine; without a champion one that is better than no model, but not beyond doubt; "
+    "and one that was not shown to be better."
+)
+GLOSSARY = (
+    ("S", "Residual standard deviation of one batch, S = √(Σ (recorded − predicted)² / (n − 1)), over its n usable "
+     "samples. Recorded errors are zeroed at the batch's first sample, along an axis at each position by the first "
+     "sweep."),
+    ("S_mean", "Accuracy: mean of S over the batches that were not used in the fit. Smaller is better."),
+    ("S_std", "Robustness: standard deviation (n − 1) of S over the same batches. Smaller is better."),
+    ("max |e|", "Largest |recorded − predicted| of any sample of any such batch."),
+    ("fitted S", "Mean S on the batches of the fit. Far below S_mean means that the model has learned its batches by "
+     "heart."),
+    ("nested", "S_mean ± S_std when every batch is predicted by the cell that the other batches chose. The best of "
+     "many cells looks better than it is; this number does not."),
+    ("of no model", "S_mean as a share of what is left when nothing is compensated."),
+    ("points", "Temperature-sensitive points (TSP): the sensors that a model takes as inputs."),
+    ("stability of points", "Mean Jaccard similarity |A∩B| / |A∪B| of the sets chosen in different folds. 1: always "
+     "the same points."),
+    ("expected next season", "Mean S under forward, the nearest to what the machine will do. Without dates no later "
+     "run can be predicted from earlier ones, and the number is optimistic."),
+    ("forward, forward-gap", "Order the runs by date, fit on the past, predict the next block of runs; each block "
+     "then joins the past. With a gap the four weeks before the block are left out too."),
+    ("leave-batch-out", "Fit on all batches but one, predict that one; every batch is left out once."),
+    ("train-on-one", "Fit on one batch, predict every other; mean over all such models. S_std is the mean over the "
+     "models of their spread."),
+    ("leave-season-out, leave-speed-out", "Leave out all batches of a season (band of start ambient) or of a spindle "
+     "speed."),
+)  # fmt: skip

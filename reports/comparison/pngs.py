@@ -28,7 +28,7 @@ def figure_pngs(result: GridResult) -> dict[str, bytes]:
         return {}
     choice = choose(result, rule.only(protocol))
     title, simulated = f"{result.machine} {result.target}, {protocol}", result.simulated
-    best, shown = best_per(cells, "family"), left_out_batches(result, choice)
+    best, shown = best_per(cells, "family"), [b for b in left_out_batches(result, choice) if b.place]
     tried = paths(cells)
     lines = best_per(tried, "family").head(_MOST_LINES)[["family", "selector"]].merge(tried)
     with _DRAWING:

@@ -31,7 +31,7 @@ class LeftOut:
 
     protocol: str
     batch_id: str
-    place: str  # best, median or worst
+    place: str  # best, median, worst; "" for all others
     S_um: float
     time_h: Array
     recorded_um: Array
@@ -113,7 +113,7 @@ def frequencies(result: GridResult, cells: pd.DataFrame, protocol: str) -> list[
 
 
 def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
-    """The best, the median and the worst batch by S of a cell; empty where no left-out prediction was kept.
+    """Every left-out batch of a cell by S, the best, median and worst by name; empty where no prediction was kept.
 
     Of the later runs, predicted forward in time, where the training kept them, else of all, left out one by one.
     """
@@ -128,7 +128,7 @@ def left_out_batches(result: GridResult, choice: Choice) -> list[LeftOut]:
     rows = rows[(rows["n_tsp"] == choice.n_tsp) & np.isfinite(rows["S_um"])].sort_values("S_um", kind="stable")
     ids, values = list(rows["batch_id"]), list(rows["S_um"])
     places = dict(zip(_three(len(ids)), ("best", "median", "worst"), strict=False))
-    return [_left_out(table, protocol, column, ids[i], place, float(values[i])) for i, place in places.items()]
+    return [_left_out(table, protocol, column, ids[i], places.get(i, ""), float(values[i])) for i in range(len(ids))]
 
 
 def _three(n: int) -> Sequence[int]:

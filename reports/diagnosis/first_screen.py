@@ -10,6 +10,7 @@ from data.units import unit_label
 from diagnosis.findings.schema import DetectionLimit, Finding, Findings
 from reports.diagnosis import tables
 from reports.labels import count, listed, three_digits
+from reports.layout import Group, Heading, Number, Pairs, Text
 
 Outcome = Literal["found", "found_and_more", "other_place", "in_set", "missed", "wrong", "false_alarm", "nothing_right"]
 RIGHT: tuple[Outcome, ...] = ("found", "nothing_right")  # outcomes of an answer that is right as a whole
@@ -51,48 +52,44 @@ class Unsealed:
         """The outcome in plain words."""
         return _HEADLINES[self.outcome]
 
-    @property
-    def right(self) -> bool:
-        """Whether the answer is right as a whole."""
-        return self.outcome in RIGHT
+    def panel(self, figures: Sequence[Number], corrected: bool) -> Group:
+        """Outcome, what was concealed and named, `figures` (before and after where `corrected`), and the seal."""
+        named, x = f"nothing; verdict: {tables.CHIPS[self.verdict]}", self.finding
+        lines = []
+        if x is not None:
+            named = effect_label(x)
+            sure = f"{tables.probability_label(x.probability)}, {tables.likelihood(x.probability)}"
+            lines += [Text(values_label(x), "small"), Text(f"probability {sure}", "small")]
+        if self.false:
+            untrue = listed([effect_label(x) for x in self.false], MOST_PARAMETERS)
+            lines.append(Text(f"not true: {untrue}", "wrong"))
+        found = "Named" if self.outcome in ("missed", "wrong", "false_alarm", "nothing_right") else "Found"
+        errors = [k for k in figures if k.label.endswith("rms")]
+        left = "Left-out error, before → after" if corrected else "Left-out error, nothing corrected"
+        three = (
+            ("Concealed", self.concealed[:1].upper() + self.concealed[1:]),
+            (found, (Text(named[:1].upper() + named[1:]), *(t for t in lines if t.text))),
+            (left, tuple(Text(_error_line(k)) for k in errors)),
+        )
+        when = self.sealed_at.replace("T", " ").replace("Z", " UTC")
+        note = (
+            "The recordings are simulated, with an effect that the machine file does not have, or with none. Seed "
+            f"{self.seed} drew what it is, and it was sealed on {when}, before the diagnosis began. The diagnosis ran "
+            f"in a process that could read the machine file and the recordings and not the answer ({self.isolation})."
+        )
+        blocks = (
+            Text("thermodrift demonstration", "eyebrow"),
+            Heading(self.headline, simulated=True, level=2),
+            Pairs(three, "three"),
+            Text(note, "note"),
+            Text(f"seal, SHA-256: {self.digest}", "note digest"),
+        )
+        return Group(blocks, f"unsealed {'right' if self.outcome in RIGHT else 'off'}")
 
-    @property
-    def column(self) -> str:
-        """The heading of what was named."""
-        return "Named" if self.outcome in ("missed", "wrong", "false_alarm", "nothing_right") else "Found"
 
-    @property
-    def sealed_when(self) -> str:
-        """``2026-01-31 12:00:00 UTC``."""
-        return self.sealed_at.replace("T", " ").replace("Z", " UTC")
-
-    @property
-    def named(self) -> str:
-        """What the diagnosis named, and where; its verdict where it named nothing."""
-        return effect_label(self.finding) if self.finding is not None else f"nothing; verdict: {self.chip}"
-
-    @property
-    def chip(self) -> str:
-        """The verdict's label."""
-        return tables.CHIPS[self.verdict]
-
-    @property
-    def values(self) -> str:
-        """The finding's values with their 90 % intervals, three at most."""
-        return "" if self.finding is None else values_label(self.finding)
-
-    @property
-    def probability(self) -> str:
-        """Of that finding, with its term."""
-        if self.finding is None:
-            return ""
-        p = self.finding.probability
-        return f"{tables.probability_label(p)}, {tables.likelihood(p)}"
-
-    @property
-    def not_true(self) -> str:
-        """The claims besides that are not true."""
-        return listed([effect_label(x) for x in self.false], MOST_PARAMETERS) if self.false else ""
+def _error_line(k: Number) -> str:
+    """``z 31.2 → 4.1 µm, noise 0.8 µm`` of a figure ``z, left-out rms``."""
+    return f"{k.label.split(',')[0]} {f'{k.before} → ' if k.before else ''}{k.value}, {k.what}"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from data.errors import InputError
 from data.files import write_atomic
 from data.units import unit_label
 from features.iso230_3 import HOUR_S, ProbePair, ThermalTest, Trace, clock, thermal_test
-from reports.drawing import GREY, LINES, MUTED, data_address, picture_bytes
+from reports.drawing import GREY, LINES, MUTED, Picture, data_address, picture_bytes
 from reports.labels import INK, ORANGE, count, listed, number, tex_escaped
-from reports.layout import Column, Row, Table
+from reports.layout import Column, Page, Pairs, Row, Section, Table, Text, given
 from reports.rendering import rendered
 
 _WIDTH_IN, _LEFT_IN, _RIGHT_IN, _TOP_IN, _BOTTOM_IN, _GAP_IN = 10.0, 0.75, 1.75, 0.62, 0.5, 0.16
@@ -187,20 +186,6 @@ class TestSheet(BaseModel):
         return tuple(ProbePair(n, t.first, t.second, t.distance_mm) for n, t in self.tilts.items())
 
 
-@dataclass(frozen=True)
-class IsoPage:
-    """Everything that the templates show."""
-
-    title: str
-    simulated: bool
-    summary: str
-    facts: tuple[tuple[str, str], ...]
-    quantities: Table
-    temperatures: Table | None
-    notes: tuple[str, ...]
-    figure_label: str
-
-
 def write_iso_report(
     batch: Batch, folder: Path | str, sheet: TestSheet | None = None, kind: str | None = None,
     start_s: float | None = None, end_s: float | None = None,
@@ -216,23 +201,21 @@ def write_iso_report(
     folder = Path(folder)
     sheet = sheet or TestSheet()
     test = thermal_test(batch, sheet.pairs, sheet.axes, kind, start_s, end_s)
-    picture = picture_bytes(iso_figure(batch, test), "png", _DPI)
-    shown = iso_page(batch, test, sheet)
-    embedded = data_address(picture, "png")
+    drawn = picture_bytes(iso_figure(batch, test), "png", _DPI)
+    page = iso_page(batch, test, sheet, drawn)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(folder / FILES[2], picture)
+        write_atomic(folder / FILES[2], drawn)
         write_atomic(folder / FILES[3], test.quantities.to_csv(index=False, lineterminator="\n"))
         for name in FILES[:2]:
-            text = rendered(f"iso230_3{Path(name).suffix}", shown, picture=embedded, file=FILES[2])
-            write_atomic(folder / name, text)
+            write_atomic(folder / name, rendered(page, Path(name).suffix))
     except OSError as error:
         raise InputError(f"report {folder}: cannot be written ({error.strerror}); give another folder") from None
     return folder / FILES[0]
 
 
-def iso_page(batch: Batch, test: ThermalTest, sheet: TestSheet) -> IsoPage:
-    """Collect the page: what is not known appears as not stated."""
+def iso_page(batch: Batch, test: ThermalTest, sheet: TestSheet, drawn: bytes) -> Page:
+    """The page with its figure `drawn` as PNG: what is not known appears as not stated."""
     pairs = "; ".join(f"{p.name} = ({p.first} − {p.second}) / {p.distance_mm:g} mm" for p in test.pairs)
     probes = "; ".join(p for p in (sheet.probes, pairs) if p)
     length = f"{clock(test.end_s - test.start_s)} h, a reading every {batch.step_s:g} s"
@@ -249,16 +232,39 @@ def iso_page(batch: Batch, test: ThermalTest, sheet: TestSheet) -> IsoPage:
         ("Probes", probes),
         ("Uncertainty", sheet.uncertainty),
     ]
-    return IsoPage(
-        title=test.title.removesuffix(" (SIMULATED)"),
-        simulated=test.simulated,
-        summary=test.explanation,
-        facts=tuple((k, v or NOT_STATED) for k, v in facts),
-        quantities=_quantities(test),
-        temperatures=_temperatures(test) if len(test.temperatures) else None,
-        notes=test.notes,
-        figure_label=_figure_label(test),
+    figure = Picture(_figure_label(test), data_address(drawn, "png"), test.simulated, "full", True, FILES[2])
+    blocks = given(
+        _quantities(test),
+        *(Text(n, "note") for n in test.notes),
+        figure,
+        _temperatures(test) if len(test.temperatures) else None,
     )
+    return Page(
+        "thermodrift thermal test, in the style of ISO 230-3",
+        test.title.removesuffix(" (SIMULATED)"),
+        (Text(test.explanation), Pairs(tuple((k, v or NOT_STATED) for k, v in facts))),
+        (
+            Section("test", "", blocks, "Test"),
+            Section("terms", "What the numbers mean", (Pairs(_TERMS, "glossary"),)),
+        ),
+        ("In the style of ISO 230-3. The numbers are also in quantities.csv.",),
+        test.simulated,
+    )
+
+
+_TERMS = (
+    ("range", "Greatest minus least reading of the period, the last reading before its start included, where there is "
+     "one."),
+    ("range in 60 min", "The same over the first 60 min of the period."),
+    ("d(60 min)", "Change, with sign, from the last reading before the period's start to 60 min after the start."),
+    ("d(t)", "The same to the last reading of the period, whose length is t."),
+    ("at, span", "Where an axis cycles: the mean reading of every stay at a target, and the difference of the two "
+     "targets. d(t) is their shift and the change of span."),
+    ("A, B", "Tilt (Y1 − Y2) / l and (X1 − X2) / l from two probes at the distance l. 1 µm/m = 1 µrad = 0.206″."),
+    ("readings", "As recorded, not smoothed; what the checks of the recording mask is left out."),
+    ("style", "The quantities and plots are in the style of ISO 230-3. The text of the standard was not at hand, so "
+     "this page is no statement that the test followed it."),
+)  # fmt: skip
 
 
 def _start(batch: Batch) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,13 +13,14 @@ import pandas as pd
 from data.batch import Batch
 from data.errors import InputError, check_suffix
 from data.machine import Machine
-from reports.drawing import Picture, picture, picture_bytes
-from reports.layout import Table
+from reports.drawing import picture, picture_bytes
+from reports.layout import Group, Heading, Items, Page, Pairs, Section, Text, given
 from reports.rendering import write_page
 from reports.twin import tables
 from reports.twin.figures import fit_figure, mode_shapes, residual_map, rms_map
 from reports.twin.flows import flow_picture, heat_stack
 from reports.twin.network_picture import counted, network_picture
+from reports.viewer import Pane, Trace, viewer
 from twin.calibration import Calibration
 from twin.calibration.identifiability import Interval
 from twin.compile import compile_network, expanded
@@ -56,30 +58,6 @@ class TwinData:
     modes: Sequence[ModeView] = ()
 
 
-@dataclass(frozen=True)
-class Part:
-    """A section: tables, pictures, notes."""
-
-    anchor: str
-    title: str
-    tables: tuple[Table, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    notes: tuple[str, ...] = ()
-    folded: tuple[Table, ...] = ()
-    findings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class TwinPage:
-    """Everything that the templates show."""
-
-    title: str
-    simulated: bool
-    summary: str
-    facts: tuple[tuple[str, str], ...]
-    parts: tuple[Part, ...]
-
-
 def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST_BATCHES) -> Path:
     """One self-contained page; .md has the tables and no pictures.
 
@@ -90,7 +68,7 @@ def write_twin_report(path: Path | str, data: TwinData, most_batches: int = MOST
         InputError: another suffix, or a place that cannot be written.
     """
     path = Path(path)
-    write_page(path, "twin", twin_page(data, most_batches, pictures=path.suffix == ".html"))
+    write_page(path, twin_page(data, most_batches, pictures=path.suffix == ".html"))
     return path
 
 
@@ -112,66 +90,89 @@ def write_picture(path: Path | str, view: Overview) -> Path:
     return path
 
 
-def twin_page(data: TwinData, most_batches: int = MOST_BATCHES, pictures: bool = True) -> TwinPage:
-    """Collect the page."""
+def twin_page(data: TwinData, most_batches: int = MOST_BATCHES, pictures: bool = True) -> Page:
+    """The page; what is not given is left out."""
     view = data.view
-    parts = [_network(data, pictures)]
-    parts += [_parameters(data)] if data.parameters else []
-    parts += [_fit(data, most_batches, pictures)] if data.compared or data.left_out is not None else []
-    parts += [_heat(data, most_batches, pictures)] if data.flows else []
-    parts += [_modes(data, pictures)] if data.modes else []
+    sections = [_network(data, pictures)]
+    sections += [_parameters(data)] if data.parameters else []
+    sections += [_fit(data, most_batches, pictures)] if data.compared or data.left_out is not None else []
+    sections += [_heat(data, most_batches, pictures)] if data.flows else []
+    sections += [_modes(data, pictures)] if data.modes else []
     facts = [("Machine", view.machine), ("Network", counted(view)), ("Values", data.origin)]
     batches = list(dict.fromkeys([c.batch_id for c in data.compared] + [f.batch_id for f in data.flows]))
     if batches:
         named = ", ".join(batches[:3]) + (f" and {len(batches) - 3} more" if len(batches) > 3 else "")
         facts.append(("Batches", named))
+    footer = (
+        "Temperatures and displacements of a twin are computed, never measured; SIMULATED marks figures and tables "
+        "whose recordings are computed too.",
+        *([] if pictures else ["The pictures are in the HTML report."]),
+    )
     simulated = view.simulated or any(c.simulated for c in data.compared)
-    return TwinPage(f"Twin of {view.machine}", simulated, view.description, tuple(facts), tuple(parts))
+    top = given(Text(view.description), Pairs(tuple(facts)))
+    return Page("thermodrift twin", f"Twin of {view.machine}", top, tuple(sections), footer, simulated)
 
 
-def _network(data: TwinData, pictures: bool) -> Part:
-    shown = [picture(network_picture(data.view), "Thermal network and error chains", data.view.simulated, "svg")]
-    return Part("network", "Network", (tables.bodies(data.view),), tuple(shown) if pictures else ())
-
-
-def _parameters(data: TwinData) -> Part:
-    free, fixed = (tables.parameters(data.parameters, data.intervals, f, data.view.simulated) for f in (True, False))
-    return Part("parameters", "Parameters", (free,), folded=(fixed,), findings=tuple(data.findings))
-
-
-def _fit(data: TwinData, most: int, pictures: bool) -> Part:
-    chosen = worst(data.compared, most)
-    own = [tables.left_out(data.left_out, data.view.simulated)] if data.left_out is not None else []
-    notes, shown = [], []
-    if data.compared:
-        notes.append("Displacements count from their first reading. Residual: recorded − simulated.")
-    if len(chosen) < len(data.compared):
-        notes.append(f"Drawn: the {len(chosen)} of {len(data.compared)} batches with the greatest residual.")
-    if pictures and data.compared:
-        simulated = any(c.simulated for c in data.compared)
-        label = "Residual rms of every batch and channel"
-        shown.append(picture(rms_map(rms_table(data.compared), simulated), label, simulated))
-        for c in chosen:
-            shown.append(picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated))
-            shown.append(picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated))
-    return Part("fit", "Simulated against recorded", tuple(own), tuple(shown), tuple(notes))
-
-
-def _heat(data: TwinData, most: int, pictures: bool) -> Part:
+def _network(data: TwinData, pictures: bool) -> Section:
     shown = []
+    if pictures:
+        label, simulated = "Thermal network and error chains", data.view.simulated
+        shown.append(picture(network_picture(data.view), label, simulated, "svg", "network"))
+    return Section("network", "Network", (*shown, tables.bodies(data.view)))
+
+
+def _parameters(data: TwinData) -> Section:
+    free, fixed = (tables.parameters(data.parameters, data.intervals, f, data.view.simulated) for f in (True, False))
+    said = (Heading("What the fit says"), Items(tuple(data.findings))) if data.findings else ()
+    return Section("parameters", "Parameters", given(free, *said, fixed.folded() if fixed.rows else None))
+
+
+def _fit(data: TwinData, most: int, pictures: bool) -> Section:
+    chosen = worst(data.compared, most)
+    simulated = any(c.simulated for c in data.compared)
+    blocks: list[Any] = []
+    if data.compared:
+        blocks.append(Text("Displacements count from their first reading. Residual: recorded − simulated.", "note"))
+    blocks.append(tables.left_out(data.left_out, data.view.simulated) if data.left_out is not None else None)
+    if pictures and data.compared:
+        blocks.append(viewer("Recorded and simulated", _panes(data.compared), simulated))
+        label = "Residual rms of every batch and channel"
+        blocks.append(picture(rms_map(rms_table(data.compared), simulated), label, simulated, look="full"))
+    if len(chosen) < len(data.compared):
+        said = f"Drawn: the {len(chosen)} of {len(data.compared)} batches with the greatest residual."
+        blocks.append(Text(said, "note"))
+    for c in chosen if pictures else ():
+        fit = picture(fit_figure(c), f"{c.batch_id}: recorded and simulated", c.simulated, look="full")
+        blocks.append(Group((fit,), "static"))
+        blocks.append(picture(residual_map(c), f"{c.batch_id}: residual map", c.simulated, look="full"))
+    return Section("fit", "Simulated against recorded", given(*blocks))
+
+
+def _panes(parts: Sequence[Compared]) -> list[Pane]:
+    """A pane per batch and channel, displacements counted from their first reading as in the figures."""
+    panes = []
+    for c in parts:
+        for name, unit, recorded, computed in zip(c.channels, c.units, c.recorded, c.computed, strict=True):
+            traces = (Trace("recorded", recorded, "recorded"), Trace("simulated", computed, "computed"))
+            panes.append(Pane(c.batch_id, name, unit, c.time_s / _HOUR_S, traces))
+    return panes
+
+
+def _heat(data: TwinData, most: int, pictures: bool) -> Section:
+    blocks: list[Any] = [Text("Every watt is computed, also where a recording gave drivers and surroundings.", "note")]
+    blocks += [tables.heat(f) for f in data.flows[:most]]
     for f in data.flows[:most] if pictures else ():
         moment = min(_HOUR_S, 0.5 * float(f.time_s[-1]))
-        shown.append(picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated))
+        blocks.append(picture(heat_stack(f), f"{f.batch_id}: where the watts go", f.simulated, look="full"))
         label = f"{f.batch_id}: heat through the network"
-        shown.append(picture(flow_picture(data.view, f, moment), label, f.simulated, "svg"))
-    notes = ("Every watt is computed, also where a recording gave drivers and surroundings.",)
-    return Part("heat", "Where the watts go", tuple(tables.heat(f) for f in data.flows[:most]), tuple(shown), notes)
+        blocks.append(picture(flow_picture(data.view, f, moment), label, f.simulated, "svg", "network"))
+    return Section("heat", "Where the watts go", tuple(blocks))
 
 
-def _modes(data: TwinData, pictures: bool) -> Part:
-    simulated = data.view.simulated
-    shown = [picture(mode_shapes(data.modes, simulated), "Shapes of the slowest modes", simulated)] if pictures else []
-    return Part("modes", "Time constants and modes", (tables.modes(data.modes, data.view),), tuple(shown))
+def _modes(data: TwinData, pictures: bool) -> Section:
+    simulated, label = data.view.simulated, "Shapes of the slowest modes"
+    shown = [picture(mode_shapes(data.modes, simulated), label, simulated, look="full")] if pictures else []
+    return Section("modes", "Time constants and modes", (*shown, tables.modes(data.modes, data.view)))
 
 
 def worst(parts: Sequence[Compared], most: int) -> list[Compared]:

@@ -10,6 +10,10 @@ import pytest
 
 from data.errors import InputError
 from reports.fleet import fleet_page, write_fleet_page
+from reports.layout import Table, Text
+from tests.toys.pages import blocks, section, unscripted
+
+HEADS = ("name", "champion", "seen", "expected", "newer", "outside", "sensors", "next", "failure")
 
 NOW = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)
 RUN = {"began": "2026-11-24T05:00:00+00:00", "ended": "2026-11-24T05:10:00+00:00", "ok": False, "summary": "no <share>"}
@@ -40,19 +44,23 @@ UNKNOWN = row_of(
 
 def test_values_and_reasons() -> None:
     page = fleet_page([DRIFTING, row_of("hmc"), UNKNOWN], [("mill", "z", "error S 6 µm above")], [], NOW)
-    mill, hmc, lathe = page.rows
-    assert page.summary == "1 alert on 1 of 3 machines." and page.alerts == (("mill", (("z", "error S 6 µm above"),)),)
-    assert (mill.state, hmc.state, lathe.state) == ("alert", "ok", "none")
-    assert mill.newer.bad and mill.newer.text == "6 µm" and mill.failure.bad and mill.failure.below == "no <share>"
-    assert mill.drift is not None and mill.drift.dots == (50.0, 100.0) and mill.drift.beyond
-    assert mill.drift.bound == pytest.approx(66.7) and mill.drift.expected == pytest.approx(33.3)
-    assert (hmc.newer.text, hmc.drift, hmc.next_run.text, hmc.failure.text) == (
+    alerts, table = blocks(page, Table)
+    assert blocks(page, Text)[0].text == "1 alert on 1 of 3 machines."
+    assert [r.cells for r in alerts.rows] == [("mill", "z", "error S 6 µm above")]
+    mill, hmc, lathe = (dict(zip(HEADS, r.cells, strict=True)) for r in table.rows)
+    assert [r.look for r in table.rows] == ["alert", "ok", "none"]
+    assert mill["newer"].alert and mill["newer"].text == "6 µm"
+    assert mill["failure"].alert and mill["failure"].below == "no <share>"
+    drift = mill["newer"].gauge
+    assert drift is not None and drift.dots == (50.0, 100.0) and drift.band == (0.0, pytest.approx(66.7))
+    assert dict(drift.marks) == {"expected": pytest.approx(33.3), "bound": pytest.approx(66.7)}
+    assert (hmc["newer"].text, hmc["newer"].gauge, hmc["next"].text, hmc["failure"].text) == (
         "not measured", None, "not known", "no run known",
     )  # fmt: skip
-    assert lathe.champion.text == "none" and lathe.expected.text == lathe.outside.text == ""
-    (doubted,) = fleet_page([UNKNOWN | {"provisional": 2}], [], [], NOW).rows
-    assert (doubted.state_label, doubted.champion.text) == ("provisional", "v2 provisional")
-    assert page.unknown == ("lathe z: the lake has other channels",)
+    assert lathe["champion"].text == "none" and lathe["expected"].text == lathe["outside"].text == ""
+    (doubted,) = blocks(fleet_page([UNKNOWN | {"provisional": 2}], [], [], NOW), Table)[0].rows
+    assert (doubted.cells[0].chip, doubted.cells[1].text) == (("provisional", "none"), "v2 provisional")
+    assert [b.text for b in section(page, "unknown").blocks] == ["lathe z: the lake has other channels"]
 
 
 def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
@@ -60,7 +68,7 @@ def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
     alerts = [("mill", "z", "error S 6 µm above"), ("mill", "", "the last retraining failed: no <share>")]
     fleets = [{"source": "/etc/fleet.yml", "served": True, "machines": 2}]
     write_fleet_page(path, [DRIFTING, row_of("hmc", simulated=True)], alerts, fleets, NOW)
-    text = path.read_text(encoding="utf-8")
+    text = unscripted(path.read_text(encoding="utf-8"))
     assert "no &lt;share&gt;" in text and "<share>" not in text and text.count("SIMULATED") == 1
     assert "http" not in text.replace("http-equiv", "")  # nothing is loaded
     assert "2 machines, served now" in text
@@ -72,4 +80,4 @@ def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
 
 def test_an_empty_fleet(tmp_path: Path) -> None:
     page = fleet_page([], [], [], NOW)
-    assert page.summary == "No alert on 0 machines." and not page.rows
+    assert blocks(page, Text)[0].text == "No alert on 0 machines." and not blocks(page, Table)[0].rows

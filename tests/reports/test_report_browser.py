@@ -15,6 +15,9 @@ import pytest
 from models.promotion import choose
 from models.protocols import PromotionRule
 from reports.comparison import write_report
+from reports.layout import Column, Page, Row, Table
+from reports.rendering import write_page
+from tests.toys.pages import unscripted
 from tests.toys.report_training import COMPARISON, Maker, promotion, results, settings, training
 
 CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
@@ -36,7 +39,8 @@ MEASURE = """<script>addEventListener("load", () => setTimeout(() => {
     const svg = box.querySelector("svg").getBoundingClientRect()
     const texts = [...box.querySelectorAll("text")].map(t => [t.textContent, t.getBoundingClientRect()])
     const others = i => texts.slice(i + 1)
-    return {id: box.id, width: svg.width, right: box.getBoundingClientRect().right, box: box.clientWidth,
+    const small = box.parentElement.classList.contains("third")
+    return {id: box.id, small, width: svg.width, right: box.getBoundingClientRect().right, box: box.clientWidth,
             texts: texts.length, cut: texts.filter(([, r]) => !inside(r, svg)).map(([t]) => t),
             covered: texts.flatMap(([t, r], i) => others(i).filter(([, s]) => !apart(r, s)).map(([u]) => [t, u]))}
   })
@@ -60,8 +64,13 @@ def console(log: str) -> list[str]:
 
 
 def measured(page: Path, width_px: int, scratch: Path, opened: bool = True) -> dict[str, Any]:
-    """What `MEASURE` finds on a copy of the page, without its rule against scripts, in a frame of this width."""
-    text = re.sub(r"<meta http-equiv[^>]*>", "", page.read_text(encoding="utf-8")).replace("</body>", MEASURE)
+    """What `MEASURE` finds on the page in a frame of this width."""
+    return in_frame(page, MEASURE, width_px, scratch, opened)
+
+
+def in_frame(page: Path, script: str, width_px: int, scratch: Path, opened: bool = False) -> dict[str, Any]:
+    """What a script posts from a copy of the page, without its rule against other scripts, in a frame."""
+    text = re.sub(r"<meta http-equiv[^>]*>", "", page.read_text(encoding="utf-8")).replace("</body>", script)
     copy = page.with_name(f"copy_{page.name}")
     copy.write_text(text.replace("<details>", "<details open>") if opened else text, encoding="utf-8")
     frame = page.with_name(f"frame_{page.name}")
@@ -91,10 +100,64 @@ def page(toy_batches: Maker, scratch: Path) -> Path:
     return write_report(trainings, scratch / "r.html", settings(scratch).promotion)
 
 
-def test_the_page_is_shown_without_a_script_and_without_an_error(page: Path, scratch: Path) -> None:
+def test_the_page_is_shown_without_an_error_and_its_viewers_are_drawn(page: Path, scratch: Path) -> None:
     dom, log = open_page(page, scratch)
-    assert console(log) == [] and "<script" not in dom
-    assert not re.search(r">[^<]*&amp;(#|lt|gt|amp)", dom), "markup shown as it stands"
+    assert console(log) == []
+    assert not re.search(r">[^<]*&amp;(#|lt|gt|amp)", unscripted(dom)), "markup shown as it stands"
+    assert dom.count("<canvas") == 2 * 2, "two charts for each of two channels"
+    assert len(re.findall(r"<option value=", dom)) == 2 * 4, "every later run can be chosen"
+    assert len(re.findall(r"0.0 to 3.3 h. residual: rms \d", dom)) == 2
+
+
+USE = """<script>addEventListener("load", () => setTimeout(() => {
+  const figure = document.querySelector("figure.viewer")
+  const charts = figure.querySelector(".charts")
+  const said = () => figure.querySelector("[aria-live]").textContent
+  const out = {whole: said()}
+  figure.querySelector("button[aria-label='next run']").click()
+  out.run = figure.querySelector("select").selectedIndex
+  out.next = said()
+  const press = key => charts.dispatchEvent(new KeyboardEvent("keydown", {key, bubbles: true}))
+  const steps = [
+    () => { press("ArrowRight"); press("ArrowRight"); out.cursor = said() },
+    () => press("+"),
+    () => { out.zoomed = said(); parent.postMessage(out, "*") },
+  ]
+  steps.forEach((step, k) => setTimeout(step, 200 * (k + 1)))
+}, 600))</script></body>"""
+ORDER = """<script>addEventListener("load", () => {
+  const body = document.querySelector("tbody")
+  const head = document.querySelector("thead th:nth-child(2) button")
+  const column = () => [...body.rows].map(r => r.cells[1].textContent)
+  const out = {}
+  head.click(); out.up = column()
+  head.click(); out.down = column()
+  const field = document.querySelector(".filter input")
+  field.value = "b1 RPM"
+  field.dispatchEvent(new Event("input"))
+  out.kept = [...body.rows].filter(r => !r.hidden).map(r => r.cells[0].textContent)
+  out.counted = document.querySelector(".filter span").textContent
+  parent.postMessage(out, "*")
+})</script></body>"""
+
+
+def test_runs_are_chosen_read_and_zoomed_with_the_keyboard(page: Path, scratch: Path) -> None:
+    found = in_frame(page, USE, 1200, scratch)
+    assert found["run"] == 1 and found["next"] != found["whole"]
+    assert re.match(r"0\.17 h: recorded [\d.−]+, predicted [\d.−]+, residual [\d.−]+ µm", found["cursor"])
+    assert re.match(r"0\.[01] to 1\.\d h\. residual: rms", found["zoomed"])
+
+
+def test_tables_sort_by_value_and_long_ones_filter(scratch: Path) -> None:
+    values = ["−2.5", "10.0", "9.5", "1.2·10⁴", "–", "< 1", "3", "4", "5", "6", "7", "8"]
+    rows = tuple(Row.of(f"b{k}", v, "4000 rpm") for k, v in enumerate(values))
+    table = Table("t", (Column("batch"), Column("S", "µm", "number"), Column("speed")), rows)
+    page = scratch / "table.html"
+    write_page(page, Page("", "t", (table,)))
+    found = in_frame(page, ORDER, 1200, scratch)
+    assert found["up"] == ["−2.5", "< 1", "3", "4", "5", "6", "7", "8", "9.5", "10.0", "1.2·10⁴", "–"]
+    assert found["down"] == found["up"][::-1]
+    assert found["kept"] and set(found["kept"]) == {"b1", "b10", "b11"} and found["counted"] == "3 of 12 rows"
 
 
 @pytest.mark.parametrize("width_px", [390, 1200])
@@ -105,7 +168,7 @@ def test_every_picture_is_readable_and_nothing_overflows_the_page(width_px: int,
     for p in found["pictures"]:
         assert p["right"] <= width_px and p["width"] >= 300 and p["texts"] > 8, p
         assert p["cut"] == [] and p["covered"] == [], p
-        assert p["width"] <= p["box"] or "left-out" not in p["id"], f"{p['id']}: curves of one batch need no scrolling"
+        assert p["width"] <= p["box"] or not p["small"], f"{p['id']}: curves of one batch need no scrolling"
 
 
 @pytest.mark.slow

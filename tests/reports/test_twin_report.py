@@ -11,9 +11,11 @@ import pytest
 
 from data.batch import Batch
 from data.errors import InputError
+from reports.drawing import Picture
 from reports.twin import tables as twin_tables
 from reports.twin.page import TwinData, twin_data, twin_page, worst, write_twin_report
 from tests.reports.toy_twin import batch, flows
+from tests.toys.pages import blocks, unscripted
 from tests.twin.machines import machine as two_bodies
 from twin.calibration.identifiability import Interval
 from twin.network import Network
@@ -75,7 +77,7 @@ def written(view: Overview, network: Network, tmp_path_factory: pytest.TempPathF
 
 
 def test_the_page_holds_everything_it_needs(written: Path) -> None:
-    text = written.read_text(encoding="utf-8")
+    text = unscripted(written.read_text(encoding="utf-8"))
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "default-src 'none'" in text
     assert text.count("data:image/") == 7  # network, map, fit, residuals, stack, flows, modes
     for part in (
@@ -105,7 +107,7 @@ def test_the_markdown_has_the_tables_and_no_picture(written: Path) -> None:
 
 def test_what_is_not_given_is_left_out_and_another_ending_is_told(view: Overview, tmp_path: Path) -> None:
     page = twin_page(TwinData(view, ()), pictures=False)
-    assert [p.title for p in page.parts] == ["Network"] and page.parts[0].pictures == ()
+    assert [s.title for s in page.sections] == ["Network"] and blocks(page, Picture) == []
     with pytest.raises(InputError, match=r"report .*x.pdf: unsupported file extension '.pdf'; give .html or .md"):
         write_twin_report(tmp_path / "x.pdf", TwinData(view, ()))
 

@@ -56,7 +56,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_holds_every_file_of_the_packages_and_no_other(wheel: Path) -> None:
     held = {n for n in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in n}
     wanted = set(repository_files())
-    assert {"machines/sample_vmc.yml", "reports/templates/report.html.j2"} <= wanted
+    assert {"machines/sample_vmc.yml", "reports/templates/page.html.j2", "reports/templates/uplot/LICENSE"} <= wanted
     assert held == wanted, "data files need a line under tool.setuptools.package-data in pyproject.toml"
 
 

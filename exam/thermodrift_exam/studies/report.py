@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from data.arrays import Array
 from data.files import staged
-from reports.drawing import data_address, picture_bytes
+from reports.drawing import Picture, picture
 from reports.labels import BLUE, GREEN, INK, NOTHING, ORANGE, count, number, percent, plus_minus
-from reports.layout import Column, Row, Table
+from reports.layout import Column, Group, Heading, Items, Page, Pairs, Row, Section, Table, Text, given
 from reports.rendering import rendered
 from thermodrift_exam.studies.base import Ordering, StudyResult
 
@@ -112,67 +112,58 @@ def _strip(ax: Axes, place: float, strip: Strip) -> None:
 Record = dict[Any, Any]
 
 
-@dataclass(frozen=True)
-class Claim:
-    """One published ordering: result, explanation, and its picture as a data: address."""
-
-    title: str
-    verdict: str
-    counted: str
-    gain: str
-    why: str
-    evidence: Table | None
-    picture: str
-
-
-@dataclass(frozen=True)
-class StudyPart:
-    """One study's section."""
-
-    key: str
-    title: str
-    source: str
-    machine: str
-    assumed: tuple[str, ...]
-    remarks: tuple[str, ...]
-    published: Table | None
-    published_picture: str
-    claims: tuple[Claim, ...]
-    figures: Table
-
-
-@dataclass(frozen=True)
-class ReproductionPage:
-    """Everything that the templates show."""
-
-    title: str
-    facts: tuple[tuple[str, str], ...]
-    overview: Table
-    parts: tuple[StudyPart, ...]
-
-
-def reproduction_page(results: Sequence[StudyResult]) -> ReproductionPage:
-    """Collect the page of one or more studies, all of it labelled simulated."""
-    parts = tuple(_part(r) for r in results)
-    verdicts = pd.Series([c.verdict for p in parts for c in p.claims])
+def reproduction_page(results: Sequence[StudyResult]) -> Page:
+    """The page of one or more studies, all of it labelled simulated."""
+    rows, sections = [], []
+    for result in results:
+        claims = _claims(result)
+        rows += [Row.of(result.study.title, title, *_verdict(row)) for title, row in claims]
+        sections.append(_section(result, claims))
+    verdicts = pd.Series([row.cells[2] for row in rows])
     counted = ", ".join(f"{(verdicts == v).sum()} {v}" for v in ("holds", "undecided", "fails"))
     counted = counted.replace("holds", "hold").replace("fails", "fail")
-    rows = [Row.of(p.title, c.title, c.verdict, c.counted, c.gain) for p in parts for c in p.claims]
     columns = (
         Column("Study"), Column("Published ordering", kind="wide"), Column("Verdict"), Column("Holds in"),
         Column("Gain: published | ours"),
     )  # fmt: skip
-    return ReproductionPage(
-        title="Published systems repeated",
-        facts=(
-            ("Studies", str(len(parts))),
-            ("Seeds", f"{len(results[0].seeds)} simulated machine-years each"),
-            ("Published orderings", counted),
-            ("thermodrift", version("thermodrift")),
-        ),
-        overview=Table("Published orderings and their verdicts", columns, tuple(rows), simulated=True),
-        parts=parts,
+    facts = (
+        ("Studies", str(len(sections))),
+        ("Seeds", f"{len(results[0].seeds)} simulated machine-years each"),
+        ("Published orderings", counted),
+        ("thermodrift", version("thermodrift")),
     )
+    overview = Table("Published orderings and their verdicts", columns, tuple(rows), simulated=True)
+    return Page(
+        "thermodrift reproduce",
+        "Published systems repeated",
+        (Text(_LEAD, "lead"), Pairs(facts), overview),
+        (*sections, Section("how", "How to read it", (Pairs(_HOW, "glossary"),))),
+        (
+            "All numbers are simulated, except those under “published”; none was measured on a machine. Every figure "
+            "of every seed: values.parquet; summaries: figures.csv, orderings.csv. `thermodrift reproduce all --out "
+            "FOLDER` writes this page.",
+        ),
+        simulated=True,
+    )
+
+
+_LEAD = (
+    "The recordings behind the published studies are not public. Each study runs here on simulated machines built to "
+    "its description, every seed another machine and another year. Nothing is tuned to make an ordering hold."
+)
+_HOW = (
+    ("seed", "Another simulated machine of the type (every conductance, capacity and heat ±20 %), with another year of "
+     "runs: room drift, start from non-equilibrium, friction, sensor offsets, noise."),
+    ("± and 5 … 95 %", "Standard deviation and quantiles over the seeds, not over batches."),
+    ("holds in", "Seeds in which every inequality of the ordering is true, with the 95 % interval of Clopper and "
+     "Pearson for its probability."),
+    ("holds, fails, undecided", "The whole interval lies above one half, below it, or neither. This is a two-sided "
+     "sign test at 5 %."),
+    ("gain", "1 − a/b of the ordering's first pair, a the one said to be less: the median over the seeds, in brackets "
+     "5 … 95 %."),
+    ("evidence", "An ordering that no source printed, counted the same way, to say why a published one holds or does "
+     "not."),
+)  # fmt: skip
 
 
 def spread(row: Record) -> tuple[str, str]:
@@ -203,49 +194,60 @@ def our_gain(row: Record) -> str:
     return f"{median} ({low} … {high}) %"
 
 
-def _part(result: StudyResult) -> StudyPart:
-    study, table = result.study, result.figures()
-    strips = _strips(result)
+def _claims(result: StudyResult) -> list[tuple[str, Record]]:
+    """Of each published ordering its label and its row."""
+    found = {str(r["ordering"]): r for r in result.orderings().to_dict("records")}
+    published = [o for o in result.study.orderings if not o.evidence_for]
+    return [(o.label[0].upper() + o.label[1:], found[o.key]) for o in published]
+
+
+def _verdict(row: Record) -> tuple[str, str, str]:
+    return str(row["verdict"]), counted_label(row), gain_label(row)
+
+
+def _section(result: StudyResult, claims: Sequence[tuple[str, Record]]) -> Section:
+    study, table, strips = result.study, result.figures(), _strips(result)
     printed: list[str] = [f.key for f in study.figures if f.published is not None]
     orderings = result.orderings()
     evidence = {key: part for key, part in orderings.groupby("evidence_for", sort=False) if key}
-    claims = [
-        _claim(result, o, orderings[orderings["ordering"] == o.key].to_dict("records")[0], strips, evidence.get(o.key))
-        for o in study.orderings
-        if not o.evidence_for
-    ]
-    return StudyPart(
-        key=study.key,
-        title=study.title,
-        source=f"{study.summary[0].upper()}{study.summary[1:]}, after the {study.source}.",
-        machine=study.machine,
-        assumed=study.assumed,
-        remarks=result.remarks,
-        published=_figures("Published figures and ours", table[table["published"].notna()]) if printed else None,
-        published_picture=_source(published_figure([strips[k] for k in printed])) if printed else "",
-        claims=tuple(claims),
-        figures=_figures("Every figure of the study", table),
-    )
+    source = f"{study.summary[0].upper()}{study.summary[1:]}, after the {study.source}."
+    blocks: list[Any] = [Text(source, "lead"), Text(study.machine, strong="Machine."), Items(study.assumed, "how soft")]
+    if printed:
+        blocks.append(_figures("Published figures and ours", table[table["published"].notna()]))
+        drawn = published_figure([strips[k] for k in printed])
+        blocks.append(_picture(drawn, "Published (diamond) and ours, a dot per seed"))
+    blocks += [Text(said) for said in result.remarks]
+    by_key = {o.key: o for o in study.orderings}
+    for title, row in claims:
+        key = str(row["ordering"])
+        blocks.append(_claim(result, by_key[key], title, row, strips, evidence.get(key)))
+    blocks.append(_figures("Every figure of the study", table).folded())
+    return Section(study.key, study.title, given(*blocks), simulated=True)
 
 
 def _claim(
-    result: StudyResult, ordering: Ordering, row: Record, strips: dict[str, Strip], found: pd.DataFrame | None
-) -> Claim:
+    result: StudyResult, ordering: Ordering, title: str, row: Record, strips: dict[str, Strip],
+    found: pd.DataFrame | None,
+) -> Group:  # fmt: skip
     names = list(dict.fromkeys(name for pair in ordering.less for name in pair))
     held = np.array([ordering.holds(values) for values in result.by_seed(names)])
     columns = (Column("Evidence", kind="wide"), Column("Verdict"), Column("Holds in"), Column("Gain"))
     rows = []
     for e in found.to_dict("records") if found is not None else []:
         rows.append(Row.of(str(e["words"]), str(e["verdict"]), counted_label(e), our_gain(e)))
-    return Claim(
-        title=ordering.label[0].upper() + ordering.label[1:],
-        verdict=str(row["verdict"]),
-        counted=counted_label(row),
-        gain=gain_label(row),
-        why=str(row["why"]),
-        evidence=Table("Evidence within the study", columns, tuple(rows), simulated=True) if rows else None,
-        picture=_source(claim_figure([strips[n] for n in names], held)),
+    verdict, counted, gain = _verdict(row)
+    blocks = given(
+        Heading(title, (verdict, verdict)),
+        Text(f"Holds in {counted} of the seeds; gain, published | ours: {gain}", "soft"),
+        Text(str(row["why"]), "" if verdict == "holds" else "why"),
+        _picture(claim_figure([strips[n] for n in names], held), "A line per seed; orange where the ordering fails"),
+        Table("Evidence within the study", columns, tuple(rows), simulated=True) if rows else None,
     )
+    return Group(blocks, "claim")
+
+
+def _picture(figure: Figure, label: str) -> Picture:
+    return replace(picture(figure, label, True, "svg", "full"), captioned=True)
 
 
 def _strips(result: StudyResult) -> dict[str, Strip]:
@@ -269,10 +271,6 @@ def _figures(caption: str, table: pd.DataFrame) -> Table:
     return Table(caption, columns, tuple(rows), simulated=True, notes=(note,))
 
 
-def _source(figure: Figure) -> str:
-    return data_address(picture_bytes(figure, "svg"), "svg")
-
-
 FILES = ("values.parquet", "figures.csv", "orderings.csv", "reproduction.md", "reproduction.html")
 
 
@@ -288,7 +286,7 @@ def write_results(results: Sequence[StudyResult], folder: Path) -> Path:
         _together([r.figures() for r in results]).to_csv(scratch / FILES[1], index=False, lineterminator="\n")
         _together([r.orderings() for r in results]).to_csv(scratch / FILES[2], index=False, lineterminator="\n")
         for name in FILES[3:]:
-            (scratch / name).write_text(rendered(name, page), encoding="utf-8")
+            (scratch / name).write_text(rendered(page, Path(name).suffix), encoding="utf-8")
     return folder / FILES[-1]
 
 

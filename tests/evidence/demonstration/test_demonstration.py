@@ -152,7 +152,7 @@ def test_a_diagnosis_comes_back_from_plain_data_as_it_was(verdict: str) -> None:
     for name, table in d.tables.items():
         assert back.tables[name].equals(table.reset_index(drop=True)), name
     one, two = diagnosis_page(d, False), diagnosis_page(back, False)
-    assert one.parts == two.parts and one.figures == two.figures
+    assert one.sections == two.sections and one.top == two.top
     with pytest.raises(InputError, match="answer: is no diagnosis"):
         from_plain("{}", d.machine)
 

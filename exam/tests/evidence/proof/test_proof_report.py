@@ -14,7 +14,10 @@ import pytest
 from matplotlib.image import imread
 
 from data.errors import WorkError
+from reports.drawing import Picture
+from reports.layout import Text
 from tests.evidence.proof.toy_proof import ROOT, toy_proof, without
+from tests.toys.pages import blocks, section, unscripted
 from thermodrift_exam.proof.report import shortfall, tables
 from thermodrift_exam.proof.report import tables as extracts
 from thermodrift_exam.proof.report.labels import measured, origin
@@ -70,7 +73,7 @@ def run() -> ProofRun:
 def text(run: ProofRun, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = write_proof_report(tmp_path_factory.mktemp("proof"), run)
     assert path.name == "report.html"
-    return path.read_text(encoding="utf-8")
+    return unscripted(path.read_text(encoding="utf-8"))
 
 
 # the page
@@ -81,7 +84,7 @@ def test_the_page_holds_everything_and_asks_no_network(text: str) -> None:
     assert re.findall(r'<section class="part" id="(\w+)"', text) == list(ANCHORS)
     assert set(re.findall(r'href="#(\w+)"', text)) == set(ANCHORS)
     assert not re.findall(r"\bnan\b|<NA>|&lt;NA", re.sub(r'src="data:[^"]*"', "", text))
-    assert "<h1>10 of 12 goals met on 60 sealed cases.</h1>" in text
+    assert "<h1>10 of 12 goals met on 60 sealed cases. <span" in text
     lead = re.search('<p class="lead">(.*)</p>', text)
     assert lead and "\u00a0%" in lead[1] and " %" not in lead[1]  # no line ends before a unit
 
@@ -96,7 +99,7 @@ def test_every_picture_is_drawn_and_says_what_is_simulated(text: str) -> None:
 
 def test_the_head_says_root_dates_version_and_what_does_not_count(text: str) -> None:
     said = dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", text))
-    assert said["Sealed root"] == ROOT[:16] and f"<code>{ROOT}</code>" in text
+    assert said["Sealed root"] == ROOT[:16] and f"Sealed root: {ROOT}</p>" in text
     assert (said["Sealed"], said["Opened"]) == ("2026-01-05 06:00 UTC", "2026-01-05 19:30 UTC")
     assert (said["thermodrift"], said["Void, left out"], said["Failed, counted as wrong"]) == ("0.1.0", "1", "1")
     assert said["Cases sealed"] == "61" and said["Cases that count"].startswith("60 (plant A ")
@@ -106,11 +109,15 @@ def test_the_head_says_root_dates_version_and_what_does_not_count(text: str) -> 
 
 def test_a_sealed_suite_has_no_warning_and_others_have() -> None:
     run = toy_proof(5, tables={})
-    assert proof_page(run).warnings == ()
-    (known,) = proof_page(replace(run, suite="development")).warnings
+    assert top_texts(run, "warning") == []
+    (known,) = top_texts(replace(run, suite="development"), "warning")
     assert known.startswith("A development suite: its seed is known")
-    (part,) = proof_page(replace(run, partial=True)).warnings
+    (part,) = top_texts(replace(run, partial=True), "warning")
     assert part.startswith("Opened in part")
+
+
+def top_texts(run: ProofRun, look: str) -> list[str]:
+    return [b.text for b in proof_page(run).top if isinstance(b, Text) and b.look == look]
 
 
 @pytest.mark.parametrize("absent", SILENT)
@@ -125,8 +132,8 @@ def test_an_absent_table_leaves_a_sentence_in_its_place(run: ProofRun, absent: s
 def test_a_table_without_rows_is_an_absent_one(run: ProofRun) -> None:
     empty = {name: pd.DataFrame(columns=list(columns)) for name, columns in TABLES.items()}
     page = proof_page(replace(run, tables=empty))
-    assert page.headline == "No goal could be evaluated on 0 sealed cases." and page.plants == ()
-    assert not [p for part in page.parts for p in (*part.wide, *part.half)]
+    assert page.headline == "No goal could be evaluated on 0 sealed cases."
+    assert blocks(page, Picture) == []
 
 
 def test_mixed_plants_say_for_each_where_its_recordings_come_from() -> None:
@@ -134,12 +141,13 @@ def test_mixed_plants_say_for_each_where_its_recordings_come_from() -> None:
     assert origin(("elements", "volumes", "grafted", "withheld")) == "A, B SIMULATED · C partly SIMULATED · D real"
     mixed = toy_proof(40, plants=("elements", "withheld"))
     page = proof_page(replace(mixed, tables=without(mixed, "series", "compared", "confusion_mechanism", "terms")))
-    assert page.origin == "A SIMULATED · D real"
-    pictures = [p for part in page.parts for p in (*part.wide, *part.half)]
+    assert page.mark == "A SIMULATED · D real"
+    pictures = blocks(page, Picture)
     assert pictures and not any(p.simulated for p in pictures)
     assert all(p.label.endswith("(A SIMULATED · D real)") for p in pictures)
-    worst = next(part for part in page.parts if part.anchor == "worst").worst
-    assert all(w.simulated == ("finite elements" in w.what) for w in worst)
+    (_, *worst) = section(page, "worst").blocks
+    heads = [w.blocks[:2] for w in worst]
+    assert heads and all(head.simulated == ("finite elements" in what.text) for head, what in heads)
 
 
 def test_a_table_that_lacks_a_column_and_a_strange_one_are_named() -> None:
@@ -202,7 +210,10 @@ def test_a_goal_is_shown_with_interval_count_and_plants() -> None:
     assert (row.informed.value, row.informed.n, row.informed.met) == ("99.0 %", "190", "")
     assert [(c.value, c.met, c.n) for c in row.plants] == [("–", "", ""), ("98.0 %", "yes", "90")]
     bar = row.whole.bar
-    assert bar is not None and (bar.wanted, bar.value) == (75.0, 62.5)  # the axis runs from 0.97 − 3 · 0.03 to 1
+    assert bar is not None and (bar.marks, bar.dots) == (
+        (("wanted", 75.0),),
+        (62.5,),
+    )  # the axis runs from 0.97 − 3 · 0.03 to 1
     assert shortfalls(goals) == ["detection: 95.5 %, goal ≥ 97 %"] and shortfalls(goals, "volumes") == []
 
 
@@ -213,13 +224,13 @@ def test_a_goal_that_no_case_speaks_for_is_neither_met_nor_missed(run: ProofRun)
     assert goal_rows(goals, ())[0].whole.value == "–" and goal_rows(goals, ())[0].whole.bar is None
     told = replace(run, tables={"goals": goals, "outcomes": run.table("outcomes")})
     assert headline(told) == "Every goal met on 60 sealed cases."
-    assert proof_page(replace(told, tables={"goals": goals})).lead == "Without a case: 1 goal."
+    assert top_texts(replace(told, tables={"goals": goals}), "lead") == ["Without a case: 1 goal."]
 
 
 def test_many_missed_goals_are_counted_and_the_first_told() -> None:
     goals = pd.DataFrame([_goal(measure=f"m{k}", met=k == 0) for k in range(8)])
     run = toy_proof(5, tables={"goals": goals})
-    said = proof_page(run).lead
+    (said,) = top_texts(run, "lead")
     assert said.startswith("Missed: m1: 95.5 %, goal ≥ 97 %; m2: ") and said.endswith("; 3 more, in the table.")
 
 
@@ -232,8 +243,8 @@ def test_a_convergence_study_is_one_row_with_its_orders(run: ProofRun) -> None:
 
 def test_rivals_without_a_case_are_no_empty_picture(run: ProofRun) -> None:
     compared = run.table("compared").assign(value=np.nan, lead=np.nan)
-    part = next(p for p in proof_page(replace(run, tables={"compared": compared})).parts if p.anchor == "baselines")
-    assert part.wide == () and part.notes == (SILENT["compared"],)
+    (only,) = section(proof_page(replace(run, tables={"compared": compared})), "baselines").blocks
+    assert only.text == SILENT["compared"]
 
 
 @pytest.mark.parametrize(

@@ -57,11 +57,11 @@ def plant_keys(plants: Sequence[str]) -> list[tuple[str, str, str]]:
     return [(marks[plant_style(p)[1]], f"plant {plant_letter(p)}", plant_style(p)[0]) for p in plants]
 
 
-def picture(figure: Figure, said: str, plants: Sequence[str]) -> Picture:
+def picture(figure: Figure, said: str, plants: Sequence[str], look: str = "full") -> Picture:
     """The figure as a data: address; its label states what is simulated."""
     only = {plant_origin(p) for p in plants} == {"SIMULATED"}
     mixed = "" if only else f" ({origin(plants)})"
-    return drawn(figure, f"{said}{mixed}", only)
+    return drawn(figure, f"{said}{mixed}", only, look=look)
 
 
 _GROUP_COLORS = {"diagnosis": BLUE, "baseline": ORANGE, "ablation": "#6b7682"}

@@ -12,7 +12,7 @@ import pandas as pd
 
 from data.errors import WorkError
 from reports.labels import NOTHING, number, p_label, percent
-from reports.layout import Column, Row, Table
+from reports.layout import Column, Gauge, Row, Table
 from thermodrift_exam.proof.report.labels import (
     KIND_WORDS,
     key_label,
@@ -331,16 +331,6 @@ _WIDTH = 100.0
 
 
 @dataclass(frozen=True)
-class Bar:
-    """Positions in 0..100 of the picture of a goal: interval, value, and goal."""
-
-    low: float
-    high: float
-    value: float
-    wanted: float
-
-
-@dataclass(frozen=True)
 class Cell:
     """A value as it is shown; `met` is yes, no or empty where it is not known."""
 
@@ -348,7 +338,7 @@ class Cell:
     interval: str
     n: str
     met: str
-    bar: Bar | None = None
+    bar: Gauge | None = None
 
 
 _NONE = Cell(NOTHING, "", "", "")
@@ -423,7 +413,7 @@ def _interval(r: Mapping[Any, Any], low: float, high: float) -> str:
     return f"{first.removesuffix(f' {unit}') if unit else first} to {last}"
 
 
-def _bar(r: Mapping[Any, Any], low: float, high: float) -> Bar:
+def _bar(r: Mapping[Any, Any], low: float, high: float) -> Gauge:
     value, wanted = _float(r["value"]), _float(r["wanted"])
     low, high = (low, high) if math.isfinite(low) and math.isfinite(high) else (value, value)
     share = "%" in str(r["goal"]) and wanted > 0.5
@@ -433,4 +423,4 @@ def _bar(r: Mapping[Any, Any], low: float, high: float) -> Bar:
     def at(x: float) -> float:
         return round(_WIDTH * min(max((x - first) / (last - first), 0.0), 1.0), 1) if math.isfinite(x) else 0.0
 
-    return Bar(at(low), at(high), at(value), at(wanted))
+    return Gauge((at(low), at(high)), (("wanted", at(wanted)),), (at(value),))
