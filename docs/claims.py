@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "results.md")
 _CLAIM = re.compile(r"(<!-- claim: (?P<key>\w+) -->\n?).*?(\n?<!-- end of claim -->)", re.DOTALL)
 
 

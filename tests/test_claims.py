@@ -31,7 +31,7 @@ def test_a_page_has_every_claim_as_the_stored_results_have_it(page: Path) -> Non
 @pytest.mark.parametrize("page", claims.PAGES, ids=lambda p: p.name)
 def test_no_figure_of_a_page_comes_from_nowhere(page: Path) -> None:
     text = re.sub(r"```.*?```", "", claims._CLAIM.sub("", page.read_text(encoding="utf-8")), flags=re.DOTALL)
-    for definition in STATED[page.name]:
+    for definition in STATED.get(page.name, ()):
         text = text.replace(definition, "")
     assert [m[0] for m in FIGURE.finditer(text)] == []
 

@@ -67,12 +67,12 @@ def pages() -> dict[str, str]:
     index = [HEAD]
     made = {}
     for section, members in SECTIONS.items():
-        index += [f"## {section}", ""]
+        index += [f"## {section}", "", '<div class="cards" markdown>', ""]
         for shown in map(example, members):
-            index += [f"### [{shown.title}]({shown.name}.md)", "", shown.text, ""]
-            index += [f"[![{shown.title}]({shown.name}.png)]({shown.name}.md)", ""]
-            index += [f"[The script: `{shown.name}.py`]({shown.name}.md)", ""]
+            index += ["<div markdown>", "", f"[![{shown.title}]({shown.name}.png)]({shown.name}.md)", ""]
+            index += [f"**[{shown.title}]({shown.name}.md)**", "", "</div>", ""]
             made[f"gallery/{shown.name}.md"] = _page(shown)
+        index += ["</div>", ""]
     return {"gallery/index.md": "\n".join(index), **made}
 
 

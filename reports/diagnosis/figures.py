@@ -311,7 +311,8 @@ def null_gains(null: pd.DataFrame, steps: pd.DataFrame, simulated: bool) -> Figu
         at = float(np.clip(r["gain"], edges[0], edges[-1]))
         ax.plot([at, at], [0, 0.72 * top], color=color, lw=2.0)
         side = "right" if at > np.sqrt(edges[0] * edges[-1]) else "left"
-        label = f"step {r['step']}, {'accepted' if r['accepted'] else 'rejected'}"
+        beyond = f" ({number(float(r['gain']), 0)} nats, left of the axis)" if r["gain"] < edges[0] else ""
+        label = f"step {r['step']}, {'accepted' if r['accepted'] else 'rejected'}{beyond}"
         ax.annotate(label, (at, (0.62 - 0.16 * (k % 3)) * top), (-5 if side == "right" else 5, 0), color=color,
                     textcoords="offset points", ha=side, va="center", fontsize=8.5,
                     path_effects=[withStroke(linewidth=3, foreground="white")])  # fmt: skip

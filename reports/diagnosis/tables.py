@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ _LIKELIHOOD = (
     (0.99, "virtually certain"), (0.95, "extremely likely"), (0.90, "very likely"), (0.66, "likely"),
     (0.50, "more likely than not"), (0.33, "about as likely as not"), (0.10, "unlikely"), (0.0, "very unlikely"),
 )  # fmt: skip
+_FREE = ("free_flux", "free_shift")  # regressions, whose sizes are per unit of their drivers
 NARROW = "\u202f"  # a space that does not break
 CHIPS = {
     "consistent": "consistent", "explained": "explained", "partly_explained": "partly explained",
@@ -154,22 +156,23 @@ def _spelled(n: int) -> str:
 _MOST_CANDIDATES, _MOST_CHANNELS = 12, 10
 
 
-def candidates(table: pd.DataFrame, simulated: bool, accepted: frozenset[tuple[str, str]] = frozenset()) -> Table:
+def candidates(table: pd.DataFrame, simulated: bool, accepted: Mapping[tuple[str, str], float]) -> Table:
     """The best of everything that was tried; those accepted are marked.
 
     Args:
         table: the diagnosis' table of candidates.
-        accepted: mechanism and place of what became a finding.
+        accepted: mechanism and place of what became a finding, with the finding's probability.
     """
-    shown = table.sort_values("rank", kind="stable")[:_MOST_CANDIDATES]
+    best = table.sort_values("rank", kind="stable")[:_MOST_CANDIDATES]
+    shown = best.sort_values("gain", ascending=False, kind="stable")
     rows = [
         Row.of(
             str(r["words"]),
             _nats(r["gain"], sign=True),
             f"{int(r['improved'])} of {int(r['batches'])}",
-            _amplitude(float(r["amplitude"]), str(r["unit"])),
+            _amplitude(r, "amplitude"),
             percent(float(r["absorbed"])),
-            _chance(float(r["probability"])),
+            _chance(accepted.get((str(r["mechanism"]), place(r)), float(r["probability"]))),
             f"{int(r['cluster'])}",
             mark="found" if (str(r["mechanism"]), place(r)) in accepted else "",
         )
@@ -181,7 +184,7 @@ def candidates(table: pd.DataFrame, simulated: bool, accepted: frozenset[tuple[s
         Column("absorbed", "by recalibrating", "number"), Column("probability", kind="number"),
         Column("cluster", kind="number"),
     )  # fmt: skip
-    notes = ["Candidates of one cluster look the same in these recordings."]
+    notes = ["Candidates of one cluster look the same in these recordings.", *_dimensionless(rows, 3)]
     if len(table) > len(shown):
         notes.append(f"Shown: the best {len(shown)} of {len(table)} that were refitted.")
     return Table("Candidates, best first", columns, tuple(rows), simulated, notes=tuple(notes))
@@ -196,8 +199,23 @@ def _nats(value: Any, sign: bool = False) -> str:
     return number(float(value), 0 if abs(float(value)) >= 9.95 else 1, sign)
 
 
-def _amplitude(value: float, unit: str) -> str:
-    return quantity(float(f"{value:.3g}"), unit) if math.isfinite(value) else NOTHING
+def _amplitude(row: Mapping[Any, Any], column: str) -> str:
+    """``31.2 W``; of a free form per its drivers, as in its label: ``1.8e−07 µm per spindle_rpm^2``."""
+    value, unit = float(row[column]), str(row["unit"])
+    if not math.isfinite(value):
+        return NOTHING
+    drivers = []
+    if str(row["mechanism"]) in _FREE and str(row["words"]).endswith(")"):
+        terms = re.sub(r"\(T_[^)]*\)", "", str(row["words"])[:-1].partition(": ")[2].partition("(")[2]).split()
+        drivers = [t for t in terms if t != "1" and not t.startswith("θ_")]
+    per = f" per {' · '.join(drivers)}" if drivers else ""
+    return quantity(float(f"{value:.3g}"), unit) + per
+
+
+def _dimensionless(rows: Sequence[Row], column: int) -> list[str]:
+    """A note where a size has no unit."""
+    bare = any(re.fullmatch(r"[−\d.e+]+", str(r.cells[column])) for r in rows)
+    return ["A size without a unit is dimensionless: a factor or a coefficient of the effect's equation."] * bare
 
 
 def _chance(p: float) -> str:
@@ -259,13 +277,13 @@ def limits(table: pd.DataFrame, simulated: bool) -> Table:
     """The least effect that would have been seen, per candidate, and what hides it."""
     rows = []
     for r in table.to_dict("records"):
-        limit, absorbed = _amplitude(float(r["limit"]), str(r["unit"])), percent(float(r["absorbed"]))
+        limit, absorbed = _amplitude(r, "limit"), percent(float(r["absorbed"]))
         rows.append(Row.of(str(r["words"]), limit, absorbed, str(r["absorbed_by"] or NOTHING)))
     columns = (
         Column("effect", kind="wide"), Column("least that would be seen", kind="number"),
         Column("absorbed", "by recalibrating", "number"), Column("mostly by"),
     )  # fmt: skip
-    return Table("Detection limits", columns, tuple(rows), simulated)
+    return Table("Detection limits", columns, tuple(rows), simulated, notes=tuple(_dimensionless(rows, 1)))
 
 
 def parameters(given: Mapping[str, FoundParameter], simulated: bool, caption: str) -> Table:

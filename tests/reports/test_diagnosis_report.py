@@ -216,7 +216,7 @@ def test_the_viewer_holds_every_left_out_run_and_channel() -> None:
 
 def test_candidates_are_ranked_in_words_and_the_accepted_is_marked() -> None:
     d = toy_diagnosis("explained")
-    table = diagnosis_tables.candidates(d.tables["candidates"], True, frozenset({("floor_sink", "bed")}))
+    table = diagnosis_tables.candidates(d.tables["candidates"], True, {("floor_sink", "bed"): 0.97})
     assert table.rows[0].mark == "found" and [r.mark for r in table.rows[1:]] == [""] * 8
     assert table.rows[0].cells == (
         "heat to the floor, bed", "+412", "11 of 12", "10.2 W/K", "63 %", "97\u202f%", "1",
@@ -224,9 +224,30 @@ def test_candidates_are_ranked_in_words_and_the_accepted_is_marked() -> None:
     assert table.rows[-1].cells[:2] == ("a joint that slips, z", "+2.0")
     assert table.rows[-1].cells[3] == "0.8 µm"
     many = pd.concat([d.tables["candidates"]] * 3).assign(rank=range(27), probability=np.nan)
-    table = diagnosis_tables.candidates(many, True)
+    table = diagnosis_tables.candidates(many, True, {})
     assert len(table.rows) == 12 and table.rows[0].cells[5] == "–"
-    assert table.notes[1] == "Shown: the best 12 of 27 that were refitted."
+    assert table.notes[-1] == "Shown: the best 12 of 27 that were refitted."
+    gains = [float(str(r.cells[1]).replace("−", "-")) for r in table.rows]
+    assert gains == sorted(gains, reverse=True)
+
+
+def test_the_size_of_a_free_form_is_per_unit_of_its_drivers() -> None:
+    row = {
+        "rank": 0, "mechanism": "free_shift", "kind": "error", "name": "free_shift_z_square", "cluster": 1,
+        "words": "displacement of no listed mechanism: z (spindle_rpm^2)", "gain": -3.0, "improved": 1, "batches": 2,
+        "absorbed": 0.5, "amplitude": 1.82e-7, "unit": "um", "probability": 0.02,
+    }  # fmt: skip
+    per_K = {"words": "displacement of no listed mechanism: z (spindle_rpm θ_bed)", "unit": "um/K", "amplitude": -2e-4}
+    bare = {
+        "mechanism": "bearing_load",
+        "words": "friction of the bearings under load: screw (spindle_rpm)",
+        "unit": "1",
+    }
+    table = diagnosis_tables.candidates(pd.DataFrame([row, row | per_K, row | bare]), True, {})
+    assert [r.cells[3] for r in table.rows] == [
+        "1.82e−07 µm per spindle_rpm^2", "−0.0002 µm/K per spindle_rpm", "1.82e−07",
+    ]  # fmt: skip
+    assert any("dimensionless" in n for n in table.notes)
 
 
 def test_a_place_is_found_in_a_candidates_unique_name() -> None:
