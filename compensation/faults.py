@@ -11,6 +11,9 @@ import numpy as np
 from compensation.substitutes import Guard, Substitutes
 from data.arrays import Array
 from data.batch import Batch
+from data.errors import InputError
+from features.rises import zeroed_error_um
+from models.metrics import residual_std_um
 
 BEGINS = 4  # a fault begins after this part of a run
 LOOKS = 75  # of the guard in a run: every five minutes in one of six hours
@@ -146,3 +149,35 @@ def fault_cost(predict: Predict, substitutes: Substitutes, batch: Batch, most_um
         if cost_um > worst_um:
             worst, worst_um = f"{' and '.join(sorted(at_fault))}: {kind}", cost_um
     return FaultCost(um_per_K, n, missed, worst, worst_um)
+
+
+_TRIED = 8  # runs, evenly spaced: the saving is far larger than its spread
+_HALF = 2  # runs at least, from which the substitutes of the other half's are learned
+
+
+def bridged(predict: Predict, target: str, batches: Sequence[Batch], names: Sequence[str]) -> tuple[str, ...]:
+    """Sensors that may be replaced for a whole run: a model without one still leaves less error than no correction.
+
+    Each in turn is taken out of training runs and replaced by what the runs of the other half show. It is one of them
+    where the mean saving in S, against sending nothing, is above its standard error.
+
+    Args:
+        batches: runs of the training.
+        names: the guarded sensors.
+    """
+    halves = [list(batches[k::2]) for k in (0, 1)]
+    if min(map(len, halves)) < _HALF:
+        return ()
+    try:
+        learned = [Substitutes.learn(half, names) for half in halves]
+    except InputError:  # too few runs in which all are recorded
+        return ()
+    saved_um: dict[str, list[float]] = {n: [] for n in names}
+    for k in np.unique(np.linspace(0, len(batches) - 1, _TRIED).round().astype(int)):
+        batch, other = batches[k], learned[1 - k % 2]
+        error_um = zeroed_error_um(batch, target)
+        for n in names:
+            left_um = error_um - predict(with_values(batch, {n: other.without(n, batch)}))
+            saved = residual_std_um(error_um) - residual_std_um(left_um)
+            saved_um[n] += [saved] if np.isfinite(saved) else []
+    return tuple(n for n, um in saved_um.items() if len(um) > 1 and np.mean(um) > np.std(um, ddof=1) / np.sqrt(len(um)))

@@ -59,8 +59,9 @@ class GuardLimits:
 
     Attributes:
         substitute_s: time in total that a channel may be replaced, s; a good channel earns it back at the same pace.
-            An hour suffices to finish the part and to call maintenance. It also bounds the pause between two samples
-            after which the guard starts afresh, since no substitute reaches across a longer one.
+            An hour suffices to finish the part and to call maintenance; the channels of `Substitutes.whole` have no
+            such limit. It also bounds the pause between two samples after which the guard starts afresh, since no
+            substitute reaches across a longer one.
         step_sd: change against the regression between two samples that is a step, in standard deviations. The standard
             deviation is that of whole runs, so 6 between two samples is far outside of what training shows.
         frozen_sd: change that the regression predicts while the value stays constant, in standard deviations.
@@ -111,6 +112,7 @@ class Substitutes:
         noise_K: standard deviation of the noise of a training row, K, (n,); None in models stored without it.
         level, level_K2, level_limit_K: mean of the channels' values over all runs, in their unit, (n,), covariance, K²,
             (n, n), and the largest usual distance of each from its regression on all others, K, (n,); None as above.
+        whole: channels that may be replaced for a whole run, see `compensation.faults.bridged`.
     """
 
     names: tuple[str, ...]
@@ -126,6 +128,7 @@ class Substitutes:
     level: Array | None = None
     level_K2: Array | None = None
     level_limit_K: Array | None = None
+    whole: tuple[str, ...] = ()
 
     @classmethod
     def learn(cls, batches: Sequence[Batch], channels: Sequence[str]) -> Self:
@@ -193,18 +196,32 @@ class Substitutes:
         assert self.level_K2 is not None and self.level_limit_K is not None
         return _regression(self.level_K2, self.level_limit_K, self._full_level_K2, good)
 
+    def without(self, name: str, batch: Batch) -> Array:
+        """Values (n,) of a channel that never arrives in a run, as the guard replaces it: its level at the first sample
+        by the levels of the others, and from there on its rise by theirs; NaN where one of these is masked."""
+        others = np.array([n != name for n in self.names])
+        at = self.names.index(name)
+        values = np.column_stack([batch.masked(n) for n in self.names])
+        rise_K = np.where(others, values - values[0], 0.0)
+        off_K = np.where(others, values[0] - (self.level if self.level is not None else np.nan), 0.0)
+        start = (self.level[at] if self.level is not None else np.nan) + self.levels(others).weights[at] @ off_K
+        return np.asarray(np.clip(start + rise_K @ self.changes(others).weights[at], self.low[at], self.high[at]))
+
     def as_plain(self) -> dict[str, Any]:
         """Numbers, strings and arrays."""
         known = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {**{name: value for name, value in known.items() if value is not None}, "names": list(self.names)}
+        plain = {name: value for name, value in known.items() if value is not None}
+        return {**plain, "names": list(self.names), "whole": list(self.whole)}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """The inverse of `as_plain`; lists in place of arrays are read too."""
         optional = ("noise_K", "level", "level_K2", "level_limit_K")
-        fields = [k for k in cls.__dataclass_fields__ if k in plain or k not in optional]
-        arrays = {k: np.asarray(plain[k], float) for k in fields if k not in ("names", "step_s")}
-        return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), **arrays)
+        others = ("names", "step_s", "whole")
+        fields = [k for k in cls.__dataclass_fields__ if k not in others and (k in plain or k not in optional)]
+        arrays = {k: np.asarray(plain[k], float) for k in fields}
+        whole = tuple(plain.get("whole", ()))
+        return cls(names=tuple(plain["names"]), step_s=float(plain["step_s"]), whole=whole, **arrays)
 
     @cached_property
     def _full_K2(self) -> Array:
@@ -316,7 +333,8 @@ class Checked:
 class Guard:
     """Checks sample after sample and replaces channels that fail.
 
-    - `lost`: absent or NaN.
+    - `lost`: absent or NaN. One that never arrived begins at the level that the others predict, where it may be
+      replaced for the whole run.
     - `implausible`: outside of the range of the channel, or infinite.
     - `stepping`: faster than ever usual in training, or suddenly away from its regression on the other good channels.
       Where several are, the worst is judged first and the others without it.
@@ -334,6 +352,7 @@ class Guard:
     def __init__(self, substitutes: Substitutes, limits: GuardLimits | None = None) -> None:
         self.substitutes = substitutes
         self.limits = limits or GuardLimits()
+        self._whole = np.isin(substitutes.names, substitutes.whole)
         self._known: dict[tuple[str, bytes], Regression] = {}  # by the mask of good channels
 
     def begin(self, levels: bool = True) -> Watch:
@@ -393,6 +412,7 @@ class Guard:
             status[i] = "off"
         off = np.array([a == "off" for a in status])
         filled = np.where(off, level, np.where(frozen, watch.same + moved_K, before + predicted_K))
+        filled = np.where(np.isnan(filled) & ~present & self._whole, level, filled)
         filled = np.where(agree & ~was_off, x, np.clip(filled, s.low, s.high))
 
         failed = np.array([a != "ok" for a in status])
@@ -491,7 +511,7 @@ class Guard:
         limits = self.limits
         present = watch.bad & present
         steady = present & (np.abs(x - watch.raw) <= usual_K)
-        spent = watch.used_s > limits.substitute_s
+        spent = self._spent(watch)
         gone = np.array([a in ("lost", "implausible") for a in status])
         stuck = np.array([a == "frozen" for a in status]) & (np.abs(x - watch.same) <= _SAME_K)
         trusted = ~spent & (not many)
@@ -502,6 +522,10 @@ class Guard:
         agreed = np.where(consistent, watch.agreed + 1, 0)
         return np.asarray(agreed >= limits.back_samples), agreed.astype(float)
 
+    def _spent(self, watch: Watch) -> Mask:
+        """Channels whose time with a substitute is over."""
+        return np.asarray((watch.used_s > self.limits.substitute_s) & ~self._whole)
+
     def _checked(self, watch: Watch, values: Mapping[str, float], sd_K: Array) -> Checked:
         s, limits = self.substitutes, self.limits
         bad = np.flatnonzero(watch.bad)
@@ -509,7 +533,7 @@ class Guard:
             f"{s.names[i]} {watch.status[i]}: "
             + ("never arrived" if np.isnan(watch.filled[i]) else f"replaced for more than {limits.substitute_s:.0f} s")
             for i in bad
-            if np.isnan(watch.filled[i]) or watch.used_s[i] > limits.substitute_s
+            if np.isnan(watch.filled[i]) or self._spent(watch)[i]
         ]
         if len(bad) > limits.bad_share * len(s.names):
             named = ", ".join(f"{s.names[i]} {watch.status[i]}" for i in bad)

@@ -86,11 +86,18 @@ def decision(machine: str) -> str:
 
 
 def _without(rows: pd.DataFrame) -> str:
-    """Runs in which a sensor of their model never arrived."""
+    """Runs in which a sensor of their model never arrived, and what was left in them."""
     if rows.empty:
         return ""
     sensors = sorted({name for names in rows["not_recorded"] for name in names.split()})
-    return f" In {rows['run'].nunique()} of the runs {', '.join(sensors)} never arrived, so nothing was sent."
+    return (
+        f" In {rows['run'].nunique()} of the runs {', '.join(sensors)} never arrived and was replaced: S "
+        f"{rows['S_um'].mean():.1f} µm over {count(len(rows))}, no model {rows['no_model_S_um'].mean():.1f}."
+    )
+
+
+def count(n: int) -> str:
+    return f"{n} run{'s' * (n > 1)} of a channel"
 
 
 def kinds() -> str:

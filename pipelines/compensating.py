@@ -100,6 +100,9 @@ def compensator(
         )
     known = [m.substitutes for m in models if m.substitutes is not None]
     widest = max(known, key=lambda s: len(s.names), default=None)  # of the most sensors: the most neighbours of each
+    if widest is not None:  # a sensor may be missing for a whole run where every axis that reads it may do without it
+        refused = {n for s in known for n in s.names if n not in s.whole}
+        widest = replace(widest, whole=tuple(n for n in widest.whole if n not in refused))
     made = [axis_model(m, limits.of(m), period_s) for m in models]
     return Compensator(machines[0], made, widest, period_s, log)
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from compensation.faults import FaultCost, fault_cost
+from compensation.faults import FaultCost, bridged, fault_cost
 from compensation.safety import ROOM
 from compensation.substitutes import Substitutes
 from data.batch import Batch
@@ -128,7 +129,8 @@ def _ordered(batches: Sequence[Batch]) -> list[Batch]:
 
 def substitutes_of(family: Family, ordered: Sequence[Batch]) -> Substitutes:
     """What replaces the sensors of a family while they fail, learned from batches in order of time."""
-    return Substitutes.learn(ordered, list(dict.fromkeys(i.partition("@")[0] for i in family.inputs)))
+    learned = Substitutes.learn(ordered, list(dict.fromkeys(i.partition("@")[0] for i in family.inputs)))
+    return replace(learned, whole=bridged(family.predict, family.target, ordered, learned.names))
 
 
 def faults_of(family: Family, batches: Sequence[Batch]) -> FaultCost | None:

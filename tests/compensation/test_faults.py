@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from compensation.faults import BEGINS, fault_cost, faults, watched, with_values
+from compensation.faults import BEGINS, bridged, fault_cost, faults, watched, with_values
 from compensation.substitutes import Guard, Substitutes
 from data.arrays import Array
 from data.batch import Batch
@@ -81,3 +81,21 @@ def test_fewer_looks_find_the_same_faults_a_little_later(learned: Substitutes, b
     assert rarely.untrusted[33] == rarely.untrusted[35] == {"t2"}
     np.testing.assert_allclose(rarely.passed.values("t2")[:31], batch.masked("t2")[:31])
     assert np.abs(rarely.passed.values("t2") - batch.masked("t2"))[33:].max() < 4.0
+
+
+def test_a_sensor_may_be_missing_where_the_model_without_it_beats_no_correction(batches: list[Batch]) -> None:
+    """z = 3 t0 − 2 t4: t0 carries most of it and follows from the others; a sensor of its own does not."""
+    whole = bridged(lambda b: 3.0 * rise(b, "t0") - 2.0 * rise(b, "t4"), "z", batches, NAMES)
+    assert whole == NAMES
+    rng = np.random.default_rng(5)
+    alone = []
+    for b in batches:
+        own = np.cumsum(rng.standard_normal(b.n_rows))
+        alone.append(with_values(b, {"t2": b.values("t2")[0] + own, "z": 20.0 * own}))
+    assert "t2" not in bridged(lambda b: 20.0 * rise(b, "t2"), "z", alone, NAMES)
+    assert bridged(of_one, "z", batches[:3], NAMES) == (), "too few runs to tell"
+
+
+def rise(batch: Batch, name: str) -> Array:
+    values = batch.masked(name)
+    return np.asarray(values - values[0])

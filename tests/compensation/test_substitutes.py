@@ -242,6 +242,27 @@ def test_a_constant_channel_is_not_frozen_where_nothing_should_move(guard: Guard
         assert set(checked.status.values()) == {"ok"}
 
 
+def test_a_channel_that_never_arrives_is_replaced_for_the_whole_run_where_it_may_be(
+    learned: Substitutes, batches: list[Batch]
+) -> None:
+    known = Substitutes.from_plain(json.loads(json.dumps(plain(replace(learned, whole=("t2",))))))
+    assert known.whole == ("t2",)
+    guard = Guard(known, LIMITS)
+    found = run(guard, batches[-1], {"t2": lambda i, v: None})
+    assert {c.fault for c in found} == {None} and set(statuses(found, "t2")) == {"lost"}, "beyond 20 steps too"
+    assert known.level_limit_K is not None
+    off_K = errors_K(found, batches[-1], "t2")
+    assert np.abs(off_K).max() < known.level_limit_K[2] and np.ptp(off_K) < 6 * known.sd_K[2]
+    np.testing.assert_allclose([c.values["t2"] for c in found], known.without("t2", batches[-1]), atol=1e-9)
+    assert run(guard, batches[-1], {"t3": lambda i, v: None})[0].fault == "t3 lost: never arrived"
+    late = run(guard, batches[-1], {"t2": lambda i, v: None if i < 30 else v})
+    assert statuses(late, "t2")[-1] == "ok" and late[-1].values["t2"] == batches[-1].values("t2")[-1]
+
+
+def plain(s: Substitutes) -> dict[str, object]:
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s.as_plain().items()}
+
+
 def test_a_channel_that_never_arrived_is_a_fault(guard: Guard, batches: list[Batch]) -> None:
     found = run(guard, batches[-1], {"t4": lambda i, v: nan if i < 3 else v})
     assert [c.fault for c in found[:4]] == ["t4 lost: never arrived"] * 3 + [None]
