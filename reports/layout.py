@@ -296,7 +296,7 @@ class Claims:
 
 @dataclass(frozen=True)
 class Group:
-    """Blocks in a box of its own look: pair, half, unsealed, changed, claim, static (for print and without scripts)."""
+    """Blocks in a box: pair, narrow, unsealed, changed, claim, or static (for print and without scripts)."""
 
     blocks: tuple[Any, ...]
     look: str

@@ -137,7 +137,7 @@ def bound_panel(name: str, left_out: pd.DataFrame, simulated: bool) -> Panel | N
         for p in reversed(_MARKERS) if p in by
     ]  # fmt: skip
     lines = [(1.0, GREEN), (bound.bound_um / bound.expected_um, INK)]
-    figure = S_against_S(clouds, lines, "expected S", "S", simulated)
+    figure = S_against_S(clouds, lines, "expected S", "S", simulated, equal=False)
     keys = [c.key for c in reversed(clouds)] + [Key("as expected", GREEN), Key("90 % bound", INK)]
     notes = (
         "The expected S rises with the disagreement of the best of other families and with the distance from the "

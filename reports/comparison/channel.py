@@ -36,10 +36,10 @@ from reports.labels import (
     count,
     decimals,
     family_label,
-    family_style,
     listed,
     number,
     selector_label,
+    styles,
 )
 from reports.layout import Details, Key, Pairs, Panel, Plot, Section, Table, Text, given
 from reports.viewer import Pane, Trace, Viewer, viewer
@@ -142,13 +142,13 @@ def runs_viewer(name: str, result: GridResult, shown: Sequence[LeftOut], digits:
 def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) -> Panel | None:
     tried = paths(cells)
     best = best_per(tried, "family")
-    if best.empty:
+    if tried["n_tsp"].nunique() < 2:
         return None
     at = dict(zip(best["family"], best["selector"], strict=True))
     if ((tried["family"] == choice.family) & (tried["selector"] == choice.selector)).any():
         at[choice.family] = choice.selector  # the promoted model's own line, where another selector is as good
     lines = tried[tried["selector"] == tried["family"].map(at)]
-    flat = best_per(cells[cells["n_tsp"] == 0], "family")
+    flat, looks = best_per(cells[cells["n_tsp"] == 0], "family"), styles(lines["family"].tolist())
     plots = tuple(
         Plot(
             figures.against_points(lines, flat, column, f"{short}, µm", choice.family, result.simulated),
@@ -157,7 +157,7 @@ def _points(name: str, result: GridResult, cells: pd.DataFrame, choice: Choice) 
         )
         for column, short in (("S_mean_um", "Accuracy S_mean"), ("S_std_um", "Robustness S_std"))
     )
-    keys = [Key(f"{family_label(f)}, {selector_label(s)}", *family_style(f)) for f, s in at.items()]
+    keys = [Key(f"{family_label(f)}, {selector_label(s)}", *looks[f]) for f, s in at.items()]
     keys += [Key(family_label(f), MUTED, figures.flat_dash(f)) for f in flat["family"]]
     return Panel(
         f"{name}: accuracy and robustness against the number of points",

@@ -25,9 +25,9 @@ from reports.labels import (
     ORANGE,
     cell_label,
     family_label,
-    family_style,
     number,
     selector_label,
+    styles,
     tex_escaped,
 )
 from reports.layout import Key, Scale
@@ -100,8 +100,9 @@ def against_points(
     for row in flat.to_dict("records"):
         ax.axhline(row[column], color=MUTED, lw=1.1, ls=_DASHES[flat_dash(row["family"])],
                    label=family_label(row["family"]))  # fmt: skip
+    looks = styles(lines["family"].tolist())
     for (family, selector), own in lines.groupby(["family", "selector"], sort=False):
-        own, (color, symbol) = own.sort_values("n_tsp"), family_style(str(family))
+        own, (color, symbol) = own.sort_values("n_tsp"), looks[str(family)]
         strong = family == chosen
         ax.plot(own["n_tsp"], own[column], color=color, marker=MARKS[symbol], lw=2.2 if strong else 1.0,
                 ms=4.5 if strong else 3.2, zorder=3 if strong else 2,
@@ -128,17 +129,21 @@ class Cloud:
     key: Key
 
 
-def S_against_S(clouds: Sequence[Cloud], lines: Sequence[tuple[float, str]], x: str, y: str, simulated: bool) -> Figure:
-    """A mark per batch on two equal logarithmic axes; a line (factor, colour) is y = factor times x."""
+def S_against_S(
+    clouds: Sequence[Cloud], lines: Sequence[tuple[float, str]], x: str, y: str, simulated: bool, equal: bool = True
+) -> Figure:
+    """A mark per batch on two logarithmic axes, equal ones by default; a line (factor, colour) is y = factor · x."""
     fig = Figure(figsize=(HALF_IN * 0.8, HALF_IN * 0.8))
     ax = axes_in(fig, 0.25, HALF_IN * 0.8 - 0.7, f"{y}, µm", f"{x}, µm")
-    scale = Scale.over([v for c in clouds for v in (*c.x_um, *c.y_um)], math.inf)
-    for axis in "xy":
+    values = [np.concatenate([of(c) for c in clouds]) for of in (lambda c: c.x_um, lambda c: c.y_um)]
+    values = [np.concatenate(values)] * 2 if equal else values
+    scales = [Scale.over(v.tolist(), math.inf) for v in values]
+    for axis, scale in zip("xy", scales, strict=True):
         logarithmic(ax, scale, axis)
     for c in clouds:
-        at = [np.maximum(v, scale.low_um) for v in (c.x_um, c.y_um)]
+        at = [np.maximum(v, scale.low_um) for v, scale in zip((c.x_um, c.y_um), scales, strict=True)]
         ax.plot(*at, color=c.key.color, marker=MARKS[c.key.symbol], ls="", ms=4.5, mec="white", mew=0.4)
-    ends = np.array([scale.low_um, scale.high_um])
+    ends = np.array([scales[0].low_um, scales[0].high_um])
     for factor, color in lines:
         ax.plot(ends, factor * ends, color=color, lw=1.3, zorder=1)
     say_simulated(ax, simulated)

@@ -207,7 +207,7 @@ def _equations(d: Diagnosis, pictures: bool) -> Section | None:
         if x.equation or x.parameters:
             blocks += [Heading(label), Text(x.equation, "law")]
         if x.parameters:
-            blocks.append(Group((tables.parameters(x.parameters, d.simulated, "Parameters"),), "half"))
+            blocks.append(Group((tables.parameters(x.parameters, d.simulated, "Parameters"),), "narrow"))
     return Section("equation", "The equation with its numbers", given(*blocks), "Equation") if blocks else None
 
 

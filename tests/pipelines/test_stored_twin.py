@@ -14,7 +14,7 @@ from models.trust import Region
 from models.twin import Twin
 from models.twin_kalman import TwinKalman
 from pipelines import model_store
-from reports.labels import family_label, family_style
+from reports.labels import family_label, styles
 from tests.models.twin_year import year
 
 
@@ -36,4 +36,6 @@ def test_every_family_has_a_name_and_a_style_of_its_own():
     assert [family_label(k) for k in ("twin", "twin_residual", "twin_kalman")] == [
         "physics twin", "twin + residual", "twin with sensors",
     ]  # fmt: skip
-    assert len({family_style(k) for k in FAMILIES}) == len(FAMILIES)
+    looks = styles(list(FAMILIES))
+    assert len(set(looks.values())) == len(FAMILIES)
+    assert len({color for color, _ in list(looks.values())[:8]}) == 8
