@@ -175,6 +175,7 @@ class Policy:
     unlisted_odds: float = development(50.0, "odds", "of the best explanation against what is not listed")
     alike_min_probability_share: float = convention(0.25, "of the likeliest", "an explanation as probable is alike")
     reported_min_probability: float = convention(0.005, "probability", "a less likely alternative is not reported")
+    named_min_probability_share: float = convention(0.1, "of the finding", "a less likely one does not count as named")
     reported_alternatives: int = convention(5, "alternatives", "in the findings")
 
     # Localisation

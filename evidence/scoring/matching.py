@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from math import pi
 
 from diagnosis.findings.schema import Finding, Findings
-from evidence.baselines.base import MIN_ALIKE_SHARE
+from diagnosis.policy import POLICY
 from evidence.scoring.answer_key import AnswerKey, Spot, TrueTerm
 from twin.mechanisms import MECHANISMS
 
@@ -81,7 +81,7 @@ def _ends(spot: Spot, body_of: Mapping[str, str]) -> set[str]:
 
 def reported_set(finding: Finding) -> list[tuple[str, Spot]]:
     """Mechanism and place of every explanation that the finding reports, its own first."""
-    least = MIN_ALIKE_SHARE * finding.probability
+    least = POLICY.named_min_probability_share * finding.probability
     own = [(finding.mechanism, Spot(finding.where.kind, finding.where.name))]
     others = [(a.mechanism, Spot(a.where.kind, a.where.name)) for a in finding.alternatives if a.probability >= least]
     return list(dict.fromkeys([*own, *others]))

@@ -15,7 +15,7 @@ from time import perf_counter, process_time
 from typing import Any
 
 import data  # noqa: F401 - found before the walls stand, since the folder around it cannot be listed behind them
-from evidence.sealing.isolation import allowed, confine
+from evidence.sealing.isolation import allowed, confine, is_package
 
 STATUS, FINDINGS, REPLIES = "status.json", "findings.json", "rivals.json"
 PLAN, SERIES = "next_run.yml", "series.csv"
@@ -26,8 +26,9 @@ def main() -> None:
     task = json.loads(sys.stdin.read())
     place = Path(task["place"])
     import_from = [Path(p) for p in task["import_from"]]
+    on_path = [str(p.parent if is_package(p) else p) for p in import_from]
     status: dict[str, Any] = {"stage": "isolated", "isolation": confine(allowed(place, import_from), place / "witness")}
-    sys.path[:0] = task["import_from"]
+    sys.path[:0] = on_path
     diagnose = _function(task["diagnose"])
     baselines = _function(task["baselines"]) if task["baselines"] else None
     _report(place, status)

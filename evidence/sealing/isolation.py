@@ -31,8 +31,8 @@ SYSTEM = (
 )  # fmt: skip
 # Folders that an answering process may read below the root: not plants/ and exam/, which draw cases, nor the scoring.
 READABLE = (
-    "data", "twin", "diagnosis", "evidence/__init__.py", "evidence/baselines", "evidence/sealing/__init__.py",
-    "evidence/sealing/examinee.py", "evidence/sealing/isolation.py",
+    "data", "twin", "diagnosis", "evidence/__init__.py", "evidence/sealing/__init__.py", "evidence/sealing/examinee.py",
+    "evidence/sealing/isolation.py",
 )  # fmt: skip
 LISTED = ("evidence", "evidence/sealing")  # names alone, so that packages are found
 DENIED = ("socket.", "subprocess.", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.system", "pty.", "os.kill")
@@ -60,14 +60,24 @@ def own_source() -> tuple[Path, tuple[Path, ...]]:
 
 
 def allowed(place: Path | None = None, import_from: Iterable[Path] = ()) -> Allowed:
-    """What an answering process may read; `place` is its own folder, with `case` to read and `answer` to write."""
+    """What an answering process may read; `place` is its own folder, with `case` to read and `answer` to write.
+
+    `import_from` are further packages, or folders of modules; of what lies next to a package only the names are seen.
+    """
     root, source = own_source()
+    import_from = list(import_from)
+    beside = [p.resolve().parent for p in import_from if is_package(p)]
     own = () if place is None else (place / "case",)
     libraries = {sysconfig.get_path(k) for k in ("stdlib", "platstdlib", "purelib", "platlib")}
     system = [*SYSTEM, *sorted(libraries), f"{sys.base_prefix}/lib", *map(str, import_from)]
     read = dict.fromkeys(Path(p).resolve() for p in (*system, *source, *own) if Path(p).exists())
     write = () if place is None else ((place / "answer").resolve(),)
-    return Allowed(tuple(read), tuple(root / name for name in LISTED), write)
+    return Allowed(tuple(read), (*(root / name for name in LISTED), *beside), write)
+
+
+def is_package(folder: Path) -> bool:
+    """Whether a folder is imported itself, and not the modules in it."""
+    return (folder / "__init__.py").is_file()
 
 
 def confine(to: Allowed, witness: Path) -> str:

@@ -38,11 +38,11 @@ class Examinee:
     """Who answers: functions as ``module:function``, called as `diagnose` is and as ``replies(diagnosis)``.
 
     `limit_s` is the longest that a diagnosis may take, and again the longest that the baselines may. `import_from` are
-    folders other than the package itself that modules may be read from.
+    packages, or folders of modules, other than the product's that may be read.
     """
 
     diagnose: str = "diagnosis.diagnose:diagnose"
-    baselines: str | None = "evidence.baselines:replies"
+    baselines: str | None = None
     limit_s: float = LIMIT_S
     import_from: tuple[str, ...] = ()
 

@@ -210,11 +210,11 @@ def _request(cases: int, to: Path | None, plants: str, suite: str, seed: int | N
 
 
 def _examinee(limit_s: float) -> Examinee:
-    from evidence.sealing.running import Examinee
+    from thermodrift_exam.proof.proving import examinee
 
     if not limit_s > 0:
         raise InputError(f"--limit: got {limit_s:g}, expected more than 0 seconds")
-    return Examinee(limit_s=limit_s)
+    return examinee(limit_s)
 
 
 def _deals(deals: int) -> int:

@@ -44,7 +44,7 @@ def executed(case: Path, plan: str, key: Mapping[str, Any], kept: Path, by: Exam
                 _add(more, plan, key)
             except InputError:  # a plan that this plant cannot run separates nothing
                 return None
-            files = examine(more, by or Examinee(baselines=None), source)
+            files = examine(more, by or Examinee(), source)
         shutil.rmtree(kept, ignore_errors=True)
         kept.mkdir()
         for name, content in files.items():

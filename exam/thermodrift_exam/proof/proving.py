@@ -13,7 +13,7 @@ import pandas as pd
 
 from data.errors import InputError, WorkError
 from evidence.sealing.folder import ProofFolder, files_digest, state_of
-from evidence.sealing.running import Examinee, RunOutcome, run
+from evidence.sealing.running import LIMIT_S, Examinee, RunOutcome, run
 from evidence.sealing.seal import Done, Suite, seal
 from thermodrift_exam.proof.report.tables import ProofRun
 from thermodrift_exam.proof.sealing.opening import unseal
@@ -110,6 +110,14 @@ def seal_proof(request: ProofRequest, workers: int, done: Done | None = None) ->
     return seal(ProofFolder(request.out), drawn(request), partial(make_case, data=request.data), workers, done)
 
 
+RIVALS = Path(__file__).resolve().parents[2] / "thermodrift_rivals"  # next to this package, which stays unseen
+
+
+def examinee(limit_s: float = LIMIT_S) -> Examinee:
+    """The diagnosis, and the baselines and ablations on its fits."""
+    return Examinee(baselines="thermodrift_rivals:replies", limit_s=limit_s, import_from=(str(RIVALS),))
+
+
 def run_proof(
     out: Path, workers: int, restart: bool = False, by: Examinee | None = None, done: Done | None = None
 ) -> RunOutcome:
@@ -118,7 +126,7 @@ def run_proof(
     Raises:
         InputError, WorkError: as `evidence.sealing.running.run`.
     """
-    return run(ProofFolder(out), by or Examinee(), workers, restart, done)
+    return run(ProofFolder(out), by or examinee(), workers, restart, done)
 
 
 def open_proof(

@@ -87,7 +87,7 @@ def test_the_hook_alone_refuses_too(tmp_path: Path) -> None:
 def test_the_drawing_of_cases_is_no_part_of_what_is_seen() -> None:
     root, parts = own_source()
     seen = [p.relative_to(root).as_posix() for p in parts]
-    assert {"data", "diagnosis", "twin", "evidence/baselines"} <= set(seen)
+    assert {"data", "diagnosis", "twin"} <= set(seen)
     assert not any(s.startswith(("plants", "exam", "evidence/scoring", "tests")) for s in seen)
 
 

@@ -14,9 +14,8 @@ import pandas as pd
 import pytest
 
 from evidence.sealing.folder import ProofFolder
-from evidence.sealing.running import Examinee
 from evidence.sealing.seal import Suite, seal
-from thermodrift_exam.proof.proving import ProofOutcome, make_case, open_proof, run_proof
+from thermodrift_exam.proof.proving import ProofOutcome, examinee, make_case, open_proof, run_proof
 from thermodrift_exam.proof.scoring.goals import GOALS
 from thermodrift_exam.proof.spec import CaseSpec
 from thermodrift_exam.proof.suite import small_suite
@@ -30,7 +29,7 @@ Proof = tuple[Path, ProofOutcome, list[CaseSpec]]
 def proof(tmp_path_factory: pytest.TempPathFactory) -> Proof:
     out, specs = tmp_path_factory.mktemp("small") / "proof", small_suite()
     seal(ProofFolder(out), Suite("development", specs, "small", secret=False), make_case, WORKERS)
-    run_proof(out, WORKERS, by=Examinee(limit_s=3600.0))  # no time is judged here
+    run_proof(out, WORKERS, by=examinee(limit_s=3600.0))  # no time is judged here
     return out, open_proof(out, WORKERS, deals=0), specs
 
 

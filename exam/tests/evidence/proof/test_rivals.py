@@ -13,10 +13,10 @@ import pytest
 from diagnosis.candidates.priors import start_values
 from diagnosis.screening.signatures import difference
 from diagnosis.search.search import Search, search
-from evidence.baselines import replies
-from evidence.baselines.base import correlations, plain_rows
-from evidence.baselines.evaluate import ABLATIONS, BASELINES
 from tests.diagnosis.small_cases import cold_floor, consistent
+from thermodrift_rivals import replies
+from thermodrift_rivals.base import correlations, plain_rows
+from thermodrift_rivals.evaluate import ABLATIONS, BASELINES
 from twin.mechanisms import MECHANISMS
 
 pytestmark = pytest.mark.slow

@@ -78,7 +78,7 @@ def goal_table(outcomes: pd.DataFrame, terms: pd.DataFrame, compared: pd.DataFra
     on, if there are any, then every plant. Shares with exact intervals, the rest by a bootstrap over cases.
     `informed` is the value of the true model (`goals.Goal`).
 
-    `compared` (`evidence.baselines.compared`) adds the lead over the best baseline, for all cases together.
+    `compared` (`thermodrift_rivals.compared`) adds the lead over the best baseline, for all cases together.
     """
     rows: list[dict[str, Any]] = []
     there = sorted(outcomes["plant"].dropna().unique())

@@ -16,8 +16,6 @@ from diagnosis.search.claims import Round
 from diagnosis.search.refits import odds_of
 from twin.mechanisms import MECHANISMS
 
-MIN_ALIKE_SHARE = 0.1  # of the first explanation's probability: less likely ones are not in the reported set
-
 
 @dataclass(frozen=True)
 class Claim:

@@ -11,24 +11,24 @@ from data.errors import WorkError
 from data.registry import Registry
 from diagnosis.result import Diagnosis
 from diagnosis.search.search import Search
-from evidence.baselines.ablations import Stage
+from thermodrift_rivals.ablations import Stage
 
 BASELINES = Registry(
     "baseline",
     {
-        "raw_correlation": "evidence.baselines.regression:raw_correlation",
-        "sparse_regression": "evidence.baselines.regression:sparse_regression",
-        "in_sample_bic": "evidence.baselines.bic:in_sample_bic",
+        "raw_correlation": "thermodrift_rivals.regression:raw_correlation",
+        "sparse_regression": "thermodrift_rivals.regression:sparse_regression",
+        "in_sample_bic": "thermodrift_rivals.bic:in_sample_bic",
     },
 )
 ABLATIONS = Registry(
     "ablation",
     {
-        "reference": "evidence.baselines.ablations:reference",
-        "no_projection": "evidence.baselines.ablations:no_projection",
-        "independent_noise": "evidence.baselines.ablations:independent_noise",
-        "no_veto": "evidence.baselines.ablations:no_veto",
-        "no_floor_check": "evidence.baselines.ablations:no_floor_check",
+        "reference": "thermodrift_rivals.ablations:reference",
+        "no_projection": "thermodrift_rivals.ablations:no_projection",
+        "independent_noise": "thermodrift_rivals.ablations:independent_noise",
+        "no_veto": "thermodrift_rivals.ablations:no_veto",
+        "no_floor_check": "thermodrift_rivals.ablations:no_floor_check",
     },
 )
 

@@ -16,7 +16,7 @@ from diagnosis.fitting.covariance import beyond_recalibration, slices_of
 from diagnosis.policy import POLICY
 from diagnosis.search.claims import Round
 from diagnosis.search.search import Search
-from evidence.baselines.base import Claim, Reply, beyond_slack, bounds
+from thermodrift_rivals.base import Claim, Reply, beyond_slack, bounds
 
 LOOKED_AT = 40  # candidates of a step whose criterion is computed, by their reduction at the weights of the step before
 REWEIGHTING_ROUNDS = 5  # of reweighting the channels

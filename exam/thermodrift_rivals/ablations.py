@@ -15,7 +15,7 @@ from diagnosis.policy import POLICY, Policy
 from diagnosis.search.claims import Round, explanations
 from diagnosis.search.refits import odds_of, refits
 from diagnosis.search.search import Search, decided, one_round
-from evidence.baselines.base import MIN_ALIKE_SHARE, Claim, Reply, claimable, correlations
+from thermodrift_rivals.base import Claim, Reply, claimable, correlations
 
 REFITS = 4  # of a screen without projection, each of another mechanism
 
@@ -40,7 +40,7 @@ class Stage:
         every = [(e.tried.candidate, e.probability) for e in explanations(done)[0]]
         others = [(c, p) for c, p in every if (c.mechanism, c.where) != (best.mechanism, best.where)]
         own = sum(p for _, p in every) - sum(p for _, p in others)
-        alike = tuple(c for c, p in others if p >= MIN_ALIKE_SHARE * own)
+        alike = tuple(c for c, p in others if p >= POLICY.named_min_probability_share * own)
         return Reply(_verdict([found], fitted, policy), (Claim(best, found.probability, alike),))
 
 

@@ -11,7 +11,7 @@ from sklearn.linear_model import Lasso, LassoCV
 from sklearn.model_selection import GroupKFold
 
 from diagnosis.search.search import Search
-from evidence.baselines.base import Claim, PlainRows, Reply, plain_rows
+from thermodrift_rivals.base import Claim, PlainRows, Reply, plain_rows
 
 SIGNIFICANT = 0.01  # for all candidates together (Bonferroni)
 ALIKE = 0.95  # of the largest correlation: as good an explanation
