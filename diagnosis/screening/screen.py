@@ -133,16 +133,19 @@ def _null(fitted: Fitted, mixed: Array, cross: Array, squares: Array, prior: Arr
     out = np.zeros((twins, cross.shape[1]))
     joint = np.block([[inner, of_model.T], [of_model, directions]])
     shared = np.vstack([mixed[:p], cross])
+    drawn = min(twins, len(directions))  # none where noise alone is judged
     for fold in range(POLICY.null_folds):
         dropped = np.arange(fold, twins, POLICY.null_folds)
         keep = np.ones(len(joint))
-        keep[p : p + twins] *= np.sqrt(twins / (twins - len(dropped)))
-        keep[p + dropped] = 0.0
+        of = dropped[dropped < drawn]
+        keep[p : p + drawn] *= np.sqrt(twins / (twins - len(dropped)))
+        keep[p + of] = 0.0
         factor = cho_factor(joint * keep[:, None] * keep + np.eye(len(joint)))
         along = cho_solve(factor, shared * keep[:, None])
         left = np.maximum(squares - np.einsum("kc,kc->c", shared * keep[:, None], along), TINY)
         size = np.sqrt(twins)  # a direction is a draw of sd 1 / sqrt(twins)
-        shown = size * (cross[dropped] - (joint[p + dropped] * keep) @ along)
+        shown = np.zeros((len(dropped), cross.shape[1]))
+        shown[: len(of)] = size * (cross[of] - (joint[p + of] * keep) @ along)
         out[dropped] = _gains(left, shown + rng.standard_normal(shown.shape) * np.sqrt(left), prior, positive)[0]
     return out
 

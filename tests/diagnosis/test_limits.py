@@ -12,6 +12,8 @@ import pandas as pd
 import pytest
 
 from diagnosis.contracts import COLUMNS, Scored
+from diagnosis.fitting.covariance import independent, white_noise
+from diagnosis.fitting.fitted import under
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, limits, one_of_each, proposed, screen
 from tests.diagnosis.small_cases import DRIFT, FLOOR, SHIFT, consistent, fitted, runs, two_bodies
@@ -69,6 +71,14 @@ def test_an_effect_of_three_times_its_limit_is_seen_and_of_a_third_is_not(name: 
         done = fitted(two_bodies(), batches)
         rank, scored = of(screen(done, proposed(done)), name)
         assert (rank < 3 and scored.gain > THRESHOLD / 2) == found
+
+
+def test_noise_alone_has_a_null_of_its_own() -> None:
+    """Without refined twins the best gains of nothing missing are those of noise."""
+    done = consistent()
+    bare = under(done, independent(done.problem, white_noise(done.problem)))
+    null = screen(bare, proposed(bare)).null
+    assert np.isfinite(null).all() and len(null) == POLICY.refined_twins and null.max() < THRESHOLD
 
 
 def test_it_is_what_reaches_the_threshold_and_a_margin() -> None:
