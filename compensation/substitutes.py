@@ -412,7 +412,8 @@ class Guard:
             status[i] = "off"
         off = np.array([a == "off" for a in status])
         filled = np.where(off, level, np.where(frozen, watch.same + moved_K, before + predicted_K))
-        filled = np.where(np.isnan(filled) & ~present & self._whole, level, filled)
+        begun = np.isnan(filled) & ~present & self._whole
+        filled = np.where(begun, level, filled)
         filled = np.where(agree & ~was_off, x, np.clip(filled, s.low, s.high))
 
         failed = np.array([a != "ok" for a in status])
@@ -437,7 +438,7 @@ class Guard:
             moved_K=moved_K,
             time_s=float(time_s) if np.isfinite(time_s) else watch.time_s,
         )
-        return after, self._checked(after, values, np.where(off, level_sd_K, sd_K))
+        return after, self._checked(after, values, np.where(off | begun, level_sd_K, sd_K))
 
     def _without_steps(self, good: Mask, change_K: Array, usual_K: Array) -> tuple[Mask, Regression]:
         """Good channels that do not step, with the regression on them."""

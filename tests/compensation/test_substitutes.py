@@ -251,6 +251,7 @@ def test_a_channel_that_never_arrives_is_replaced_for_the_whole_run_where_it_may
     found = run(guard, batches[-1], {"t2": lambda i, v: None})
     assert {c.fault for c in found} == {None} and set(statuses(found, "t2")) == {"lost"}, "beyond 20 steps too"
     assert known.level_limit_K is not None
+    assert found[0].sd_K["t2"] < known.level_limit_K[2], "of the levels at the first sample"
     off_K = errors_K(found, batches[-1], "t2")
     assert np.abs(off_K).max() < known.level_limit_K[2] and np.ptp(off_K) < 6 * known.sd_K[2]
     np.testing.assert_allclose([c.values["t2"] for c in found], known.without("t2", batches[-1]), atol=1e-9)
