@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from reports.labels import count
@@ -20,13 +21,16 @@ def write_fleet_page(
     alerts: Sequence[tuple[str, str, str]],
     fleets: Sequence[Mapping[str, Any]],
     now: datetime,
+    pages: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write the page; rows and fleets as `pipelines.fleet_view` makes them, alerts as (machine, channel, reason).
+
+    `pages` are the newest reports of trainings by machine, as links from the page.
 
     Raises:
         InputError: another suffix than .html, or no place to write.
     """
-    write_page(path, fleet_page(rows, alerts, fleets, now), (".html",))
+    write_page(path, fleet_page(rows, alerts, fleets, now, pages), (".html",))
 
 
 def fleet_page(
@@ -34,6 +38,7 @@ def fleet_page(
     alerts: Sequence[tuple[str, str, str]],
     fleets: Sequence[Mapping[str, Any]],
     now: datetime,
+    pages: Mapping[str, str] = MappingProxyType({}),
 ) -> Page:
     """The page, see `write_fleet_page`."""
     machines = {r["machine"] for r in rows}
@@ -57,7 +62,7 @@ def fleet_page(
     )
     simulated = bool(rows) and all(r["simulated"] for r in rows if r["n_seen"])
     sections = [Section("alerts", "Alerts", (_alerts(alerts),))] if alerts else []
-    table = Table("", _COLUMNS, tuple(_row(r, now, simulated) for r in rows), notes=(_NOTE,), look="stacked")
+    table = Table("", _COLUMNS, tuple(_row(r, now, simulated, pages) for r in rows), notes=(_NOTE,), look="stacked")
     sections.append(Section("fleet", "Machines and channels, worst first", (table,), "Machines and channels"))
     if unknown:
         sections.append(Section("unknown", "Not known", tuple(Text(said, "note") for said in unknown)))
@@ -83,7 +88,7 @@ def _alerts(alerts: Sequence[tuple[str, str, str]]) -> Table:
     return Table("", columns, tuple(Row.of(*a) for a in alerts))
 
 
-def _row(r: Mapping[str, Any], now: datetime, simulated: bool) -> Row:
+def _row(r: Mapping[str, Any], now: datetime, simulated: bool, pages: Mapping[str, str]) -> Row:
     """A machine's channel: alert, none (no champion, at best provisional) or ok."""
     has = r["version"] is not None
     state = "alert" if r["alerts"] else "ok" if has else "none"
@@ -94,7 +99,8 @@ def _row(r: Mapping[str, Any], now: datetime, simulated: bool) -> Row:
     drifted = newer is not None and bound is not None and newer > bound
     seen = r["last_seen"] or ""
     return Row.of(
-        Cell(f"{r['machine']} {r['channel']}", chip=(label, state), simulated=r["simulated"] and not simulated),
+        Cell(f"{r['machine']} {r['channel']}", chip=(label, state), simulated=r["simulated"] and not simulated,
+             link=pages.get(r["machine"], "")),
         Cell(f"v{r['version']} {r['family']}", _days(r["age_days"])) if has else Cell(lacking, r["reason"]),
         Cell(seen[:10] or ("not known" if has else ""), _days(r["seen_days_ago"]) if seen else "",
              "old_champion" in r["rules"]),

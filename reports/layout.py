@@ -103,7 +103,10 @@ class Gauge:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell with a smaller line below, a chip (text, look), a gauge; `alert` where it is the reason of an alert."""
+    """A cell with a smaller line below, a chip (text, look), a gauge; `alert` where it is the reason of an alert.
+
+    `link` is where its text leads to, relative to the page.
+    """
 
     text: str
     below: str = ""
@@ -111,6 +114,7 @@ class Cell:
     chip: tuple[str, str] = ("", "")
     gauge: Gauge | None = None
     simulated: bool = False
+    link: str = ""
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote
 
 import typer
 
@@ -139,8 +142,9 @@ def status(
     if html is not None:
         from reports.fleet import write_fleet_page
 
-        write_fleet_page(html, view.rows, [(a.machine, a.channel, a.reason) for a in view.alerts], view.fleets,
-                         datetime.now(UTC))  # fmt: skip
+        shown = [(a.machine, a.channel, a.reason) for a in view.alerts]
+        pages = newest_reports({r["machine"] for r in view.rows}, html)
+        write_fleet_page(html, view.rows, shown, view.fleets, datetime.now(UTC), pages)
     if as_json:
         tables = {k: found[k] for k in ("models", "trainings", "diagnoses", "lake", "as_of")}
         alerts = [a.__dict__ for a in view.alerts]
@@ -156,6 +160,17 @@ def status(
             console.note(f"alert {a.text}")
         if view.alerts:
             raise typer.Exit(ALERT_CODE)
+
+
+def newest_reports(machines: Iterable[str], page: Path) -> dict[str, str]:
+    """By machine the newest report that `train` wrote into the home, as a link from the page."""
+    found = {}
+    for machine in machines:
+        named = re.compile(rf"{re.escape(machine)}-\d{{8}}-\d{{6}}\.html")
+        own = sorted(p for p in (home() / "reports").glob("*.html") if named.fullmatch(p.name))
+        if own:
+            found[machine] = quote(os.path.relpath(own[-1], page.resolve().parent))
+    return found
 
 
 def _deliver() -> None:

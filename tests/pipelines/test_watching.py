@@ -21,6 +21,7 @@ from models.metrics import residual_std_um
 from models.trust import farthest, watched
 from pipelines import fleet_state, model_store, registry, settings, training, watching
 from pipelines.caller import DirectCaller
+from pipelines.commands.status import newest_reports
 from pipelines.fleet import Fleet, FleetMachine
 from pipelines.fleet_view import fleet_view
 from pipelines.recordings import home_lake, load_batches
@@ -211,3 +212,18 @@ def test_a_channel_that_the_fleet_file_leaves_out_is_no_row(place: Place, tmp_pa
     assert [r["channel"] for r in fleet_view(tmp_path, channels).rows] == ["z"]
     fleet_state.write_schedule(tmp_path, Fleet("/m/fleet.yml", (replace(one, channels=()),)), {})
     assert {r["channel"] for r in fleet_view(tmp_path, channels).rows} == {"x", "z"}
+
+
+def test_a_row_of_the_page_leads_to_the_newest_report_of_its_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("THERMODRIFT_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "home" / "reports"
+    folder.mkdir(parents=True)
+    stamps = ("mill-20260101-120000", "mill-20260301-080000", "mill-2-20260401-080000", "mill-notes")
+    for name in stamps:
+        (folder / f"{name}.html").write_text("")
+    found = newest_reports(("mill", "mill-2", "lathe"), tmp_path / "pages" / "fleet.html")
+    assert found == {
+        "mill": "../home/reports/mill-20260301-080000.html", "mill-2": "../home/reports/mill-2-20260401-080000.html",
+    }  # fmt: skip

@@ -67,11 +67,12 @@ def test_the_page_is_whole_and_escaped(tmp_path: Path) -> None:
     path = tmp_path / "fleet.html"
     alerts = [("mill", "z", "error S 6 µm above"), ("mill", "", "the last retraining failed: no <share>")]
     fleets = [{"source": "/etc/fleet.yml", "served": True, "machines": 2}]
-    write_fleet_page(path, [DRIFTING, row_of("hmc", simulated=True)], alerts, fleets, NOW)
+    write_fleet_page(path, [DRIFTING, row_of("hmc", simulated=True)], alerts, fleets, NOW, {"mill": "r/a%20b.html"})
     text = unscripted(path.read_text(encoding="utf-8"))
     assert "no &lt;share&gt;" in text and "<share>" not in text and text.count("SIMULATED") == 1
     assert "http" not in text.replace("http-equiv", "")  # nothing is loaded
     assert "2 machines, served now" in text
+    assert text.count("<a href=") == 3 and '<a href="r/a%20b.html">mill z</a>' in text
     page = fleet_page([row_of("mill", simulated=True), row_of("hmc", simulated=True)], [], [], NOW)
     assert page.simulated  # then the title says so, and no row
     with pytest.raises(InputError, match="unsupported file extension"):
