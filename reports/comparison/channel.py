@@ -65,7 +65,7 @@ def channel_part(
         *headline(name, group[0], choice, outcome, digits),
         Text(f"Points: {', '.join(choice.inputs)}.", "note") if choice.inputs else None,
         left_out or Text("No left-out prediction of this model was kept.", "soft"),
-        runs_viewer(name, result, shown, digits),
+        runs_viewer(name, group[0], shown, digits),
         groups_table(name, result, choice, digits),
         why_panel(name, result, choice, rule, digits),
         Details("Promotion, and what changed since the last training", _promotion(name, group, choices, outcome, rule)),
@@ -124,11 +124,12 @@ def _boards(name: str, result: GridResult, promoted: Promoted, digits: int) -> t
     return given(race_table(name, result, digits), apart, *boards)
 
 
-def runs_viewer(name: str, result: GridResult, shown: Sequence[LeftOut], digits: int) -> Viewer | None:
+def runs_viewer(name: str, training: Training, shown: Sequence[LeftOut], digits: int) -> Viewer | None:
     """Every left-out run, recorded and predicted; None along an axis, where a run is no line over the time."""
+    result, unit = training.result, training.params.get("unit", "um")
     panes = [
         Pane(
-            b.batch_id, result.target, "um", b.time_h,
+            b.batch_id, result.target, unit, b.time_h,
             (Trace("recorded", b.recorded_um, "recorded"), Trace("predicted", b.predicted_um, "computed")),
             f"S = {number(b.S_um, digits)} µm",
         )

@@ -184,6 +184,9 @@ def test_the_viewer_holds_every_later_run(toy_batches: Maker) -> None:
         read = np.where(np.isfinite(steps), np.nancumsum(steps), np.nan) * line["q"]
         span = np.ptp(own[name].dropna())
         assert np.allclose(read, own[name], atol=span / 1000, equal_nan=True)
+    (other,) = blocks(page_of([replace(training(result), params={"unit": "mrad"})], RULE).sections[0], Viewer)
+    assert plain["unit"] == "µm" and json.loads(other.json)["panes"][0]["unit"] == "mrad"
+    assert other.panes[0].summary.endswith(" mrad")
     assert "<" not in found.json, "a name could end the script element"
 
 
