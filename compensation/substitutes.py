@@ -199,12 +199,13 @@ class Substitutes:
     def without(self, name: str, batch: Batch) -> Array:
         """Values (n,) of a channel that never arrives in a run, as the guard replaces it: its level at the first sample
         by the levels of the others, and from there on its rise by theirs; NaN where one of these is masked."""
+        assert self.level is not None
         others = np.array([n != name for n in self.names])
         at = self.names.index(name)
         values = np.column_stack([batch.masked(n) for n in self.names])
         rise_K = np.where(others, values - values[0], 0.0)
-        off_K = np.where(others, values[0] - (self.level if self.level is not None else np.nan), 0.0)
-        start = (self.level[at] if self.level is not None else np.nan) + self.levels(others).weights[at] @ off_K
+        off_K = np.where(others, values[0] - self.level, 0.0)
+        start = self.level[at] + self.levels(others).weights[at] @ off_K
         return np.asarray(np.clip(start + rise_K @ self.changes(others).weights[at], self.low[at], self.high[at]))
 
     def as_plain(self) -> dict[str, Any]:

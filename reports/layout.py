@@ -17,6 +17,7 @@ from matplotlib.text import Text as FigureText
 
 from data.units import in_error_unit
 from reports.drawing import inline_svg
+from reports.viewer import Viewer
 
 _MANTISSAS = ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))  # densest first
 _CLOSEST, _MOST_TICKS = 7.0, 7  # least distance of two ticks, in 0..100
@@ -353,7 +354,7 @@ class Page:
     @property
     def with_viewer(self) -> bool:
         """Whether a block of the page is a viewer of runs."""
-        return any(type(b).__name__ == "Viewer" for b in every_block(self))
+        return any(isinstance(b, Viewer) for b in every_block(self))
 
 
 def every_block(part: Any) -> Iterator[Any]:

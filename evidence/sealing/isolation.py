@@ -66,13 +66,13 @@ def allowed(place: Path | None = None, import_from: Iterable[Path] = ()) -> Allo
     """
     root, source = own_source()
     import_from = list(import_from)
-    beside = [p.resolve().parent for p in import_from if is_package(p)]
+    parents = [p.resolve().parent for p in import_from if is_package(p)]
     own = () if place is None else (place / "case",)
     libraries = {sysconfig.get_path(k) for k in ("stdlib", "platstdlib", "purelib", "platlib")}
     system = [*SYSTEM, *sorted(libraries), f"{sys.base_prefix}/lib", *map(str, import_from)]
     read = dict.fromkeys(Path(p).resolve() for p in (*system, *source, *own) if Path(p).exists())
     write = () if place is None else ((place / "answer").resolve(),)
-    return Allowed(tuple(read), (*(root / name for name in LISTED), *beside), write)
+    return Allowed(tuple(read), (*(root / name for name in LISTED), *parents), write)
 
 
 def is_package(folder: Path) -> bool:

@@ -84,6 +84,7 @@ def test_the_page_holds_everything_and_asks_no_network(text: str) -> None:
     assert re.findall(r'<section class="part" id="(\w+)"', text) == list(ANCHORS)
     assert set(re.findall(r'href="#(\w+)"', text)) == set(ANCHORS)
     assert not re.findall(r"\bnan\b|<NA>|&lt;NA", re.sub(r'src="data:[^"]*"', "", text))
+    assert text.count('<span class="chip met">met</span>') == 10
     assert "<h1>10 of 12 goals met on 60 sealed cases. <span" in text
     lead = re.search('<p class="lead">(.*)</p>', text)
     assert lead and "\u00a0%" in lead[1] and " %" not in lead[1]  # no line ends before a unit
