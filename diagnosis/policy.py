@@ -39,7 +39,7 @@ class Policy:
     baseline_steps: int = cost(12, "steps", "under each covariance")
     weight_rounds: int = cost(3, "rounds", "of more weight for channels that would be predicted worse")
     weight_factor: float = convention(4.0, "factor", "of such a channel's weight in each of them")
-    plain_steps: int = cost(5, "steps", "of a fit that is to simulate alone")
+    plain_steps: int = cost(20, "steps", "of a fit that is to simulate alone; most end after ten")
 
     # Refined twins and their covariance
     refined_twins: int = cost(100, "draws", "directions of structure; half as many about the first calibration")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
@@ -33,7 +34,7 @@ from diagnosis.policy import POLICY
 from diagnosis.screening.signatures import imperfections
 from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Block, Noise, Unknown
-from twin.calibration.least_squares import FitOptions, State, annealed, descend, settled, x_of, z_bounds
+from twin.calibration.least_squares import FitOptions, State, annealed, descend, likelier, settled, x_of, z_bounds
 from twin.calibration.problem import EVERY_S, CalibrationProblem
 from twin.compile import compile_network
 from twin.schema import TwinPart
@@ -119,13 +120,15 @@ def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
 
 
 def relearned(fitted: Fitted) -> Fitted:
-    """The fit at its optimum with the scale of structure, and what no draw shows, that are likeliest now: they may have
-    stood in for an effect."""
+    """The fit at its likeliest optimum, from where it is and from where it would simulate alone (`plain`), with the
+    scale of structure, and what no draw shows, that are likeliest there: they may have stood in for an effect."""
     before = fitted.marginal.covariance
-    if before.structure is None:
+    if (structure := before.structure) is None:
         return relinearised(fitted)
     factor = np.ones(len(fitted.rows)) if before.factor is None else before.factor
-    return replace(_learned(fitted, before.structure, fitted.runs, (before.share,), factor), weight=fitted.weight)
+    starts = fitted, under(plain(fitted), before)
+    done = [_learned(start, structure, fitted.runs, (before.share,), factor) for start in starts]
+    return replace(max(done, key=lambda f: f.log_evidence), weight=fitted.weight)
 
 
 def _learned(at: Point, structure: Structure, runs: int, shares: Sequence[float], factor: Array) -> Fitted:
@@ -333,17 +336,23 @@ class LeftOutRows:
 def plain(fitted: Fitted) -> Fitted:
     """The same twin part calibrated to simulate alone: each channel's misfit is its noise, rows that repeat each other
     count as one (`twin.calibration`), and some channels for more (`Fitted.weight`). What a machine file states is
-    simulated without structure."""
-    problem = fitted.problem
-    state = State.at(problem, fitted.z, fitted.own, fitted.noise)
-    state = annealed(problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
-    one = calibrated(_moved(fitted, state), state.noise, fitted.runs)
-    if not fitted.weight:
-        return one
-    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(fitted.weight))
-    state = State.at(problem, one.z, one.nuisance, noise)
-    state = descend(problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
-    return calibrated(_moved(fitted, state), noise, fitted.runs)
+    simulated without structure.
+
+    Structure can hold a fit where no twin simulates well alone, so that the priors' means are a second start. The
+    likelier optimum is taken.
+    """
+    problem, tolerance = fitted.problem, POLICY.fit_tolerance_nats
+    if fitted.weight:
+        one = plain(replace(fitted, weight=()))
+        noise = replace(one.noise, factor=one.noise.factor / np.sqrt(fitted.weight))
+        state = descend(problem, State.at(problem, one.z, one.nuisance, noise), POLICY.plain_steps, tolerance)
+        return calibrated(_moved(fitted, state), noise, fitted.runs)
+    here = State.at(problem, fitted.z, fitted.own, fitted.noise)
+    state = annealed(problem, here, POLICY.plain_steps, tolerance)
+    with suppress(WorkError):  # no machine is as the priors' means say
+        options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
+        state = likelier(problem, state, settled(problem, options)[0])
+    return calibrated(_moved(fitted, state), state.noise, fitted.runs)
 
 
 def _moved(at: Point, state: State) -> Point:
