@@ -28,7 +28,7 @@ from data.processes import Processes
 from diagnosis.contracts import Candidate, Fitted, Scored
 from diagnosis.diagnose import diagnose
 from diagnosis.fitting.fitted import baseline
-from diagnosis.fitting.twins import misfits
+from diagnosis.fitting.twins import drawn_misfits
 from diagnosis.localisation.where_when import locate
 from diagnosis.policy import POLICY
 from diagnosis.screening.screen import Screen, proposed, screen
@@ -98,7 +98,7 @@ def steps_of(p: Posed, repeats: int, which: tuple[str, ...] = STEPS) -> Iterator
     yield "screen", took
     if "refined twins" in which:
         rng = np.random.default_rng(0)
-        drawn = partial(misfits, fitted.machine, fitted.part, fitted.batches, problem, fitted.values)
+        drawn = partial(drawn_misfits, fitted.machine, fitted.part, fitted.batches, problem, fitted.values)
         yield "refined twins", timed(lambda: drawn(POLICY.refined_twins, rng), 1)[0]
     yield "refit", statistics.median(timed(partial(refit, fitted, s), 1)[0] for s in chosen(fitted, seen))
     if "locate" in which:

@@ -29,12 +29,23 @@ from diagnosis.fitting.covariance import (
     white_noise,
 )
 from diagnosis.fitting.marginal import Marginal
-from diagnosis.fitting.twins import misfits
+from diagnosis.fitting.twins import drawn_misfits
 from diagnosis.policy import POLICY
 from diagnosis.screening.signatures import imperfections
 from twin.calibration.estimate import check_batches
 from twin.calibration.fit_problem import Block, Noise, Unknown
-from twin.calibration.least_squares import FitOptions, State, annealed, descend, likelier, settled, x_of, z_bounds
+from twin.calibration.least_squares import (
+    FitOptions,
+    State,
+    annealed,
+    descend,
+    likelier,
+    misfits,
+    noise_left,
+    settled,
+    x_of,
+    z_bounds,
+)
 from twin.calibration.problem import EVERY_S, CalibrationProblem
 from twin.compile import compile_network
 from twin.schema import TwinPart
@@ -120,8 +131,8 @@ def on_all_rows(fitted: Fitted, batches: Sequence[Batch]) -> Fitted:
 
 
 def relearned(fitted: Fitted) -> Fitted:
-    """The fit at its likeliest optimum, from where it is and from where it would simulate alone (`plain`), with the
-    scale of structure, and what no draw shows, that are likeliest there: they may have stood in for an effect."""
+    """The fit at its optimum with the scale of structure, and what no draw shows, that are likeliest now: they may have
+    stood in for an effect. The likelier of two optima: that near the fit, and that near the `plain` one."""
     before = fitted.marginal.covariance
     if (structure := before.structure) is None:
         return relinearised(fitted)
@@ -157,7 +168,7 @@ def _structure(at: Point, draws: int, rng: np.random.Generator, tell: Callable[[
         tell("refined twins", n, of)
 
     def about(at: Point) -> list[Array]:
-        drawn = misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, rng, progress)
+        drawn = drawn_misfits(at.machine, at.part, at.batches, at.problem, at.values, draws, rng, progress)
         blocks = list(at.problem.linearise(at.x, at.nuisance))
         return clipped(beyond_recalibration(blocks, _spread(at.problem.unknowns), drawn))
 
@@ -338,21 +349,26 @@ def plain(fitted: Fitted) -> Fitted:
     count as one (`twin.calibration`), and some channels for more (`Fitted.weight`). What a machine file states is
     simulated without structure.
 
-    Structure can hold a fit where no twin simulates well alone, so that the priors' means are a second start. The
-    likelier optimum is taken.
+    Structure can hold a fit where no twin simulates well alone: where a misfit passes for noise, the priors' means are
+    a second start, and the likelier optimum is taken.
     """
     problem, tolerance = fitted.problem, POLICY.fit_tolerance_nats
-    if fitted.weight:
-        one = plain(replace(fitted, weight=()))
-        noise = replace(one.noise, factor=one.noise.factor / np.sqrt(fitted.weight))
-        state = descend(problem, State.at(problem, one.z, one.nuisance, noise), POLICY.plain_steps, tolerance)
-        return calibrated(_moved(fitted, state), noise, fitted.runs)
-    here = State.at(problem, fitted.z, fitted.own, fitted.noise)
-    state = annealed(problem, here, POLICY.plain_steps, tolerance)
-    with suppress(WorkError):  # no machine is as the priors' means say
+    state = State.at(problem, fitted.z, fitted.own, fitted.noise)
+    state = annealed(problem, state, POLICY.plain_steps, tolerance)
+    if misfits(noise_left(problem, state)):
         options = FitOptions(max_iterations=POLICY.plain_steps, tolerance=tolerance, reweight=True)
-        state = likelier(problem, state, settled(problem, options)[0])
-    return calibrated(_moved(fitted, state), state.noise, fitted.runs)
+        with suppress(WorkError):  # no machine is as the priors' means say
+            state = likelier(problem, state, settled(problem, options)[0])
+    one = calibrated(_moved(fitted, state), state.noise, fitted.runs)
+    return _weighted(one, np.array(fitted.weight)) if fitted.weight else one
+
+
+def _weighted(one: Fitted, weight: Array) -> Fitted:
+    """A `plain` fit in which channels count for more by factors (C,)."""
+    noise = replace(one.noise, factor=one.noise.factor / np.sqrt(weight))
+    state = State.at(one.problem, one.z, one.nuisance, noise)
+    state = descend(one.problem, state, POLICY.plain_steps, POLICY.fit_tolerance_nats)
+    return calibrated(_moved(one, state), noise, one.runs)
 
 
 def _moved(at: Point, state: State) -> Point:
@@ -370,7 +386,10 @@ def calibrated(at: Point, noise: Noise, runs: int = 0) -> Fitted:
 @lru_cache(maxsize=16)
 def left_out_rows(fitted: Fitted) -> LeftOutRows:
     """Every batch predicted, free-running, by the `plain` fit to all others; its starts and zeros are its own."""
-    one = plain(fitted)
+    return _left_out(plain(fitted))
+
+
+def _left_out(one: Fitted) -> LeftOutRows:
     problem, spread = one.problem, _spread(one.problem.unknowns)
     blocks = list(problem.linearise(one.x, one.nuisance))
     low, high = z_bounds(problem.unknowns)
@@ -412,15 +431,16 @@ def unharmed(before: Fitted, after: Fitted) -> tuple[Fitted, dict[str, tuple[flo
     What it adds lets it predict every channel as well; which of them it favours is a matter of weights. At first each
     channel counts as it did before: what is explained better would count for more, and the others for less.
     """
-    raised = worsened(left_out_rows(before), left_out_rows(after))
+    known = left_out_rows(before)
+    raised = worsened(known, left_out_rows(after))
     if not raised:
         return after, {}
-    weight = (plain(after).noise.factor / plain(before).noise.factor) ** 2
+    one = plain(replace(after, weight=()))
+    weight = (one.noise.factor / plain(before).noise.factor) ** 2
     for _ in range(POLICY.weight_rounds):
-        fair = replace(after, weight=tuple(weight.tolist()))
-        still = worsened(left_out_rows(before), left_out_rows(fair))
+        still = worsened(known, _left_out(_weighted(one, weight)))
         if not still:
-            return fair, {}
+            return replace(after, weight=tuple(weight.tolist())), {}
         weight[[after.problem.channels.index(c) for c in still]] *= POLICY.weight_factor
     return after, raised
 

@@ -31,7 +31,7 @@ from twin.simulation import simulate
 Rng = np.random.Generator
 
 
-def misfits(
+def drawn_misfits(
     machine: Machine,
     part: TwinPart,
     batches: Sequence[Batch],
