@@ -80,6 +80,15 @@ def number(value: float, digits: int = 1, sign: bool = False) -> str:
     return text.replace("-", "−")
 
 
+def digits_of(*values: float) -> int:
+    """Digits after the point for values that are compared: two that count of the largest, one of the smallest."""
+    sizes = [abs(v) for v in values if v and math.isfinite(v)]
+    if not sizes:
+        return 0
+    largest, smallest = 1 - math.floor(math.log10(max(sizes) * 1.005)), -math.floor(math.log10(min(sizes) * 1.05))
+    return max(0, min(2, max(largest, smallest)))
+
+
 def plus_minus(mean: float, std: float, digits: int) -> str:
     """``2.9 ± 0.8``; without a spread the mean alone."""
     return f"{number(mean, digits)} ± {number(std, digits)}" if math.isfinite(std) else number(mean, digits)

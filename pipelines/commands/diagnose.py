@@ -13,7 +13,7 @@ from data.errors import InputError, WorkError
 from data.units import unit_label
 from pipelines import console
 from pipelines.options import Json, split
-from reports.labels import count, number
+from reports.labels import count, digits_of, number
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -121,8 +121,8 @@ def error_table(d: Diagnosis) -> Table:
     columns = ("channel", "unit", "batches", "before", "after", "noise")
     table = console.table("left-out rms", *columns, left=columns[:2])
     for r in by_channel(d.tables["rms"]).to_dict("records"):
-        digits = 1 if max(r["before"], r["after"]) >= 9.5 else 2
-        shown = (number(r[k], digits) for k in ("before", "after", "floor"))
+        rms = [r[k] for k in ("before", "after", "floor")]
+        shown = (number(v, digits_of(*rms)) for v in rms)
         table.add_row(str(r["channel"]), unit_label(str(r["unit"])), str(r["batches"]), *shown)
     return table
 

@@ -17,7 +17,7 @@ from data.units import unit_label
 from reports.diagnosis.map import KINDS
 from reports.diagnosis.tables import SEEN_Z, ordered, strongest
 from reports.drawing import MUTED, SIGNED, WIDTH_IN, calm, head, legend_row
-from reports.labels import BLUE, INK, ORANGE, number, tex_escaped
+from reports.labels import BLUE, INK, ORANGE, digits_of, number, tex_escaped
 
 FLOOR = "#cfd6dd"
 _ROW_IN, _MOST_ROWS, _MOST_RUNS = 0.27, 12, 30
@@ -99,7 +99,7 @@ def _numbers(ax: Axes, part: pd.DataFrame, changed: bool, wide_in: float) -> Non
     for x, label in zip(columns, ("rms", "noise", "runs better" if changed else ""), strict=True):
         ax.text(x, -0.86, label, fontsize=7.5, color=MUTED, **style)
     for i, r in enumerate(part.to_dict("records")):
-        digits = _digits(max(r["before"], r["after"]))
+        digits = digits_of(r["before"], r["after"], r["floor"])
         after = number(r["after"], digits)
         values = f"{number(r['before'], digits)} → {after}" if changed else after
         cells = (values, number(r["floor"], digits), f"{r['improved']} of {r['batches']}" if changed else "")
@@ -158,7 +158,7 @@ def _run(ax: Axes, own: pd.DataFrame, scores: pd.DataFrame, channel: str, change
     unit = unit_label(str(own["unit"].iloc[0])) if len(own) else ""
     ax.set_title(tex_escaped(f"{channel}, {unit}"), fontsize=8.5, loc="left", color=INK, pad=3)
     for r in scores.to_dict("records"):
-        digits = _digits(max(r["before"], r["after"]))
+        digits = digits_of(r["before"], r["after"])
         after = f"rms {number(r['after'], digits)} {unit_label(r['unit'])}"
         label = after.replace("rms ", f"rms {number(r['before'], digits)} → ") if changed else after
         ax.set_title(label, fontsize=8, loc="right", color=BLUE, pad=3)
@@ -170,10 +170,6 @@ def _run(ax: Axes, own: pd.DataFrame, scores: pd.DataFrame, channel: str, change
 def _shortened(name: str) -> str:
     """Both ends of a long name: what distinguishes runs stands mostly last."""
     return name if len(name) <= 13 else f"{name[:4]}…{name[-8:]}"
-
-
-def _digits(value: float) -> int:
-    return 0 if value >= 99.5 else 1 if value >= 0.95 else 2
 
 
 BY = {"regime": "by regime", "batch": "by run", "hour": "by time of day", "since_start": "since the run's start"}

@@ -19,7 +19,7 @@ from reports.diagnosis.first_screen import Continued, Unsealed, limits_sentence,
 from reports.diagnosis.map import Mark, mismatch_picture
 from reports.diagnosis.tables import by_change, by_channel, chosen_channels, mismatch, telling
 from reports.drawing import Picture, picture
-from reports.labels import number, sentence
+from reports.labels import digits_of, number, sentence
 from reports.layout import (
     Claim,
     Claims,
@@ -303,7 +303,7 @@ def _figures(d: Diagnosis) -> list[Number]:
         telling = ranked[ranked["change"] > _TELLING]
         ranked = telling if changed and len(telling) else ranked
         for r in ranked[:_MOST_FIGURES].to_dict("records"):
-            digits = 1 if max(r["before"], r["after"]) >= 0.95 else 2
+            digits = digits_of(r["before"], r["after"], r["floor"])
             unit = unit_label(str(r["unit"]))
             before = number(r["before"], digits) if changed else ""
             noise = f"noise {number(r['floor'], digits)} {unit}"
